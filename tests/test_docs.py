@@ -20,11 +20,11 @@ from webots_mcp.bridge.devices import MOST_OBJECTS, SECTORS
 from webots_mcp.cli import described, names
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.database.connection import OLDEST_SQLITE, SCHEMA_FILE
+from webots_mcp.judging.detection.events import kind_names
 from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.questions.declaring import MAX_WAIT_S
 from webots_mcp.server import create_server
 from webots_mcp.setup.client_entries import claude_desktop, clients_of, is_ours
-from webots_mcp.store.detection.events import kind_names
 
 CHECKOUT = Path(__file__).parents[1]
 DOCS = CHECKOUT / "docs"

@@ -68,10 +68,10 @@ from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
-from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import OpenReaders, Recording
 from webots_mcp.store.requests import Requester
 from webots_mcp.store.retention import Asked, ask
+from webots_mcp.store.sql import describe_schema
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "

@@ -30,6 +30,11 @@ from webots_mcp.database.connection import Role, connect, require_current, schem
 from webots_mcp.database.pauses import PAUSED
 from webots_mcp.database.queue import Command, CommandQueue, fetch_command, list_commands
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, WebotsMCPError
+from webots_mcp.judging.checks import CHECKS, check_run
+from webots_mcp.judging.detection.events import find_events
+from webots_mcp.judging.detection.kinds import Event as FoundEvent
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.divergence import compare_repeats
 from webots_mcp.signals.conditions.compiler import read_expectation
 from webots_mcp.signals.naming import Value
 from webots_mcp.signals.parameter import Value as ParameterValue
@@ -44,14 +49,9 @@ from webots_mcp.standin import (
 )
 from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.in_process import DEFAULT_WORLD
-from webots_mcp.store.checks import CHECKS, check_run
-from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import Event as FoundEvent
-from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.export import Source
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
-from webots_mcp.store.questions.first_difference import compare_repeats
 from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, find_subject, whole_run
@@ -385,7 +385,7 @@ class RobotRecording:
         Args:
             kinds: `standstill`, `stuck`, `jump`, `oscillation`, `missing`, `gap`, ...; none for all
                 but pictures.
-            options: More fields of `webots_mcp.store.detection.kinds.EventOptions`.
+            options: More fields of `webots_mcp.judging.detection.kinds.EventOptions`.
 
         Raises:
             InvalidInputError: There is no such kind.

@@ -20,7 +20,7 @@ from tests.detection.labelled import Array, LabelledRun
 from tests.detection.writing import Writer
 from tests.memory import memory_connection
 from webots_mcp.analysis.summary import MOST_CHANCE, Outcome, rank
-from webots_mcp.store.questions.compare import Comparison, compare_runs
+from webots_mcp.judging.comparison import Comparison, compare_runs
 
 _RUNS: Final = (3, 5, 10)
 _EFFECTS_SD: Final = (0.5, 1.0, 2.0, 4.0)

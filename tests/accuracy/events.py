@@ -20,9 +20,9 @@ from tests.detection.labelled import SETTING, Measure, Setting
 from tests.detection.measuring import Report, measure
 from tests.detection.sensing import READING_NOISES_M
 from tests.detection.swinging import NOISE_SHARE_LEVELS
-from webots_mcp.store.checks import CHECKS
-from webots_mcp.store.detection.events import KINDS
-from webots_mcp.store.detection.kinds import EventOptions
+from webots_mcp.judging.checks import CHECKS
+from webots_mcp.judging.detection.events import KINDS
+from webots_mcp.judging.detection.kinds import EventOptions
 
 INTERVALS_S: Final = (0.016, 0.064, 0.16, 0.5)
 LEVELS: Final = ("no noise", "little", "much")

@@ -12,8 +12,8 @@ from tests.accuracy.__main__ import PARTS, SHOWN, figures, page_of
 from tests.accuracy.page import FIGURES, PAGE, README, Part, sections, share
 from tests.benchmarks.core import Bench
 from tests.checks.labelled import FAULTS, WRITTEN
-from webots_mcp.store.checks import CHECKS
-from webots_mcp.store.detection.events import kind_names
+from webots_mcp.judging.checks import CHECKS
+from webots_mcp.judging.detection.events import kind_names
 
 PAGE_TEXT = PAGE.read_text("utf-8")
 SECTIONS = sections(PAGE_TEXT)

@@ -16,18 +16,18 @@ from tests.benchmarks.core import Bench, Line, Target, benchmark, compared, time
 from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.database.connection import connect
+from webots_mcp.judging.detection.events import find_events, timeline
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.divergence import compare_rows
+from webots_mcp.judging.trends import trends
 from webots_mcp.plotting import plot
 from webots_mcp.questions.monitor import look_back
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.detection.events import find_events, timeline
-from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.logs import LogFilter, Window, count_lines, newest_lines
-from webots_mcp.store.questions.first_difference import compare_rows
-from webots_mcp.store.questions.series import query_history
-from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.catalogue import list_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.series import query_history
 
 _ROWS: Final = 1_000_000
 _OVERVIEW: Final = "pose.0"

@@ -10,8 +10,8 @@ import numpy as np
 
 from tests.checks.labelled import FAULTS, WRITTEN, healthy, record
 from tests.memory import memory_connection
-from webots_mcp.store.checks import CHECKS, check_run
-from webots_mcp.store.checks.finding import Finding
+from webots_mcp.judging.checks import CHECKS, check_run
+from webots_mcp.judging.checks.finding import Finding
 
 OF_EACH_FAULT: Final = 5
 HEALTHY: Final = "healthy"

@@ -13,8 +13,8 @@ import pytest
 
 from tests.checks.judging import HEALTHY, checked, judge, render
 from tests.recordings.rows import Recorded, RecordedRobot
+from webots_mcp.judging.checks import CHECKS, check_run
 from webots_mcp.signals.conditions.compiler import read_expectation
-from webots_mcp.store.checks import CHECKS, check_run
 from webots_mcp.store.chunk_making import make_chunks
 
 

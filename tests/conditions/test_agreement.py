@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from tests.conditions.writing import Node, Rows, conditions, rows, written
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.database.connection import connect
+from webots_mcp.judging.detection.condition import values_at, where_held
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.detection.condition import values_at, where_held
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from tests.conditions.writing import Node, Rows, conditions, rows, written
 from tests.frames import frame_of, frame_of_states
 from webots_mcp.errors import ConditionFailedError
+from webots_mcp.judging.detection.condition import holds_in
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.signals.naming import find_position
-from webots_mcp.store.detection.condition import holds_in
 
 COMPARISON: dict[str, Any] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,

@@ -7,8 +7,8 @@ import pytest
 from tests.conditions.writing import Rows
 from tests.frames import frame_of_states
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError, UnknownSignalError
+from webots_mcp.judging.detection.condition import aggregated
 from webots_mcp.signals.conditions.scoring import Facts, Scored, parse_score
-from webots_mcp.store.detection.condition import aggregated
 
 STATES: Rows = [
     (0.0, {"x": -1.0, "error": -2.0, "mode": "drive", "bumper": False, "gone": None}),

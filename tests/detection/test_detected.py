@@ -19,8 +19,8 @@ from tests.detection.writing import write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.analysis.swings import MUCH_SLOWER
-from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import EventOptions
+from webots_mcp.judging.detection.events import find_events
+from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 pytestmark = pytest.mark.slow

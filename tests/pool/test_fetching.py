@@ -25,14 +25,14 @@ from webots_mcp import MCPBridge
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.trends import trends
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.parameters import find_trial_set, trials_of
 from webots_mcp.store.purge import prune
-from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.runs import run_info
 
 OF_RUN = ("kept_stretch", "kept_state", "log", "event", "image", "parameter_value", "state")
 LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id", "path",

@@ -7,11 +7,11 @@ import sqlite3
 from dataclasses import fields, is_dataclass
 from typing import Any, Final, cast
 
-from webots_mcp.store.detection.events import find_events, timeline
-from webots_mcp.store.questions.compare import compare_runs
-from webots_mcp.store.questions.series import query_history
-from webots_mcp.store.questions.trends import trends
+from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.detection.events import find_events, timeline
+from webots_mcp.judging.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.series import query_history
 
 _LOCAL: Final = {
     "id", "ids", "run_id", "run_ids", "session_id", "robot_id", "cursor", "path",

@@ -17,9 +17,9 @@ from PIL import Image
 from tests.recordings.rows import Recorded
 from tests.report.conftest import Shown
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
+from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.plugins.report.making import Report, make_report
 from webots_mcp.plugins.report.words import cut, length, number
-from webots_mcp.store.questions.compare import compare_runs
 
 EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
 

@@ -16,7 +16,7 @@ from tests.server.conftest import Connect, ask, fail, text_of
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.server import create_server
-from webots_mcp.store.questions.sql import FOLDER, LINE, Statement, decode
+from webots_mcp.store.sql import FOLDER, LINE, Statement, decode
 
 pytestmark = pytest.mark.anyio
 

@@ -17,8 +17,8 @@ from webots_mcp.database.connection import Role, connect, keep_deadline, shipped
 from webots_mcp.errors import DatabaseError, ForeignDatabaseError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge
-from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.sql import describe_schema
 
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT {} FROM n"
 AS_ROBOT = ENDLESS.format("i AS id, 'rover' AS name") + " WHERE i < 0"

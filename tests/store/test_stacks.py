@@ -29,8 +29,8 @@ from webots_mcp.database.stacks import (
     stacks_path,
 )
 from webots_mcp.database.waiting_file import adopt
+from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.recording import look
 from webots_mcp.store.run_rows import pace_of
 

@@ -36,7 +36,7 @@ from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.signals.naming import listed, spelled_out
 
 if TYPE_CHECKING:
-    from webots_mcp.store.questions.first_difference import Parting
+    from webots_mcp.judging.divergence import Parting
 
 EXIT_CODES: Final = {"fail": 1, "not looked at": 2}
 _ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
@@ -208,9 +208,9 @@ def repeat(
     Supervisor, or in a simulator process of its own, as a trial does. Where runs part after a
     reset, and processes of their own do not, the reset is to blame.
     """
-    from webots_mcp.store.questions.first_difference import compare_repeats
-    from webots_mcp.store.questions.runs import annotate_run
+    from webots_mcp.judging.divergence import compare_repeats
     from webots_mcp.store.run_rows import fetch_run
+    from webots_mcp.store.runs import annotate_run
 
     ways = sorted(dict.fromkeys(by or ["reset"]))  # processes first: others are judged by them
     if number < 2:
@@ -296,8 +296,8 @@ def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
 
 
 def _answer(found: Sequence[Parting]) -> dict[str, Any]:
+    from webots_mcp.judging.divergence import verdict_on
     from webots_mcp.questions.compare_runs import parting_facts
-    from webots_mcp.store.questions.first_difference import verdict_on
 
     facts = [{"run_id": each.run_ids[1], **parting_facts(each)} for each in found]
     shown = ("run_id", "verdict", "growth", "notes")

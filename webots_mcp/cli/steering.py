@@ -501,9 +501,9 @@ class _Progress:
 
 
 def _show_trials(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
+    from webots_mcp.judging.divergence import repeats_noted
     from webots_mcp.store.parameters import ranking_of, trials_of
-    from webots_mcp.store.questions.first_difference import repeats_noted
-    from webots_mcp.store.questions.runs import unseen
+    from webots_mcp.store.runs import unseen
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)

@@ -15,7 +15,7 @@ from zlib import crc32
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.questions.series import MOST_POINTS
+from webots_mcp.store.series import MOST_POINTS
 
 # Colours that people with any kind of colour vision can tell apart.
 #

@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 from webots_mcp.analysis.arrays import np, rhythm_of
 from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.plotting.parts import Part
-from webots_mcp.store.questions.series import NumberColumns, RunHistory
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.segment import Deadline
+from webots_mcp.store.series import NumberColumns, RunHistory
 from webots_mcp.store.signals import Signal
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum

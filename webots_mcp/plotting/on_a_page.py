@@ -19,7 +19,7 @@ from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.signals import SignalAxes, paint_signals
 from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.questions.series import MOST_POINTS
+from webots_mcp.store.series import MOST_POINTS
 
 ROOM: Final = Room(points=MOST_POINTS, panels=8, lanes=8, rows=16)
 WIDTH_PX: Final = 900

@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.events import Events, Found, drawn_kinds, find_events
+from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
+from webots_mcp.judging.detection.search import find_motion
 from webots_mcp.plotting.canvas import (
     TEXT_PX,
     Area,
@@ -21,15 +24,12 @@ from webots_mcp.plotting.canvas import (
     wrapped,
 )
 from webots_mcp.plotting.intervals import Interval, Lane
-from webots_mcp.store.detection.events import Events, Found, drawn_kinds, find_events
-from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
-from webots_mcp.store.detection.search import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
-from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.catalogue import one_signal, signals_of
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.run_rows import fetch_run
+from webots_mcp.store.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.signals import Signal
 
 Known = dict[str, Signal]

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.judging.detection.events import Found
 from webots_mcp.plotting.canvas import (
     DASHES,
     INK,
@@ -59,7 +60,6 @@ from webots_mcp.plotting.parts import (
     unread_parts,
 )
 from webots_mcp.signals.naming import listed, spelled_out
-from webots_mcp.store.detection.events import Found
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 

@@ -9,6 +9,9 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.events import Found
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.search import motion_in
 from webots_mcp.plotting.canvas import (
     DASHES,
     INK,
@@ -55,9 +58,6 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.signals.naming import listed, spelled_out
-from webots_mcp.store.detection.events import Found
-from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.search import motion_in
 from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange

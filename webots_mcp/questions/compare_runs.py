@@ -13,6 +13,17 @@ from pydantic import Field
 
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
+from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.comparison import (
+    COMPARE_DEADLINE_S,
+    Comparison,
+    Difference,
+    Group,
+    compare_runs,
+)
+from webots_mcp.judging.detection.kinds import EventOptions, both_of
+from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
 from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
 from webots_mcp.questions.budget import (
     DETAIL_BUDGET_TOKENS,
@@ -50,20 +61,10 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
-from webots_mcp.store.checks import CHECK_DEADLINE_S, check_run
-from webots_mcp.store.checks.finding import Finding
-from webots_mcp.store.detection.kinds import EventOptions, both_of
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
-from webots_mcp.store.questions.compare import (
-    COMPARE_DEADLINE_S,
-    Comparison,
-    Difference,
-    Group,
-    compare_runs,
-)
-from webots_mcp.store.questions.first_difference import PartedSignal, Parting, compare_rows
-from webots_mcp.store.questions.runs import (
+from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.runs import (
     MOST_RUNS,
     Measure,
     RunInfo,
@@ -72,7 +73,6 @@ from webots_mcp.store.questions.runs import (
     pace,
     run_info,
 )
-from webots_mcp.store.recording import Recording, View, look
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",

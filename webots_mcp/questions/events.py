@@ -8,6 +8,16 @@ from typing import Annotated, Any, Final
 from pydantic import AfterValidator, Field
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.events import (
+    KINDS,
+    Events,
+    Found,
+    kind_names,
+    search_events,
+    stored_kinds,
+    timeline,
+)
+from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts, both_of
 from webots_mcp.questions.answers import EventsAnswer, KindVerdicts, Table, TimelineAnswer
 from webots_mcp.questions.budget import (
     DETAIL_BUDGET_TOKENS,
@@ -35,16 +45,6 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
-from webots_mcp.store.detection.events import (
-    KINDS,
-    Events,
-    Found,
-    kind_names,
-    search_events,
-    stored_kinds,
-    timeline,
-)
-from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts, both_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.questions.answers import (
     ChangeSeries,
     HistoryAnswer,
@@ -52,7 +53,10 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
-from webots_mcp.store.questions.series import (
+from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
+from webots_mcp.store.reading.ranges import Scope, TimeRange
+from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.series import (
     DEFAULT_POINTS,
     ChangeColumns,
     NumberColumns,
@@ -61,10 +65,6 @@ from webots_mcp.store.questions.series import (
     query_history,
     query_rows,
 )
-from webots_mcp.store.questions.trends import RunTrends, StateTrend, Trend, trends
-from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
-from webots_mcp.store.reading.ranges import Scope, TimeRange
-from webots_mcp.store.recording import Recording, View
 
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 

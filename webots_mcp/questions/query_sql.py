@@ -25,7 +25,9 @@ from webots_mcp.questions.budget import (
     tokens_of,
 )
 from webots_mcp.questions.declaring import READS, ShownLimit, question
-from webots_mcp.store.questions.sql import (
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.sql import (
     FOLDER,
     LINE,
     Cell,
@@ -35,8 +37,6 @@ from webots_mcp.store.questions.sql import (
     decode,
     require_select,
 )
-from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
-from webots_mcp.store.recording import Recording
 
 DEFAULT_ROWS: Final = 100
 _BUDGET_BYTES: Final = 5_000  # of values: what is read, of which as much is shown as fits

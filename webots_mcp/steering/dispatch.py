@@ -30,6 +30,9 @@ from webots_mcp.errors import (
     UnknownActionError,
     UnknownSignalError,
 )
+from webots_mcp.judging.detection.events import search_events
+from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.trends import trends
 from webots_mcp.questions.answers import CommandAnswer, RunAnswer
 from webots_mcp.questions.budget import (
     RESULT_BUDGET_TOKENS,
@@ -48,10 +51,6 @@ from webots_mcp.questions.monitor import movement
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import flatten, perhaps_meant
-from webots_mcp.store.detection.events import search_events
-from webots_mcp.store.detection.kinds import Event
-from webots_mcp.store.questions.runs import pace
-from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
 from webots_mcp.store.reading.segment import Subject
@@ -73,6 +72,7 @@ from webots_mcp.store.robots import (
     without_observers,
 )
 from webots_mcp.store.run_rows import State, state_at
+from webots_mcp.store.runs import pace
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
 

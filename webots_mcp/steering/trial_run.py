@@ -64,9 +64,9 @@ from webots_mcp.store.parameters import (
     trials_of,
 )
 from webots_mcp.store.policy import LAUNCH
-from webots_mcp.store.questions.runs import run_info, score_run
 from webots_mcp.store.recording import Job, Recording
 from webots_mcp.store.requests import permit
+from webots_mcp.store.runs import run_info, score_run
 
 if TYPE_CHECKING:
     import optuna

@@ -42,10 +42,10 @@ from webots_mcp.store.parameters import (
     take_up,
     trials_of,
 )
-from webots_mcp.store.questions.runs import score_run
 from webots_mcp.store.recording import Job, Recording, View
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import find_block, robot_name
+from webots_mcp.store.runs import score_run
 
 OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
 _LOOK_EVERY_S: Final = 0.02

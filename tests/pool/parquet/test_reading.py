@@ -18,16 +18,16 @@ from tests.pool.parquet.conftest import RECORDINGS, Many
 from tests.pool.rows import ship, uuid_of
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.events import find_events
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.trends import trends
 from webots_mcp.plugins.pool import duckdb_statement as asking
 from webots_mcp.plugins.pool.parquet_files import Storage
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_contents import pooled_runs
-from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.questions.runs import list_runs
-from webots_mcp.store.questions.sql import FOLDER
-from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.runs import list_runs
+from webots_mcp.store.sql import FOLDER
 
 COUNTS = "SELECT recording_uuid, count(*) FROM state GROUP BY recording_uuid"
 MEANS = """

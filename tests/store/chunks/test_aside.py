@@ -15,9 +15,9 @@ import pytest
 from tests import unprivileged
 from tests.recordings.long import build
 from webots_mcp.database.connection import connect
+from webots_mcp.judging.trends import trends
 from webots_mcp.store.chunk_making import LEAST_ROWS, make_missing_chunks
 from webots_mcp.store.purge import prune
-from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
+from webots_mcp.judging.detection.events import find_events
+from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 SWING_S = (100.0, 130.0)

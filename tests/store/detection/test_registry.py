@@ -11,12 +11,12 @@ import pytest
 
 import webots_mcp
 from tests.recordings.rover import Recorder
+from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.detection import events
+from webots_mcp.judging.detection.events import find_events, timeline
+from webots_mcp.judging.detection.kinds import Event, EventKind, EventOptions
+from webots_mcp.judging.detection.search import Search
 from webots_mcp.plotting.parts import event_lanes, parts_of
-from webots_mcp.store.detection import events
-from webots_mcp.store.detection.events import find_events, timeline
-from webots_mcp.store.detection.kinds import Event, EventKind, EventOptions
-from webots_mcp.store.detection.search import Search
-from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from tests.recordings.rover import start_run
-from webots_mcp.store.checks import check_run
+from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.detection.events import Events, find_events
+from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.detection.events import Events, find_events
-from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 OPTIONS = EventOptions(kinds=("standstill", "stuck"))

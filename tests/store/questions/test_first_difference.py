@@ -13,17 +13,17 @@ import pytest
 
 from tests.recordings.rover import Recorder
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
-from webots_mcp.store import chunk_making
-from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
-from webots_mcp.store.purge import prune
-from webots_mcp.store.questions.first_difference import (
+from webots_mcp.judging.divergence import (
     Parting,
     compare_repeats,
     compare_rows,
     repeats_noted,
     verdict_on,
 )
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
 
 ROWS = 500

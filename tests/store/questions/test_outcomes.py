@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder
-from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.questions.compare import Comparison, compare_runs
-from webots_mcp.store.questions.runs import Measure
+from webots_mcp.judging.comparison import Comparison, compare_runs
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.store.runs import Measure
 
 State = Callable[[float], dict[str, Any]]
 DURATION_S = 40

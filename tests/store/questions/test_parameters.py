@@ -13,9 +13,9 @@ from tests.bridge.conftest import STEP_MS
 from webots_mcp import MCPBridge
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.questions.compare import compare_runs
-from webots_mcp.store.questions.runs import list_runs
+from webots_mcp.store.runs import list_runs
 
 
 def drive(database: Path) -> None:

@@ -17,8 +17,8 @@ from webots_mcp.errors import (
     NothingRecordedError,
     UnknownRunError,
 )
-from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
-from webots_mcp.store.questions.runs import annotate_run, list_runs, run_info
+from webots_mcp.judging.comparison import Comparison, Difference, compare_runs
+from webots_mcp.store.runs import annotate_run, list_runs, run_info
 
 
 def test_runs_are_listed_with_code_duration_and_end(rover: sqlite3.Connection) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.recordings.rover import record_rover
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.questions.sql import describe_schema, query_sql
+from webots_mcp.store.sql import describe_schema, query_sql
 
 
 def test_a_select_answers_with_columns_and_rows(rover: sqlite3.Connection) -> None:

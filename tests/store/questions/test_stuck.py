@@ -11,10 +11,10 @@ import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
-from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.detection.search import ModeUses, RunNoise, Search
-from webots_mcp.store.detection.standstill import judge_standstills
+from webots_mcp.judging.detection.events import find_events
+from webots_mcp.judging.detection.kinds import Event, EventOptions
+from webots_mcp.judging.detection.search import ModeUses, RunNoise, Search
+from webots_mcp.judging.detection.standstill import judge_standstills
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline

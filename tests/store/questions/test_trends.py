@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import start_run
+from webots_mcp.judging.trends import RunTrends, Trend, trends
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
-from webots_mcp.store.questions.trends import RunTrends, Trend, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Course = Callable[[float], float | None]  # from the time; None leaves the key out

@@ -10,14 +10,14 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.store.detection.events import asked_kinds
-from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Verdicts
-from webots_mcp.store.detection.search import Search, events_touching
-from webots_mcp.store.questions.series import query_rows
+from webots_mcp.judging.detection.events import asked_kinds
+from webots_mcp.judging.detection.kinds import Event, EventOptions, Ledger, Verdicts
+from webots_mcp.judging.detection.search import Search, events_touching
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame_summary import change_points
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
+from webots_mcp.store.series import query_rows
 from webots_mcp.store.signals import Signal
 
 ROWS = 20_000

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.judging.detection.events import find_events
+from webots_mcp.judging.detection.kinds import Event, EventOptions
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.questions.series import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import moment_of, shown_time
+from webots_mcp.store.series import query_rows
 
 STEP_S = 0.032
 ROWS = 700

@@ -17,15 +17,15 @@ from tests.recordings.rover import start_run
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
+from webots_mcp.judging.detection.events import EventOptions, find_events
+from webots_mcp.judging.trends import trends
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
-from webots_mcp.store.detection.events import EventOptions, find_events
-from webots_mcp.store.questions.series import query_history, query_rows
-from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.run_rows import newest_state
+from webots_mcp.store.series import query_history, query_rows
 
 STEP_MS = 16
 CALLS = 2000

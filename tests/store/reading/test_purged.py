@@ -10,11 +10,11 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
+from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.store.purge import prune
-from webots_mcp.store.questions.compare import compare_runs
-from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.series import RunHistory, query_history
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:

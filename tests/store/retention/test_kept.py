@@ -13,12 +13,12 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.purge import prune
-from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import look
 from webots_mcp.store.retention import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 from webots_mcp.store.run_rows import newest_state
+from webots_mcp.store.series import query_history
 
 NONE = Limit(rows=0)
 ALL = Limit()

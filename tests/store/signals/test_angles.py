@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from tests.recordings.rover import start_run
 from webots_mcp.analysis.arrays import Array
 from webots_mcp.analysis.summary import unwrap
+from webots_mcp.judging.trends import Trend, trends
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.questions.trends import Trend, trends
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
 

@@ -8,13 +8,13 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.judging.trends import trends
 from webots_mcp.signals.naming import flatten
 from webots_mcp.signals.register import MAX_SIGNALS, Place, places
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
-from webots_mcp.store.questions.series import query_rows
-from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.catalogue import catalogue, list_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, find_range, find_subject
+from webots_mcp.store.series import query_rows
 
 
 def test_every_leaf_has_a_dotted_name() -> None:

@@ -17,10 +17,10 @@ from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias, TypeVar
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.extras.requirements import install_line
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.search import Motion, find_motion
 from webots_mcp.signals.naming import FARTHEST_M, metres_in
 from webots_mcp.store.chunk_table import Cells
-from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.search import Motion, find_motion
 from webots_mcp.store.export import (
     CHUNK_ROWS,
     Column,

@@ -25,21 +25,21 @@ from webots_mcp.errors import (
     UnknownSignalError,
     WebotsMCPError,
 )
+from webots_mcp.judging.checks import check_run
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.making import obstacles_of
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.checks import check_run
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
-from webots_mcp.store.questions.runs import RunInfo, list_runs
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import RUNNING, list_robots, without_observers
 from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
+from webots_mcp.store.runs import RunInfo, list_runs
 
 Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 

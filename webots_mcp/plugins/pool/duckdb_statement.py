@@ -23,7 +23,7 @@ import psutil
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.parquet_files import CHUNK, Storage, files_of, name_of, package
 from webots_mcp.plugins.pool.pool_interface import Table, tables
-from webots_mcp.store.questions.sql import (
+from webots_mcp.store.sql import (
     FOLDER,
     MAX_BYTES,
     MAX_COLUMNS,

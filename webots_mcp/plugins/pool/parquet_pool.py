@@ -45,7 +45,7 @@ from webots_mcp.plugins.pool.parquet_files import (
 from webots_mcp.plugins.pool.pool_interface import LISTED, Batch, Row, Table, batches, table, tables
 from webots_mcp.plugins.pool.value_columns import NameAndKind, chunks_of, columns_of
 from webots_mcp.signals.naming import unit_in
-from webots_mcp.store.questions.sql import Result
+from webots_mcp.store.sql import Result
 
 # A part is over when its file is so large, or its rows in memory are, or when what comes at a time
 # is so little beside it that it would be written again for almost nothing.

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from webots_mcp.plugins.pool.fetching import Fetched
     from webots_mcp.plugins.pool.pool_interface import Pool
     from webots_mcp.plugins.pool.shipping import Report
-    from webots_mcp.store.questions.sql import Result
+    from webots_mcp.store.sql import Result
 
 _MOST_NAMED: Final = 3
 _SHORT: Final = 8  # of a UUID: as much of it as tells one from the others

@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.store.questions.sql import Result
+    from webots_mcp.store.sql import Result
 
 SQLValue: TypeAlias = "int | float | str | bytes | None"
 Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]

@@ -47,7 +47,7 @@ from webots_mcp.plugins.pool.pool_interface import (
     tables,
 )
 from webots_mcp.store.models import STATISTICS
-from webots_mcp.store.questions.sql import Result, require_max_rows
+from webots_mcp.store.sql import Result, require_max_rows
 
 Connection: TypeAlias = "psycopg.Connection[tuple[Any, ...]]"
 

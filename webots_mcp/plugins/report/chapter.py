@@ -10,6 +10,11 @@ from typing import Final, NamedTuple
 
 from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.detection.events import KINDS, Found, choose, search_events, stored_kinds
+from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
+from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.plugins.report.words import (
     Grid,
     Row,
@@ -27,18 +32,13 @@ from webots_mcp.plugins.report.words import (
     valued,
 )
 from webots_mcp.signals.naming import find_mode
-from webots_mcp.store.checks import check_run
-from webots_mcp.store.detection.events import KINDS, Found, choose, search_events, stored_kinds
-from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines
 from webots_mcp.store.parameters import described
-from webots_mcp.store.questions.compare import compare_runs
-from webots_mcp.store.questions.runs import RunInfo, run_info
-from webots_mcp.store.questions.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.robots import Session, fetch_session
 from webots_mcp.store.run_rows import fetch_run
+from webots_mcp.store.runs import RunInfo, run_info
 
 MOST_EVENTS: Final = 200
 MOST_ENTRIES: Final = 500  # of the timeline

@@ -19,6 +19,7 @@ from pydantic import Field
 from webots_mcp import __version__
 from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.plotting.canvas import Room
 from webots_mcp.plotting.on_a_page import Figure, figure_part, signals_figure, way_figure
 from webots_mcp.plotting.signals import compose_signals
@@ -29,7 +30,6 @@ from webots_mcp.questions.answers import NotedAnswer
 from webots_mcp.questions.budget import notes_of
 from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range

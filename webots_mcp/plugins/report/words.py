@@ -14,9 +14,9 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.analysis.summary import Spread
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.judging.comparison import Comparison, Difference, compare_runs
+from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.signals import naming
-from webots_mcp.store.detection.kinds import Event
-from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
 
 LONGEST_TEXT: Final = 1_000  # characters of a cell
 _LONGEST_VALUE: Final = 400  # of a value within one

@@ -36,7 +36,6 @@ from webots_mcp.analysis.swings import (
 )
 from webots_mcp.signals.naming import words_of
 from webots_mcp.store import chunk_making
-from webots_mcp.store.questions.series import STATES_SHARE, signals_left
 from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.frame import Frame, Zones, read_frame, read_kept
@@ -49,6 +48,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     shown_time,
 )
+from webots_mcp.store.series import STATES_SHARE, signals_left
 from webots_mcp.store.signals import Signal
 
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
+from webots_mcp.judging.detection.condition import every_call_of
+from webots_mcp.judging.detection.events import Found
+from webots_mcp.judging.detection.kinds import Event, NotSearchableError
+from webots_mcp.judging.detection.search import Motion, RunNoise, Search
 from webots_mcp.signals.conditions.compiler import Expectation
-from webots_mcp.store.detection.condition import every_call_of
-from webots_mcp.store.detection.events import Found
-from webots_mcp.store.detection.kinds import Event, NotSearchableError
-from webots_mcp.store.detection.search import Motion, RunNoise, Search
-from webots_mcp.store.questions.runs import RunInfo
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_source import NOT_READ
+from webots_mcp.store.runs import RunInfo
 
 Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at"]
 WORST_FIRST: Final[tuple[Outcome, ...]] = (

@@ -8,14 +8,14 @@ from typing import Any, Final, cast
 
 from webots_mcp.analysis.arrays import Array, Run, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
+from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times, total_s
+from webots_mcp.judging.detection.condition import lasting
+from webots_mcp.judging.detection.jump import JUMP
+from webots_mcp.judging.detection.kinds import Event, NotSearchableError
+from webots_mcp.judging.detection.search import in_metres, places_in
+from webots_mcp.judging.detection.standstill import ON_THE_SPOT
 from webots_mcp.signals.naming import METRES, counted, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signals.register import PLACES
-from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total_s
-from webots_mcp.store.detection.condition import lasting
-from webots_mcp.store.detection.jump import JUMP
-from webots_mcp.store.detection.kinds import Event, NotSearchableError
-from webots_mcp.store.detection.search import in_metres, places_in
-from webots_mcp.store.detection.standstill import ON_THE_SPOT
 from webots_mcp.store.signals import Signal, stored_roles
 
 _OFF_THE_FLOOR_M: Final = 0.3

@@ -12,19 +12,11 @@ from typing import Final
 
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread, Summary, spread_of, verdicts_on
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.search import motion_in
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.parameter import Value
-from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.search import motion_in
 from webots_mcp.store.parameters import differing, parameters_of, scored_runs
-from webots_mcp.store.questions.runs import (
-    OUT_OF_TIME,
-    Measure,
-    RunInfo,
-    RunPart,
-    outcomes_of,
-    run_infos,
-)
 from webots_mcp.store.reading.catalogue import catalogue, resolve_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.frame_summary import summary_of
@@ -32,6 +24,14 @@ from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
+from webots_mcp.store.runs import (
+    OUT_OF_TIME,
+    Measure,
+    RunInfo,
+    RunPart,
+    outcomes_of,
+    run_infos,
+)
 from webots_mcp.store.signals import Signal
 
 # -- how a signal differs between groups of runs ---------------------------------------------------

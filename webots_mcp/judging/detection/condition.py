@@ -23,6 +23,14 @@ from webots_mcp.errors import (
     InvalidInputError,
     UnknownSignalError,
 )
+from webots_mcp.judging.detection.kinds import (
+    Alike,
+    Event,
+    EventKind,
+    NotAskedError,
+    NotSearchableError,
+)
+from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.conditions import Condition, Evaluator, parse_condition
 from webots_mcp.signals.conditions.compiler import (
     ARITHMETIC,
@@ -35,14 +43,6 @@ from webots_mcp.signals.conditions.scoring import Aggregate
 from webots_mcp.signals.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
 from webots_mcp.signals.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
 from webots_mcp.signals.naming import FARTHEST_M, NO_POSITION, Value, find_position, metres_in
-from webots_mcp.store.detection.kinds import (
-    Alike,
-    Event,
-    EventKind,
-    NotAskedError,
-    NotSearchableError,
-)
-from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.catalogue import say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import recorded_share

@@ -26,13 +26,13 @@ from webots_mcp.database.connection import transaction
 from webots_mcp.database.liveness import dead_sessions
 from webots_mcp.database.pauses import paused_s
 from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.condition import aggregated, position_in
+from webots_mcp.judging.detection.events import Found, asked_kinds, kind_names, search_events
+from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
 from webots_mcp.signals.conditions.scoring import Facts, Score, Scored, parse_score
 from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed, nearest_first
 from webots_mcp.signals.parameter import Value
-from webots_mcp.store.detection.condition import aggregated, position_in
-from webots_mcp.store.detection.events import Found, asked_kinds, kind_names, search_events
-from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
 from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import Frame, read_frame

@@ -16,16 +16,14 @@ from webots_mcp.analysis.standstill import (
     shortest_seen_s,
 )
 from webots_mcp.analysis.track import Track, track_of
-from webots_mcp.signals.naming import NAME_POSITION
-from webots_mcp.store.chunks import shown
-from webots_mcp.store.detection.kinds import (
+from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
     EventKind,
     EventOptions,
     NotSearchableError,
 )
-from webots_mcp.store.detection.search import (
+from webots_mcp.judging.detection.search import (
     NO_TIME,
     ModeUse,
     ModeUses,
@@ -35,6 +33,8 @@ from webots_mcp.store.detection.search import (
     in_metres,
     tracks_in,
 )
+from webots_mcp.signals.naming import NAME_POSITION
+from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame
 
 # -- whether it should have moved: what shows it, and what speaks against it -----------------------

@@ -21,9 +21,9 @@ from webots_mcp.analysis.arrays import (
     runs_alike,
     runs_of,
 )
+from webots_mcp.judging.detection.kinds import Alike, Event, EventKind
+from webots_mcp.judging.detection.search import MOST_NAMED, Search
 from webots_mcp.signals.naming import find_targets, listed
-from webots_mcp.store.detection.kinds import Alike, Event, EventKind
-from webots_mcp.store.detection.search import MOST_NAMED, Search
 from webots_mcp.store.reading.catalogue import other_form
 from webots_mcp.store.reading.frame import Frame, Zones
 from webots_mcp.store.reading.segment import just_after

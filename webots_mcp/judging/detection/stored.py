@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.database.pauses import VIOLATION
-from webots_mcp.store.detection.kinds import (
+from webots_mcp.judging.detection.kinds import (
     LEVELS,
     Alike,
     Event,
@@ -19,7 +19,7 @@ from webots_mcp.store.detection.kinds import (
     NotSearchableError,
     but_for_numbers,
 )
-from webots_mcp.store.detection.search import Search
+from webots_mcp.judging.detection.search import Search
 from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,

@@ -13,11 +13,9 @@ from typing import Any, Final
 
 from webots_mcp.database.liveness import dead_sessions
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.signals.naming import flatten
-from webots_mcp.store.chunks import parse
-from webots_mcp.store.detection import condition, jump, sensors, standstill, stored
-from webots_mcp.store.detection import jump as oscillation
-from webots_mcp.store.detection.kinds import (
+from webots_mcp.judging.detection import condition, jump, sensors, standstill, stored
+from webots_mcp.judging.detection import jump as oscillation
+from webots_mcp.judging.detection.kinds import (
     Event,
     EventKind,
     EventOptions,
@@ -25,7 +23,9 @@ from webots_mcp.store.detection.kinds import (
     Verdicts,
     count_by_kind,
 )
-from webots_mcp.store.detection.search import Search, events_touching, find_motion
+from webots_mcp.judging.detection.search import Search, events_touching, find_motion
+from webots_mcp.signals.naming import flatten
+from webots_mcp.store.chunks import parse
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange

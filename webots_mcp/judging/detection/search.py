@@ -16,10 +16,7 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.analysis.track import PathLength, Track, tracks_of
-from webots_mcp.signals.naming import FARTHEST_M, listed, metres_in, unit_in
-from webots_mcp.signals.register import first_in, pair_in
-from webots_mcp.store.chunks import shown
-from webots_mcp.store.detection.kinds import (
+from webots_mcp.judging.detection.kinds import (
     Event,
     EventKind,
     EventOptions,
@@ -27,6 +24,9 @@ from webots_mcp.store.detection.kinds import (
     NotAskedError,
     NotSearchableError,
 )
+from webots_mcp.signals.naming import FARTHEST_M, listed, metres_in, unit_in
+from webots_mcp.signals.register import first_in, pair_in
+from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds

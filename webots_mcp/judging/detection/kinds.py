@@ -17,7 +17,7 @@ from webots_mcp.signals.naming import Value
 from webots_mcp.store.reading.frame_source import NOT_READ
 
 if TYPE_CHECKING:
-    from webots_mcp.store.detection.search import Search
+    from webots_mcp.judging.detection.search import Search
 
 LEVELS: Final = LOG_LEVELS
 

@@ -13,10 +13,8 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import ConditionFailedError, UnknownSignalError
-from webots_mcp.signals.conditions.compiler import Expectation
-from webots_mcp.signals.naming import counted
-from webots_mcp.store.checks import of_motion, of_sensors
-from webots_mcp.store.checks.finding import (
+from webots_mcp.judging.checks import of_motion, of_sensors
+from webots_mcp.judging.checks.finding import (
     WORST_FIRST,
     Check,
     Finding,
@@ -26,24 +24,26 @@ from webots_mcp.store.checks.finding import (
     times,
     total_s,
 )
-from webots_mcp.store.detection import jump, sensors
-from webots_mcp.store.detection.condition import (
+from webots_mcp.judging.detection import jump, sensors
+from webots_mcp.judging.detection.condition import (
     NONE_EXPECTED,
     Adherence,
     expectations_of,
     judge_expectation,
 )
-from webots_mcp.store.detection.events import Found, asked_kinds, search_events
-from webots_mcp.store.detection.kinds import EventOptions, NotSearchableError
-from webots_mcp.store.detection.search import Search
+from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
+from webots_mcp.judging.detection.kinds import EventOptions, NotSearchableError
+from webots_mcp.judging.detection.search import Search
+from webots_mcp.signals.conditions.compiler import Expectation
+from webots_mcp.signals.naming import counted
 from webots_mcp.store.project_file import ALL, Expected
-from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot
 from webots_mcp.store.recording import rows_beside
 from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.run_rows import fetch_run
+from webots_mcp.store.runs import run_info
 
 CHECK_DEADLINE_S: Final = 8.0
 _OF_EVENTS: Final = 0.7  # of the time

@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import Final, Literal
 
 from webots_mcp.analysis.arrays import np, runs_of
+from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times
+from webots_mcp.judging.detection.jump import JUMP
+from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed, words_of
-from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times
-from webots_mcp.store.detection.jump import JUMP
-from webots_mcp.store.detection.kinds import Event
-from webots_mcp.store.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.store.signals import Signal, stored_roles
 
 MOST_NAMED: Final = 3

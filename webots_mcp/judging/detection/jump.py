@@ -27,15 +27,15 @@ from webots_mcp.analysis.swings import (
     find_swings,
     swings_in,
 )
-from webots_mcp.signals.naming import in_snake_case, listed, metres_in
-from webots_mcp.store.detection.kinds import (
+from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
     EventKind,
     EventOptions,
     NotSearchableError,
 )
-from webots_mcp.store.detection.search import MOST_NAMED, Search
+from webots_mcp.judging.detection.search import MOST_NAMED, Search
+from webots_mcp.signals.naming import in_snake_case, listed, metres_in
 from webots_mcp.store.reading.frame import Frame, Zones
 from webots_mcp.store.signals import Signal
 

@@ -15,13 +15,13 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import ask, text_of
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
+from webots_mcp.judging.run_measures import way_in
 from webots_mcp.server import create_server
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.catalogue import catalogue, list_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.runs import way_in
 
 SPEED_M_S: Final = 0.5
 DRIVES_S: Final = 20.0

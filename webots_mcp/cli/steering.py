@@ -502,8 +502,8 @@ class _Progress:
 
 def _show_trials(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
     from webots_mcp.judging.divergence import repeats_noted
+    from webots_mcp.judging.run_score import unseen
     from webots_mcp.store.parameters import ranking_of, trials_of
-    from webots_mcp.store.runs import unseen
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)

@@ -14,6 +14,7 @@ from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread, Summary, spread_o
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
+from webots_mcp.judging.run_measures import OUT_OF_TIME, Measure, RunPart, outcomes_of
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.parameter import Value
 from webots_mcp.store.parameters import differing, parameters_of, scored_runs
@@ -24,14 +25,7 @@ from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.runs import (
-    OUT_OF_TIME,
-    Measure,
-    RunInfo,
-    RunPart,
-    outcomes_of,
-    run_infos,
-)
+from webots_mcp.store.runs import RunInfo, run_infos
 from webots_mcp.store.signals import Signal
 
 # -- how a signal differs between groups of runs ---------------------------------------------------

@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
 from webots_mcp.judging.comparison import COMPARE_DEADLINE_S
+from webots_mcp.judging.run_measures import OUT_OF_TIME
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import METRES, Value, counted, listed
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, Decoded, Replaced
@@ -26,7 +27,6 @@ from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot, just_after
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.runs import OUT_OF_TIME
 from webots_mcp.store.signals import Signal
 
 _MATTERS: Final = 0.001  # of metres, of radians, of the largest value where there is no scale

@@ -24,6 +24,7 @@ from webots_mcp.judging.comparison import (
 )
 from webots_mcp.judging.detection.kinds import EventOptions, both_of
 from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
+from webots_mcp.judging.run_measures import Measure
 from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
 from webots_mcp.questions.budget import (
     DETAIL_BUDGET_TOKENS,
@@ -64,15 +65,7 @@ from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.runs import (
-    MOST_RUNS,
-    Measure,
-    RunInfo,
-    annotate_run,
-    list_runs,
-    pace,
-    run_info,
-)
+from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",

@@ -18,6 +18,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection.events import asked_kinds, search_events
 from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.detection.search import doubt_of_length, doubt_of_unit, motion_in
+from webots_mcp.judging.run_measures import Way, way_in
 from webots_mcp.judging.trends import RunTrends, trends
 from webots_mcp.questions.answers import MonitorAnswer
 from webots_mcp.questions.budget import (
@@ -36,7 +37,6 @@ from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.runs import Way, way_in
 
 USUAL_DURATION_S: Final = 10.0
 _REPORT_INTERVAL_S: Final = 1.0

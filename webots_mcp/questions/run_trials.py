@@ -17,6 +17,7 @@ from webots_mcp.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.divergence import repeats_noted
+from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.answers import TrialsAnswer
 from webots_mcp.questions.budget import (
     condensed,
@@ -64,7 +65,6 @@ from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import robot_name
-from webots_mcp.store.runs import require_kinds, unseen
 
 _WAIT_S: Final = 60.0
 _TRIAL_S: Final = 300.0

@@ -44,6 +44,7 @@ from webots_mcp.errors import (
     NoDatabaseError,
 )
 from webots_mcp.extras.requirements import explain_extra
+from webots_mcp.judging.run_score import score_run
 from webots_mcp.signals.conditions import Evaluator, parse_condition
 from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, any_port, end_left_over
 from webots_mcp.steering.trial_plan import Range, TrialPlan, WorldPlan
@@ -66,7 +67,7 @@ from webots_mcp.store.parameters import (
 from webots_mcp.store.policy import LAUNCH
 from webots_mcp.store.recording import Job, Recording
 from webots_mcp.store.requests import permit
-from webots_mcp.store.runs import run_info, score_run
+from webots_mcp.store.runs import run_info
 
 if TYPE_CHECKING:
     import optuna

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from webots_mcp.database.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
+from webots_mcp.judging.run_score import score_run
 from webots_mcp.steering.dispatch import (
     ACTION,
     BLOCK_NOTICED_S,
@@ -45,7 +46,6 @@ from webots_mcp.store.parameters import (
 from webots_mcp.store.recording import Job, Recording, View
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import find_block, robot_name
-from webots_mcp.store.runs import score_run
 
 OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
 _LOOK_EVERY_S: Final = 0.02

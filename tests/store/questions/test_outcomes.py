@@ -11,7 +11,7 @@ import pytest
 from tests.recordings.rover import Recorder
 from webots_mcp.judging.comparison import Comparison, compare_runs
 from webots_mcp.judging.detection.kinds import EventOptions
-from webots_mcp.store.runs import Measure
+from webots_mcp.judging.run_measures import Measure
 
 State = Callable[[float], dict[str, Any]]
 DURATION_S = 40

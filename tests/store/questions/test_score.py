@@ -9,7 +9,7 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
-from webots_mcp.store.runs import score_run, unseen
+from webots_mcp.judging.run_score import score_run, unseen
 
 
 @pytest.mark.parametrize(

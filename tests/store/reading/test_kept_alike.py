@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.run_score import score_run
 from webots_mcp.judging.trends import trends
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.runs import score_run
 from webots_mcp.store.series import query_history
 
 ROWS = 60

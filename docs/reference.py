@@ -15,7 +15,7 @@ from webots_mcp import MemoryDatabase, pytest_plugin, testing
 from webots_mcp.cli import described
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 
 _COMMENT: Final = re.compile(r"/\*(.*?)\*/", re.DOTALL)
 _TOC: Final = "```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n"

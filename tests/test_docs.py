@@ -14,6 +14,7 @@ import pytest
 
 import webots_mcp
 from webots_mcp import MCPBridge, MemoryDatabase, testing
+from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.bridge.backlog import MAX_WAITING_BYTES, MAX_WAITING_ROWS
 from webots_mcp.bridge.capture import MOST_LINES_PER_S
 from webots_mcp.bridge.devices import MOST_OBJECTS, SECTORS
@@ -21,9 +22,8 @@ from webots_mcp.cli import described, names
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.database.connection import OLDEST_SQLITE, SCHEMA_FILE
 from webots_mcp.judging.detection.events import kind_names
-from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.questions.declaring import MAX_WAIT_S
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.client_entries import claude_desktop, clients_of, is_ours
 
 CHECKOUT = Path(__file__).parents[1]

@@ -11,7 +11,7 @@ from docs import reference
 from webots_mcp import MemoryDatabase
 from webots_mcp.cli import described, names
 from webots_mcp.database.connection import SCHEMA_FILE
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 
 
 def parts(text: str) -> dict[str, str]:

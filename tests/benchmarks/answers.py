@@ -15,10 +15,10 @@ from mcp.types import ImageContent, TextContent, Tool
 
 from tests.benchmarks.core import Bench, Line, Target, benchmark
 from tests.benchmarks.processes import environment
+from webots_mcp.answers.budget import tokens_in
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.database.connection import connect
-from webots_mcp.questions.budget import tokens_in
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 

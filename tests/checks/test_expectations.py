@@ -24,7 +24,7 @@ from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.run_score import score_run
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.signals.conditions.compiler import read_expectation
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.project_file import ProjectWatch, read_project

@@ -11,7 +11,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.diagnosis import Diagnosis, all_checks, diagnose, subject_of
+from webots_mcp.setup.doctor import Diagnosis, all_checks, diagnose, subject_of
 from webots_mcp.store.recording import Recording
 
 Look = Callable[..., Diagnosis]

@@ -10,7 +10,7 @@ import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.contract import DATABASE_NAME, OBSERVER, OBSERVER_NAME
-from webots_mcp.diagnosis import Diagnosis, all_checks, diagnose, subject_of
+from webots_mcp.setup.doctor import Diagnosis, all_checks, diagnose, subject_of
 from webots_mcp.store.recording import Recording
 
 PLAIN = "from controller import Robot\nrobot = Robot()\n"

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tests.diagnosis.conftest import found
-from webots_mcp.diagnosis import (
+from webots_mcp.setup.doctor import (
     PAGE,
     Diagnosis,
     Examined,

@@ -26,7 +26,7 @@ from tests.webots.conftest import (
 )
 from webots_mcp.contract import ENDED_BY, SEE_STEPS, UNMOVED, UNSEEN, host_name
 from webots_mcp.database.liveness import process_identity
-from webots_mcp.diagnosis import Diagnosis
+from webots_mcp.setup.doctor import Diagnosis
 
 WAITS = "import sys; print('ready', flush=True); sys.stdin.read()"
 COMPUTES = "print('ready', flush=True)\nwhile True: pass"

@@ -20,7 +20,7 @@ from tests.evaluations.asking import Outcome, ask_by_command, ask_by_plan
 from tests.evaluations.scenario import Scenario, read_scenarios
 from tests.tool_list import counts_of
 from webots_mcp.contract import MemoryDatabase
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from webots_mcp.cli import main
-from webots_mcp.server import ToolServer
+from webots_mcp.server.mcp_server import ToolServer
 
 if __name__ == "__main__":
     file, *options = sys.argv[1:]

@@ -31,7 +31,7 @@ from webots_mcp.plotting.trials import compose_trials
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import MergedQuestion
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline

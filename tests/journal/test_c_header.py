@@ -24,7 +24,7 @@ from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import C_HEADER
 from webots_mcp.database.waiting_file import journal_parts
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.recording import Recording
 
 HERE = Path(__file__).parent
@@ -240,7 +240,7 @@ def test_a_locale_with_another_decimal_point_changes_no_number(
 READER = """
 import sys, time
 from pathlib import Path
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.recording import Recording
 folder = Path(sys.argv[1])
 print("ready", flush=True)

@@ -16,7 +16,7 @@ from tests.server.conftest import ask, text_of
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
 from webots_mcp.judging.run_measures import way_in
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.catalogue import catalogue, list_signals
 from webots_mcp.store.reading.frame import Frame, read_frame

@@ -269,7 +269,9 @@ def assert_readable(texts: list[tuple[str, Any]], size: tuple[int, int]) -> None
         assert wide < 2 or high < 2, f"{text!r} and {other!r} overlap by {wide:.0f} x {high:.0f} px"
 
 
-@pytest.mark.parametrize("module", ["webots_mcp.server", "webots_mcp.plotting", "webots_mcp"])
+@pytest.mark.parametrize(
+    "module", ["webots_mcp.server.mcp_server", "webots_mcp.plotting", "webots_mcp"]
+)
 def test_what_draws_waits_for_the_first_picture(module: str) -> None:
     code = (
         f"import sys, {module}\n"

@@ -22,7 +22,7 @@ from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import NotAllowedError
 from webots_mcp.plugins.page.page_server import steer
-from webots_mcp.server import INSTRUCTIONS, create_server
+from webots_mcp.server.mcp_server import INSTRUCTIONS, create_server
 from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.policy import LAUNCH, Policy, read_policy

@@ -18,7 +18,7 @@ from tests.waiting import until
 from tests.webots.conftest import start_webots as start_webots
 from tests.webots.conftest import webots as webots
 from webots_mcp import MCPBridge
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import InProcessSupervisor
 
 STEP_MS = 16

@@ -22,7 +22,7 @@ from mcp import Client
 from PIL import Image
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.retention import Limit, set_limits
 

@@ -14,7 +14,7 @@ from mcp import Client, StdioServerParameters
 
 from tests.recordings.rover import record_rover
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 
 Way = Literal["memory", "memory-legacy", "stdio", "stdio-legacy"]
 WAYS: tuple[Way, ...] = ("memory", "memory-legacy", "stdio", "stdio-legacy")

@@ -16,9 +16,9 @@ from tests.recordings.long import build
 from tests.recordings.rows import Recorded
 from tests.server.conftest import text_of
 from tests.server.story import client_on
+from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
 from webots_mcp.database.connection import connect
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
 from webots_mcp.questions.declaring import MergedQuestion
 
 pytestmark = pytest.mark.anyio

@@ -22,7 +22,7 @@ from tests.waiting import until
 from webots_mcp.contract import HANG_VARIABLE
 from webots_mcp.database.connection import connect
 from webots_mcp.database.queue import CommandQueue, fetch_command
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.steering.dispatch import withdraw_if_blocked
 from webots_mcp.store.recording import Recording as Store

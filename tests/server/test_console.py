@@ -24,7 +24,7 @@ from tests.webots.conftest import (
     wait_for_line,
     write_project,
 )
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.simulator import console
 from webots_mcp.simulator.console import belongs
 from webots_mcp.simulator.instances import instances

@@ -9,7 +9,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask
-from webots_mcp.diagnosis import all_checks
+from webots_mcp.setup.doctor import all_checks
 
 pytestmark = pytest.mark.anyio
 

@@ -26,10 +26,10 @@ from mcp.client.streamable_http import streamable_http_client
 
 from tests.server.conftest import Driver, ask, fail
 from tests.waiting import until, wait_for
-from webots_mcp.access_token import access_token, new_token, token_file
 from webots_mcp.cli import main
-from webots_mcp.http_server import Place, guarded_app
-from webots_mcp.server import create_server
+from webots_mcp.server.access_token import access_token, new_token, token_file
+from webots_mcp.server.http_server import Place, guarded_app
+from webots_mcp.server.mcp_server import create_server
 
 pytestmark = pytest.mark.anyio
 Mode = Literal["auto", "legacy"]

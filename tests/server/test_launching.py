@@ -23,7 +23,7 @@ from tests.webots.conftest import (
     wait_for_line,
     write_project,
 )
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.setup.file_change import apply
 from webots_mcp.setup.project_edits import controller_change, with_observer

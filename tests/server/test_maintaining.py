@@ -10,7 +10,7 @@ from mcp import Client
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask
 from tests.waiting import until
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
 

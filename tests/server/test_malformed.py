@@ -13,7 +13,7 @@ from mcp import Client
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
 from tests.server.malformed import Damage, Damaged, damages, record
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 
 pytestmark = pytest.mark.anyio
 

@@ -14,7 +14,7 @@ from tests.bridge.conftest import Recording
 from tests.processes.conftest import data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, fail
 from tests.waiting import until
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Simulation
 
 __all__ = ["data_dir", "filed", "start"]

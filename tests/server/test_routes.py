@@ -23,7 +23,7 @@ from tests.webots.conftest import (
 )
 from tests.webots.server import WebotsServer
 from webots_mcp.contract import host_name
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 
 pytestmark = pytest.mark.anyio
 

@@ -19,7 +19,7 @@ from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, text_of
 from tests.waiting import until
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Mode, Simulation
 
 __all__ = ["data_dir", "filed", "start"]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from webots_mcp.questions.budget import GLANCE, WHOLE, Limits, shorten, tokens_in, tokens_of
+from webots_mcp.answers.budget import GLANCE, WHOLE, Limits, shorten, tokens_in, tokens_of
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

@@ -15,7 +15,7 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.sql import FOLDER, LINE, Statement, decode
 
 pytestmark = pytest.mark.anyio

@@ -21,8 +21,8 @@ from mcp import Client, StdioServerParameters
 import webots_mcp
 from tests.waiting import wait_for
 from webots_mcp import __version__
+from webots_mcp.answers.budget import tokens_in
 from webots_mcp.contract import bundled
-from webots_mcp.questions.budget import tokens_in
 from webots_mcp.setup.client_entries import is_ours
 from webots_mcp.setup.file_change import apply
 from webots_mcp.setup.skills import PLUGIN, Part, parts_of, skill_files

@@ -24,7 +24,7 @@ from tests.waiting import wait_for
 from webots_mcp import __version__
 from webots_mcp.plugins.cluster import dask_cluster as cluster
 from webots_mcp.plugins.cluster.dask_cluster import Needs, digest_of, packed, what_lacks
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.parameters import Result
 
 Write = Callable[[str], Path]

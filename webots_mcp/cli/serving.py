@@ -107,7 +107,7 @@ def serve(
     asked = limits.asked()
     place = None
     if http is not None:
-        from webots_mcp.http_server import place_of
+        from webots_mcp.server.http_server import place_of
 
         place = place_of(http, allow_host, tls_cert, tls_key)
     elif allow_host or tls_cert or tls_key:
@@ -121,7 +121,7 @@ def serve(
     if asked and not read_only:
         _ask_for(asked, database, data_dir)
     with _keeping_what_is_made():
-        from webots_mcp.server import create_server
+        from webots_mcp.server.mcp_server import create_server
 
         server = create_server(
             database,
@@ -134,7 +134,7 @@ def serve(
     with ending_in_time(), _ending_with_the_client():
         if place is None:
             return server.run()
-        from webots_mcp.http_server import serve_http
+        from webots_mcp.server.http_server import serve_http
 
         serve_http(server, place, partial(_say_address, database))
 
@@ -160,7 +160,7 @@ def token(
     It is in a file that only you can read. The address of the page of 'webots-mcp view' is made
     from it.
     """
-    from webots_mcp.access_token import access_token, new_token, token_file
+    from webots_mcp.server.access_token import access_token, new_token, token_file
 
     shown = new_token() if new else access_token()
     if as_json:

@@ -19,7 +19,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPE
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from webots_mcp.diagnosis import Checked, Examined
+    from webots_mcp.setup.doctor import Checked, Examined
     from webots_mcp.setup.file_change import FileChange
     from webots_mcp.simulator.project import ProjectController
 
@@ -501,7 +501,7 @@ def doctor(
     Nothing is changed. Exit code 0: nothing is wrong (there may be warnings). 1: something is
     wrong. 2: it could not look.
     """
-    from webots_mcp.diagnosis import all_checks, diagnose
+    from webots_mcp.setup.doctor import all_checks, diagnose
 
     checked = diagnose(_examined(recorded), all_checks(with_server=not no_server))
     if as_json:
@@ -515,7 +515,7 @@ def _examined(recorded: Where) -> Examined:
     from dataclasses import replace
 
     from webots_mcp.contract import choose_data_dir
-    from webots_mcp.diagnosis import subject_of
+    from webots_mcp.setup.doctor import subject_of
 
     try:
         recording = recorded.recording()

@@ -12,21 +12,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
-from webots_mcp.judging.checks.finding import Finding
-from webots_mcp.judging.comparison import (
-    COMPARE_DEADLINE_S,
-    Comparison,
-    Difference,
-    Group,
-    compare_runs,
-)
-from webots_mcp.judging.detection.kinds import EventOptions, both_of
-from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
-from webots_mcp.judging.run_measures import Measure
-from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     WHOLE,
     answer_about,
@@ -45,6 +31,20 @@ from webots_mcp.questions.budget import (
     shown,
     without_empty,
 )
+from webots_mcp.answers.models import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
+from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.comparison import (
+    COMPARE_DEADLINE_S,
+    Comparison,
+    Difference,
+    Group,
+    compare_runs,
+)
+from webots_mcp.judging.detection.kinds import EventOptions, both_of
+from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
+from webots_mcp.judging.run_measures import Measure
 from webots_mcp.questions.declaring import (
     READS,
     SETS,

@@ -9,10 +9,10 @@ import anyio
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.budget import cut_text
+from webots_mcp.answers.models import CommandAnswer, RunAnswer
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.questions.answers import CommandAnswer, RunAnswer
-from webots_mcp.questions.budget import cut_text
 from webots_mcp.questions.declaring import (
     CHANGES,
     DESTROYS,

@@ -42,6 +42,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from webots_mcp import contract
+from webots_mcp.answers.budget import Client, compact_json, reader
+from webots_mcp.answers.models import Answer, ShownPicture
 from webots_mcp.errors import (
     InvalidInputError,
     MalformedRowError,
@@ -49,8 +51,6 @@ from webots_mcp.errors import (
     NothingRecordedError,
     WebotsMCPError,
 )
-from webots_mcp.questions.answers import Answer, ShownPicture
-from webots_mcp.questions.budget import Client, compact_json, reader
 from webots_mcp.signals.naming import perhaps_meant
 from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope

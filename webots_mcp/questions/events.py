@@ -7,19 +7,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.detection.events import (
-    KINDS,
-    Events,
-    Found,
-    kind_names,
-    search_events,
-    stored_kinds,
-    timeline,
-)
-from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts, both_of
-from webots_mcp.questions.answers import EventsAnswer, KindVerdicts, Table, TimelineAnswer
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     answer_about,
     detailed,
@@ -33,6 +21,18 @@ from webots_mcp.questions.budget import (
     wall_clock,
     without_empty,
 )
+from webots_mcp.answers.models import EventsAnswer, KindVerdicts, Table, TimelineAnswer
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.events import (
+    KINDS,
+    Events,
+    Found,
+    kind_names,
+    search_events,
+    stored_kinds,
+    timeline,
+)
+from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts, both_of
 from webots_mcp.questions.declaring import (
     READS,
     AnyNames,

@@ -8,10 +8,10 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.budget import cut_text, fitting, is_for_a_person, wall_clock
+from webots_mcp.answers.models import LogsAnswer, Table
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
-from webots_mcp.questions.answers import LogsAnswer, Table
-from webots_mcp.questions.budget import cut_text, fitting, is_for_a_person, wall_clock
 from webots_mcp.questions.declaring import (
     READS,
     Cursor,

@@ -8,20 +8,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
-from webots_mcp.questions.answers import (
-    ChangeSeries,
-    HistoryAnswer,
-    NumberSeries,
-    Part,
-    RowColumns,
-    RunSeries,
-    RunTrendTables,
-    SignalsAnswer,
-    TrendsAnswer,
-)
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     answer_about,
     compact_json,
     cut_for_a_model,
@@ -40,6 +27,19 @@ from webots_mcp.questions.budget import (
     tokens_of,
     without_empty,
 )
+from webots_mcp.answers.models import (
+    ChangeSeries,
+    HistoryAnswer,
+    NumberSeries,
+    Part,
+    RowColumns,
+    RunSeries,
+    RunTrendTables,
+    SignalsAnswer,
+    TrendsAnswer,
+)
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.questions.declaring import (
     READS,
     AnyNames,

@@ -14,14 +14,7 @@ from anyio import to_thread
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.detection.events import asked_kinds, search_events
-from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
-from webots_mcp.judging.detection.search import doubt_of_length, doubt_of_unit, motion_in
-from webots_mcp.judging.run_measures import Way, way_in
-from webots_mcp.judging.trends import RunTrends, trends
-from webots_mcp.questions.answers import MonitorAnswer
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     answer_about,
     figure,
     newest_runs,
@@ -29,6 +22,13 @@ from webots_mcp.questions.budget import (
     room_tokens,
     seconds,
 )
+from webots_mcp.answers.models import MonitorAnswer
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.events import asked_kinds, search_events
+from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
+from webots_mcp.judging.detection.search import doubt_of_length, doubt_of_unit, motion_in
+from webots_mcp.judging.run_measures import Way, way_in
+from webots_mcp.judging.trends import RunTrends, trends
 from webots_mcp.questions.declaring import MAX_WAIT_S, READS, Caller, RobotName, question
 from webots_mcp.questions.events import fitting_events, not_shown_of, verdicts_of
 from webots_mcp.questions.history import MOST_SIGNALS, trend_tables

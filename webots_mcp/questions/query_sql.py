@@ -13,9 +13,7 @@ from anyio import to_thread
 from anyio.lowlevel import RunVar
 from pydantic import Field
 
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.answers import SqlAnswer, Table
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     LONGEST_NAME,
     cut_for_a_model,
     fitting,
@@ -24,6 +22,8 @@ from webots_mcp.questions.budget import (
     room_tokens,
     tokens_of,
 )
+from webots_mcp.answers.models import SqlAnswer, Table
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.declaring import READS, ShownLimit, question
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import Recording

@@ -10,20 +10,7 @@ from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
 
-from webots_mcp.contract import CUSTOM_DATA
-from webots_mcp.database.liveness import dead_sessions
-from webots_mcp.diagnosis import Checked, diagnose, subject_of, worst
-from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.questions.answers import (
-    DiagnosisAnswer,
-    FullStateAnswer,
-    RobotsAnswer,
-    SensorsAnswer,
-    StateAnswer,
-    Table,
-    WorldAnswer,
-)
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     ANSWER_TOKENS,
     LARGE_ANSWER_TOKENS,
     STATE_BUDGET_TOKENS,
@@ -42,7 +29,20 @@ from webots_mcp.questions.budget import (
     tokens_in,
     tokens_of,
 )
+from webots_mcp.answers.models import (
+    DiagnosisAnswer,
+    FullStateAnswer,
+    RobotsAnswer,
+    SensorsAnswer,
+    StateAnswer,
+    Table,
+    WorldAnswer,
+)
+from webots_mcp.contract import CUSTOM_DATA
+from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.questions.declaring import READS, RobotName, RunId, question
+from webots_mcp.setup.doctor import Checked, diagnose, subject_of, worst
 from webots_mcp.signals.naming import OBSERVED
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.observed_pose import pose_at

@@ -14,12 +14,7 @@ from anyio import to_thread
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
 from webots_mcp.analysis.summary import Best, Ranked, Ranking
-from webots_mcp.contract import MAX_RUN_S
-from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.divergence import repeats_noted
-from webots_mcp.judging.run_score import require_kinds, unseen
-from webots_mcp.questions.answers import TrialsAnswer
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     condensed,
     cut_text,
     figure,
@@ -29,6 +24,11 @@ from webots_mcp.questions.budget import (
     notes_of,
     shown,
 )
+from webots_mcp.answers.models import TrialsAnswer
+from webots_mcp.contract import MAX_RUN_S
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.divergence import repeats_noted
+from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.compare_runs import webots_list_runs
 from webots_mcp.questions.declaring import (
     DESTROYS,

@@ -10,18 +10,7 @@ from typing import Annotated, Any, Final, Literal
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.contract import BUILT_IN_ACTIONS, BreakpointAction, CommandStatus
-from webots_mcp.database import pauses as stored
-from webots_mcp.database.queue import Command, list_commands
-from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.questions.answers import (
-    BreakpointAnswer,
-    BreakpointsAnswer,
-    CommandAnswer,
-    CommandsAnswer,
-    ParametersAnswer,
-)
-from webots_mcp.questions.budget import (
+from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     WHOLE,
     condensed,
@@ -36,6 +25,17 @@ from webots_mcp.questions.budget import (
     tokens_of,
     without_empty,
 )
+from webots_mcp.answers.models import (
+    BreakpointAnswer,
+    BreakpointsAnswer,
+    CommandAnswer,
+    CommandsAnswer,
+    ParametersAnswer,
+)
+from webots_mcp.contract import BUILT_IN_ACTIONS, BreakpointAction, CommandStatus
+from webots_mcp.database import pauses as stored
+from webots_mcp.database.queue import Command, list_commands
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.declaring import (
     CHANGES,
     DESTROYS,

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.budget import compact_json, notes_of, seconds, some
+from webots_mcp.answers.models import CommandAnswer, RunAnswer, ShownPicture
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
-from webots_mcp.questions.answers import CommandAnswer, RunAnswer, ShownPicture
-from webots_mcp.questions.budget import compact_json, notes_of, seconds, some
 from webots_mcp.questions.declaring import (
     CHANGES,
     READS,

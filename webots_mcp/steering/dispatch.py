@@ -14,6 +14,18 @@ from typing import Any, Final, NamedTuple, cast
 import anyio
 from anyio import to_thread
 
+from webots_mcp.answers.budget import (
+    RESULT_BUDGET_TOKENS,
+    WHOLE,
+    cut_text,
+    detailed,
+    figure,
+    seconds,
+    shorten,
+    shown,
+    table,
+)
+from webots_mcp.answers.models import CommandAnswer, RunAnswer
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
     CUSTOM_DATA,
@@ -33,18 +45,6 @@ from webots_mcp.errors import (
 from webots_mcp.judging.detection.events import search_events
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import trends
-from webots_mcp.questions.answers import CommandAnswer, RunAnswer
-from webots_mcp.questions.budget import (
-    RESULT_BUDGET_TOKENS,
-    WHOLE,
-    cut_text,
-    detailed,
-    figure,
-    seconds,
-    shorten,
-    shown,
-    table,
-)
 from webots_mcp.questions.events import fitting_events, not_shown_of
 from webots_mcp.questions.history import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.monitor import movement

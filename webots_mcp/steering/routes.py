@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 import anyio
 from anyio import to_thread
 
+from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -30,7 +31,6 @@ from webots_mcp.errors import (
     NoDatabaseError,
     NothingRecordedError,
 )
-from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.simulator.console import belongs
 from webots_mcp.simulator.instances import Instance, instance_at, instances
 from webots_mcp.simulator.launch import Launch, SessionStart, newest_in, starts_since

@@ -22,7 +22,7 @@ from tests.server.story import rows_of
 from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of
 from tests.waiting import until
 from webots_mcp.database.connection import connect as database
-from webots_mcp.server import create_server
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Simulation
 
 pytestmark = [pytest.mark.anyio, pytest.mark.slow]

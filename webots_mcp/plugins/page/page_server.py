@@ -25,12 +25,12 @@ from urllib.parse import parse_qsl
 import anyio
 
 from webots_mcp import __version__
-from webots_mcp.access_token import LOOPBACK, named_host, page_key
+from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
-from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.send_command import set_parameters
+from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.signals.parameter import Value
 from webots_mcp.simulator.orders import Order
 from webots_mcp.steering.dispatch import Dispatcher

@@ -23,11 +23,11 @@ from typing import Any, Final
 
 from PIL import Image
 
+from webots_mcp.answers.models import ShownPicture
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, Moment, require
 from webots_mcp.questions import control_simulation, edit_scene, send_command, show_pictures
-from webots_mcp.questions.answers import ShownPicture
 from webots_mcp.simulator import orders
 from webots_mcp.simulator.instances import PORTS_TRIED, find_webots
 from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, free_port

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 from pydantic import Field
 
 from webots_mcp import __version__
+from webots_mcp.answers.budget import notes_of
+from webots_mcp.answers.models import NotedAnswer
 from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import Event
@@ -26,8 +28,6 @@ from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, compose_trajectory
 from webots_mcp.plugins.report.chapter import Chapter, Moment, chapter_of
 from webots_mcp.plugins.report.words import Beside, beside, clock, counted, size, time_at
-from webots_mcp.questions.answers import NotedAnswer
-from webots_mcp.questions.budget import notes_of
 from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.invalid_rows import left_out_so_far

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
+from webots_mcp.answers.models import Answer, Table
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
-from webots_mcp.questions.answers import Answer, Table
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, shown_time
 from webots_mcp.store.recording import Recording, View, look, storage

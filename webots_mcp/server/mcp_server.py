@@ -42,14 +42,14 @@ from mcp.types import (
 from pydantic import Field, ValidationError
 
 from webots_mcp import __version__
+from webots_mcp.answers.budget import compact_json, cut_text
+from webots_mcp.answers.models import ShownPicture
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.database.liveness import reap_if_dead
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.answers import ShownPicture
-from webots_mcp.questions.budget import compact_json, cut_text
 from webots_mcp.questions.declaring import (
     Caller,
     Id,

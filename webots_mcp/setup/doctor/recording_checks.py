@@ -25,7 +25,9 @@ from webots_mcp.database.connection import (
 )
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.waiting_file import count_rows, waiting_paths
-from webots_mcp.diagnosis import (
+from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
+from webots_mcp.extras.requirements import install_line, missing_requirements, package_of
+from webots_mcp.setup.doctor import (
     Diagnosis,
     Examined,
     ago,
@@ -36,8 +38,6 @@ from webots_mcp.diagnosis import (
     warning,
     wrong,
 )
-from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
-from webots_mcp.extras.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of

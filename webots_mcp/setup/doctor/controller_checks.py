@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.contract import find_project
-from webots_mcp.diagnosis import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.setup.doctor import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
 from webots_mcp.setup.interpreter import Interpreter, chosen, look_into
 from webots_mcp.setup.project_edits import AlreadyPatchedError, attaching_place, is_plain_robot
 from webots_mcp.signals.naming import find_position

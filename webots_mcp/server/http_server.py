@@ -22,9 +22,9 @@ from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect
 from starlette.responses import PlainTextResponse
 
-from webots_mcp.access_token import LOOPBACK, access_token, is_admitted, named_host
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.http_limits import MOST_SESSIONS, PromptProtocol, SessionLimit
+from webots_mcp.server.access_token import LOOPBACK, access_token, is_admitted, named_host
+from webots_mcp.server.http_limits import MOST_SESSIONS, PromptProtocol, SessionLimit
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer

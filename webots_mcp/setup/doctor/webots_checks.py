@@ -25,16 +25,6 @@ from urllib.request import urlopen
 from webots_mcp import __version__
 from webots_mcp.contract import UNSEEN, host_name, instance_of
 from webots_mcp.database.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
-from webots_mcp.diagnosis import (
-    Diagnosis,
-    Examined,
-    check,
-    last_seen_s,
-    ok,
-    unclear,
-    warning,
-    wrong,
-)
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.setup.client_entries import (
     TOKEN_VARIABLE,
@@ -45,6 +35,16 @@ from webots_mcp.setup.client_entries import (
     is_ours,
     object_in,
     words_of,
+)
+from webots_mcp.setup.doctor import (
+    Diagnosis,
+    Examined,
+    check,
+    last_seen_s,
+    ok,
+    unclear,
+    warning,
+    wrong,
 )
 from webots_mcp.setup.wsl import WAY_OUT, ask_windows, in_wsl, is_wsl, on_windows
 from webots_mcp.simulator.instances import find_webots, installations, shown_of

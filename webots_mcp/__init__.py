@@ -12,21 +12,22 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.mcp_bridge import BridgeStats, MCPBridge
+    from webots_mcp.contract import VERSION as __version__
     from webots_mcp.contract import MemoryDatabase
 
-__version__ = "0.1.0"
 __all__ = ["BridgeStats", "MCPBridge", "MemoryDatabase", "__version__"]
 
-
-_HOMES = {
-    "MCPBridge": "webots_mcp.bridge.mcp_bridge",
-    "BridgeStats": "webots_mcp.bridge.mcp_bridge",
-    "MemoryDatabase": "webots_mcp.contract",
+_HOMES = {  # the module of each name, and its name there
+    "BridgeStats": ("webots_mcp.bridge.mcp_bridge", "BridgeStats"),
+    "MCPBridge": ("webots_mcp.bridge.mcp_bridge", "MCPBridge"),
+    "MemoryDatabase": ("webots_mcp.contract", "MemoryDatabase"),
+    "__version__": ("webots_mcp.contract", "VERSION"),
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(import_module(_HOMES[name]), name)
+    module, its_name = _HOMES[name]
+    globals()[name] = value = getattr(import_module(module), its_name)
     return value

@@ -19,6 +19,7 @@ from webots_mcp.errors import InvalidInputError
 if TYPE_CHECKING:
     import tempfile
 
+VERSION: Final = "0.1.0"
 APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
 SCHEMA_VERSION: Final = 10  # PRAGMA user_version of a database that this version reads and writes
 

@@ -11,7 +11,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask
 from tests.server.story import rows_of
-from webots_mcp.questions.monitor import movement
+from webots_mcp.answers.movement import movement
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import Recording
 

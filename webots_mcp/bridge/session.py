@@ -24,7 +24,7 @@ from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.scene_changes import SceneEdits
 from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
 from webots_mcp.bridge.watchdog import Watchdog
-from webots_mcp.contract import UNMOVED, UNSEEN, Database, MemoryDatabase
+from webots_mcp.contract import UNMOVED, UNSEEN, VERSION, Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.signals.register import SignalNames, StateChanges
 
@@ -87,10 +87,8 @@ class Session:
         kind: str | None = None,
         hang_after_s: float = 0.0,
     ) -> None:
-        from webots_mcp import __version__
-
         robot = (simulation.robot, simulation.supervisor)
-        self.identity = identify(*robot, __version__, throttle.interval, kind)
+        self.identity = identify(*robot, VERSION, throttle.interval, kind)
         self.errors = errors
         self.simulation = simulation
         self.throttle = throttle

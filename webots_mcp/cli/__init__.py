@@ -201,13 +201,13 @@ def app_for(argv: Sequence[str]) -> App:
     """The application with the command that is called; with all of them for help and completion."""
     from cyclopts import App, Group, Parameter
 
-    from webots_mcp import __version__
     from webots_mcp.cli.commands import COMMANDS, GROUPS
+    from webots_mcp.contract import VERSION
 
     app = App(
         name="webots-mcp",
         help=_HELP,
-        version=__version__,
+        version=VERSION,
         version_flags=["--version"],
         suppress_keyboard_interrupt=False,
         default_parameter=Parameter(negative=(), show_default=False),

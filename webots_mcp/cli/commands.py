@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.plugins import plugin_commands
+from webots_mcp.extras.plugins import plugin_commands
 
 
 class Command(NamedTuple):

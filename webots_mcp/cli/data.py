@@ -40,7 +40,7 @@ from webots_mcp.cli.terminal import (
 )
 from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins import export_formats
+from webots_mcp.extras.plugins import export_formats
 from webots_mcp.store.merging import write_bundle
 from webots_mcp.store.purge import Purged
 

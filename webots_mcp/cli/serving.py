@@ -20,7 +20,7 @@ from webots_mcp.cli.options import HERE, DataDir, Json, Limits, Parameter, Where
 from webots_mcp.cli.terminal import ending_in_time, print_json
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
-from webots_mcp.plugins import stand_in_simulator
+from webots_mcp.extras.plugins import stand_in_simulator
 
 if TYPE_CHECKING:
     from webots_mcp.contract import Database

@@ -395,7 +395,7 @@ def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManage
 
 @contextmanager
 def _cluster(options: TrialOptions, plan: WorldPlan) -> Generator[Simulators]:
-    from webots_mcp.plugins import cluster_offered, load
+    from webots_mcp.extras.plugins import cluster_offered, load
 
     with load(cluster_offered())(
         options.scheduler,

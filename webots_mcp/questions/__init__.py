@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Final
 
-from webots_mcp.plugins import question_modules
+from webots_mcp.extras.plugins import question_modules
 from webots_mcp.questions.declaring import Question
 
 # In the order in which clients list them; those of plugins follow.

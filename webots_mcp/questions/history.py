@@ -10,12 +10,9 @@ from pydantic import Field
 
 from webots_mcp.answers.budget import (
     answer_about,
-    compact_json,
-    cut_for_a_model,
     figure,
     figures,
     fitting,
-    is_for_a_person,
     notes_of,
     range_in,
     room_tokens,
@@ -23,7 +20,6 @@ from webots_mcp.answers.budget import (
     short_name,
     shown,
     some,
-    table,
     tokens_of,
     without_empty,
 )
@@ -38,8 +34,9 @@ from webots_mcp.answers.models import (
     SignalsAnswer,
     TrendsAnswer,
 )
+from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
+from webots_mcp.judging.trends import trends
 from webots_mcp.questions.declaring import (
     READS,
     AnyNames,
@@ -385,16 +382,8 @@ def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
 
 # -- what each signal did, in words --
 
-TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
-STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")
 DEFAULT_LIMIT: Final = 20
-MOST_SIGNALS: Final = 500
-_STATES_SHARE: Final = 0.25  # of the budget, at most
-_LONGEST_SAYING: Final = 200
 _ASK_FOR_OTHERS: Final = "signals=['...'] asks for others, limit for more"
-EMPTY: Final = '""'  # a name without a character
-_SHOWN_VALUES: Final = 6
-_SHOWN_CONSTANTS: Final = 20
 
 
 @question(
@@ -439,93 +428,10 @@ def _trends(
     }
 
 
-def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTables:
-    """The trends of a run as tables that fit the budget."""
-    changed = [state for state in run.states if state.changes]
-    states = fitting([_state_row(state) for state in changed], int(budget_tokens * _STATES_SHARE))
-    moving = _moving(run)
-    constant, without_value = some(_constants(run), _SHOWN_CONSTANTS), some(run.without_value)
-    left_tokens = budget_tokens - tokens_of([states, constant, without_value])
-    rows = fitting([_trend_row(trend) for trend in moving[:limit]], left_tokens)
-    return RunTrendTables(
-        run_id=run.run_id,
-        start_s=seconds(run.start_s),
-        end_s=seconds(run.end_s if run.cut_at_s is None else run.cut_at_s),
-        row_count=run.rows,
-        resolution_s=run.resolution_s,
-        numbers=table(TREND_COLUMNS, rows),
-        states=table(STATE_COLUMNS, states),
-        constant=constant or None,
-        without_value=without_value or None,
-        not_shown=_not_shown(run, len(rows), len(states)),
-        rows_missing_from_s=seconds(run.cut_at_s),
-    )
-
-
-def _moving(run: RunTrends) -> list[Trend]:
-    """Those that changed, or lost their value: no constant is dead."""
-    return [trend for trend in run.numbers if trend.shape != "constant" or trend.is_lacking]
-
-
-def _constants(run: RunTrends) -> list[str]:
-    """What never changed, each with its value."""
-    numbers = [
-        f"{trend.name or EMPTY} {figure(trend.summary.last):g} {trend.unit or ''}".rstrip()
-        for trend in run.numbers
-        if trend.shape == "constant" and not trend.is_lacking
-    ]
-    states = [
-        f"{each.name or EMPTY} {compact_json(each.last)}" for each in run.states if not each.changes
-    ]
-    return numbers + states
-
-
-def _trend_row(trend: Trend) -> list[Any]:
-    """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
-    return [
-        short_name(trend.name),
-        cut_for_a_model(trend.says, _LONGEST_SAYING),
-        figure(trend.summary.last),
-        figure(trend.mean),
-        figure(trend.deviation),
-    ]
-
-
-def _state_row(state: StateTrend) -> list[Any]:
-    """A text or a flag as a row under `STATE_COLUMNS`."""
-    longest_first = [*state.time_by_value_s.items()]
-    most = len(longest_first) if is_for_a_person() else _SHOWN_VALUES
-    times = {shown(value): round(duration_s, 3) for value, duration_s in longest_first[:most]}
-    if rest := longest_first[most:]:
-        times[f"… {len(rest)} more values"] = round(sum(duration_s for _, duration_s in rest), 3)
-    return [
-        short_name(state.name),
-        state.changes,
-        shown(state.last),
-        seconds(state.since_s),
-        times,
-    ]
-
-
 def _hint_of_trends(runs: Sequence[RunTrendTables]) -> str | None:
     if not runs:
         return "no row in that range: leave the range out, or see notes"
     return _ASK_FOR_OTHERS if any(run.not_shown for run in runs) else None
-
-
-def _not_shown(run: RunTrends, numbers: int, states: int) -> str | None:
-    """How many of the signals that changed are not shown."""
-    all_states = sum(bool(state.changes) for state in run.states)
-    counts = (("numbers", numbers, _changed(run)), ("texts and flags", states, all_states))
-    others = [
-        f"{all_of - told} of {all_of} {what}" for what, told, all_of in counts if told < all_of
-    ]
-    return ", ".join(others) or None
-
-
-def _changed(run: RunTrends) -> int:
-    """How many numbers changed, also beyond those that were read."""
-    return run.total - (len(run.numbers) - len(_moving(run)))
 
 
 TRENDS: Final = merged(

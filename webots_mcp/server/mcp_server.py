@@ -41,10 +41,9 @@ from mcp.types import (
 )
 from pydantic import Field, ValidationError
 
-from webots_mcp import __version__
 from webots_mcp.answers.budget import compact_json, cut_text
 from webots_mcp.answers.models import ShownPicture
-from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.contract import VERSION, Database, MemoryDatabase
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.database.liveness import reap_if_dead
 from webots_mcp.database.maintenance import Maintainer
@@ -116,7 +115,7 @@ def create_server(
     mcp = ToolServer(
         "webots-mcp",
         title="Webots flight recorder",
-        version=__version__,
+        version=VERSION,
         instructions=INSTRUCTIONS,
         tools=[tool_of(each, recording, output_schema=output_schemas) for each in shown],
         unlisted={

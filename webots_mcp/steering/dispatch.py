@@ -25,7 +25,10 @@ from webots_mcp.answers.budget import (
     shown,
     table,
 )
+from webots_mcp.answers.event_tables import fitting_events, not_shown_of
 from webots_mcp.answers.models import CommandAnswer, RunAnswer
+from webots_mcp.answers.movement import movement
+from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
     CUSTOM_DATA,
@@ -45,9 +48,6 @@ from webots_mcp.errors import (
 from webots_mcp.judging.detection.events import search_events
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import trends
-from webots_mcp.questions.events import fitting_events, not_shown_of
-from webots_mcp.questions.history import MOST_SIGNALS, trend_tables
-from webots_mcp.questions.monitor import movement
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import flatten, perhaps_meant

@@ -21,7 +21,7 @@ from webots_mcp.analysis.arrays import Array, Indexes, np
 from webots_mcp.analysis.summary import Ranked
 from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins import ExportFormat, export_formats, load
+from webots_mcp.extras.plugins import ExportFormat, export_formats, load
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, flatten
 from webots_mcp.store.chunk_table import Cells, Kind, Part, chunk_table
 from webots_mcp.store.chunks import (

@@ -20,8 +20,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from anyio import CancelScope, to_thread
 
-from webots_mcp import __version__
-from webots_mcp.contract import new_uuid
+from webots_mcp.contract import VERSION, new_uuid
 from webots_mcp.errors import DatabaseError, NoDatabaseError, NotAllowedError
 from webots_mcp.store.policy import LAUNCH, Policy, policies_of
 from webots_mcp.store.recording import Recording
@@ -72,7 +71,7 @@ class Requester(NamedTuple):
     transport: str
 
 
-BY_COMMAND_LINE: Final = Requester("webots-mcp", __version__, "cli")
+BY_COMMAND_LINE: Final = Requester("webots-mcp", VERSION, "cli")
 
 
 class OpenRequest:

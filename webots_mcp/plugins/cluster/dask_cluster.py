@@ -26,8 +26,7 @@ from pkgutil import resolve_name
 from platform import python_version
 from typing import Any, Final, NamedTuple
 
-from webots_mcp import __version__
-from webots_mcp.contract import DATABASE_NAME, host_name
+from webots_mcp.contract import DATABASE_NAME, VERSION, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.pool.pool_contents import open_pool
@@ -102,8 +101,8 @@ class Returned(NamedTuple):
 
 def what_lacks(needs: Needs) -> str | None:
     """What keeps this machine from running a trial; None where nothing does."""
-    if needs.version != __version__:
-        return f"it has webots-mcp {__version__}, not {needs.version}"
+    if needs.version != VERSION:
+        return f"it has webots-mcp {VERSION}, not {needs.version}"
     if not Path(needs.world).is_file():
         return f"there is no file {needs.world}: {_SHARED}"
     if digest_of(needs.world) != needs.digest:
@@ -357,7 +356,7 @@ def cluster(
         _require_pool(ship_to)
         ship_to = ship_to if "://" in ship_to else str(Path(ship_to).absolute())
     with _connected(address) as client:
-        needs = Needs(__version__, plan.world, digest_of(plan.world), is_stand_in, ship_to)
+        needs = Needs(VERSION, plan.world, digest_of(plan.world), is_stand_in, ship_to)
         _require_fit(client, address, needs)
         yield ClusterSimulators(client, address, needs, most)
 
@@ -424,10 +423,10 @@ def _other_versions(client: Any, workers: list[str]) -> Iterator[str]:
     told = client.get_versions(packages=["webots_mcp"])["workers"]
     for each in workers:
         version = told[each]["packages"].get("webots_mcp")
-        if version != __version__:
+        if version != VERSION:
             has = f"webots-mcp {version}" if version else "no webots-mcp"
             python = told[each]["host"]["python"]
-            yield f"worker {each} (Python {python}) has {has}: here is {__version__}"
+            yield f"worker {each} (Python {python}) has {has}: here is {VERSION}"
 
 
 def _other_pythons(client: Any) -> list[str]:

@@ -1,6 +1,6 @@
 """Formats of exports that need packages of their own: Parquet, MCAP and Rerun's recordings."""
 
-from webots_mcp.plugins import ExportFormat, Plugin
+from webots_mcp.extras.plugins import ExportFormat, Plugin
 
 PLUGIN = Plugin(
     formats=(

@@ -4,7 +4,7 @@ A server on loopback. It asks the same questions as the tools, on connections th
 write; what a button does goes the way that the tools' commands go.
 """
 
-from webots_mcp.plugins import Plugin, PluginCommand
+from webots_mcp.extras.plugins import Plugin, PluginCommand
 
 PLUGIN = Plugin(
     commands=(PluginCommand("view", "What is recorded now", f"{__name__}.view_command:view"),)

@@ -24,8 +24,8 @@ from urllib.parse import parse_qsl
 
 import anyio
 
-from webots_mcp import __version__
 from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.contract import VERSION
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
@@ -392,7 +392,7 @@ class ChunkMaker(threading.Thread):
 
 
 _WAIT_S: Final = 10.0
-_BY_PAGE: Final = Requester("webots-mcp view", __version__, "page")
+_BY_PAGE: Final = Requester("webots-mcp view", VERSION, "page")
 
 
 def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:

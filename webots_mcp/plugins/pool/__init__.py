@@ -6,7 +6,7 @@ a pool can do; `pool_contents` opens one of the two kinds, which are `postgres_p
 `parquet_pool`.
 """
 
-from webots_mcp.plugins import Plugin, PluginCommand
+from webots_mcp.extras.plugins import Plugin, PluginCommand
 
 PLUGIN = Plugin(
     commands=tuple(

@@ -48,7 +48,7 @@ def prove(
     prints names no file, user or machine: please send it with an issue. The exit code is 1 if
     anything is otherwise.
     """
-    from webots_mcp import __version__
+    from webots_mcp.contract import VERSION
     from webots_mcp.plugins.prove.bench import Bench, tried
     from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
     from webots_mcp.simulator.instances import find_webots
@@ -81,7 +81,7 @@ def prove(
         with suppress(OSError):  # rather than of a kernel, whose name may be that of a machine
             system["system"] = platform.freedesktop_os_release()["PRETTY_NAME"]
         system |= {"machine": platform.machine(), "python": platform.python_version()}
-        versions = {"webots": find_webots().version, "webots_mcp": __version__}
+        versions = {"webots": find_webots().version, "webots_mcp": VERSION}
         print_json({**versions, **system, "counts": counts, "checks": found})
     else:
         print(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 from pydantic import Field
 
-from webots_mcp import __version__
 from webots_mcp.answers.budget import notes_of
 from webots_mcp.answers.models import NotedAnswer
-from webots_mcp.contract import make_folder, whole_file
+from webots_mcp.contract import VERSION, make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.plotting.canvas import Room
@@ -578,7 +577,7 @@ def render(page: Page) -> bytes:
     told: Mapping[str, Any] = {
         "page": page,
         "policy": _POLICY,
-        "version": __version__,
+        "version": VERSION,
         "made": clock(page.made_wall_time_s),
         "size": size(page.size_bytes or 0),
         "counted": counted,

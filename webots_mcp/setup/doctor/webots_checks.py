@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
-from webots_mcp import __version__
-from webots_mcp.contract import UNSEEN, host_name, instance_of
+from webots_mcp.contract import UNSEEN, VERSION, host_name, instance_of
 from webots_mcp.database.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.setup.client_entries import (
@@ -340,7 +339,7 @@ def sides(subject: Examined) -> Iterator[Diagnosis]:
     ours = f"webots-mcp {windows.version}" if windows.server else "no webots-mcp"
     webots = f"Webots at {windows.webots}" if windows.webots else "no Webots"
     seen = (
-        f"in WSL: webots-mcp {__version__}, {on_this}; on Windows: {ours}, {webots}; the project "
+        f"in WSL: webots-mcp {VERSION}, {on_this}; on Windows: {ours}, {webots}; the project "
         f"is {f'on Windows ({there})' if there else f'in WSL ({subject.project})'}"
     )
     meet = windows.server and windows.webots if there else here

@@ -1,0 +1,115 @@
+"""The trends of a run as tables that fit a number of tokens."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from webots_mcp.answers.budget import (
+    compact_json,
+    cut_for_a_model,
+    figure,
+    fitting,
+    is_for_a_person,
+    seconds,
+    short_name,
+    shown,
+    some,
+    table,
+    tokens_of,
+)
+from webots_mcp.answers.models import (
+    RunTrendTables,
+)
+from webots_mcp.judging.trends import RunTrends, StateTrend, Trend
+
+TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
+STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")
+MOST_SIGNALS: Final = 500
+_STATES_SHARE: Final = 0.25  # of the budget, at most
+_LONGEST_SAYING: Final = 200
+EMPTY: Final = '""'  # a name without a character
+_SHOWN_VALUES: Final = 6
+_SHOWN_CONSTANTS: Final = 20
+
+
+def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTables:
+    """The trends of a run as tables that fit the budget."""
+    changed = [state for state in run.states if state.changes]
+    states = fitting([_state_row(state) for state in changed], int(budget_tokens * _STATES_SHARE))
+    moving = _moving(run)
+    constant, without_value = some(_constants(run), _SHOWN_CONSTANTS), some(run.without_value)
+    left_tokens = budget_tokens - tokens_of([states, constant, without_value])
+    rows = fitting([_trend_row(trend) for trend in moving[:limit]], left_tokens)
+    return RunTrendTables(
+        run_id=run.run_id,
+        start_s=seconds(run.start_s),
+        end_s=seconds(run.end_s if run.cut_at_s is None else run.cut_at_s),
+        row_count=run.rows,
+        resolution_s=run.resolution_s,
+        numbers=table(TREND_COLUMNS, rows),
+        states=table(STATE_COLUMNS, states),
+        constant=constant or None,
+        without_value=without_value or None,
+        not_shown=_not_shown(run, len(rows), len(states)),
+        rows_missing_from_s=seconds(run.cut_at_s),
+    )
+
+
+def _moving(run: RunTrends) -> list[Trend]:
+    """Those that changed, or lost their value: no constant is dead."""
+    return [trend for trend in run.numbers if trend.shape != "constant" or trend.is_lacking]
+
+
+def _constants(run: RunTrends) -> list[str]:
+    """What never changed, each with its value."""
+    numbers = [
+        f"{trend.name or EMPTY} {figure(trend.summary.last):g} {trend.unit or ''}".rstrip()
+        for trend in run.numbers
+        if trend.shape == "constant" and not trend.is_lacking
+    ]
+    states = [
+        f"{each.name or EMPTY} {compact_json(each.last)}" for each in run.states if not each.changes
+    ]
+    return numbers + states
+
+
+def _trend_row(trend: Trend) -> list[Any]:
+    """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
+    return [
+        short_name(trend.name),
+        cut_for_a_model(trend.says, _LONGEST_SAYING),
+        figure(trend.summary.last),
+        figure(trend.mean),
+        figure(trend.deviation),
+    ]
+
+
+def _state_row(state: StateTrend) -> list[Any]:
+    """A text or a flag as a row under `STATE_COLUMNS`."""
+    longest_first = [*state.time_by_value_s.items()]
+    most = len(longest_first) if is_for_a_person() else _SHOWN_VALUES
+    times = {shown(value): round(duration_s, 3) for value, duration_s in longest_first[:most]}
+    if rest := longest_first[most:]:
+        times[f"… {len(rest)} more values"] = round(sum(duration_s for _, duration_s in rest), 3)
+    return [
+        short_name(state.name),
+        state.changes,
+        shown(state.last),
+        seconds(state.since_s),
+        times,
+    ]
+
+
+def _not_shown(run: RunTrends, numbers: int, states: int) -> str | None:
+    """How many of the signals that changed are not shown."""
+    all_states = sum(bool(state.changes) for state in run.states)
+    counts = (("numbers", numbers, _changed(run)), ("texts and flags", states, all_states))
+    others = [
+        f"{all_of - told} of {all_of} {what}" for what, told, all_of in counts if told < all_of
+    ]
+    return ", ".join(others) or None
+
+
+def _changed(run: RunTrends) -> int:
+    """How many numbers changed, also beyond those that were read."""
+    return run.total - (len(run.numbers) - len(_moving(run)))

@@ -11,11 +11,12 @@ from typing import Any, Final
 import anyio
 
 import webots_mcp
-from webots_mcp import MemoryDatabase, pytest_plugin, testing
+from webots_mcp import MemoryDatabase, testing
 from webots_mcp.cli import described
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.server.mcp_server import create_server
+from webots_mcp.testing import pytest_plugin
 
 _COMMENT: Final = re.compile(r"/\*(.*?)\*/", re.DOTALL)
 _TOC: Final = "```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.mcp_bridge import BridgeStats, MCPBridge
-    from webots_mcp.contract import VERSION as __version__
+    from webots_mcp.contract import VERSION as __version__  # noqa: N811
     from webots_mcp.contract import MemoryDatabase
 
 __all__ = ["BridgeStats", "MCPBridge", "MemoryDatabase", "__version__"]

@@ -243,7 +243,7 @@ def test_no_fixture_takes_a_name_that_a_test_suite_may_use_itself(
     pytester: pytest.Pytester,
 ) -> None:
     text = pytester.runpytest_inprocess("--fixtures").stdout.str()
-    names = re.findall(r"^(\w+) -- .*webots_mcp.pytest_plugin\.py:\d+$", text, re.MULTILINE)
+    names = re.findall(r"^(\w+) -- .*webots_mcp.testing.pytest_plugin\.py:\d+$", text, re.MULTILINE)
     assert len(names) == 7
     assert all(name.startswith("webots_") for name in names)
 
@@ -257,7 +257,7 @@ def test_a_run_that_does_not_use_the_plugin_does_not_pay_for_it(pytester: pytest
         def test_nothing_is_loaded(pytestconfig):
             assert pytestconfig.pluginmanager.has_plugin("webots_mcp")
             loaded = [name for name in sys.modules if name.startswith("webots_mcp.")]
-            assert loaded == ["webots_mcp.pytest_plugin"]
+            assert loaded == ["webots_mcp.testing.pytest_plugin"]
             assert "sqlite3" not in sys.modules
             assert "WEBOTS_MCP_STRICT" not in os.environ
             assert not any("standin" in folder for folder in sys.path)

@@ -25,7 +25,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-import webots_mcp
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.database.connection import connect, shipped_objects
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
@@ -279,7 +278,7 @@ def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) 
 
 LINE: Final = (sys.executable, "-m", __name__)
 # Modules are looked for here first, so that no file of the user's folder is taken for one.
-FOLDER: Final = Path(webots_mcp.__file__).parent.parent
+FOLDER: Final = Path(__file__).parents[2]  # which holds the package
 
 _MAX_HEAP_BYTES: Final = 400_000_000
 _TIMED_OUT: Final = 124  # the exit code of timeout(1): no other end of the process has it

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from webots_mcp.standin import InProcessSupervisor
     from webots_mcp.testing import RobotFactory, RobotRecording, SimulationFactory
 
-_PACKAGE = str(Path(__file__).parent) + os.sep
-_TESTING = _PACKAGE + "testing.py"
+_TESTING = str(Path(__file__).parent) + os.sep
+_PACKAGE = str(Path(__file__).parents[1]) + os.sep
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:
     """Show a command's status with the reason, which pytest itself would cut off."""
-    asked = sys.modules.get("webots_mcp.testing")
+    asked = sys.modules.get("webots_mcp.testing.recording")
     if asked is None or not isinstance(left, asked.CommandStatus):
         return None
     return [f"{left!r} {op} {right!r}"]

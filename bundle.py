@@ -21,7 +21,8 @@ from mcp.types import Tool
 
 from hatch_build import registry_name
 from webots_mcp import __version__
-from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, MemoryDatabase
+from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER
+from webots_mcp.database.location import MemoryDatabase
 from webots_mcp.server.mcp_server import create_server
 
 TOML: Final[Any] = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")

@@ -7,8 +7,9 @@ from collections.abc import Generator
 from contextlib import closing, contextmanager
 from functools import cache
 
-from webots_mcp.contract import MemoryDatabase, new_uuid
+from webots_mcp.contract import new_uuid
 from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.location import MemoryDatabase
 
 
 @contextmanager

@@ -19,7 +19,7 @@ import anyio
 from mcp.types import Tool
 
 from webots_mcp.answers.budget import tokens_in
-from webots_mcp.contract import MemoryDatabase
+from webots_mcp.database.location import MemoryDatabase
 from webots_mcp.server.mcp_server import create_server
 
 

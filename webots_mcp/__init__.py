@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from webots_mcp.bridge.mcp_bridge import BridgeStats, MCPBridge
     from webots_mcp.contract import VERSION as __version__  # noqa: N811
-    from webots_mcp.contract import MemoryDatabase
+    from webots_mcp.database.location import MemoryDatabase
 
 __all__ = ["BridgeStats", "MCPBridge", "MemoryDatabase", "__version__"]
 
 _HOMES = {  # the module of each name, and its name there
     "BridgeStats": ("webots_mcp.bridge.mcp_bridge", "BridgeStats"),
     "MCPBridge": ("webots_mcp.bridge.mcp_bridge", "MCPBridge"),
-    "MemoryDatabase": ("webots_mcp.contract", "MemoryDatabase"),
+    "MemoryDatabase": ("webots_mcp.database.location", "MemoryDatabase"),
     "__version__": ("webots_mcp.contract", "VERSION"),
 }
 

@@ -6,18 +6,11 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import os
-import sqlite3
 import sys
 import zlib
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
-
-from webots_mcp.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    import tempfile
+from typing import Final, Literal, NamedTuple, get_args
 
 VERSION: Final = "0.1.0"
 APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
@@ -40,8 +33,6 @@ KEEP_LAST_VARIABLE: Final = "WEBOTS_MCP_KEEP_LAST_S"
 HANG_VARIABLE: Final = "WEBOTS_MCP_HANG_AFTER_S"
 PARAMETERS_VARIABLE: Final = "WEBOTS_MCP_PARAMETERS"
 
-PRIVATE_FOLDER: Final = 0o700  # recordings hold pictures and logs: they are their owner's alone
-PRIVATE_FILE: Final = 0o600
 
 CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
 FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")
@@ -232,94 +223,6 @@ def new_uuid() -> str:
     return "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:]))
 
 
-class MemoryDatabase:
-    """A database in memory that a bridge and a server in one process share.
-
-    Every connection to `uri` sees the same data; the data lives until `close` (or the end of
-    the process). Pictures need files, so `data_dir` is a temporary folder, made when first asked
-    for and removed with the database.
-    """
-
-    def __init__(self) -> None:
-        self.uri: Final = f"file:/webots-mcp-{os.urandom(8).hex()}?vfs=memdb"
-        self._keeper = sqlite3.connect(self.uri, uri=True, check_same_thread=False)
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
-
-    @property
-    def data_dir(self) -> Path:
-        """A temporary folder for the pictures of this database."""
-        if self._folder is None:
-            import tempfile  # only where needed: it is half of this module's import time
-
-            self._folder = tempfile.TemporaryDirectory(prefix="webots-mcp-")
-        return Path(self._folder.name)
-
-    def close(self) -> None:
-        """Forget the data, once the last other connection is closed as well."""
-        self._keeper.close()
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
-
-    def __repr__(self) -> str:
-        return f"MemoryDatabase({self.uri!r})"
-
-
-Database = Path | MemoryDatabase
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder that is its owner's alone; one that is there already keeps its mode.
-
-    Raises:
-        OSError: It cannot be made.
-    """
-    folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
-
-
-@contextmanager
-def whole_file(file: Path) -> Generator[Path]:
-    """A file next to it to write to, private to its owner, which replaces it when it is complete.
-
-    Raises:
-        OSError: It cannot be written; no part of it is left.
-    """
-    aside = file.with_name(f"{file.name}.part")
-    aside.touch(PRIVATE_FILE)
-    try:
-        aside.chmod(PRIVATE_FILE)  # also of one that a killed process has left
-        yield aside
-        os.replace(aside, file)  # noqa: PTH105
-    finally:
-        aside.unlink(missing_ok=True)
-
-
-@contextmanager
-def placed(file: Path) -> Generator[Path]:
-    """As `whole_file`, for a file that somebody has named.
-
-    Raises:
-        InvalidInputError: It cannot be written.
-    """
-    try:
-        with whole_file(file) as aside:
-            yield aside
-    except OSError as error:
-        raise InvalidInputError(f"{file} cannot be written: {error}") from error
-
-
-def full_path(path: str | os.PathLike[str]) -> Path:
-    """The path with `~` and links followed.
-
-    Raises:
-        OSError: `~` is no user's home, links form a circle, or the name is not valid.
-    """
-    try:
-        return Path(path).expanduser().resolve()
-    except (RuntimeError, ValueError) as error:
-        raise OSError(f"{str(path)!r} cannot be followed: {error}; give the full path") from error
-
-
 def bundled(name: str) -> Path:
     """The folder `name` (examples): in the package, or in a checkout next to it.
 
@@ -330,107 +233,3 @@ def bundled(name: str) -> Path:
         if folder.is_dir():
             return folder
     raise FileNotFoundError(f"{name}/ is missing: install webots-mcp again")
-
-
-class DataFolder(NamedTuple):
-    """Where the database and the pictures live, and the rule that chose it."""
-
-    path: Path
-    chosen_by: str
-
-
-def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
-    """Where the database and the pictures live; the same answer for bridge and server.
-
-    In rising order of precedence: `~/.webots-mcp/data`; `mcp_data/` in the nearest folder at or
-    above the current one that is a Webots project (see `find_project`); the environment variable
-    `WEBOTS_MCP_DATA_DIR`; the argument.
-    """
-    return choose_data_dir(data_dir).path
-
-
-def choose_data_dir(data_dir: str | os.PathLike[str] | None = None) -> DataFolder:
-    """As `resolve_data_dir`, with the rule."""
-    if data_dir is not None:
-        return DataFolder(full_path(data_dir), "it was named")
-    if named := os.environ.get(DATA_DIR_VARIABLE):
-        return DataFolder(full_path(named), f"the environment variable {DATA_DIR_VARIABLE}")
-    if project := find_project(Path.cwd()):
-        return DataFolder(project / PROJECT_DATA_FOLDER, f"the Webots project {project}")
-    default = Path.home() / ".webots-mcp" / "data"
-    return DataFolder(default, f"the default, as {Path.cwd()} is in no Webots project")
-
-
-def find_project(folder: Path) -> Path | None:
-    """Return the nearest folder, at or above this one, that is a Webots project.
-
-    It holds `worlds/`, and there a world or next to it `controllers/`. ROS 2 packages and projects
-    of extern controllers have worlds alone: Webots needs no more.
-    """
-    return next((each for each in (folder, *folder.parents) if _is_project(each)), None)
-
-
-def _is_project(folder: Path) -> bool:
-    worlds = folder / WORLD_FOLDER
-    try:
-        if not worlds.is_dir():
-            return False
-        return (folder / CONTROLLER_FOLDER).is_dir() or any(
-            name.endswith(WORLD_ENDING)
-            for name in os.listdir(worlds)  # noqa: PTH208
-        )
-    except OSError:  # a folder that this user may not list is no project of theirs
-        return False
-
-
-def require_world_of(project: Path | None, world: Path) -> Path:
-    """The project of a world that may be opened: a world starts the controllers of its project.
-
-    Args:
-        project: It has to lie in this one; None for any.
-        world: Its file, with links followed.
-
-    Raises:
-        InvalidInputError: It is no world, or lies in no project, or in another one.
-    """
-    if world.suffix != WORLD_ENDING:
-        raise InvalidInputError(f"{world} is no world: its name does not end with {WORLD_ENDING}")
-    if project is not None and not world.is_relative_to(project):
-        raise InvalidInputError(f"{world} lies outside of the project {project}")
-    own = find_project(world.parent)
-    if own is None:
-        raise InvalidInputError(
-            f"{world} lies in no Webots project: that is {PROJECT_IS}; move it into one"
-        )
-    return project or own
-
-
-def resolve_database(
-    database: str | os.PathLike[str] | MemoryDatabase | None = None,
-    data_dir: str | os.PathLike[str] | None = None,
-) -> tuple[Database, Path]:
-    """The database and the folder of its pictures, from what a user gave.
-
-    Args:
-        database: A file, `":memory:"` for a new one in memory, an open `MemoryDatabase`, or None
-            for `webots.db` in the data folder.
-        data_dir: The data folder; None for the database's own folder, else `resolve_data_dir`.
-
-    Raises:
-        TypeError: `database` is of another type.
-        OSError: A path cannot be followed.
-    """
-    if isinstance(database, str) and database == ":memory:":
-        database = MemoryDatabase()
-    if isinstance(database, MemoryDatabase):
-        return database, database.data_dir if data_dir is None else resolve_data_dir(data_dir)
-    if database is None:
-        folder = resolve_data_dir(data_dir)
-        return folder / DATABASE_NAME, folder
-    if not isinstance(database, (str, os.PathLike)):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise TypeError(
-            f"database={database!r} is a {type(database).__name__}; give a path, ':memory:' or a "
-            "webots_mcp.MemoryDatabase (shared by bridge and server in one process)"
-        )
-    file = full_path(database)
-    return file, file.parent if data_dir is None else resolve_data_dir(data_dir)

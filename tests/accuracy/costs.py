@@ -19,7 +19,7 @@ from tests.golden.drawing import KINDS
 from tests.golden.stored import drawn
 from tests.tool_list import counts_of
 from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
-from webots_mcp.contract import MemoryDatabase
+from webots_mcp.database.location import MemoryDatabase
 from webots_mcp.server.mcp_server import create_server
 
 _KILLS: Final = 200  # of each kind with a server

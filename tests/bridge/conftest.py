@@ -16,8 +16,9 @@ import pytest
 from tests.waiting import wait_for
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import encoding, recorder
-from webots_mcp.contract import DATABASE_NAME, Database
+from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
+from webots_mcp.database.location import Database
 from webots_mcp.database.waiting_file import waiting_path
 from webots_mcp.standin import InProcessSupervisor
 

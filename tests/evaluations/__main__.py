@@ -19,7 +19,7 @@ import anyio
 from tests.evaluations.asking import Outcome, ask_by_command, ask_by_plan
 from tests.evaluations.scenario import Scenario, read_scenarios
 from tests.tool_list import counts_of
-from webots_mcp.contract import MemoryDatabase
+from webots_mcp.database.location import MemoryDatabase
 from webots_mcp.server.mcp_server import create_server
 
 

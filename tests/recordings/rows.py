@@ -9,8 +9,9 @@ import sqlite3
 import time
 from typing import Any
 
-from webots_mcp.contract import Database, new_uuid
+from webots_mcp.contract import new_uuid
 from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.location import Database
 
 
 def insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> int:

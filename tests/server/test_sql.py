@@ -13,7 +13,7 @@ from mcp.types import CallToolResult
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
-from webots_mcp.contract import MemoryDatabase
+from webots_mcp.database.location import MemoryDatabase
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.sql import FOLDER, LINE, Statement, decode

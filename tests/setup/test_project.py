@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp.contract import require_world_of, resolve_data_dir
+from webots_mcp.database.location import require_world_of, resolve_data_dir
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.simulator.project import controllers_of, project_of
 

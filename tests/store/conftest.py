@@ -12,7 +12,7 @@ import pytest
 from tests.memory import memory_connection
 from tests.recordings.rover import record_rover
 from tests.recordings.rows import Recorded
-from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading import frame_summary

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp.contract import Database
 from webots_mcp.database import liveness
 from webots_mcp.database.connection import connect
+from webots_mcp.database.location import Database
 from webots_mcp.database.queue import (
     CLAIM,
     MAX_PARAMS_BYTES,

@@ -28,10 +28,10 @@ from webots_mcp.contract import (
     MAX_STEPS,
     SCREENSHOT_FOLDER,
     Then,
-    full_path,
-    require_world_of,
 )
+from webots_mcp.database.files import full_path
 from webots_mcp.database.liveness import EXTERN
+from webots_mcp.database.location import require_world_of
 from webots_mcp.database.pauses import Cause
 from webots_mcp.errors import (
     CommandRefusedError,

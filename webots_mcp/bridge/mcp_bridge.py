@@ -26,11 +26,9 @@ from webots_mcp.contract import (
     STRICT_VARIABLE,
     THROTTLE_VARIABLE,
     BreakpointAction,
-    Database,
-    MemoryDatabase,
     find_log_level,
-    resolve_database,
 )
+from webots_mcp.database.location import Database, MemoryDatabase, resolve_database
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.signals.parameter import declare
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.simulation import Run
-from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME, make_folder, whole_file
+from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME
+from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 if TYPE_CHECKING:

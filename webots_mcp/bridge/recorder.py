@@ -38,7 +38,7 @@ from webots_mcp.bridge.registration import (
     register,
 )
 from webots_mcp.bridge.simulation import Clock, Run
-from webots_mcp.contract import DATABASE_NAME, Database, new_uuid
+from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import (
     FAILURES,
     connect,
@@ -55,6 +55,7 @@ from webots_mcp.database.connection import (
     text_of,
 )
 from webots_mcp.database.liveness import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
+from webots_mcp.database.location import Database
 from webots_mcp.database.waiting_file import (
     STATEMENTS,
     Kind,

@@ -24,7 +24,8 @@ from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.scene_changes import SceneEdits
 from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
 from webots_mcp.bridge.watchdog import Watchdog
-from webots_mcp.contract import UNMOVED, UNSEEN, VERSION, Database, MemoryDatabase
+from webots_mcp.contract import UNMOVED, UNSEEN, VERSION
+from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.signals.register import SignalNames, StateChanges
 

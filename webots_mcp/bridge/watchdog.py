@@ -21,7 +21,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.contract import PRIVATE_FILE, Database
+from webots_mcp.database.files import PRIVATE_FILE
+from webots_mcp.database.location import Database
 from webots_mcp.database.stacks import FORMAT, LIBRARIES, SIGNAL, VERSION, read_stacks, stacks_path
 from webots_mcp.database.waiting_file import lock
 

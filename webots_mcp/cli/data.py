@@ -38,7 +38,7 @@ from webots_mcp.cli.terminal import (
     shown_progress,
     wait,
 )
-from webots_mcp.contract import placed
+from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.plugins import export_formats
 from webots_mcp.store.merging import write_bundle

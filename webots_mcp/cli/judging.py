@@ -29,7 +29,9 @@ from webots_mcp.cli.options import (
     make_chunks_first,
 )
 from webots_mcp.cli.terminal import print_answer, print_json, print_table
-from webots_mcp.contract import find_project, host_name, placed
+from webots_mcp.contract import host_name
+from webots_mcp.database.files import placed
+from webots_mcp.database.location import find_project
 from webots_mcp.database.stacks import INSTALLED, STEPPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.extras.requirements import explain_extra

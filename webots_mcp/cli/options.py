@@ -156,7 +156,7 @@ class Where:
 
     def recording(self, *, read_only: bool = True) -> Recording:
         """The recording."""
-        from webots_mcp.contract import resolve_database
+        from webots_mcp.database.location import resolve_database
         from webots_mcp.store.recording import Recording
 
         where = resolve_database(self.database, self.data_dir)

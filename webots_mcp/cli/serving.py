@@ -23,7 +23,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPE
 from webots_mcp.extras.plugins import stand_in_simulator
 
 if TYPE_CHECKING:
-    from webots_mcp.contract import Database
+    from webots_mcp.database.location import Database
     from webots_mcp.simulator.launch import Launch, SessionStart
     from webots_mcp.simulator.orders import WebotsLine
     from webots_mcp.store.recording import Recording
@@ -100,7 +100,7 @@ def serve(
     """
     import logging
 
-    from webots_mcp.contract import resolve_database
+    from webots_mcp.database.location import resolve_database
 
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     database, data_dir = resolve_database(recorded.database, recorded.data_dir)
@@ -249,7 +249,7 @@ def observe(
     --extern Webots starts the observer itself, and this command is not needed. It ends when Webots
     reloads the world or ends; with --json it says then where it has recorded.
     """
-    from webots_mcp.contract import resolve_data_dir
+    from webots_mcp.database.location import resolve_data_dir
     from webots_mcp.simulator import observer
 
     period_ms = observer.checked_period(observer.PERIOD_MS if period_ms is None else period_ms)
@@ -421,7 +421,8 @@ def _watch(recording: Recording, before: int, world: Path, patience_s: float) ->
 
 def _recording(data_dir: Path | None, project: Path) -> Recording:
     """Where the controllers of the project record, whatever folder this one is started in."""
-    from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, resolve_database
+    from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER
+    from webots_mcp.database.location import resolve_database
     from webots_mcp.store.recording import Recording
 
     named = data_dir or os.environ.get(DATA_DIR_VARIABLE)

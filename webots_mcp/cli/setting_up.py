@@ -259,7 +259,7 @@ def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
 
 def _remove_observer(world: Path, writing: Writing) -> None:
     """Take the observer out of a world, or delete the copy that was made for it."""
-    from webots_mcp.contract import find_project
+    from webots_mcp.database.location import find_project
     from webots_mcp.setup.project_edits import undo, unused_controller
 
     change = undo(world)
@@ -347,8 +347,9 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
     Raises:
         InvalidInputError: The file is invalid.
     """
-    from webots_mcp.contract import DATABASE_NAME, make_folder
+    from webots_mcp.contract import DATABASE_NAME
     from webots_mcp.database.connection import connect, create_schema, schema_version
+    from webots_mcp.database.files import make_folder
     from webots_mcp.store.project_file import compile_project, file_of, read_project
 
     if (file := file_of(data_dir)) is None:
@@ -389,7 +390,7 @@ def _allowed(project: Path) -> tuple[FileChange, str | None]:
 
 def _ignored(data_dir: Path, writing: Writing) -> tuple[FileChange, str | None]:
     """What keeps the recording out of the project's repository."""
-    from webots_mcp.contract import make_folder
+    from webots_mcp.database.files import make_folder
     from webots_mcp.setup.client_entries import ignore_file
 
     change = ignore_file(data_dir)
@@ -514,7 +515,7 @@ def doctor(
 def _examined(recorded: Where) -> Examined:
     from dataclasses import replace
 
-    from webots_mcp.contract import choose_data_dir
+    from webots_mcp.database.location import choose_data_dir
     from webots_mcp.setup.doctor import subject_of
 
     try:

@@ -15,15 +15,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
-from webots_mcp.contract import (
-    APPLICATION_ID,
-    PRIVATE_FILE,
-    SCHEMA_VERSION,
-    Database,
-    MemoryDatabase,
-    make_folder,
-    new_uuid,
-)
+from webots_mcp.contract import APPLICATION_ID, SCHEMA_VERSION, new_uuid
+from webots_mcp.database.files import PRIVATE_FILE, make_folder
+from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.errors import (
     DatabaseError,
     ForeignDatabaseError,

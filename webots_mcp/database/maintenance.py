@@ -24,7 +24,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
-from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.database.connection import (
     CHECKPOINT_TIMEOUT_MS,
     connect,
@@ -35,6 +34,7 @@ from webots_mcp.database.connection import (
     text_of,
 )
 from webots_mcp.database.liveness import Lease, give_back, take
+from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn
 

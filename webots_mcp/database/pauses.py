@@ -21,14 +21,11 @@ from __future__ import annotations
 import math
 import sqlite3
 import time
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, BreakpointAction
 from webots_mcp.database.connection import transaction
 from webots_mcp.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    from webots_mcp.signals.conditions import Condition
 
 PAUSED: Final = "paused"  # how a command controls the loop: the column session.pause_state
 STEPPING: Final = "stepping"
@@ -216,7 +213,7 @@ def list_breakpoints(connection: sqlite3.Connection, robot_id: int) -> list[Stor
 def set_breakpoint(
     connection: sqlite3.Connection,
     robot_id: int,
-    condition: Condition,
+    condition: str,
     action: BreakpointAction,
     after_hits: int,
     created_by: str,
@@ -227,7 +224,7 @@ def set_breakpoint(
         InvalidInputError: The robot has as many as there may be.
     """
     with transaction(connection):
-        asked = (condition.text, action, after_hits)
+        asked = (condition, action, after_hits)
         if (like := connection.execute(_LIKE, (robot_id, *asked)).fetchone()) is not None:
             return int(like[0])
         if connection.execute(_COUNT, (robot_id,)).fetchone()[0] >= MAX_BREAKPOINTS:

@@ -166,7 +166,7 @@ def _store(
     with recording.view(robot) as view:
         name, robot_id, notes = view.robot.name, view.robot.id, _notes(view, condition)
     with recording.writer() as connection:
-        return name, stored.set_breakpoint(connection, robot_id, condition, *asked), notes
+        return name, stored.set_breakpoint(connection, robot_id, condition.text, *asked), notes
 
 
 def _notes(view: View, condition: Condition) -> list[str]:

@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.contract import full_path, make_folder
+from webots_mcp.database.files import full_path, make_folder
 from webots_mcp.errors import CommandRefusedError
 
 _HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[0-9A-Za-z._-]+)(?::[0-9]{1,5})?")

@@ -43,9 +43,10 @@ from pydantic import Field, ValidationError
 
 from webots_mcp.answers.budget import compact_json, cut_text
 from webots_mcp.answers.models import ShownPicture
-from webots_mcp.contract import VERSION, Database, MemoryDatabase
+from webots_mcp.contract import VERSION
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.database.liveness import reap_if_dead
+from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.questions import all_questions

@@ -16,8 +16,10 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Final
 
-from webots_mcp.contract import LogLevel, LogSource, find_project, full_path, host_name
+from webots_mcp.contract import LogLevel, LogSource, host_name
+from webots_mcp.database.files import full_path
 from webots_mcp.database.liveness import give_back, held_jobs, holder_of, lease_of, take
+from webots_mcp.database.location import find_project
 from webots_mcp.errors import (
     CommandRefusedError,
     DatabaseError,

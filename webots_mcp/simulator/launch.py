@@ -8,15 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.contract import (
-    OBSERVER_NAME,
-    WORLD_ENDING,
-    find_project,
-    full_path,
-    host_name,
-    require_world_of,
-)
+from webots_mcp.contract import OBSERVER_NAME, WORLD_ENDING, host_name
 from webots_mcp.database.connection import transaction
+from webots_mcp.database.files import full_path
+from webots_mcp.database.location import find_project, require_world_of
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.simulator.console import as_row
 from webots_mcp.simulator.orders import WebotsAddress, WebotsLine, address_of

@@ -15,9 +15,9 @@ from webots_mcp.contract import (
     PROJECT_IS,
     WORLD_ENDING,
     WORLD_FOLDER,
-    find_project,
-    full_path,
 )
+from webots_mcp.database.files import full_path
+from webots_mcp.database.location import find_project
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import quoted
 

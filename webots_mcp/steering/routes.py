@@ -17,13 +17,8 @@ import anyio
 from anyio import to_thread
 
 from webots_mcp.answers.models import CommandAnswer
-from webots_mcp.contract import (
-    DATA_DIR_VARIABLE,
-    DATABASE_NAME,
-    HEARTBEAT_LATE_S,
-    UNMOVED,
-    find_project,
-)
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, HEARTBEAT_LATE_S, UNMOVED
+from webots_mcp.database.location import find_project
 from webots_mcp.errors import (
     AmbiguousRobotError,
     CommandRefusedError,

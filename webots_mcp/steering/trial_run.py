@@ -30,13 +30,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol, TypeAlias
 
-from webots_mcp.contract import (
-    DATA_DIR_VARIABLE,
-    DATABASE_NAME,
-    ENDED_BY,
-    PARAMETERS_VARIABLE,
-    make_folder,
-)
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, ENDED_BY, PARAMETERS_VARIABLE
+from webots_mcp.database.files import make_folder
 from webots_mcp.errors import (
     CommandRefusedError,
     ConditionFailedError,

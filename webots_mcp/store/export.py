@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, ClassVar, Final, Literal, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import Array, Indexes, np
 from webots_mcp.analysis.summary import Ranked
-from webots_mcp.contract import placed
+from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.plugins import ExportFormat, export_formats, load
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, flatten

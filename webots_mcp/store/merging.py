@@ -19,14 +19,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, get_args
 
-from webots_mcp.contract import (
-    DATABASE_NAME,
-    PRIVATE_FILE,
-    REMOTE_SILENCE_S,
-    host_name,
-    make_folder,
-    whole_file,
-)
+from webots_mcp.contract import DATABASE_NAME, REMOTE_SILENCE_S, host_name
 from webots_mcp.database.connection import (
     FrozenConnection,
     connect,
@@ -34,6 +27,7 @@ from webots_mcp.database.connection import (
     require_shipped,
     transaction,
 )
+from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
 from webots_mcp.database.liveness import end_session, reap
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError

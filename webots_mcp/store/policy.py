@@ -28,7 +28,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.contract import PROJECT_FILE, Database, find_project, full_path
+from webots_mcp.contract import PROJECT_FILE
+from webots_mcp.database.files import full_path
+from webots_mcp.database.location import Database, find_project
 from webots_mcp.errors import InvalidInputError, NotAllowedError
 from webots_mcp.store.project_file import load_toml
 

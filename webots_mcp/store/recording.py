@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
+from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database import liveness
 from webots_mcp.database.connection import (
     FAILURES,
@@ -35,6 +35,7 @@ from webots_mcp.database.connection import (
     text_of,
 )
 from webots_mcp.database.liveness import Lease, still_held
+from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.queue import any_unfinished
 from webots_mcp.database.waiting_file import adopt, count_rows, left_waiting, waiting_paths

@@ -25,8 +25,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.contract import DATABASE_NAME, Database
+from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect, shipped_objects
+from webots_mcp.database.location import Database
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.run_rows import reading_texts

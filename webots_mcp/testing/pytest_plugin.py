@@ -19,7 +19,7 @@ import pytest
 
 if TYPE_CHECKING:
     from webots_mcp import MCPBridge, MemoryDatabase
-    from webots_mcp.contract import Database
+    from webots_mcp.database.location import Database
     from webots_mcp.standin import InProcessSupervisor
     from webots_mcp.testing import RobotFactory, RobotRecording, SimulationFactory
 

@@ -13,11 +13,9 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from webots_mcp.analysis.summary import LARGEST
-from webots_mcp.contract import (
-    LOG_LEVELS,
-    Database,
-)
+from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.database.connection import Role, connect, require_current, schema_version
+from webots_mcp.database.location import Database
 from webots_mcp.database.queue import Command, CommandQueue, fetch_command, list_commands
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.checks import CHECKS, check_run

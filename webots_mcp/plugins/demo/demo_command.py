@@ -19,14 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from webots_mcp.cli.options import Json, Parameter
 from webots_mcp.cli.terminal import answer_lines, print_json, rewrite
-from webots_mcp.contract import (
-    DATA_DIR_VARIABLE,
-    DATABASE_NAME,
-    full_path,
-    host_name,
-    whole_file,
-)
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, host_name
 from webots_mcp.database.connection import connect
+from webots_mcp.database.files import full_path, whole_file
 from webots_mcp.database.liveness import give_back, holder_of, lease_of, process_alive, take
 from webots_mcp.errors import CommandRefusedError, NothingRecordedError, WebotsMCPError
 from webots_mcp.extras.requirements import quoted

@@ -21,7 +21,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
-from webots_mcp.contract import placed
+from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 from uuid import NAMESPACE_URL, uuid5
 
 from webots_mcp.analysis.arrays import np
-from webots_mcp.contract import placed
+from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way

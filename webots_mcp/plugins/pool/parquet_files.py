@@ -38,7 +38,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final, cast
 from uuid import uuid4
 
-from webots_mcp.contract import SCHEMA_VERSION, host_name, make_folder
+from webots_mcp.contract import SCHEMA_VERSION, host_name
+from webots_mcp.database.files import make_folder
 from webots_mcp.database.liveness import process_identity
 from webots_mcp.errors import (
     InvalidInputError,

@@ -18,7 +18,8 @@ from pydantic import Field
 
 from webots_mcp.answers.budget import notes_of
 from webots_mcp.answers.models import NotedAnswer
-from webots_mcp.contract import VERSION, make_folder, whole_file
+from webots_mcp.contract import VERSION
+from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.plotting.canvas import Room

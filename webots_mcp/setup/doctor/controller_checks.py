@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.contract import find_project
+from webots_mcp.database.location import find_project
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.setup.doctor import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
 from webots_mcp.setup.interpreter import Interpreter, chosen, look_into

@@ -317,6 +317,31 @@ def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]
     return get_close_matches(spelled, harmless, most)
 
 
+def describe_unknown(given: Iterable[str], known: Sequence[str] | None, of: str) -> str | None:
+    """Return the error of parameters that an action does not take, with the ones that it takes.
+
+    Args:
+        given: The names that were given.
+        known: The names of its parameters; None where any name may be given.
+        of: The action.
+
+    Returns:
+        None where there is no such parameter.
+    """
+    unknown = [] if known is None else [name for name in given if name not in known]
+    if not unknown:
+        return None
+    word = "parameter" if len(unknown) == 1 else "parameters"
+    text = f"action {of!r} takes no {word} {', '.join(f'{name!r:.80}' for name in unknown[:5])}"
+    if not known:
+        return f"{text}: it takes none"
+    from difflib import get_close_matches
+
+    near = get_close_matches(unknown[0], known, 1, 0.5)
+    offer = f". Did you mean {near[0]!r}? It" if near else ": it"
+    return f"{text}{offer} takes {', '.join(map(repr, known))}"
+
+
 def is_destructive(action: str) -> bool:
     """Return whether an action, command or option says by its name that it loses something."""
     return not _DESTRUCTIVE.isdisjoint(words_of(_NO_WORD.sub("_", action)))

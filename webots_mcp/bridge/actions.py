@@ -38,6 +38,7 @@ from webots_mcp.errors import (
     InvalidInputError,
 )
 from webots_mcp.liveness import EXTERN
+from webots_mcp.naming import describe_unknown
 from webots_mcp.pauses import Cause
 
 if TYPE_CHECKING:
@@ -68,9 +69,13 @@ def begin(session: Session, command: ClaimedCommand) -> Progress:
 
     Raises:
         CommandRefusedError: It needs a Supervisor and this robot is not one.
+        InvalidInputError: It does not take such a parameter.
     """
-    if BUILT_IN_ACTIONS[command.action].needs_supervisor:
+    action = BUILT_IN_ACTIONS[command.action]
+    if action.needs_supervisor:
         session.simulation.require_supervisor(command.action)
+    if unknown := describe_unknown(command.params, action.parameters, command.action):
+        raise InvalidInputError(unknown)
     return _known[command.action](session, command)
 
 

@@ -31,7 +31,7 @@ from webots_mcp.errors import (
     UnknownActionError,
     UnknownSignalError,
 )
-from webots_mcp.naming import flatten, perhaps_meant
+from webots_mcp.naming import describe_unknown, flatten, perhaps_meant
 from webots_mcp.questions.answers import CommandAnswer, RunAnswer
 from webots_mcp.questions.budget import (
     RESULT_BUDGET_TOKENS,
@@ -178,6 +178,7 @@ class Dispatcher:
         request_id = permit(self._recording, action, params)
         with self._recording.reader() as connection:
             view = find_target(connection, robot, action)
+            _require_parameters(view, action, params)
         with self._recording.writer() as connection:
             return CommandQueue(connection).enqueue(
                 view.robot.id,
@@ -752,6 +753,15 @@ def _require_action(view: View, action: str) -> None:
         f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its own actions "
         f"are {known[:_SHOWN_ACTIONS]}, the built-in ones {list(BUILT_IN_ACTIONS)}"
     )
+
+
+def _require_parameters(view: View, action: str, params: Mapping[str, Any]) -> None:
+    """Refuse parameters that a built-in action does not take; the bridge would refuse them too."""
+    built_in = BUILT_IN_ACTIONS.get(action)
+    if built_in is None or (view.session and action in view.session.actions):
+        return
+    if unknown := describe_unknown(params, built_in.parameters, action):
+        raise InvalidInputError(unknown)
 
 
 def _require_live(view: View) -> Session:

@@ -61,10 +61,12 @@ OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual
 _SEEN: Final = f"{WORLD}."
 PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
 # Words of actions that ask for the same, whatever their letters; and words that say no more.
-_SAME_ACTION: Final = (
+# Words of actions and of arguments that mean the same.
+_SAME_MEANING: Final = (
     {"pause", "stop", "halt", "freeze"}, {"resume", "start", "play", "continue", "unpause"},
     {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport", "move", "place", "change"},
     {"add", "node", "spawn"}, {"drive", "move", "go", "goto"},
+    {"duration", "for", "length", "period", "s", "seconds", "time"},
 )  # fmt: skip
 # Words of actions, commands and options that lose something: none is ever offered as a correction.
 _DESTRUCTIVE: Final = frozenset((
@@ -356,7 +358,7 @@ def harmless_first(action: str, known: Iterable[str]) -> list[str]:
 
 def _groups_of(action: str) -> set[int]:
     words = set(words_of(action)) - _OF_ACTIONS
-    return {number for number, group in enumerate(_SAME_ACTION) if words and words <= group}
+    return {number for number, group in enumerate(_SAME_MEANING) if words and words <= group}
 
 
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:

@@ -19,7 +19,6 @@ import logging
 import threading
 from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing
-from difflib import get_close_matches
 from pathlib import Path
 from sqlite3 import Connection
 from typing import Annotated, Any, Final, cast
@@ -48,7 +47,7 @@ from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.naming import harmless_first
+from webots_mcp.naming import harmless_first, perhaps_meant
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.answers import ShownPicture
 from webots_mcp.questions.budget import compact_json, cut_text
@@ -466,11 +465,13 @@ class CheckedTool(Tool):
         names = [name for name in arguments if name in unknown]
         listed, inside = list(self.parameters["properties"]), self.of_controller
         said = f"unknown argument {shown_value(names[0])}"
-        is_typo = any(get_close_matches(name, listed) for name in names)
+        is_typo = any(perhaps_meant(name, listed) for name in names)
         if inside and inside not in arguments and not is_typo:
-            given = {name: value for name, value in arguments.items() if name not in unknown}
-            given[inside] = {name: arguments[name] for name in names}
-            shown = ", ".join(f"{name}={compact_json(value)}" for name, value in given.items())
+            lacking = [name for name in self.parameters.get("required", ()) if name != inside]
+            call = {name: "..." for name in lacking if name not in arguments}
+            call |= {n: compact_json(v) for n, v in arguments.items() if n not in unknown}
+            call[inside] = compact_json({name: arguments[name] for name in names})
+            shown = ", ".join(f"{name}={value}" for name, value in call.items())
             if len(shown) > _LONGEST_CALL:
                 shown = f"{inside}={{...}}"
             return f"{said}: names of the controller go into `{inside}`: {self.name}({shown})"

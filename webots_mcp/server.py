@@ -339,6 +339,7 @@ _USUAL: Final[Mapping[str, tuple[Any, ...]]] = {  # what a model takes for grant
 _NOBODY_ASKS_FOR: Final = 1_000
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
+_TOOL_PREFIX: Final = "webots_"
 _LONGEST_CALL: Final = 300  # characters of a call that is shown as an example
 _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
 
@@ -505,10 +506,23 @@ class ToolServer(MCPServer):
                 f"{name} changes the simulation or the recording, and this server is --read-only: "
                 "ask for a server that was started without"
             )
-        if self._tool_manager.get_tool(name) is None and (make := self._unlisted.get(name)):
+        if self._tool_manager.get_tool(name) is None:
+            make = self._unlisted.get(name)
+            if make is None:
+                raise ToolError(self._unknown(name))
             context = context or Context(mcp_server=self)
             return await make().run(arguments, context, convert_result=True)
         return await super().call_tool(name, arguments, context)
+
+    def _unknown(self, name: str) -> str:
+        """There is no such tool, and which one was perhaps meant."""
+        listed = [tool.name for tool in self._tool_manager.list_tools()]
+        known = {*listed, *self._unlisted} - {*self._withheld}
+        bare = (each.removeprefix(_TOOL_PREFIX) for each in sorted(known))
+        near = perhaps_meant(name.removeprefix(_TOOL_PREFIX), bare)
+        meant = " or ".join(f"{_TOOL_PREFIX}{each}" for each in near)
+        offer = f"Did you mean {meant}?" if meant else "tools/list names all tools."
+        return f"There is no tool {shown_value(name)}. {offer}"
 
     async def get_prompt(
         self,

@@ -253,3 +253,24 @@ async def test_names_of_the_controller_are_shown_in_the_argument_that_takes_them
     async with connect() as client:
         told = await fail(client, f"webots_{tool}", **arguments)
     assert told.endswith(f": {call}")
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("webots_get_robot_stat", "Did you mean webots_get_robot_state"),
+        ("webots_find_event", "Did you mean webots_find_events"),
+        ("webots_get_timelines", "Did you mean webots_get_timeline"),  # one that is not listed
+        ("webots_world_reste", "tools/list names all tools."),  # nothing that loses something
+        ("x" * 100_000, "tools/list names all tools."),
+    ],
+)
+async def test_a_misspelt_tool_is_refused_with_the_nearest_one(
+    connect: Connect, name: str, told: str
+) -> None:
+    async with connect() as client:
+        answer = await client.call_tool(name, {})
+    assert answer.is_error
+    assert text_of(answer).startswith(f"There is no tool '{name[:20]}")
+    assert told in text_of(answer)
+    assert len(text_of(answer)) < 300

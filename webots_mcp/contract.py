@@ -59,8 +59,10 @@ class BuiltInAction(NamedTuple):
         needs_supervisor: Only a Supervisor can do it.
         ends_steps: A `step` or `run` command that is still at work ends with it.
         runs_user_code: It calls functions of the controller, which may take their time.
+        parameters: The names of its parameters; None where the controller decides.
     """
 
+    parameters: tuple[str, ...] | None = ()
     needs_supervisor: bool = True
     ends_steps: bool = False
     runs_user_code: bool = False
@@ -71,24 +73,26 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "pause": BuiltInAction(ends_steps=True),
     "resume": BuiltInAction(ends_steps=True),
     "fast": BuiltInAction(ends_steps=True),
-    "step": BuiltInAction(ends_steps=True),
-    "run": BuiltInAction(ends_steps=True),
-    "cancel_run": BuiltInAction(needs_supervisor=False),
+    "step": BuiltInAction(("steps",), ends_steps=True),
+    "run": BuiltInAction(
+        ("until", "for_s", "reset", "pace", "then", "parameters", "prune", "by"), ends_steps=True
+    ),
+    "cancel_run": BuiltInAction(("command_id",), needs_supervisor=False),
     "reset": BuiltInAction(ends_steps=True),
     "reload": BuiltInAction(ends_steps=True),
-    "load_world": BuiltInAction(ends_steps=True),
-    "quit": BuiltInAction(ends_steps=True),
-    "screenshot": BuiltInAction(),
-    "take_frame": BuiltInAction(needs_supervisor=False),
-    "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
-    "set_parameters": BuiltInAction(needs_supervisor=False),
+    "load_world": BuiltInAction(("world",), ends_steps=True),
+    "quit": BuiltInAction(("status",), ends_steps=True),
+    "screenshot": BuiltInAction(("quality",)),
+    "take_frame": BuiltInAction(("camera",), needs_supervisor=False),
+    "reset_state": BuiltInAction(None, needs_supervisor=False, runs_user_code=True),
+    "set_parameters": BuiltInAction(("values", "when", "by"), needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),
-    "keep": BuiltInAction(needs_supervisor=False),
-    "get_scene": BuiltInAction(),
-    "get_field": BuiltInAction(),
-    "set_field": BuiltInAction(),
-    "add_node": BuiltInAction(),
-    "remove_node": BuiltInAction(),
+    "keep": BuiltInAction(("reason",), needs_supervisor=False),
+    "get_scene": BuiltInAction(("path", "types", "names", "fields", "depth", "cursor")),
+    "get_field": BuiltInAction(("path", "start")),
+    "set_field": BuiltInAction(("path", "value", "stop")),
+    "add_node": BuiltInAction(("path", "vrml")),
+    "remove_node": BuiltInAction(("path",)),
 }
 
 OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers

@@ -300,3 +300,26 @@ def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:
     assert {name: action.__name__ for name, action in known.items()} == {
         name: name for name in BUILT_IN_ACTIONS
     }  # pyright: ignore[reportPrivateUsage]
+
+
+@pytest.mark.parametrize(
+    "action", [name for name, each in BUILT_IN_ACTIONS.items() if each.parameters is not None]
+)
+def test_a_parameter_that_a_built_in_action_does_not_take_is_refused(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Callable[[int], None],
+    action: str,
+) -> None:
+    drive(1)
+    command, at_s = recording.send(action, stepps=5), robot.getTime()
+    drive(1)
+    status, result, error = recording.fate(command)
+    assert (status, result) == ("failed", None)
+    assert error is not None
+    assert f"action {action!r} takes no parameter 'stepps'" in error
+    assert ("Did you mean 'steps'?" in error) == (action == "step")
+    assert all(repr(name) in error for name in BUILT_IN_ACTIONS[action].parameters or ())
+    assert robot.getTime() == pytest.approx(at_s + 0.016)
+    assert robot.simulationGetMode() != robot.SIMULATION_MODE_PAUSE

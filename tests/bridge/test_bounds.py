@@ -342,6 +342,22 @@ def test_a_state_that_never_comes_to_its_end_is_recorded_as_far_as_it_says(
     assert recording.states() == [{"key 0": True, "key 1": True, "key 2": True}]
 
 
+class Computed(dict[str, object]):
+    """A dict that holds nothing itself."""
+
+    def items(self) -> Any:
+        return [("left", 1), ("right", 2)]
+
+
+@pytest.mark.parametrize("state", [Computed(), {"wheels": Computed()}, {"wheels": [Computed()]}])
+def test_a_mapping_is_recorded_by_its_own_items_whatever_it_holds(
+    bridge: MCPBridge, recording: Recording, state: dict[str, Any]
+) -> None:
+    bridge.publish(state)
+    wheels = {"left": 1, "right": 2}
+    assert recording.states() in ([wheels], [{"wheels": wheels}], [{"wheels": [wheels]}])
+
+
 def test_what_is_added_to_the_devices_may_never_come_to_its_end_either(
     bridge: MCPBridge, recording: Recording
 ) -> None:

@@ -50,8 +50,30 @@ HUGE = 2**63
         ("find_events", {"strt_s": 1}, "unknown argument 'strt_s': there is start_s, "),
         ("find_events", {"for_s": 2.0}, "unknown argument 'for_s': there is start_s, "),
         ("query_history", {"signals": ["x"], "cursor": 3}, "only rows go on with cursor"),
-        ("monitor", {"duration_wall_s": 2, "lookback_wall_s": 9}, "give either duration_wall_s"),
-        ("monitor", {"duration_wall_s": 2, "duration": 9}, "give either duration_wall_s"),
+        (
+            "monitor",
+            {"duration_wall_s": 2, "lookback_wall_s": 9},
+            "duration_wall_s and lookback_wall_s exclude each other: give ",
+        ),
+        (
+            "monitor",
+            {"duration_wall_s": 2, "duration": 9},
+            "duration and duration_wall_s exclude each other: give ",
+        ),
+        (
+            "send_command",
+            {"speed": 1},
+            "unknown argument 'speed': names of the controller go into `params`: "
+            'webots_send_command(action=..., params={"speed":1})',
+        ),
+        (
+            "set_parameters",
+            {"kp": 1.5, "when": "reset"},
+            "unknown argument 'kp': names of the controller go into `values`: "
+            'webots_set_parameters(when="reset", values={"kp":1.5})',
+        ),
+        ("run", {"duration": 5}, "unknown argument 'duration': there is for_s, "),
+        ("run", {"seconds": 5, "until": "x > 1"}, "unknown argument 'seconds': there is for_s, "),
         ("simulation_control", {"command": "pause", "steps": 2}, "steps is for command='step'"),
         ("get_trends", {"robot": "r" * 201}, "robot must have at most 200 characters, not"),
     ],
@@ -231,3 +253,24 @@ async def test_names_of_the_controller_are_shown_in_the_argument_that_takes_them
     async with connect() as client:
         told = await fail(client, f"webots_{tool}", **arguments)
     assert told.endswith(f": {call}")
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("webots_get_robot_stat", "Did you mean webots_get_robot_state"),
+        ("webots_find_event", "Did you mean webots_find_events"),
+        ("webots_get_timelines", "Did you mean webots_get_timeline"),  # one that is not listed
+        ("webots_world_reste", "tools/list names all tools."),  # nothing that loses something
+        ("x" * 100_000, "tools/list names all tools."),
+    ],
+)
+async def test_a_misspelt_tool_is_refused_with_the_nearest_one(
+    connect: Connect, name: str, told: str
+) -> None:
+    async with connect() as client:
+        answer = await client.call_tool(name, {})
+    assert answer.is_error
+    assert text_of(answer).startswith(f"There is no tool '{name[:20]}")
+    assert told in text_of(answer)
+    assert len(text_of(answer)) < 300

@@ -267,6 +267,17 @@ async def test_an_unknown_action_is_refused_with_what_asks_for_the_same_in_other
     assert f"did you mean {meant}? " in told
 
 
+async def test_a_parameter_that_a_built_in_action_does_not_take_is_refused_unsent(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot()
+    async with connect() as client:
+        asked = {"action": "step", "params": {"count": 5}}
+        text = await fail(client, "webots_send_command", **asked)
+    assert "action 'step' takes no parameter 'count': it takes 'steps'" in text
+    assert recorded.connection.execute("SELECT count(*) FROM command").fetchone() == (0,)
+
+
 @pytest.mark.parametrize("params", [{"x": "y" * 70_000}])
 async def test_parameters_beyond_the_limit_are_refused(
     connect: Connect, recorded: Recorded, params: dict[str, Any]

@@ -15,7 +15,7 @@ import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded, insert
-from tests.server.conftest import Connect, ask, fail
+from tests.server.conftest import Connect, ask, fail, text_of
 from tests.waiting import until
 from tests.webots.conftest import (
     CONTROLLER,
@@ -158,6 +158,24 @@ async def test_what_waits_for_a_run_is_told_beside_several_robots_of_the_past(
             robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
         answer = await ask(client, "webots_get_logs")
     assert answer["lines"]["rows"] == [[None, "info", "console: No module named 'arm'", None]]
+
+
+async def test_what_the_console_says_of_a_controller_that_never_recorded_is_named(
+    connect: Connect, recorded: Recorded
+) -> None:
+    insert(recorded.connection, "console_line", {
+        "instance": "here:1234", "wall_time_s": time.time(), "level": "warning",
+        "source": "webots", "message": "WARNING: bot exited with status: 1.",
+    })  # fmt: skip
+    named = "bot exited with status: 1.': a controller may have failed before it recorded anything"
+    async with connect() as client:
+        for tool in ("list_robots", "get_robot_state", "find_events", "check_run", "diagnose"):
+            answer = await client.call_tool(f"webots_{tool}", {})
+            assert named in text_of(answer), tool
+        told = await ask(client, "webots_get_logs", level="error")
+        assert (told["matching"], told["hint"][:25]) == (0, "no robot has recorded yet")
+        recorded.robot(ended_wall_time_s=time.time(), end_reason="finished")
+        assert named in (await ask(client, "webots_list_robots"))["hint"]
 
 
 async def test_the_command_line_follows_what_comes(recorded: Recorded, file: Path) -> None:

@@ -95,7 +95,7 @@ async def test_a_tool_that_is_not_listed_answers_when_it_is_called(
     recorded.robot().state(1.0, {"x": 1})
     async with connect(core=True, read_only=True) as client:
         assert (await ask(client, "webots_get_sensors"))["hint"]
-        with pytest.raises(AssertionError, match="Unknown tool"):
+        with pytest.raises(AssertionError, match="There is no tool"):
             await ask(client, "webots_world_resets")
 
 

@@ -39,6 +39,7 @@ from webots_mcp.errors import (
     InterruptedCommandError,
     InvalidInputError,
 )
+from webots_mcp.signals.naming import describe_unknown
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session
@@ -68,9 +69,13 @@ def begin(session: Session, command: ClaimedCommand) -> Progress:
 
     Raises:
         CommandRefusedError: It needs a Supervisor and this robot is not one.
+        InvalidInputError: It does not take such a parameter.
     """
-    if BUILT_IN_ACTIONS[command.action].needs_supervisor:
+    action = BUILT_IN_ACTIONS[command.action]
+    if action.needs_supervisor:
         session.simulation.require_supervisor(command.action)
+    if unknown := describe_unknown(command.params, action.parameters, command.action):
+        raise InvalidInputError(unknown)
     return _known[command.action](session, command)
 
 

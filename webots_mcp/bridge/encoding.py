@@ -331,7 +331,7 @@ class Cleaner:
         if isinstance(value, (list, tuple, set, frozenset, deque)):
             return self._items(cast("Iterable[object]", value), place, depth)
         if isinstance(value, Mapping):
-            return self._mapping(cast("Mapping[object, object]", value), place, depth)
+            return self._own_mapping(cast("Mapping[object, object]", value), place, depth)
         return self._object(value, place, depth)
 
     # -- numbers and texts ---------------------------------------------------------------------
@@ -380,6 +380,16 @@ class Cleaner:
         items = islice(value.items(), count)
         self._unfilled.append(_Unfilled(cleaned, value, items, place, depth + 1))
         return cleaned
+
+    def _own_mapping(self, value: Mapping[object, object], place: Place, depth: int) -> object:
+        """All items of a type of the user; where they do not end, as many as its length says."""
+        most = max(self._room // ROOM_OF_A_VALUE, _TOP_KEYS)
+        if len(value) > most:
+            return self._mapping(value, place, depth)
+        found = dict(islice(value.items(), most + 1))
+        if len(found) > most:
+            found = dict(islice(found.items(), len(value)))
+        return self._mapping(found, place, depth)
 
     def _fill(self, unfilled: _Unfilled) -> None:
         cleaned, value, items, place, depth = unfilled

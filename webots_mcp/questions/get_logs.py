@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import Annotated, Final
 
 from pydantic import Field
@@ -43,6 +44,11 @@ _COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
 _LONGEST_MESSAGE: Final = 500
 _BUDGET_TOKENS: Final = 1_500
+_ANY_LINE: Final = LogFilter(None, Window(-math.inf, math.inf), "", "debug")
+_NONE_MATCHES: Final = (
+    "no robot has recorded yet, and no line of Webots' console matches: leave out the level, the "
+    "text and the source to see all of its lines"
+)
 _NO_RUN_YET: Final = (
     "lines without a run_id came from Webots' console before a run began: a controller that never "
     "began one may have failed there"
@@ -80,7 +86,6 @@ def webots_get_logs(
     """
     scope = Scope(robot=robot, run_id=run_id, last_s=last_s, start_s=start_s, end_s=end_s)
     lowest = level or "debug"
-    anytime = Window(-math.inf, math.inf)
     try:
         with recording.view(robot, run_id) as view:
             run = view.require_run()
@@ -89,14 +94,15 @@ def webots_get_logs(
             asked = LogFilter(one_run, window, filter_text, lowest, cursor, view.robot.id, source)
             return _answer(recording, view, asked, lines, time_of_day=time_of_day)
     except (NothingRecordedError, AmbiguousRobotError):
-        asked = LogFilter(None, anytime, filter_text, lowest, source=source)
+        asked = replace(_ANY_LINE, text=filter_text, lowest_level=lowest, source=source)
         with recording.reader() as connection:
             is_any_live = any(each.live for each in list_robots(connection, time.time()))
             waiting = [] if is_any_live else waiting_lines(connection, asked, lines)
-        if not waiting:
-            raise
+            if not waiting and (is_any_live or not waiting_lines(connection, _ANY_LINE, 1)):
+                raise
         shown = _table(_newest_fitting(waiting), time_of_day=time_of_day)
-        return LogsAnswer(lines=shown, matching=len(waiting), hint=_NO_RUN_YET)
+        hint = _NO_RUN_YET if waiting else _NONE_MATCHES
+        return LogsAnswer(lines=shown if waiting else None, matching=len(waiting), hint=hint)
 
 
 def _row(line: LogLine) -> dict[str, object]:

@@ -65,10 +65,16 @@ async def webots_monitor(
     Movement, trends and events of that window. Of longer ago: webots_get_trends and
     webots_find_events.
     """
-    if sum(each is not None for each in (duration_wall_s, lookback_wall_s, duration)) > 1:
+    asked = {
+        "duration": duration,
+        "duration_wall_s": duration_wall_s,
+        "lookback_wall_s": lookback_wall_s,
+    }
+    given = [name for name, value in asked.items() if value is not None]
+    if len(given) > 1:
         raise InvalidInputError(
-            "give either duration_wall_s, to watch from now on, or lookback_wall_s, to look back "
-            "at once"
+            f"{' and '.join(given)} exclude each other: give duration_wall_s alone to watch from "
+            "now on, or lookback_wall_s alone to look back at once"
         )
     duration_wall_s = duration_wall_s or duration or USUAL_DURATION_S
     if lookback_wall_s is not None:

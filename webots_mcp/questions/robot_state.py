@@ -51,11 +51,14 @@ from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of
 from webots_mcp.store.retention import described, unheeded
 from webots_mcp.store.retention_plan import file_sizes
 from webots_mcp.store.robots import (
+    Robot,
     Session,
     WorldSeen,
     companions,
+    console_trouble,
     fetch_session,
     list_robots,
+    nothing_recorded,
     rows_waiting,
     world_seen,
 )
@@ -98,19 +101,27 @@ def webots_list_robots(recording: Recording) -> RobotsAnswer:
     with recording.reader() as connection:
         now_s = time.time()
         robots = list_robots(connection, now_s)
-        none = f"no robot has been recorded yet. {GETTING_STARTED}"
+        none = f"{nothing_recorded(connection)}. {GETTING_STARTED}"
         if not robots and not told:
             raise NothingRecordedError(none)
         views = _fitting([view_of(connection, robot, now_s) for robot in _liveliest(robots)])
         live = [view for view in views if view.robot.live]
-        hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
         return RobotsAnswer(
             **(live[0].header() if len(live) == 1 else storage(connection)),
             robots=_robots(views, told=told) if views else None,
             database=name_of(recording.database) if told else None,
             retention=_retention(recording, connection) if told else None,
-            hint=hint if len(robots) > len(views) else None if robots else none,
+            hint=_hint_of_robots(connection, robots, len(views)) if robots else none,
         )
+
+
+def _hint_of_robots(
+    connection: sqlite3.Connection, robots: Sequence[Robot], shown: int
+) -> str | None:
+    if len(robots) > shown:
+        return f"{len(robots)} robots in all, the latest {shown} are shown"
+    is_any_live = any(robot.live for robot in robots)
+    return None if is_any_live else console_trouble(connection)
 
 
 @question("Get world information", READS)

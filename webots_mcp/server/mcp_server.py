@@ -19,7 +19,6 @@ import logging
 import threading
 from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing
-from difflib import get_close_matches
 from pathlib import Path
 from sqlite3 import Connection
 from typing import Annotated, Any, Final, cast
@@ -60,7 +59,7 @@ from webots_mcp.questions.declaring import (
     listed,
     shown_value,
 )
-from webots_mcp.signals.naming import harmless_first
+from webots_mcp.signals.naming import harmless_first, perhaps_meant
 from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
@@ -340,6 +339,7 @@ _USUAL: Final[Mapping[str, tuple[Any, ...]]] = {  # what a model takes for grant
 _NOBODY_ASKS_FOR: Final = 1_000
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
+_TOOL_PREFIX: Final = "webots_"
 _LONGEST_CALL: Final = 300  # characters of a call that is shown as an example
 _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
 
@@ -466,11 +466,13 @@ class CheckedTool(Tool):
         names = [name for name in arguments if name in unknown]
         listed, inside = list(self.parameters["properties"]), self.of_controller
         said = f"unknown argument {shown_value(names[0])}"
-        is_typo = any(get_close_matches(name, listed) for name in names)
+        is_typo = any(perhaps_meant(name, listed) for name in names)
         if inside and inside not in arguments and not is_typo:
-            given = {name: value for name, value in arguments.items() if name not in unknown}
-            given[inside] = {name: arguments[name] for name in names}
-            shown = ", ".join(f"{name}={compact_json(value)}" for name, value in given.items())
+            lacking = [name for name in self.parameters.get("required", ()) if name != inside]
+            call = {name: "..." for name in lacking if name not in arguments}
+            call |= {n: compact_json(v) for n, v in arguments.items() if n not in unknown}
+            call[inside] = compact_json({name: arguments[name] for name in names})
+            shown = ", ".join(f"{name}={value}" for name, value in call.items())
             if len(shown) > _LONGEST_CALL:
                 shown = f"{inside}={{...}}"
             return f"{said}: names of the controller go into `{inside}`: {self.name}({shown})"
@@ -504,10 +506,23 @@ class ToolServer(MCPServer):
                 f"{name} changes the simulation or the recording, and this server is --read-only: "
                 "ask for a server that was started without"
             )
-        if self._tool_manager.get_tool(name) is None and (make := self._unlisted.get(name)):
+        if self._tool_manager.get_tool(name) is None:
+            make = self._unlisted.get(name)
+            if make is None:
+                raise ToolError(self._unknown(name))
             context = context or Context(mcp_server=self)
             return await make().run(arguments, context, convert_result=True)
         return await super().call_tool(name, arguments, context)
+
+    def _unknown(self, name: str) -> str:
+        """There is no such tool, and which one was perhaps meant."""
+        listed = [tool.name for tool in self._tool_manager.list_tools()]
+        known = {*listed, *self._unlisted} - {*self._withheld}
+        bare = (each.removeprefix(_TOOL_PREFIX) for each in sorted(known))
+        near = perhaps_meant(name.removeprefix(_TOOL_PREFIX), bare)
+        meant = " or ".join(f"{_TOOL_PREFIX}{each}" for each in near)
+        offer = f"Did you mean {meant}?" if meant else "tools/list names all tools."
+        return f"There is no tool {shown_value(name)}. {offer}"
 
     async def get_prompt(
         self,

@@ -61,10 +61,12 @@ OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual
 _SEEN: Final = f"{WORLD}."
 PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
 # Words of actions that ask for the same, whatever their letters; and words that say no more.
-_SAME_ACTION: Final = (
+# Words of actions and of arguments that mean the same.
+_SAME_MEANING: Final = (
     {"pause", "stop", "halt", "freeze"}, {"resume", "start", "play", "continue", "unpause"},
     {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport", "move", "place", "change"},
     {"add", "node", "spawn"}, {"drive", "move", "go", "goto"},
+    {"duration", "for", "length", "period", "s", "seconds", "time"},
 )  # fmt: skip
 # Words of actions, commands and options that lose something: none is ever offered as a correction.
 _DESTRUCTIVE: Final = frozenset((
@@ -317,6 +319,31 @@ def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]
     return get_close_matches(spelled, harmless, most)
 
 
+def describe_unknown(given: Iterable[str], known: Sequence[str] | None, of: str) -> str | None:
+    """Return the error of parameters that an action does not take, with the ones that it takes.
+
+    Args:
+        given: The names that were given.
+        known: The names of its parameters; None where any name may be given.
+        of: The action.
+
+    Returns:
+        None where there is no such parameter.
+    """
+    unknown = [] if known is None else [name for name in given if name not in known]
+    if not unknown:
+        return None
+    word = "parameter" if len(unknown) == 1 else "parameters"
+    text = f"action {of!r} takes no {word} {', '.join(f'{name!r:.80}' for name in unknown[:5])}"
+    if not known:
+        return f"{text}: it takes none"
+    from difflib import get_close_matches
+
+    near = get_close_matches(unknown[0], known, 1, 0.5)
+    offer = f". Did you mean {near[0]!r}? It" if near else ": it"
+    return f"{text}{offer} takes {', '.join(map(repr, known))}"
+
+
 def is_destructive(action: str) -> bool:
     """Return whether an action, command or option says by its name that it loses something."""
     return not _DESTRUCTIVE.isdisjoint(words_of(_NO_WORD.sub("_", action)))
@@ -331,7 +358,7 @@ def harmless_first(action: str, known: Iterable[str]) -> list[str]:
 
 def _groups_of(action: str) -> set[int]:
     words = set(words_of(action)) - _OF_ACTIONS
-    return {number for number, group in enumerate(_SAME_ACTION) if words and words <= group}
+    return {number for number, group in enumerate(_SAME_MEANING) if words and words <= group}
 
 
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:

@@ -50,7 +50,7 @@ from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import trends
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
-from webots_mcp.signals.naming import flatten, perhaps_meant
+from webots_mcp.signals.naming import describe_unknown, flatten, perhaps_meant
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
 from webots_mcp.store.reading.segment import Subject
@@ -178,6 +178,7 @@ class Dispatcher:
         request_id = permit(self._recording, action, params)
         with self._recording.reader() as connection:
             view = find_target(connection, robot, action)
+            _require_parameters(view, action, params)
         with self._recording.writer() as connection:
             return CommandQueue(connection).enqueue(
                 view.robot.id,
@@ -752,6 +753,15 @@ def _require_action(view: View, action: str) -> None:
         f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its own actions "
         f"are {known[:_SHOWN_ACTIONS]}, the built-in ones {list(BUILT_IN_ACTIONS)}"
     )
+
+
+def _require_parameters(view: View, action: str, params: Mapping[str, Any]) -> None:
+    """Refuse parameters that a built-in action does not take; the bridge would refuse them too."""
+    built_in = BUILT_IN_ACTIONS.get(action)
+    if built_in is None or (view.session and action in view.session.actions):
+        return
+    if unknown := describe_unknown(params, built_in.parameters, action):
+        raise InvalidInputError(unknown)
 
 
 def _require_live(view: View) -> Session:

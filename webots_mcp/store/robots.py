@@ -124,6 +124,10 @@ class Session:
         return self.host == host_name() and process_alive(*process)
 
 
+_CONSOLE_TROUBLE: Final = (
+    "SELECT substr(message, 1, 200) FROM console_line WHERE level IN ('warning', 'error', "
+    "'critical') ORDER BY id DESC LIMIT 1"
+)
 _COLUMNS: Final = columns_of(Session)
 _NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
@@ -240,6 +244,27 @@ def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
     return row[0]
 
 
+def nothing_recorded(connection: sqlite3.Connection) -> str:
+    """Return that no robot was ever seen, with what Webots' console says about it."""
+    text = "no robot has been recorded in this database yet"
+    trouble = console_trouble(connection)
+    return f"{text}. {trouble}" if trouble else text
+
+
+def console_trouble(connection: sqlite3.Connection) -> str | None:
+    """Return the newest warning of Webots' console that belongs to no run; None without any.
+
+    A controller that fails before its bridge exists leaves nothing else.
+    """
+    row = connection.execute(_CONSOLE_TROUBLE).fetchone()
+    if row is None:
+        return None
+    return (
+        f"Webots' console says {row[0]!r}: a controller may have failed before it recorded "
+        "anything. webots_get_logs shows the console"
+    )
+
+
 def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> Robot:
     """The robot of that name; without a name the only live one, else the only one ever seen.
 
@@ -252,7 +277,7 @@ def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float
     """
     robots = list_robots(connection, now_s)
     if not robots:
-        raise NothingRecordedError("no robot has been recorded in this database yet")
+        raise NothingRecordedError(nothing_recorded(connection))
     if name is not None:
         return _named(robots, name)
     live = [robot for robot in robots if robot.live]

@@ -37,7 +37,7 @@ from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import Recording, View, view_of
-from webots_mcp.store.robots import RUNNING, list_robots, without_observers
+from webots_mcp.store.robots import RUNNING, list_robots, nothing_recorded, without_observers
 from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
 from webots_mcp.store.runs import RunInfo, list_runs
 
@@ -156,7 +156,7 @@ def _view(connection: sqlite3.Connection, choice: Choice) -> View:
     now_s = time.time()
     robots = without_observers(list_robots(connection, now_s))
     if not robots:
-        raise NothingRecordedError("no robot has been recorded in this database yet")
+        raise NothingRecordedError(nothing_recorded(connection))
     named = [robot for robot in robots if robot.name == choice.robot]
     if choice.robot is not None and not named:
         raise UnknownRobotError(f"robot {choice.robot!r} is not in this database")

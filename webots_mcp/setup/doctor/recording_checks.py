@@ -41,7 +41,12 @@ from webots_mcp.setup.doctor import (
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
-from webots_mcp.store.robots import fetch_session, handler_at_work, rows_waiting
+from webots_mcp.store.robots import (
+    fetch_session,
+    handler_at_work,
+    nothing_recorded,
+    rows_waiting,
+)
 
 _OLDEST_PYTHON: Final = (3, 10)
 _NEWEST_PYTHON: Final = (3, 13)  # that it was tried with
@@ -276,7 +281,7 @@ def _is_about_schema(subject: Examined) -> bool:
 def recording_now(subject: Examined) -> Iterator[Diagnosis]:
     """Who writes, and how old the newest is."""
     if not subject.views:
-        yield warning("no robot has been recorded yet", GETTING_STARTED)
+        yield warning(nothing_recorded(subject.opened), GETTING_STARTED)
     elif not subject.live:
         silent_s = subject.now_s - max(last_seen_s(view) for view in subject.views)
         yield warning(

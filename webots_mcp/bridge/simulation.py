@@ -18,6 +18,8 @@ from webots_mcp.liveness import LoopTimes
 from webots_mcp.stacks import STEPPING
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
+_LONGEST_WAIT_S: Final = 0.1  # for the moment at which a step is due
+_PROMPT_S: Final = 0.002  # of wall time that a step takes which was due when it was asked for
 _INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers
 
 
@@ -26,6 +28,9 @@ class Simulation:
 
     Args:
         robot: A Webots `Robot` or `Supervisor`, or an instance of a subclass.
+
+    Attributes:
+        world_is_waiting: The world waits for this robot's steps, as long as a command makes them.
 
     Raises:
         TypeError: `robot` is something else.
@@ -39,6 +44,9 @@ class Simulation:
         self.meter = LoopMeter()
         self._gate = StepGate(robot, self.meter)
         self._time_s = 0.0
+        self._next_step_s = 0.0  # by the monotonic clock, in real time
+        self._is_set_free = False
+        self.world_is_waiting = False
 
     @property
     def time_s(self) -> float:
@@ -58,8 +66,11 @@ class Simulation:
 
     @property
     def waits_for_robot(self) -> bool:
-        """Whether the simulation waits for this robot's next step (field `synchronization`)."""
-        return bool(self.robot.getSynchronization())
+        """Whether the simulation waits for this robot's next step (field `synchronization`).
+
+        Webots' library answers with the value at the start.
+        """
+        return bool(self.robot.getSynchronization()) and not self._is_set_free
 
     @property
     def mode(self) -> int:
@@ -88,12 +99,21 @@ class Simulation:
         self.end()
         return False
 
-    def advance(self) -> bool:
-        """Make one basic time step; False if Webots says quit."""
-        if self._gate.advance(max(round(self.basic_time_step_s * 1000), 1)) != QUIT:
-            return True
-        self.end()
-        return False
+    def advance_unless_paused(self) -> bool:
+        """Make one basic time step once it is due in real time; False if paused, or after a quit.
+
+        A step that is asked for in a pause does not return. So the loop does not wait in the step,
+        but before it, and asks for the mode right before the step.
+        """
+        step_s, now_s = self.basic_time_step_s, time.monotonic()
+        time.sleep(min(max(self._next_step_s - now_s, 0.0), step_s, _LONGEST_WAIT_S))
+        if not self.pump() or self.paused:
+            return False
+        if self._gate.advance(max(round(step_s * 1000), 1)) == QUIT:
+            self.end()
+            return False
+        self._next_step_s = max(self._next_step_s, time.monotonic() - _PROMPT_S) + step_s
+        return True
 
     @contextmanager
     def world_waits(self) -> Generator[None]:
@@ -102,15 +122,32 @@ class Simulation:
         Webots reads the field `synchronization` before each step. Where the node has none, the
         world goes on without waiting.
         """
-        own: Any = self.robot.getSelf()
-        field = own.getField("synchronization") if own is not None else None
+        field = self._synchronization
         if field is not None:
             field.setSFBool(True)
+        self.world_is_waiting = True
         try:
             yield
         finally:
+            self.world_is_waiting = False
             if field is not None and not self.over:
                 field.setSFBool(False)
+                self.pump()  # sends it: this may be the last call before the process ends
+
+    def set_world_free(self) -> bool:
+        """Let the world not wait for this robot's steps; False if it does not wait already."""
+        field = self._synchronization
+        if field is None or not field.getSFBool():
+            return False
+        field.setSFBool(False)
+        self._is_set_free = True
+        return self.pump()
+
+    @property
+    def _synchronization(self) -> Any:
+        """The field of the robot's own node; None where a PROTO hides it."""
+        own: Any = self.robot.getSelf()
+        return own.getField("synchronization") if own is not None else None
 
     def guard_steps(self, guard: Guard | None) -> None:
         """Let `guard` answer the controller's steps; None: let Webots answer them again."""

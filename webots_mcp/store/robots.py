@@ -483,6 +483,11 @@ _SILENCES: Final = (
     "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
     f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}"
 )
+_SLOW_STEPS: Final = 3.0  # usual steps that one may last before the world counts as standing
+_USUAL_STEP: Final = (
+    "SELECT step_wait_wall_s / nullif(steps, 0) FROM run WHERE session_id = ? "
+    "ORDER BY id DESC LIMIT 1"
+)
 PRESS_PLAY: Final = (
     "press play in Webots if it is paused there: only a person can resume it while the controller "
     "is inside step(); else check what its loop is waiting for"
@@ -560,6 +565,8 @@ def _block_in_code(
                 return None
             held_up = _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
             return Block(held_up, _FREE_IT)
+        if session.silent_s(now_s) < _SLOW_STEPS * _usual_step_s(connection, session):
+            return None
         return Block(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
     if not stacks.is_hang:
         return Block(_AWAITS_PERSON.format(stacks.place), "let it go on")
@@ -567,6 +574,12 @@ def _block_in_code(
         return None
     hang = _hang(connection, session, now_s)
     return Block(hang, _FREE_IT) if hang and _is_sure(connection, session, now_s) else None
+
+
+def _usual_step_s(connection: sqlite3.Connection, session: Session) -> float:
+    """How long the loop has waited in a step on average, in wall seconds; 0 before it is known."""
+    ((usual_s,),) = connection.execute(_USUAL_STEP, (session.id,)).fetchall() or [(None,)]
+    return usual_s or 0.0
 
 
 def _is_sure(connection: sqlite3.Connection, session: Session, now_s: float) -> bool:

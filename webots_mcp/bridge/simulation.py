@@ -46,6 +46,8 @@ class Simulation:
         self._time_s = 0.0
         self._next_step_s = 0.0  # by the monotonic clock, in real time
         self._is_set_free = False
+        self._mode_set: int | None = None  # until the next answer
+        self._steps_at_setting = 0
         self.world_is_waiting = False
 
     @property
@@ -74,17 +76,24 @@ class Simulation:
 
     @property
     def mode(self) -> int:
-        """The simulation mode in Webots' last answer."""
+        """The mode that was set since Webots' last answer, else the one in that answer."""
+        if self._mode_set is not None and self._steps_at_setting == self.meter.steps:
+            return self._mode_set
         return int(self.robot.simulationGetMode())
 
     @property
     def paused(self) -> bool:
-        """Whether the mode in Webots' last answer is PAUSE."""
+        """Whether `mode` is PAUSE."""
         return self.mode == self.robot.SIMULATION_MODE_PAUSE
 
     def set_mode(self, name: str) -> None:
-        """Set the mode `pause`, `real_time` or `fast`."""
-        self.robot.simulationSetMode(getattr(self.robot, f"SIMULATION_MODE_{name.upper()}"))
+        """Set the mode `pause`, `real_time` or `fast`.
+
+        Webots changes it after its answer, which may still have the mode that was set before.
+        """
+        self._mode_set = int(getattr(self.robot, f"SIMULATION_MODE_{name.upper()}"))
+        self._steps_at_setting = self.meter.steps
+        self.robot.simulationSetMode(self._mode_set)
 
     @property
     def mode_name(self) -> str:
@@ -94,6 +103,7 @@ class Simulation:
 
     def pump(self) -> bool:
         """Exchange messages with Webots without advancing time; False if it says quit."""
+        self._mode_set = None
         if self._gate.exchange() != QUIT:
             return True
         self.end()
@@ -109,6 +119,7 @@ class Simulation:
         time.sleep(min(max(self._next_step_s - now_s, 0.0), step_s, _LONGEST_WAIT_S))
         if not self.pump() or self.paused:
             return False
+        self._mode_set = None
         if self._gate.advance(max(round(step_s * 1000), 1)) == QUIT:
             self.end()
             return False
@@ -411,6 +422,11 @@ class LoopMeter:
         """Count from here, the end of a step."""
         self._own_s = self._step_s = 0.0
         self._steps = min(self._steps, 0)
+
+    @property
+    def steps(self) -> int:
+        """The steps of the controller so far, for comparison only: each run counts anew."""
+        return self._steps
 
     @property
     def times(self) -> LoopTimes | None:

@@ -136,6 +136,18 @@ class Dispatcher:
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
 
+    async def name_mode_afterwards(self, answer: CommandAnswer) -> None:
+        """Correct the mode in an answer that is given some time after its command was done."""
+
+        def correct(command_id: int) -> None:
+            with self._recording.reader() as connection:
+                command = fetch_command(connection, command_id)
+                view = look(connection, robot_name(connection, command.robot_id))
+                _name_mode_afterwards(view, command, answer)
+
+        if answer.command_id is not None:
+            await to_thread.run_sync(correct, answer.command_id)
+
     async def wait(self, command_id: int, timeout_s: float) -> CommandAnswer:
         """Continue to wait for a command that was sent before; it is not cancelled at the deadline.
 
@@ -352,7 +364,8 @@ def _name_mode_afterwards(view: View, command: Command, answer: CommandAnswer) -
         answer.result = cast("dict[str, Any]", answer.result) | {"mode": mode}
     when = "now" if status == "done" else "once that has been done"
     note = f"command {later_id} ({action}) came after it: the mode is {mode} {when}"
-    answer.hint = "; ".join(filter(None, (answer.hint, note)))
+    if note not in (answer.hint or ""):
+        answer.hint = "; ".join(filter(None, (answer.hint, note)))
 
 
 def _error(command: Command) -> str | None:

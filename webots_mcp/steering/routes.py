@@ -273,6 +273,7 @@ class Attempt(Request):
         if self.order not in ("pause", "step"):
             answer.evidence = await self._shown(situation, _EVIDENCE_S)
             answer.hint = answer.hint if answer.evidence else _NOTHING_SEEN
+            await self.dispatcher.name_mode_afterwards(answer)
         return answer
 
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:

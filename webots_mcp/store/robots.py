@@ -485,8 +485,7 @@ _SILENCES: Final = (
 )
 _SLOW_STEPS: Final = 3.0  # usual steps that one may last before the world counts as standing
 _USUAL_STEP: Final = (
-    "SELECT step_wait_wall_s / nullif(steps, 0) FROM run WHERE session_id = ? "
-    "ORDER BY id DESC LIMIT 1"
+    "SELECT sum(step_wait_wall_s) / nullif(sum(steps), 0) FROM run WHERE session_id = ?"
 )
 PRESS_PLAY: Final = (
     "press play in Webots if it is paused there: only a person can resume it while the controller "
@@ -578,7 +577,7 @@ def _block_in_code(
 
 def _usual_step_s(connection: sqlite3.Connection, session: Session) -> float:
     """How long the loop has waited in a step on average, in wall seconds; 0 before it is known."""
-    ((usual_s,),) = connection.execute(_USUAL_STEP, (session.id,)).fetchall() or [(None,)]
+    (usual_s,) = connection.execute(_USUAL_STEP, (session.id,)).fetchone()
     return usual_s or 0.0
 
 
@@ -675,6 +674,8 @@ def _why_standing(
     connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
 ) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
+    if session.host == host_name() and is_stopped(session.pid):
+        return _STOPPED_PROCESS.format(session.pid)
     if _has_lost_simulator(session):
         return CONNECTION_LOST.format(session.pid)
     if inside := handler_at_work(connection, session, now_s):

@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 Action = Callable[["Session", ClaimedCommand], Progress]
 
 _ROUND_S: Final = 0.05  # of wall time in which a loop makes steps before it looks around
-_LAST_STEPS: Final = 4  # made without looking around, which may take longer than a step
 _SCREENSHOT_TIMEOUT_S: Final = 10.0
 _RESET_TIMEOUT_S: Final = 10.0
 _RELOAD_TIMEOUT_S: Final = 30.0
@@ -168,11 +167,12 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
 
     The first is awaited without waiting in it: a controller that hangs, and so holds up the world,
     must not block this loop too. Then the world can go on, and is made to wait for this robot, so
-    that it stops at the very step.
+    that it stops at the very step. A pause, by a breakpoint or in Webots, ends it: a step asked for
+    during one would not return.
     """
     pause, simulation, watch = session.pause, session.simulation, session.watch
     simulation.pump()  # the newest answer may be older than the world
-    counted_steps, counted_to_s = 0, simulation.time_s
+    counted_steps, counted_to_s, ended_by = 0, simulation.time_s, ""
     pause.change_mode_temporarily(command.id, "real_time", stepping=True)
     watch.stepping = command.id
 
@@ -184,20 +184,28 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
         counted_to_s = time_s
         return counted_steps
 
-    def steps_until(count: int, go_on: Callable[[], object], last: int = 0) -> Generator[None]:
-        until_s = time.monotonic() + _ROUND_S
-        while made() < count and watch.stepping == command.id:
-            go_on()
-            is_long = time.monotonic() > until_s and count - made() > last
-            if simulation.over or is_long:
-                yield  # for a heartbeat, and for commands that end this one
-                until_s = time.monotonic() + _ROUND_S
+    def steps_until(count: int, go_on: Callable[[], bool], round_s: float) -> Generator[None]:
+        """Go on until so many steps are made, and yield for a heartbeat, rows and commands."""
+        nonlocal ended_by
+        until_s = time.monotonic() + round_s
+        while made() < count and watch.stepping == command.id and not ended_by:
+            may_go_on = go_on()
+            if time.monotonic() >= until_s or simulation.over:
+                yield
+                until_s = time.monotonic() + round_s
+                may_go_on = may_go_on and not simulation.paused
+            if pause.active:
+                ended_by = "a breakpoint paused it"
+            elif not may_go_on:
+                ended_by = "it was paused in Webots"
 
     try:
-        yield from steps_until(1, simulation.pump)
-        if made() < steps:
-            with simulation.world_waits():
-                yield from steps_until(steps, simulation.advance, _LAST_STEPS)
+        yield from steps_until(1, simulation.pump, _ROUND_S)
+        if made() < steps and watch.stepping == command.id and not ended_by:
+            with pause.world_waits():
+                # Conditions are evaluated on what is published in a round.
+                round_s = 0.0 if session.breakpoints.armed else _ROUND_S
+                yield from steps_until(steps, simulation.advance_unless_paused, round_s)
                 simulation.set_mode("pause")  # before the world stops waiting
     except InterruptedCommandError as interruption:
         watch.stepping = None
@@ -205,7 +213,8 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
     simulation.set_mode("pause")
     if not simulation.pump():  # the world may have made a step until it was paused
         yield  # Webots has ended the controller
-    why = {"why": "it was cancelled before the last step"} if made() < steps else {}
+    ended_by = ended_by or "it was cancelled"
+    why = {"why": f"{ended_by} before the last step"} if made() < steps else {}
     watch.stepping = None
     session.look()
     pause.begin(Cause(command.id))

@@ -508,6 +508,10 @@ _SILENCES: Final = (
     "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
     f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}"
 )
+_SLOW_STEPS: Final = 3.0  # usual steps that one may last before the world counts as standing
+_USUAL_STEP: Final = (
+    "SELECT sum(step_wait_wall_s) / nullif(sum(steps), 0) FROM run WHERE session_id = ?"
+)
 PRESS_PLAY: Final = (
     "press play in Webots if it is paused there: only a person can resume it while the controller "
     "is inside step(); else check what its loop is waiting for"
@@ -585,6 +589,8 @@ def _block_in_code(
                 return None
             held_up = _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
             return Block(held_up, _FREE_IT)
+        if session.silent_s(now_s) < _SLOW_STEPS * _usual_step_s(connection, session):
+            return None
         return Block(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
     if not stacks.is_hang:
         return Block(_AWAITS_PERSON.format(stacks.place), "let it go on")
@@ -592,6 +598,12 @@ def _block_in_code(
         return None
     hang = _hang(connection, session, now_s)
     return Block(hang, _FREE_IT) if hang and _is_sure(connection, session, now_s) else None
+
+
+def _usual_step_s(connection: sqlite3.Connection, session: Session) -> float:
+    """How long the loop has waited in a step on average, in wall seconds; 0 before it is known."""
+    (usual_s,) = connection.execute(_USUAL_STEP, (session.id,)).fetchone()
+    return usual_s or 0.0
 
 
 def _is_sure(connection: sqlite3.Connection, session: Session, now_s: float) -> bool:
@@ -687,6 +699,8 @@ def _why_standing(
     connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
 ) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
+    if session.host == host_name() and is_stopped(session.pid):
+        return _STOPPED_PROCESS.format(session.pid)
     if _has_lost_simulator(session):
         return CONNECTION_LOST.format(session.pid)
     if inside := handler_at_work(connection, session, now_s):

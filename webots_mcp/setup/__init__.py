@@ -193,6 +193,16 @@ def controllers_in(world: Path) -> list[str]:
     return list(dict.fromkeys(name for name in named if name))
 
 
+def names_a_supervisor(world: Path) -> bool:
+    """Whether a world file gives a robot the rights of a Supervisor.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    words = _WORDS.findall(world.read_text("utf-8", "replace"))
+    return ("supervisor", "TRUE") in pairwise(words)
+
+
 PROBE_TIMEOUT_S: Final = 30.0
 _PREFERENCE: Final = "pythonCommand"
 _SECTION: Final = re.compile(r"\s*\[(.*)\]\s*")

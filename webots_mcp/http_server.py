@@ -216,7 +216,7 @@ def gate(app: ASGIApp, place: Place) -> ASGIApp:
 
 
 def _lowered(scope: Scope) -> Scope:
-    """The request with its hosts in lower case: the SDK compares letters, and hosts have no case."""
+    """The request with its hosts in lower case, in which the SDK knows them: they have no case."""
     headers = [
         (name, value.lower() if name in (b"host", b"origin") else value)
         for name, value in scope["headers"]

@@ -60,13 +60,13 @@ ELSEWHERE: Final = frozenset((
 OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
 _SEEN: Final = f"{WORLD}."
 PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
-# Words of actions that ask for the same, whatever their letters; and words that say no more.
-# Words of actions and of arguments that mean the same.
+# Words of actions and of arguments that mean the same, whatever their letters.
 _SAME_MEANING: Final = (
     {"pause", "stop", "halt", "freeze"}, {"resume", "start", "play", "continue", "unpause"},
     {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport", "move", "place", "change"},
     {"add", "node", "spawn"}, {"drive", "move", "go", "goto"},
     {"duration", "for", "length", "period", "s", "seconds", "time"},
+    {"action", "command"}, {"condition", "until"},
 )  # fmt: skip
 # Words of actions, commands and options that lose something: none is ever offered as a correction.
 _DESTRUCTIVE: Final = frozenset((

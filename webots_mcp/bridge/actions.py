@@ -38,7 +38,7 @@ from webots_mcp.errors import (
     InvalidInputError,
 )
 from webots_mcp.liveness import EXTERN
-from webots_mcp.naming import describe_unknown
+from webots_mcp.naming import misfit_of_parameters
 from webots_mcp.pauses import Cause
 
 if TYPE_CHECKING:
@@ -68,13 +68,16 @@ def begin(session: Session, command: ClaimedCommand) -> Progress:
 
     Raises:
         CommandRefusedError: It needs a Supervisor and this robot is not one.
-        InvalidInputError: It does not take such a parameter.
+        InvalidInputError: It does not take such a parameter, or lacks one.
     """
     action = BUILT_IN_ACTIONS[command.action]
     if action.needs_supervisor:
         session.simulation.require_supervisor(command.action)
-    if unknown := describe_unknown(command.params, action.parameters, command.action):
-        raise InvalidInputError(unknown)
+    misfit = misfit_of_parameters(
+        command.params, action.parameters, action.required, command.action
+    )
+    if misfit is not None:
+        raise InvalidInputError(misfit)
     return _known[command.action](session, command)
 
 
@@ -353,7 +356,9 @@ def screenshot(session: Session, command: ClaimedCommand) -> Progress:
 def take_frame(session: Session, command: ClaimedCommand) -> Progress:
     """Take a picture of the newest measurement of a camera, a range finder or a lidar."""
     name = command.params.get("camera") or ""
-    device = find_pictured(session.simulation.robot, str(name))
+    if not isinstance(name, str):
+        raise InvalidInputError(f"camera must be the name of a device, not {name!r:.80}")
+    device = find_pictured(session.simulation.robot, name)
     picture, camera = take_picture(device), str(device.getName())
     saved = session.album.add_frame(camera, picture.bgra, picture.width, picture.height)
     when = {"sim_time_s": session.clock.sim_time_s}

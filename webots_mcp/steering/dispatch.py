@@ -31,7 +31,7 @@ from webots_mcp.errors import (
     UnknownActionError,
     UnknownSignalError,
 )
-from webots_mcp.naming import describe_unknown, flatten, perhaps_meant
+from webots_mcp.naming import flatten, misfit_of_parameters, perhaps_meant
 from webots_mcp.questions.answers import CommandAnswer, RunAnswer
 from webots_mcp.questions.budget import (
     RESULT_BUDGET_TOKENS,
@@ -785,12 +785,13 @@ def _require_action(view: View, action: str) -> None:
 
 
 def _require_parameters(view: View, action: str, params: Mapping[str, Any]) -> None:
-    """Refuse parameters that a built-in action does not take; the bridge would refuse them too."""
+    """Refuse parameters that do not fit a built-in action; the bridge would refuse them too."""
     built_in = BUILT_IN_ACTIONS.get(action)
     if built_in is None or (view.session and action in view.session.actions):
         return
-    if unknown := describe_unknown(params, built_in.parameters, action):
-        raise InvalidInputError(unknown)
+    misfit = misfit_of_parameters(params, built_in.parameters, built_in.required, action)
+    if misfit is not None:
+        raise InvalidInputError(misfit)
 
 
 def _require_live(view: View) -> Session:

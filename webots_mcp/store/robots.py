@@ -118,9 +118,15 @@ class Session:
         return self.host == host_name() and process_alive(*process)
 
 
+# Of the newest Webots, unless a controller has begun to record since. What a controller printed
+# comes first: its traceback ends with the reason, and Webots itself only says that it exited.
 _CONSOLE_TROUBLE: Final = (
-    "SELECT substr(message, 1, 200) FROM console_line WHERE level IN ('warning', 'error', "
-    "'critical') ORDER BY id DESC LIMIT 1"
+    "WITH trouble AS (SELECT id, instance, source, message FROM console_line WHERE level IN "
+    "('warning', 'error', 'critical') AND wall_time_s > "
+    "(SELECT coalesce(max(started_wall_time_s), 0) FROM session)) "
+    "SELECT substr(message, 1, 200) FROM trouble WHERE id IN (SELECT max(id) FROM trouble WHERE "
+    "instance = (SELECT instance FROM trouble ORDER BY id DESC LIMIT 1) GROUP BY source) "
+    "ORDER BY source = 'console' DESC, id"
 )
 _COLUMNS: Final = columns_of(Session)
 _NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
@@ -246,16 +252,17 @@ def nothing_recorded(connection: sqlite3.Connection) -> str:
 
 
 def console_trouble(connection: sqlite3.Connection) -> str | None:
-    """Return the newest warning of Webots' console that belongs to no run; None without any.
+    """Return the newest warnings of Webots' console that belong to no run; None without any.
 
-    A controller that fails before its bridge exists leaves nothing else.
+    A controller that fails before its bridge exists leaves nothing else. What was said before the
+    newest session began is left out: a controller has recorded since.
     """
-    row = connection.execute(_CONSOLE_TROUBLE).fetchone()
-    if row is None:
+    said = [repr(message) for (message,) in connection.execute(_CONSOLE_TROUBLE).fetchall()]
+    if not said:
         return None
     return (
-        f"Webots' console says {row[0]!r}: a controller may have failed before it recorded "
-        "anything. webots_get_logs shows the console"
+        f"Webots' console says {' and '.join(said)}: a controller may have failed before it "
+        "recorded anything. webots_get_logs shows the console"
     )
 
 

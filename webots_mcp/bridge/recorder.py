@@ -277,8 +277,9 @@ class Recorder:
         try:
             if is_free:
                 self._disconnect()
-            self.off = self.off or _CLOSED  # first: who puts a row from now on drops it
             self._leave_waiting()
+            self.off = self.off or _CLOSED
+            self._backlog.drop_rows_in_memory(self.off)  # that a thread has put since
         finally:
             if is_free:
                 self._lock.release()
@@ -433,7 +434,7 @@ class Recorder:
     def _put(self, row: Row) -> None:
         """Let a row wait in memory, without the connection lock."""
         self._backlog.put(row)
-        if self.off is not None:  # perhaps since the bridge was closed meanwhile
+        if self.off is not None:  # the bridge was closed meanwhile: nobody else looks any more
             self._backlog.drop_rows_in_memory(self.off)
 
     def _keep(self, row: Row) -> None:

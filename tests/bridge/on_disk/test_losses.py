@@ -28,6 +28,7 @@ from webots_mcp.bridge import backlog
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.waiting_file import adopt
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")
 
@@ -332,5 +333,7 @@ def test_threads_may_log_while_the_bridge_closes(file: Path, filed: Recording) -
     assert ended.returncode == 0, ended.stderr[-2000:]
     counts = [tuple(map(int, told.split())) for told in ended.stdout.splitlines()]
     assert len(counts) == 10
+    with closing(connect(file, "writer")) as connection:
+        adopt(connection, file)  # what the last moment has left in files
     recorded = filed.rows("SELECT count(*) FROM log WHERE message = 'a line'")[0]
     assert recorded == sum(said - dropped for said, dropped in counts)

@@ -434,7 +434,7 @@ class Recorder:
     def _put(self, row: Row) -> None:
         """Let a row wait in memory, without the connection lock."""
         self._backlog.put(row)
-        if self.off is not None:  # the bridge was closed meanwhile: nobody else looks any more
+        if self.off is not None:  # the bridge was closed meanwhile, and no other call looks at it
             self._backlog.drop_rows_in_memory(self.off)
 
     def _keep(self, row: Row) -> None:

@@ -60,9 +60,11 @@ class BuiltInAction(NamedTuple):
         ends_steps: A `step` or `run` command that is still at work ends with it.
         runs_user_code: It calls functions of the controller, which may take their time.
         parameters: The names of its parameters; None where the controller decides.
+        required: Those that must be given.
     """
 
     parameters: tuple[str, ...] | None = ()
+    required: tuple[str, ...] = ()
     needs_supervisor: bool = True
     ends_steps: bool = False
     runs_user_code: bool = False
@@ -77,22 +79,22 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "run": BuiltInAction(
         ("until", "for_s", "reset", "pace", "then", "parameters", "prune", "by"), ends_steps=True
     ),
-    "cancel_run": BuiltInAction(("command_id",), needs_supervisor=False),
+    "cancel_run": BuiltInAction(("command_id",), ("command_id",), needs_supervisor=False),
     "reset": BuiltInAction(ends_steps=True),
     "reload": BuiltInAction(ends_steps=True),
-    "load_world": BuiltInAction(("world",), ends_steps=True),
+    "load_world": BuiltInAction(("world",), ("world",), ends_steps=True),
     "quit": BuiltInAction(("status",), ends_steps=True),
     "screenshot": BuiltInAction(("quality",)),
     "take_frame": BuiltInAction(("camera",), needs_supervisor=False),
     "reset_state": BuiltInAction(None, needs_supervisor=False, runs_user_code=True),
-    "set_parameters": BuiltInAction(("values", "when", "by"), needs_supervisor=False),
+    "set_parameters": BuiltInAction(("values", "when", "by"), ("values",), needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),
-    "keep": BuiltInAction(("reason",), needs_supervisor=False),
+    "keep": BuiltInAction(("reason",), ("reason",), needs_supervisor=False),
     "get_scene": BuiltInAction(("path", "types", "names", "fields", "depth", "cursor")),
-    "get_field": BuiltInAction(("path", "start")),
-    "set_field": BuiltInAction(("path", "value", "stop")),
-    "add_node": BuiltInAction(("path", "vrml")),
-    "remove_node": BuiltInAction(("path",)),
+    "get_field": BuiltInAction(("path", "start"), ("path",)),
+    "set_field": BuiltInAction(("path", "value", "stop"), ("path", "value")),
+    "add_node": BuiltInAction(("path", "vrml"), ("vrml",)),
+    "remove_node": BuiltInAction(("path",), ("path",)),
 }
 
 OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers

@@ -323,3 +323,46 @@ def test_a_parameter_that_a_built_in_action_does_not_take_is_refused(
     assert all(repr(name) in error for name in BUILT_IN_ACTIONS[action].parameters or ())
     assert robot.getTime() == pytest.approx(at_s + 0.016)
     assert robot.simulationGetMode() != robot.SIMULATION_MODE_PAUSE
+
+
+@pytest.mark.parametrize(
+    "action", [name for name, each in BUILT_IN_ACTIONS.items() if each.required]
+)
+def test_a_parameter_that_a_built_in_action_needs_is_named_where_it_is_missing(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None], action: str
+) -> None:
+    drive(1)
+    command = recording.send(action)
+    drive(1)
+    status, result, error = recording.fate(command)
+    assert (status, result) == ("failed", None)
+    needed = BUILT_IN_ACTIONS[action].required
+    assert error is not None and f"action {action!r} needs the parameter" in error
+    assert all(repr(name) in error for name in needed)
+
+
+def test_every_required_parameter_is_one_that_the_action_takes() -> None:
+    assert all({*each.required} <= {*(each.parameters or ())} for each in BUILT_IN_ACTIONS.values())
+
+
+@pytest.mark.parametrize(
+    ("action", "params", "said"),
+    [
+        ("take_frame", {"camera": 5}, "camera must be the name of a device, not 5"),
+        ("set_field", {"path": "BALL", "value": 1, "stop": "yes"}, "stop must be true or false"),
+    ],
+)
+def test_a_parameter_of_another_type_is_refused_with_its_value(
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Callable[[int], None],
+    action: str,
+    params: dict[str, Any],
+    said: str,
+) -> None:
+    drive(1)
+    command = recording.send(action, **params)
+    drive(1)
+    status, _, error = recording.fate(command)
+    assert status == "failed"
+    assert error is not None and said in error

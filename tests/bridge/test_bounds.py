@@ -358,6 +358,42 @@ def test_a_mapping_is_recorded_by_its_own_items_whatever_it_holds(
     assert recording.states() in ([wheels], [{"wheels": wheels}], [{"wheels": [wheels]}])
 
 
+class NeverEnding(dict[str, object]):
+    """A dict whose items never end."""
+
+    def items(self) -> Any:
+        return ((i, i) for i in itertools.count())
+
+
+class FailsMidway(dict[str, object]):
+    """A dict that cannot read all of its items, and whose keys need not be hashable."""
+
+    def items(self) -> Any:
+        yield "left", 1
+        yield ["right"], 2
+        raise OSError("the bus is off")
+
+
+@pytest.mark.parametrize(
+    ("mapping", "stored", "named"),
+    [
+        (NeverEnding(a=1), {"0": 0}, "dict cut after 1"),
+        (FailsMidway(), {"left": 1, "['right']": 2}, "type FailsMidway: the bus is off"),
+    ],
+)
+def test_what_a_mapping_does_not_give_is_named_and_the_rest_is_recorded(
+    bridge: MCPBridge,
+    recording: Recording,
+    mapping: dict[str, object],
+    stored: dict[str, object],
+    named: str,
+) -> None:
+    bridge.publish({"wheels": mapping})
+    assert recording.states() == [{"wheels": stored}]
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {"wheels": named}
+
+
 def test_what_is_added_to_the_devices_may_never_come_to_its_end_either(
     bridge: MCPBridge, recording: Recording
 ) -> None:

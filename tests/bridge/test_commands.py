@@ -344,3 +344,34 @@ def test_a_disabled_camera_is_said_once_and_costs_no_row(
 def test_an_idle_get_command_returns_none(bridge: MCPBridge) -> None:
     assert bridge.get_command() is None
     assert Path(bridge.data_dir).is_dir()
+
+
+class LateSupervisor(InProcessSupervisor):
+    """As with Webots, an answer has the mode from before the change that was asked for with it."""
+
+    _answered: int | None = None
+
+    def simulationSetMode(self, mode: int) -> None:
+        self._answered = super().simulationGetMode()
+        super().simulationSetMode(mode)
+
+    def simulationGetMode(self) -> int:
+        return super().simulationGetMode() if self._answered is None else self._answered
+
+    def step(self, time_step: int | None = None) -> int:
+        self._answered = None
+        return super().step(time_step)
+
+
+def test_what_sets_the_mode_answers_with_that_mode_though_webots_last_answer_has_the_one_before(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    robot = LateSupervisor()
+    with MCPBridge(robot, database=database) as bridge:
+        robot.step(16)
+        sent = [recording.send(name) for name in ("pause", "fast", "pause", "resume")]
+        while recording.fate(sent[-1])[0] != "done":
+            bridge.get_command()
+            robot.step(16)
+        modes = [recording.fate(each)[1]["mode"] for each in sent]
+    assert modes == ["pause", "fast", "pause", "real_time"]

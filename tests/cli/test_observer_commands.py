@@ -47,6 +47,15 @@ def test_what_was_added_is_taken_away_again(arena: Path) -> None:
     assert not (arena / CONTROLLER).parent.exists()
 
 
+def test_undo_leaves_no_empty_folder_in_a_project_of_worlds_alone(tmp_path: Path) -> None:
+    (tmp_path / "worlds").mkdir()
+    (tmp_path / WORLD).write_bytes(DEFAULT_WORLD.read_bytes())
+    assert run("--observer", WORLD, cwd=tmp_path).returncode == 0
+    assert (tmp_path / CONTROLLER).exists()
+    assert run("--undo", COPY, "--yes", cwd=tmp_path).returncode == 0
+    assert [each.name for each in tmp_path.iterdir()] == ["worlds"]
+
+
 def test_in_place_changes_the_world_itself_and_undo_brings_it_back(arena: Path) -> None:
     world = (arena / WORLD).read_bytes()
     assert run("--observer", WORLD, "--in-place", cwd=arena).returncode == 0

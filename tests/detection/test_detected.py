@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from itertools import combinations, pairwise
 
@@ -19,6 +20,7 @@ from tests.detection.writing import write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.analysis.swings import MUCH_SLOWER
+from webots_mcp.judging.detection import standstill
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -88,6 +90,22 @@ def test_a_robot_stood_as_long_whatever_part_of_its_run_is_asked_for(
 
 
 BY_CHANCE = {"settling", "roaming"}  # of so few cases, whether their goals are reached
+
+
+@pytest.mark.parametrize("rows_at_once", [1, 500])
+def test_standstills_are_the_same_however_many_are_judged_at_once(
+    rows_at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = [draw_case(kind, 3, 0, most_values=0).runs[-1] for kind in driving.DRAWN]
+    options = EventOptions(kinds=("standstill", "stuck"))
+    with memory_connection() as connection:
+        write_all(connection, runs)
+        whole = find_range(connection, Scope(since_wall_time=0.0))
+        at_once = find_events(connection, whole, options, limit=500, deadline_s=math.inf)
+        monkeypatch.setattr(standstill, "JUDGED_AT_ONCE", rows_at_once)
+        one_by_one = find_events(connection, whole, options, limit=500, deadline_s=math.inf)
+    assert {event.kind for event in at_once.events} == {"standstill", "stuck"}
+    assert one_by_one.events == at_once.events
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS.keys() - BY_CHANCE))

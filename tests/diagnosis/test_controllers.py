@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -93,6 +94,27 @@ def test_a_controller_that_records_now_has_all_that_it_needs(
 
 def test_a_project_of_extern_controllers_alone_is_well(ask: Ask) -> None:
     assert ask("Controllers").verdict == "ok"
+
+
+@pytest.mark.parametrize(
+    ("field", "verdict"),
+    [("", "warning"), ("supervisor FALSE", "warning"), ("supervisor TRUE", "ok")],
+)
+def test_without_code_the_worlds_show_whether_a_robot_is_a_supervisor(
+    project: Path, ask: Ask, field: str, verdict: str
+) -> None:
+    world = project / "worlds" / "arena.wbt"
+    world.write_text(f'#VRML_SIM R2025a utf8\nRobot {{ controller "<extern>" {field} }}\n')
+    finding = ask("Supervisor")
+    assert finding.verdict == verdict
+    assert (finding.fix is not None) == (verdict == "warning")
+
+
+def test_outside_of_a_project_controllers_are_not_checked(project: Path, ask: Ask) -> None:
+    shutil.rmtree(project / "worlds")
+    for name in ("Controllers", "Supervisor"):
+        assert ask(name).verdict == "not checked"
+        assert "in no Webots project" in ask(name).seen
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,8 @@ from webots_mcp.setup.doctor import (
 from webots_mcp.store.recording import Recording
 
 CHECKOUT = Path(__file__).parents[2]
-# What a machine without Webots, and a project without clients, cannot have.
-ELSEWHERE = {"Webots", "Clients", "Recording now", "Free space"}
+# What a machine without Webots, and a folder of no project and without clients, cannot have.
+ELSEWHERE = {"Webots", "Clients", "Controllers", "Supervisor", "Recording now", "Free space"}
 
 
 def test_each_check_has_its_part_of_the_page_and_each_part_its_check() -> None:

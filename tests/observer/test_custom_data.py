@@ -213,6 +213,20 @@ def test_a_reset_begins_a_run_in_which_the_old_text_is_not_believed(robots: Robo
     assert robots.states()[-1][0] < 0.3
 
 
+def test_a_text_that_was_on_its_way_at_a_reset_is_not_believed_in_the_new_run(
+    robots: Robots,
+) -> None:
+    robots.go_on(3, rover='{"seq": 8, "at_s": 0.3}')
+    robots.rover.simulationReset()
+    robots.go_on(1, rover='{"seq": 9, "at_s": 0.4}')
+    robots.go_on(2)
+    began = [time_s for time_s, _ in robots.states()]
+    since = max(number for number in range(1, len(began)) if began[number] < began[number - 1])
+    assert all("at_s" not in state for _, state in robots.states()[since:])
+    robots.go_on(2, rover='{"seq": 10, "at_s": 0.05}')
+    assert (robots.newest()["at_s"], robots.newest()["seq_missed"]) == (0.05, 0)
+
+
 def test_a_robot_that_is_gone_ends_its_session_and_one_put_back_begins_another(
     robots: Robots, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,9 +22,6 @@ class Simulator:
         self.time_s = self.told_s = 0.0
         self.asked: list[int] = []
 
-    def getSynchronization(self) -> bool:
-        return self.synchronous
-
     def getTime(self) -> float:
         return self.told_s
 
@@ -59,7 +56,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def rounds(simulator: Any, count: int = 10) -> list[int]:
-    looping = StepPace(simulator, STEP_MS)
+    looping = StepPace(simulator, STEP_MS, world_waits=simulator.synchronous)
     for _ in range(count):
         assert looping.go_on()
     return simulator.asked

@@ -8,7 +8,7 @@ import socket
 import sqlite3
 import struct
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from http.client import HTTPMessage
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from tests.page.conftest import Server
 from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.plugins.page.page_server import MOST_TABS
+from webots_mcp.plugins.page.page_server import MOST_CONNECTIONS, MOST_TABS
 
 
 def answer(server: Server, path: str, **headers: str) -> tuple[int, str]:
@@ -217,6 +217,20 @@ def test_a_request_that_comes_byte_by_byte_is_not_waited_for(told: Server) -> No
             except OSError:
                 break
     assert answer(told, "")[0] == 200
+
+
+def test_of_many_idle_connections_the_idlest_are_closed(told: Server) -> None:
+    with ExitStack() as stack:
+        address, more = ("127.0.0.1", told.port), 20
+        connections = [
+            stack.enter_context(closing(socket.create_connection(address, 60)))
+            for _ in range(MOST_CONNECTIONS + more)
+        ]
+        assert answer(told, "")[0] == 200
+        for closed in connections[:more]:
+            assert closed.recv(1) == b""
+        connections[-1].sendall(f"GET {told.path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        assert connections[-1].recv(12) == b"HTTP/1.1 200"
 
 
 def raw(server: Server, said: str) -> int:

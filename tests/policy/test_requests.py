@@ -227,7 +227,9 @@ async def test_trials_stop_where_the_file_forbids_what_they_would_do_next(
         allow(project, "[allow]\nactions = ['set_parameters']\n")
         over = await ask(client, "webots_run_trials", trial_set=begun["trial_set"])
         assert "line 2" in over["state"] and over["over"] < 800
-    assert [each["outcome"] for each in requests_in(file, refused=True)][-1] == "refused"
+    refused = requests_in(file, refused=True)
+    assert [each["outcome"] for each in refused] == ["refused", "refused"]
+    assert {each["tool"] for each in refused} == {"webots_run_trials"}
 
 
 async def test_read_only_stands_above_the_file_and_holds_for_leaves_people_free(

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+import string
+from pathlib import Path
+from typing import Any, Final
 
+import anyio
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from mcp.server.mcpserver import Context
+from mcp.server.mcpserver.exceptions import ToolError
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, Driver, ask, fail, text_of
+from webots_mcp import MemoryDatabase
+from webots_mcp.questions import all_questions
+from webots_mcp.server.mcp_server import tool_of
+from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio
 
@@ -73,6 +85,9 @@ HUGE = 2**63
             'webots_set_parameters(when="reset", values={"kp":1.5})',
         ),
         ("run", {"duration": 5}, "unknown argument 'duration': there is for_s, "),
+        ("run", {"condition": "x > 1"}, "unknown argument 'condition': there is until, "),
+        ("run", {"kp": 2, "duration_s": 5}, "unknown argument 'duration_s': there is for_s, "),
+        ("send_command", {"command": "go"}, "unknown argument 'command': there is action, "),
         ("run", {"seconds": 5, "until": "x > 1"}, "unknown argument 'seconds': there is for_s, "),
         ("simulation_control", {"command": "pause", "steps": 2}, "steps is for command='step'"),
         ("get_trends", {"robot": "r" * 201}, "robot must have at most 200 characters, not"),
@@ -245,6 +260,12 @@ async def test_nothing_that_loses_something_is_offered_as_what_was_meant(
             'webots_send_command(action="go_to", params={"x":1.5})',
         ),
         ("run", {"kp": 2}, 'webots_run(parameters={"kp":2})'),
+        ("run", {"values": {"kp": 2}}, 'webots_run(parameters={"kp":2})'),
+        (
+            "send_command",
+            {"text": "a" * 1_000, "timeout_wall_s": 3.0},
+            "webots_send_command(action=..., timeout_wall_s=3.0, params={...})",
+        ),
     ],
 )
 async def test_names_of_the_controller_are_shown_in_the_argument_that_takes_them(
@@ -255,9 +276,53 @@ async def test_names_of_the_controller_are_shown_in_the_argument_that_takes_them
     assert told.endswith(f": {call}")
 
 
+_NAMES: Final = st.text(string.ascii_letters + "_", min_size=1, max_size=12)
+_PLAIN: Final = st.one_of(st.booleans(), st.integers(-9, 9), st.text(max_size=400))
+_VALUES: Final = st.dictionaries(_NAMES, _PLAIN, min_size=1, max_size=5)
+_OWN: Final = st.fixed_dictionaries({}, optional={"robot": st.text(max_size=200)})
+
+
+@pytest.mark.parametrize("name", [each.name for each in all_questions() if each.of_controller])
+@given(_VALUES | st.fixed_dictionaries({"arguments": _VALUES}), _OWN)
+def test_a_suggested_call_has_all_that_its_tool_requires_and_nothing_else(
+    name: str, unknown: dict[str, Any], own: dict[str, Any]
+) -> None:
+    (question,) = (each for each in all_questions() if each.name == name)
+    recording = Recording(MemoryDatabase(), Path("unused"))
+    tool = tool_of(question, recording)
+    arguments = own | {key: value for key, value in unknown.items() if key not in own}
+    allowed = tool.parameters["properties"]
+    assume(arguments.keys() - allowed.keys())
+    with pytest.raises(ToolError) as refused:
+        anyio.run(tool.run, arguments, Context[Any]())
+    said = str(refused.value)
+    if f": {name}(" not in said:
+        assert "there is " in said and said.split("there is ")[1].split(", ")[0] in allowed
+        return
+    call = call_of(said.partition(f": {name}(")[2].removesuffix(")"))
+    assert call.keys() <= allowed.keys()
+    assert call.keys() >= {*tool.parameters.get("required", ()), *own}
+    shown = {key: value for key, value in call.items() if value is not ...}
+    if shown.keys() >= {*tool.parameters.get("required", ())}:
+        tool.fn_metadata.arg_model.model_validate(shown)
+
+
+def call_of(text: str) -> dict[str, Any]:
+    """The arguments of a suggested call; `...` where one stands for its value."""
+    found: dict[str, Any] = {}
+    while text:
+        name, _, text = text.partition("=")
+        dots = next((each for each in ("{...}", "...") if text.startswith(each)), None)
+        value, end = (..., len(dots)) if dots else json.JSONDecoder().raw_decode(text)
+        found[name], text = value, text[end:].removeprefix(", ")
+    return found
+
+
 @pytest.mark.parametrize(
     ("name", "told"),
     [
+        ("WEBOTS_GET_LOGS", "Did you mean webots_get_logs"),
+        ("webots_get_stat", "webots_get_robot_state"),
         ("webots_get_robot_stat", "Did you mean webots_get_robot_state"),
         ("webots_find_event", "Did you mean webots_find_events"),
         ("webots_get_timelines", "Did you mean webots_get_timeline"),  # one that is not listed

@@ -26,7 +26,7 @@ from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.steering.dispatch import withdraw_if_blocked
 from webots_mcp.store.recording import Recording as Store
-from webots_mcp.store.robots import WAITING_IN_STEP, find_block
+from webots_mcp.store.robots import WAITING_IN_STEP, Block, find_block
 
 __all__ = ["data_dir", "filed", "start"]
 pytestmark = pytest.mark.anyio
@@ -126,6 +126,28 @@ async def test_what_a_controller_has_claimed_meanwhile_is_not_withdrawn(
         assert withdraw_if_blocked(store, second)
         found = [fetch_command(connection, each.id).status for each in (first, second)]
     assert found == ["claimed", "cancelled"]
+
+
+async def test_a_step_that_takes_no_longer_than_others_is_not_taken_for_a_pause(
+    soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
+) -> None:
+    simulation = start(LOOP, mode="realtime")
+    simulation.wait_for(lambda: has_states(filed))
+    database = data_dir / "webots.db"
+    async with Client(create_server(database, data_dir)) as client:
+        await paused_by_hand(simulation, client)
+    store = Store(database, data_dir)
+
+    def block() -> Block | None:
+        with store.view() as view:
+            return find_block(view.connection, view.session, view.run, view.now_s)
+
+    simulation.wait_for(lambda: block() is not None)
+    with closing(connect(database, "writer")) as connection:
+        connection.execute("UPDATE run SET steps = 10, step_wait_wall_s = 36000.0")
+        assert block() is None
+        connection.execute("UPDATE run SET steps = 10, step_wait_wall_s = 0.2")
+        assert block() is not None
 
 
 async def test_a_loop_that_asks_seldom_gets_its_command(
@@ -250,3 +272,63 @@ def test_a_loop_that_computes_is_no_hang_until_it_is_silent_for_twice_the_limit(
     silent_s, block = seen[-1]
     assert silent_s >= 6.0
     assert "rover.py:" in str(block)
+
+
+# Where the loop is blocked once the file `hang` is there, and how it is let go.
+BLOCKED = {
+    "stopped by a signal": "pass",
+    "asleep": "while os.path.exists('hang'): time.sleep(0.05)",
+    "reading": "open('answer').readline()",
+    "computing": "while os.path.exists('hang'): pass",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", BLOCKED)
+async def test_whatever_blocks_the_loop_each_command_is_withdrawn_and_none_runs_later(
+    soon: None,
+    start: Callable[..., Simulation],
+    filed: Recording,
+    data_dir: Path,
+    tmp_path: Path,
+    how: str,
+) -> None:
+    hang, answer = tmp_path / "hang", tmp_path / "answer"
+    os.mkfifo(answer)
+    blocks = LOOP + f"    if os.path.exists('hang'):\n        {BLOCKED[how]}\n"
+    simulation = start(f"import os, time\nos.chdir({str(tmp_path)!r})\n{blocks}", mode="realtime")
+    simulation.wait_for(lambda: has_states(filed))
+    pid = simulation.controller("rover").pid
+    assert pid is not None
+    hang.touch()
+    if how == "stopped by a signal":
+        os.kill(pid, signal.SIGSTOP)
+    reasons = {"stopped by a signal": f"(process {pid}) is stopped"}
+    said: dict[str, str] = {}
+    async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
+
+        async def send(tool: str, given: dict[str, Any]) -> None:
+            said[f"{tool} {given}"] = text_of(await client.call_tool(tool, given))
+
+        async with anyio.create_task_group() as tasks:
+            for tool, given in ASKED:
+                if tool != "webots_run_trials":  # which refuses others meanwhile
+                    tasks.start_soon(send, tool, given)
+    for asked, text in said.items():
+        assert reasons.get(how, "in rover.py:") in text, (asked, text)
+    sent = "SELECT max(sent) FROM (SELECT count(*) AS sent FROM command GROUP BY action)"
+    assert filed.rows(sent) == [1]
+    assert set(filed.rows("SELECT status FROM command")) == {"cancelled"}
+
+    (rows,) = filed.rows("SELECT count(*) FROM state")
+    hang.unlink()
+    if how == "reading":
+        answer.write_text("yes\n")
+    if how == "stopped by a signal":
+        os.kill(pid, signal.SIGCONT)
+    simulation.wait_for(lambda: filed.rows("SELECT count(*) FROM state")[0] > rows + 20)
+    assert set(filed.rows("SELECT status FROM command")) == {"cancelled"}
+    values = "SELECT DISTINCT json_extract(data, '$.kp'), json_extract(data, '$.ran') FROM state"
+    assert filed.rows(values) == [(2.0, 0)]
+    assert filed.rows("SELECT count(*) FROM run") == [1]
+    assert simulation.mode is Mode.REAL_TIME

@@ -267,14 +267,20 @@ async def test_an_unknown_action_is_refused_with_what_asks_for_the_same_in_other
     assert f"did you mean {meant}? " in told
 
 
-async def test_a_parameter_that_a_built_in_action_does_not_take_is_refused_unsent(
-    connect: Connect, recorded: Recorded
+@pytest.mark.parametrize(
+    ("action", "params", "said"),
+    [
+        ("step", {"count": 5}, "action 'step' takes no parameter 'count': it takes 'steps'"),
+        ("keep", {}, "action 'keep' needs the parameter 'reason': it takes 'reason'"),
+    ],
+)
+async def test_parameters_that_do_not_fit_a_built_in_action_are_refused_unsent(
+    connect: Connect, recorded: Recorded, action: str, params: dict[str, Any], said: str
 ) -> None:
     recorded.robot()
     async with connect() as client:
-        asked = {"action": "step", "params": {"count": 5}}
-        text = await fail(client, "webots_send_command", **asked)
-    assert "action 'step' takes no parameter 'count': it takes 'steps'" in text
+        text = await fail(client, "webots_send_command", action=action, params=params)
+    assert said in text
     assert recorded.connection.execute("SELECT count(*) FROM command").fetchone() == (0,)
 
 

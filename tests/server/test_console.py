@@ -174,8 +174,41 @@ async def test_what_the_console_says_of_a_controller_that_never_recorded_is_name
             assert named in text_of(answer), tool
         told = await ask(client, "webots_get_logs", level="error")
         assert (told["matching"], told["hint"][:25]) == (0, "no robot has recorded yet")
-        recorded.robot(ended_wall_time_s=time.time(), end_reason="finished")
-        assert named in (await ask(client, "webots_list_robots"))["hint"]
+        assert [row[2] for row in told["lines"]["rows"]] == [
+            "webots: WARNING: bot exited with status: 1."
+        ]
+        none = await ask(client, "webots_get_logs", filter_text="no such words")
+        assert "lines" not in none and none["matching"] == 0
+
+
+async def test_a_controller_that_failed_after_another_run_is_named_until_one_records_again(
+    connect: Connect, recorded: Recorded
+) -> None:
+    begun_s = time.time()
+    past = recorded.robot(
+        started_wall_time_s=begun_s, ended_wall_time_s=begun_s, end_reason="finished"
+    )
+    past.state(1.0, {"x": 1})
+    for source, message in (
+        ("console", "[bot] ModuleNotFoundError: No module named 'arm'"),
+        ("webots", "WARNING: bot exited with status: 1."),
+    ):
+        insert(recorded.connection, "console_line", {
+            "instance": "here:1234", "wall_time_s": begun_s + 1.0, "level": "warning",
+            "source": source, "message": message,
+        })  # fmt: skip
+    async with connect() as client:
+        for tool in ("get_robot_state", "find_events", "check_run", "get_trends"):
+            why = (await ask(client, f"webots_{tool}"))["why"]
+            assert "No module named 'arm'\" and 'WARNING: bot exited with status: 1.'" in why, tool
+        assert "No module named 'arm'" in (await ask(client, "webots_list_robots"))["hint"]
+        later_s = begun_s + 2.0
+        past.beat(ended_wall_time_s=later_s)
+        recorded.robot(
+            "later", started_wall_time_s=later_s, ended_wall_time_s=later_s, end_reason="finished"
+        )
+        answer = await ask(client, "webots_check_run", robot="later")
+        assert "console" not in answer.get("why", "")
 
 
 async def test_the_command_line_follows_what_comes(recorded: Recorded, file: Path) -> None:

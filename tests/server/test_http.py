@@ -39,6 +39,12 @@ _INITIALIZE = {
     "capabilities": {},
     "clientInfo": {"name": "raw", "version": "1"},
 }
+_SERVE = """
+from webots_mcp import http_limits
+from webots_mcp.cli import main
+http_limits.BODY_S = {}
+raise SystemExit(main())
+"""
 _LOAD = 500  # calls of each of two clients
 _AT_ONCE = 10
 
@@ -46,10 +52,10 @@ _AT_ONCE = 10
 class Http:
     """`webots-mcp serve --http` on a data folder."""
 
-    def __init__(self, data_dir: Path, *options: str, at: str = "0") -> None:
+    def __init__(self, data_dir: Path, *options: str, at: str = "0", body_s: float = 60) -> None:
         where = ["--http", at, "--data-dir", str(data_dir), *options]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "webots_mcp", "serve", *where],
+            [sys.executable, "-c", _SERVE.format(body_s), "serve", *where],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -114,8 +120,8 @@ def home(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 def serve(tmp_path: Path) -> Iterator[Callable[..., Http]]:
     running: list[Http] = []
 
-    def start(*options: str, at: str = "0") -> Http:
-        running.append(Http(tmp_path, *options, at=at))
+    def start(*options: str, at: str = "0", body_s: float = 60) -> Http:
+        running.append(Http(tmp_path, *options, at=at, body_s=body_s))
         return running[-1]
 
     yield start
@@ -145,6 +151,7 @@ async def test_nobody_gets_in_without_the_token_or_from_elsewhere(
     for origin in ("http://127.0.0.1:{}@evil", "http://localhost:x", "https://localhost:{}"):
         assert server.status(Origin=origin.format(server.port)) == 403, origin
     assert server.status(Host=f"localhost:{server.port}", Origin="http://localhost:1") == 200
+    assert server.status(Host=f"LOCALHOST:{server.port}", Origin="http://LocalHost:1") == 200
     assert server.status(Origin="http://robots.example") == 403
     assert server.status(Origin="null") == 403
     modern = {"Mcp_Protocol_Version": "2026-07-28", "Mcp_Method": "tools/list"}
@@ -393,7 +400,7 @@ async def test_a_client_that_goes_away_while_it_speaks_is_no_defect(
             with closing(http.client.HTTPConnection("127.0.0.1", server.port)) as connection:
                 connection.request("POST", "/mcp", said, named)
     assert server.status() == 200
-    assert "ASGI" not in server.stop()
+    assert "Traceback" not in server.stop()
 
 
 async def test_at_the_limit_of_sessions_the_one_that_is_idle_for_longest_ends(
@@ -439,3 +446,16 @@ async def test_a_connection_that_sends_no_whole_headers_ends(
         answer = stranger.recv(100)  # until the server ends it
     assert answer.startswith(b"HTTP/1.1 408 ") if said else answer == b""
     assert server.status() == 200
+
+
+async def test_a_request_whose_body_does_not_come_ends(serve: Callable[..., Http]) -> None:
+    server = serve(body_s=0.5)
+    with closing(socket.create_connection(("127.0.0.1", server.port), 60)) as stranger:
+        stranger.sendall(
+            f"POST /mcp HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {server.token}\r\n"
+            "Content-Length: 100\r\n\r\n{".encode()
+        )
+        answer = stranger.recv(100)
+    assert answer.startswith(b"HTTP/1.1 408 ")
+    assert server.status() == 200
+    assert "Traceback" not in server.stop()

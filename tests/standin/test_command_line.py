@@ -71,6 +71,16 @@ def test_its_exit_status_is_that_of_its_controllers(
     assert subprocess.run([*COMMAND, *arguments], check=False).returncode == status
 
 
+def test_it_ends_with_its_last_controller(world: Path, write_controller: WriteController) -> None:
+    file = write_controller("import nothing_of_that_name", name="other")
+    arguments = [str(world), f"--robot=rover={file}"]
+    ended = subprocess.run(
+        [*COMMAND, *arguments], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert ended.returncode == 1
+    assert "No module named 'nothing_of_that_name'" in ended.stdout
+
+
 def test_a_bad_world_or_option_is_said_on_stderr(world: Path) -> None:
     for arguments, message in (
         (["missing.wbt"], "cannot read the world"),

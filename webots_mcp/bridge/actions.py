@@ -39,7 +39,7 @@ from webots_mcp.errors import (
     InterruptedCommandError,
     InvalidInputError,
 )
-from webots_mcp.signals.naming import describe_unknown
+from webots_mcp.signals.naming import misfit_of_parameters
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 Action = Callable[["Session", ClaimedCommand], Progress]
 
 _ROUND_S: Final = 0.05  # of wall time in which a loop makes steps before it looks around
-_LAST_STEPS: Final = 4  # made without looking around, which may take longer than a step
 _SCREENSHOT_TIMEOUT_S: Final = 10.0
 _RESET_TIMEOUT_S: Final = 10.0
 _RELOAD_TIMEOUT_S: Final = 30.0
@@ -69,13 +68,16 @@ def begin(session: Session, command: ClaimedCommand) -> Progress:
 
     Raises:
         CommandRefusedError: It needs a Supervisor and this robot is not one.
-        InvalidInputError: It does not take such a parameter.
+        InvalidInputError: It does not take such a parameter, or lacks one.
     """
     action = BUILT_IN_ACTIONS[command.action]
     if action.needs_supervisor:
         session.simulation.require_supervisor(command.action)
-    if unknown := describe_unknown(command.params, action.parameters, command.action):
-        raise InvalidInputError(unknown)
+    misfit = misfit_of_parameters(
+        command.params, action.parameters, action.required, command.action
+    )
+    if misfit is not None:
+        raise InvalidInputError(misfit)
     return _known[command.action](session, command)
 
 
@@ -168,11 +170,12 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
 
     The first is awaited without waiting in it: a controller that hangs, and so holds up the world,
     must not block this loop too. Then the world can go on, and is made to wait for this robot, so
-    that it stops at the very step.
+    that it stops at the very step. A pause, by a breakpoint or in Webots, ends it: a step asked for
+    during one would not return.
     """
     pause, simulation, watch = session.pause, session.simulation, session.watch
     simulation.pump()  # the newest answer may be older than the world
-    counted_steps, counted_to_s = 0, simulation.time_s
+    counted_steps, counted_to_s, ended_by = 0, simulation.time_s, ""
     pause.change_mode_temporarily(command.id, "real_time", stepping=True)
     watch.stepping = command.id
 
@@ -184,20 +187,28 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
         counted_to_s = time_s
         return counted_steps
 
-    def steps_until(count: int, go_on: Callable[[], object], last: int = 0) -> Generator[None]:
-        until_s = time.monotonic() + _ROUND_S
-        while made() < count and watch.stepping == command.id:
-            go_on()
-            is_long = time.monotonic() > until_s and count - made() > last
-            if simulation.over or is_long:
-                yield  # for a heartbeat, and for commands that end this one
-                until_s = time.monotonic() + _ROUND_S
+    def steps_until(count: int, go_on: Callable[[], bool], round_s: float) -> Generator[None]:
+        """Go on until so many steps are made, and yield for a heartbeat, rows and commands."""
+        nonlocal ended_by
+        until_s = time.monotonic() + round_s
+        while made() < count and watch.stepping == command.id and not ended_by:
+            may_go_on = go_on()
+            if time.monotonic() >= until_s or simulation.over:
+                yield
+                until_s = time.monotonic() + round_s
+                may_go_on = may_go_on and not simulation.paused
+            if pause.active:
+                ended_by = "a breakpoint paused it"
+            elif not may_go_on:
+                ended_by = "it was paused in Webots"
 
     try:
-        yield from steps_until(1, simulation.pump)
-        if made() < steps:
-            with simulation.world_waits():
-                yield from steps_until(steps, simulation.advance, _LAST_STEPS)
+        yield from steps_until(1, simulation.pump, _ROUND_S)
+        if made() < steps and watch.stepping == command.id and not ended_by:
+            with pause.world_waits():
+                # Conditions are evaluated on what is published in a round.
+                round_s = 0.0 if session.breakpoints.armed else _ROUND_S
+                yield from steps_until(steps, simulation.advance_unless_paused, round_s)
                 simulation.set_mode("pause")  # before the world stops waiting
     except InterruptedCommandError as interruption:
         watch.stepping = None
@@ -205,7 +216,8 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
     simulation.set_mode("pause")
     if not simulation.pump():  # the world may have made a step until it was paused
         yield  # Webots has ended the controller
-    why = {"why": "it was cancelled before the last step"} if made() < steps else {}
+    ended_by = ended_by or "it was cancelled"
+    why = {"why": f"{ended_by} before the last step"} if made() < steps else {}
     watch.stepping = None
     session.look()
     pause.begin(Cause(command.id))
@@ -344,7 +356,9 @@ def screenshot(session: Session, command: ClaimedCommand) -> Progress:
 def take_frame(session: Session, command: ClaimedCommand) -> Progress:
     """Take a picture of the newest measurement of a camera, a range finder or a lidar."""
     name = command.params.get("camera") or ""
-    device = find_pictured(session.simulation.robot, str(name))
+    if not isinstance(name, str):
+        raise InvalidInputError(f"camera must be the name of a device, not {name!r:.80}")
+    device = find_pictured(session.simulation.robot, name)
     picture, camera = take_picture(device), str(device.getName())
     saved = session.album.add_frame(camera, picture.bgra, picture.width, picture.height)
     when = {"sim_time_s": session.clock.sim_time_s}

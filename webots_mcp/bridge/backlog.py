@@ -139,7 +139,10 @@ class Backlog:
     def drop_rows_in_memory(self, why: str) -> None:
         """Drop the rows in memory, which nothing will write any more."""
         while self._rows:
-            self._remove_oldest()
+            try:
+                self._remove_oldest()
+            except IndexError:  # another thread was quicker
+                return
             self._drop(1, why)
 
     def close(self) -> str | None:

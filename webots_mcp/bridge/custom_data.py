@@ -41,6 +41,8 @@ _LONGEST_SIGNAL: Final = 1_000  # characters of what is no JSON
 _READ_LONG_AGAIN_S: Final = 1.0  # of wall time
 _MOST_FOUND: Final = 10  # robots whose fields are looked for in one round
 _STALE_S: Final = 1.0  # of simulation time in which a text from before a reset is not believed
+_EPSILON_S: Final = 1e-9
+_DELAY_STEPS: Final = 2  # after a reset in which a text that is new may be from before it
 # Strings, which stay as they are, and what C prints of numbers that JSON lacks.
 _C_NUMBERS: Final = re.compile(
     r'"(?:\\.|[^"\\])*"?|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
@@ -270,6 +272,7 @@ class _Recording:
         self._names, self._changes = SignalNames(), StateChanges()
         self._values: Mapping[str, Any] = {}
         self._stale_until_s = -1.0
+        self._delay_s = _DELAY_STEPS * observer.simulation.basic_time_step_s
         self._sequence = _Sequence()
         registration = self.recorder.registration
         if registration is not None and registration.reloaded:
@@ -281,7 +284,9 @@ class _Recording:
         if self._clock.follow(self._followed, self._observed_run):
             self._begin_run()
         if is_new:
-            self._values, self._stale_until_s = signals_of(text), -1.0
+            self._values = signals_of(text)
+        if is_new and not self._may_be_of_former_run:
+            self._stale_until_s = -1.0
             if self._sequence.count(self._values.get("seq")):
                 self._report_missed()
         if is_new or is_due:
@@ -294,6 +299,12 @@ class _Recording:
         for (ended,) in (ids and self.recorder.fetch(_END_REASON, (ids.session_id,))) or ():
             reason = ended or reason
         self.recorder.close(reason, self._clock.sim_time_s)
+
+    @property
+    def _may_be_of_former_run(self) -> bool:
+        """Whether a text that is new may have been on its way when the world was reset."""
+        was_reset = self._stale_until_s >= 0.0
+        return was_reset and self._clock.sim_time_s < self._delay_s + _EPSILON_S
 
     def _begin_run(self) -> None:
         """The world was reset: what the field holds is of the time before it."""

@@ -267,6 +267,14 @@ LONGEST_S: Final = 0.01
 Place: TypeAlias = "tuple[Place | None, str | int]"
 
 
+class _Pairs(list[tuple[Any, Any]]):
+    """Items that were taken from a mapping, whose keys need not be hashable."""
+
+    def items(self) -> Iterable[tuple[Any, Any]]:
+        """As a mapping gives them."""
+        return self
+
+
 class _Unfilled(NamedTuple):
     """A copy whose items are still to come."""
 
@@ -368,7 +376,7 @@ class Cleaner:
 
     # -- dicts ---------------------------------------------------------------------------------
 
-    def _mapping(self, value: Mapping[object, object], place: Place, depth: int) -> object:
+    def _mapping(self, value: Mapping[object, object] | _Pairs, place: Place, depth: int) -> object:
         count = len(value)
         if not self._take(ROOM_OF_A_VALUE * count):
             self._name(place, f"dict[{count}]")
@@ -382,13 +390,18 @@ class Cleaner:
         return cleaned
 
     def _own_mapping(self, value: Mapping[object, object], place: Place, depth: int) -> object:
-        """All items of a type of the user; where they do not end, as many as its length says."""
+        """The items of a type of the user: until one fails, or as its length says if too many."""
         most = max(self._room // ROOM_OF_A_VALUE, _TOP_KEYS)
-        if len(value) > most:
+        if (count := len(value)) > most:
             return self._mapping(value, place, depth)
-        found = dict(islice(value.items(), most + 1))
+        found = _Pairs()
+        try:
+            found.extend((key, item) for key, item in islice(value.items(), most + 1))
+        except Exception as error:  # noqa: BLE001  (as for any value)
+            self._name(place, failure(value, error))
         if len(found) > most:
-            found = dict(islice(found.items(), len(value)))
+            del found[count:]
+            self._name(place, f"dict cut after {count}")
         return self._mapping(found, place, depth)
 
     def _fill(self, unfilled: _Unfilled) -> None:

@@ -550,7 +550,10 @@ class MCPBridge:
         _bridges.pop(id(self.robot), None)
         if self._capture is not None:
             self._capture.close()
-        self._session.close(reason)
+        try:
+            self._session.close(reason)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("close", error)
         self._closed = True  # last: an interrupted call is repeated by `_close_at_exit`
         atexit.unregister(self._close_at_exit)
 

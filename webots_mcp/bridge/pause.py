@@ -14,7 +14,9 @@ from webots_mcp.database.pauses import (
     PAUSED,
     RESUME,
     SESSION_BEFORE,
+    SET_FREE,
     STEPPING,
+    STEPPING_WORLD,
     Cause,
 )
 
@@ -96,6 +98,24 @@ class Pause:
         before = self.running_mode
         self.end(command_id, mode, stepping=stepping)
         self._mode_before = before
+
+    @contextmanager
+    def world_waits(self) -> Generator[None]:
+        """Let the world wait for this robot's steps meanwhile.
+
+        The heartbeat has it first: where the process is killed meanwhile, the session after this
+        one lets the world go on (`set_world_free`).
+        """
+        self._heartbeat.change_loop(STEPPING_WORLD)
+        with self._simulation.world_waits():
+            yield
+        if self._heartbeat.loop == STEPPING_WORLD:  # else a breakpoint has paused it
+            self._heartbeat.change_loop(STEPPING)
+
+    def set_world_free(self) -> None:
+        """Let a world go on that the bridge of an ended process had made wait for its steps."""
+        if self._simulation.supervisor and self._simulation.set_world_free():
+            self._journal.log("warning", "bridge", SET_FREE)
 
     def restore_mode(self) -> None:
         """Return to the mode before `change_mode_temporarily`; the loop continues in it."""

@@ -76,6 +76,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.signals.register import Seen, find_changes, write_changes
 
+_CLOSED: Final = "the bridge is closed"
 _LOCK_PATIENCE_S: Final = 0.001  # how long to wait for another thread of this process
 _WRITER_PATIENCE_S: Final = 0.001  # and for another writer, whose commit takes 50 us
 # Windows may sleep for 15 ms where less was asked for.
@@ -114,7 +115,6 @@ class Recorder:
         registration: The ids to record under; None while the database is not open.
         off: Why recording has ended for good; None while it has not.
         rows_written: Rows that the database took.
-        rows_dropped: Rows that will never be in it.
     """
 
     def __init__(
@@ -129,7 +129,9 @@ class Recorder:
         self.connection: sqlite3.Connection | None = None
         self.registration: Registration | None = None
         self.off: str | None = None
-        self.rows_written = self.rows_dropped = 0
+        self._closing: int | None = None  # the thread that closes, or has closed
+        self.rows_written = 0
+        self._dropped: dict[int, int] = {}  # by thread: each counts its own
         self.last_use_s = time.monotonic()
         self._identity = identity
         self._clock = clock
@@ -138,7 +140,8 @@ class Recorder:
         self._files: tuple[int, ...] = ()
         self._retry_at_s = 0.0
         self._confirmed = 0  # rows that were written when the files were looked after
-        self._unreported = 0  # dropped rows that no event in the database reports yet
+        self._reported_dropped = 0  # by events in the database
+        self._unreported = False  # there are dropped rows that none reports yet
         self._why_dropped = ""
         self._open(patient=True)
 
@@ -146,6 +149,11 @@ class Recorder:
     def rows_waiting(self) -> int:
         """Rows that the database could not take yet."""
         return self._backlog.rows
+
+    @property
+    def rows_dropped(self) -> int:
+        """Rows that will never be in the database."""
+        return sum(tuple(self._dropped.values()))
 
     @property
     def rows_in_memory(self) -> int:
@@ -166,8 +174,11 @@ class Recorder:
             How many rows the statement changed, or None where it was deferred.
         """
         self.last_use_s = time.monotonic()
+        if self._closing is not None and self._closing != get_ident():
+            self._drop(1, _CLOSED)
+            return None
         if not self._lock.acquire(this_call(), _LOCK_PATIENCE_S):
-            self._backlog.put(Row(kind, run, values))
+            self._put(Row(kind, run, values))
             return None
         try:
             return self._write(kind, run, values)
@@ -183,7 +194,7 @@ class Recorder:
         self.last_use_s = time.monotonic()
         if not self._lock.acquire(this_call(), _LOCK_PATIENCE_S):
             for values in rows:
-                self._backlog.put(Row(kind, run, values))
+                self._put(Row(kind, run, values))
             return
         try:
             if not self._write_together(kind, run, rows):
@@ -210,6 +221,8 @@ class Recorder:
 
     def _locked(self, act: Callable[[], Result]) -> Result | None:
         """Call `act` with the connection lock; None where another thread has it, or it fails."""
+        if self._closing is not None and self._closing != get_ident():
+            return None
         if not self._lock.acquire(this_call()):
             return None
         try:
@@ -249,20 +262,28 @@ class Recorder:
         self.record("session end", None, {"reason": reason, **times, **status})
 
     def close(self, reason: str, sim_time_s: float) -> None:
-        """End run and session, write the waiting rows (for up to a second), and disconnect."""
+        """End run and session, write the waiting rows (for up to a second), and disconnect.
+
+        Rows that other threads record from now on are dropped. A connection that one of them still
+        uses after a second is left open: SQLite forbids to close it meanwhile.
+        """
+        self._closing = get_ident()
         self._locked(self._look_after_files)  # what went into a deleted file is counted as dropped
         if self.off is None:
             self.end(reason, sim_time_s)
         until_s = time.monotonic() + 1
         while not self.flush() and self.connection and time.monotonic() < until_s:
             time.sleep(0.005)
-        self._lock.acquire(this_call(), 1.0)
+        is_free = self._lock.acquire(this_call(), 1.0)
         try:
-            self._disconnect()
+            if is_free:
+                self._disconnect()
             self._leave_waiting()
-            self.off = self.off or "the bridge is closed"
+            self.off = self.off or _CLOSED
+            self._backlog.drop_rows_in_memory(self.off)  # that a thread has put since
         finally:
-            self._lock.release()
+            if is_free:
+                self._lock.release()
 
     def abandon(self) -> None:
         """In a forked child: leave connection and session to the parent, which continues."""
@@ -411,6 +432,12 @@ class Recorder:
 
     # -- rows that wait or are dropped ---------------------------------------------------------
 
+    def _put(self, row: Row) -> None:
+        """Let a row wait in memory, without the connection lock."""
+        self._backlog.put(row)
+        if self.off is not None:  # the bridge was closed meanwhile, and no other call looks at it
+            self._backlog.drop_rows_in_memory(self.off)
+
     def _keep(self, row: Row) -> None:
         if self.off is not None:
             self._drop(1, self.off)
@@ -419,14 +446,17 @@ class Recorder:
 
     def _drop(self, rows: int, why: str) -> None:
         """Count rows as dropped, and warn; raises in strict mode."""
-        self.rows_dropped += rows
-        self._unreported += rows
+        mine = get_ident()
+        self._dropped[mine] = self._dropped.get(mine, 0) + rows
+        self._unreported = True
         self._why_dropped = why
         self.errors.warn(f"dropped: {why}", f"rows are being dropped: {why}")
 
     def _report_dropped(self) -> None:
         """Record an event that reports the unreported drops."""
-        rows, self._unreported = self._unreported, 0
+        self._unreported = False
+        rows = self.rows_dropped - self._reported_dropped
+        self._reported_dropped += rows
         now, data = self._clock.newest_s(self.run), {"row_count": rows, "why": self._why_dropped}
         values = (now, time.time(), "dropped", None, json.dumps(data))
         self._write("event", self.run, values)

@@ -22,7 +22,7 @@ from webots_mcp.contract import (
 from webots_mcp.database import liveness
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.liveness import process_identity
-from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.pauses import PAUSED, STEPPING_WORLD
 from webots_mcp.database.waiting_file import enter_robot, enter_session
 
 # -- the identity of a process ---------------------------------------------------------------------
@@ -178,6 +178,10 @@ _PAUSED_MODE: Final = (
     "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? "
     "AND pause_state = ?"
 )
+_LEFT_WAITING: Final = (
+    "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) "
+    "AND instance = ? AND pause_state = ?"
+)
 _LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 
 # Sessions of this process. Its pid alone does not identify it: in a container pids repeat.
@@ -193,6 +197,8 @@ class Registration(NamedTuple):
     reloaded: bool
     paused_mode: str | None
     """The mode to go back to, where the session before this one left the simulation paused."""
+    left_waiting: bool
+    """The session before this one ended while the world waited for its steps."""
 
 
 def register(
@@ -220,10 +226,13 @@ def register(
             connection.execute(_RELOADED_SESSION, (robot_id,))
             connection.execute(_RELOADED_RUN, (robot_id,))
         paused_mode = _paused_mode(connection, identity, robot_id)
+        waiting = connection.execute(
+            _LEFT_WAITING, (robot_id, identity.instance, STEPPING_WORLD)
+        ).fetchone()
         session = describe_session(identity, session_uuid, actions)
         session_id = enter_session(connection, robot_id, session)
     _own_sessions.add(session_id)
-    return Registration(robot_id, name, session_id, reloaded, paused_mode)
+    return Registration(robot_id, name, session_id, reloaded, paused_mode, waiting is not None)
 
 
 def deregister(session_id: int) -> None:

@@ -55,6 +55,8 @@ _SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is re
 def set_field(session: Session, command: ClaimedCommand) -> Progress:
     """Set the field, or the entry of a field, at a `path` to a `value`."""
     robot, params = session.simulation.robot, command.params
+    if (stops := params.get("stop")) is not None and not isinstance(stops, bool):
+        raise InvalidInputError(f"stop must be true or false, not {stops!r:.80}")
     place = yield from find(robot, params.get("path"))
     _require_settable(robot, place)
     value = checked(place.path, place.type_name, params.get("value"))
@@ -62,7 +64,7 @@ def set_field(session: Session, command: ClaimedCommand) -> Progress:
     before = read(place.field, place.entry)
     reset = session.scene.remember_field(_edit(place, before, value), place.node)
     write(place.field, value, place.entry)
-    if params.get("stop") is True:
+    if stops:
         place.node.resetPhysics()
     facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
     facts |= {"from": _shown(before), "to": _shown(value)}

@@ -137,6 +137,8 @@ class Session:
         mode = simulation.mode_name if simulation.supervisor else None
         values = {"now": time.time(), "sim_time": clock.sim_time_s, "mode": mode}
         self.recorder.record("reload confirmed", clock.run, values)
+        if registration.left_waiting:
+            self.pause.set_world_free()
         if registration.paused_mode is not None:
             self.pause.take_over(registration.paused_mode)
 

@@ -18,6 +18,8 @@ from webots_mcp.database.stacks import STEPPING
 from webots_mcp.errors import CommandRefusedError
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
+_LONGEST_WAIT_S: Final = 0.1  # for the moment at which a step is due
+_PROMPT_S: Final = 0.002  # of wall time that a step takes which was due when it was asked for
 _INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers
 
 
@@ -26,6 +28,9 @@ class Simulation:
 
     Args:
         robot: A Webots `Robot` or `Supervisor`, or an instance of a subclass.
+
+    Attributes:
+        world_is_waiting: The world waits for this robot's steps, as long as a command makes them.
 
     Raises:
         TypeError: `robot` is something else.
@@ -39,6 +44,11 @@ class Simulation:
         self.meter = LoopMeter()
         self._gate = StepGate(robot, self.meter)
         self._time_s = 0.0
+        self._next_step_s = 0.0  # by the monotonic clock, in real time
+        self._is_set_free = False
+        self._mode_set: int | None = None  # until the next answer
+        self._steps_at_setting = 0
+        self.world_is_waiting = False
 
     @property
     def time_s(self) -> float:
@@ -58,22 +68,32 @@ class Simulation:
 
     @property
     def waits_for_robot(self) -> bool:
-        """Whether the simulation waits for this robot's next step (field `synchronization`)."""
-        return bool(self.robot.getSynchronization())
+        """Whether the simulation waits for this robot's next step (field `synchronization`).
+
+        Webots' library answers with the value at the start.
+        """
+        return bool(self.robot.getSynchronization()) and not self._is_set_free
 
     @property
     def mode(self) -> int:
-        """The simulation mode in Webots' last answer."""
+        """The mode that was set since Webots' last answer, else the one in that answer."""
+        if self._mode_set is not None and self._steps_at_setting == self.meter.steps:
+            return self._mode_set
         return int(self.robot.simulationGetMode())
 
     @property
     def paused(self) -> bool:
-        """Whether the mode in Webots' last answer is PAUSE."""
+        """Whether `mode` is PAUSE."""
         return self.mode == self.robot.SIMULATION_MODE_PAUSE
 
     def set_mode(self, name: str) -> None:
-        """Set the mode `pause`, `real_time` or `fast`."""
-        self.robot.simulationSetMode(getattr(self.robot, f"SIMULATION_MODE_{name.upper()}"))
+        """Set the mode `pause`, `real_time` or `fast`.
+
+        Webots changes it after its answer, which may still have the mode that was set before.
+        """
+        self._mode_set = int(getattr(self.robot, f"SIMULATION_MODE_{name.upper()}"))
+        self._steps_at_setting = self.meter.steps
+        self.robot.simulationSetMode(self._mode_set)
 
     @property
     def mode_name(self) -> str:
@@ -83,17 +103,28 @@ class Simulation:
 
     def pump(self) -> bool:
         """Exchange messages with Webots without advancing time; False if it says quit."""
+        self._mode_set = None
         if self._gate.exchange() != QUIT:
             return True
         self.end()
         return False
 
-    def advance(self) -> bool:
-        """Make one basic time step; False if Webots says quit."""
-        if self._gate.advance(max(round(self.basic_time_step_s * 1000), 1)) != QUIT:
-            return True
-        self.end()
-        return False
+    def advance_unless_paused(self) -> bool:
+        """Make one basic time step once it is due in real time; False if paused, or after a quit.
+
+        A step that is asked for in a pause does not return. So the loop does not wait in the step,
+        but before it, and asks for the mode right before the step.
+        """
+        step_s, now_s = self.basic_time_step_s, time.monotonic()
+        time.sleep(min(max(self._next_step_s - now_s, 0.0), step_s, _LONGEST_WAIT_S))
+        if not self.pump() or self.paused:
+            return False
+        self._mode_set = None
+        if self._gate.advance(max(round(step_s * 1000), 1)) == QUIT:
+            self.end()
+            return False
+        self._next_step_s = max(self._next_step_s, time.monotonic() - _PROMPT_S) + step_s
+        return True
 
     @contextmanager
     def world_waits(self) -> Generator[None]:
@@ -102,15 +133,32 @@ class Simulation:
         Webots reads the field `synchronization` before each step. Where the node has none, the
         world goes on without waiting.
         """
-        own: Any = self.robot.getSelf()
-        field = own.getField("synchronization") if own is not None else None
+        field = self._synchronization
         if field is not None:
             field.setSFBool(True)
+        self.world_is_waiting = True
         try:
             yield
         finally:
+            self.world_is_waiting = False
             if field is not None and not self.over:
                 field.setSFBool(False)
+                self.pump()  # sends it: this may be the last call before the process ends
+
+    def set_world_free(self) -> bool:
+        """Let the world not wait for this robot's steps; False if it does not wait already."""
+        field = self._synchronization
+        if field is None or not field.getSFBool():
+            return False
+        field.setSFBool(False)
+        self._is_set_free = True
+        return self.pump()
+
+    @property
+    def _synchronization(self) -> Any:
+        """The field of the robot's own node; None where a PROTO hides it."""
+        own: Any = self.robot.getSelf()
+        return own.getField("synchronization") if own is not None else None
 
     def guard_steps(self, guard: Guard | None) -> None:
         """Let `guard` answer the controller's steps; None: let Webots answer them again."""
@@ -374,6 +422,11 @@ class LoopMeter:
         """Count from here, the end of a step."""
         self._own_s = self._step_s = 0.0
         self._steps = min(self._steps, 0)
+
+    @property
+    def steps(self) -> int:
+        """The steps of the controller so far, for comparison only: each run counts anew."""
+        return self._steps
 
     @property
     def times(self) -> LoopTimes | None:

@@ -324,7 +324,7 @@ def launch(
         Parameter(
             "--stand-in",
             help="Run the world on the stand-in simulator that comes with webots-mcp, where no "
-            "Webots is installed; it ends with Ctrl-C.",
+            "Webots is installed; it ends with its last controller, or with Ctrl-C.",
         ),
     ] = False,
     robot: Annotated[
@@ -372,7 +372,10 @@ def launch(
         threading.Thread(target=_watch, args=watched, daemon=True).start()
         named = _controllers(robot)
         with StandInConsole(recording) as recorder:
-            return stand_in_simulator()(file, mode or "realtime", None, named, recorder)
+            status = stand_in_simulator()(file, mode or "realtime", None, named, recorder)
+        if not _has_recorded(*watched[:2]):
+            _say("no controller has recorded; 'webots-mcp logs' shows what they printed")
+        return status
     if robot:
         raise InvalidInputError("--robot is for --stand-in: Webots runs what the world names")
     start = Start(file, mode, headless, stream, port or free_port())
@@ -397,6 +400,17 @@ def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
             raise InvalidInputError(f"--robot {text!r} is not NAME=FILE")
         named[name] = file
     return named
+
+
+def _has_recorded(recording: Recording, before: int) -> bool:
+    """Whether a session after `before` has a run."""
+    from webots_mcp.simulator.launch import starts_since
+
+    try:
+        return any(each.run_id is not None for each in starts_since(recording, before))
+    except WebotsMCPError as error:
+        _say(str(error))
+        return True
 
 
 def _watch(recording: Recording, before: int, world: Path, patience_s: float) -> None:

@@ -259,6 +259,7 @@ def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
 
 def _remove_observer(world: Path, writing: Writing) -> None:
     """Take the observer out of a world, or delete the copy that was made for it."""
+    from webots_mcp.contract import CONTROLLER_FOLDER, WORLD_ENDING, WORLD_FOLDER
     from webots_mcp.database.location import find_project
     from webots_mcp.setup.project_edits import undo, unused_controller
 
@@ -270,9 +271,15 @@ def _remove_observer(world: Path, writing: Writing) -> None:
         unused = unused_controller(project, sys.executable)
         files += [writing.delete(file) for file in unused]
         for folder in {file.parent for file in unused}:
-            if not any(folder.iterdir()):
-                folder.rmdir()
+            _remove_if_empty(folder)
+            if any((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}")):  # it stays a project
+                _remove_if_empty(project / CONTROLLER_FOLDER)
     _print_files(files, writing)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _print_files(

@@ -11,7 +11,10 @@ Webots has one simulation mode `pause`. What is known of a pause depends on who 
 - A person in Webots, another controller, or the controller's own code: its bridge is not asked and
   may not get to run. Only an observer sees it (the event `mode`); press play, or ask the observer.
 
-While a `step` command lets the loop make its steps, `session.pause_state` has `STEPPING`.
+While a `step` command lets the loop make its steps, `session.pause_state` has `STEPPING`. An
+observer, for which the world does not wait otherwise, makes it wait for these steps by the field
+`synchronization`: then it has `STEPPING_WORLD`, by which a later session sees that the field has to
+be set back.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -29,6 +32,7 @@ from webots_mcp.errors import InvalidInputError
 
 PAUSED: Final = "paused"  # how a command controls the loop: the column session.pause_state
 STEPPING: Final = "stepping"
+STEPPING_WORLD: Final = "stepping the world"  # which waits for this robot meanwhile
 PAUSE: Final = "pause"  # the kinds of the events
 RESUME: Final = "resume"
 VIOLATION: Final = "violation"  # what was expected did not hold
@@ -36,6 +40,10 @@ VIOLATION: Final = "violation"  # what was expected did not hold
 IN_WEBOTS: Final = "a person or another controller, in Webots"
 SESSION_BEFORE: Final = "the controller's session before this one"
 BRIDGE_CLOSED: Final = "the bridge, which was closed"
+SET_FREE: Final = (
+    "the field 'synchronization' of this robot was set back to FALSE: its controller's session "
+    "before this one ended in the middle of a step command, while the world waited for its steps"
+)
 
 # The texts of a status for a pause that no bridge has begun.
 SEEN_PAUSED: Final = "paused in Webots, as robot"

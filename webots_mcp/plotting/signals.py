@@ -63,6 +63,8 @@ from webots_mcp.signals.naming import listed, spelled_out
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
+_EVENTS_SHARE: Final = 0.4  # of the time, whatever the curves take
+
 
 def plot_signals(
     connection: sqlite3.Connection,
@@ -116,14 +118,13 @@ def compose_signals(
     `found` is what was searched before in the whole of these runs, each event by itself. `room` is
     how much it may be; None for that of a PNG of 900 x 500 pixels. `grouped` are the signals of
     each panel; None puts those of one unit and scale together. `deadline_s` is for all that is
-    read, events last; what is not read in it is hatched, and a note says so.
+    read, a share of it for events; what is not read in it is hatched, and a note says so.
     """
     room = room or Sheet().room
     deadline = Deadline(deadline_s)
     mode = mode_signal(known_signals(connection, ranges), bands)
-    parts = parts_of(
-        connection, ranges, [*names, *([mode] if mode else [])], room.points, deadline_s
-    )
+    curves_s = deadline_s * (1 - _EVENTS_SHARE) if events else deadline_s
+    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])], room.points, curves_s)
     overlaid = len(parts) > 1
     curves = [curve for part in parts for curve in _curves(part)]
     if grouped and not overlaid:
@@ -139,8 +140,9 @@ def compose_signals(
     if events and not overlaid:
         drawn = [name for panel in panels for name in panel.names] or names
         marked, event_notes = event_lanes(
-            connection, parts[0], drawn, room.rows - len(below), found, deadline.left_s
-        )
+            connection, parts[0], drawn, room.rows - len(below), found,
+            max(deadline.left_s, _EVENTS_SHARE * deadline_s),
+        )  # fmt: skip
     plot = SignalAxes(
         title=title_of(parts),
         x_label=_x_label(parts),

@@ -65,6 +65,7 @@ from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.signals import Signal
 
 _FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
+_SIGNALS_SHARE: Final = 0.5  # of the time; the rest is for the way, and for when it was stuck
 
 
 def plot_trajectory(
@@ -109,25 +110,26 @@ def compose_trajectory(
 ) -> tuple[TrajectoryAxes, tuple[str, ...]]:
     """What `plot_trajectory` paints, and its notes; arguments and errors as there.
 
-    `found` is as in `compose_signals`. `deadline_s` is for each thing that is read; where a way was
-    cut by it, it has no end.
+    `found` is as in `compose_signals`. `deadline_s` is for all that is read; where a way was cut by
+    it, it has no end.
     """
+    deadline = Deadline(deadline_s)
     known = known_signals(connection, ranges)
-    x, y = position_of(connection, known, ranges[-1], position)
+    x, y = position_of(connection, known, ranges[-1], position, deadline)
     mode = mode_signal(known, bands)
     flags = _flags(known) if events else []
     names = [x.name, y.name, *([mode] if mode else []), *flags]
-    parts = parts_of(connection, ranges, names, deadline_s=deadline_s)
+    parts = parts_of(connection, ranges, names, deadline_s=_SIGNALS_SHARE * deadline.left_s)
     tracks: list[Track] = []
     unlooked: list[str] = []
     for part in parts:
         modes = _lane(part, mode) if len(parts) == 1 else None
         marks = [_flagged(part, flag) for flag in flags]
+        path = read_path(connection, part, x, y, deadline.left_s)
         if events:
-            stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline_s, found)
+            stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline.left_s, found)
             marks.insert(0, stuck)
             unlooked += notes
-        path = read_path(connection, part, x, y, deadline_s)
         tracks.append(Track(part.name, path, modes, marks))
     if not any(track.path.places for track in tracks):
         if not all(track.path.is_whole for track in tracks):
@@ -149,6 +151,7 @@ def position_of(
     known: Known,
     newest: TimeRange,
     named: tuple[str, str] | None = None,
+    deadline: Deadline | None = None,
 ) -> tuple[Signal, Signal]:
     """The position that is drawn: the one named, else the one of the newest run.
 
@@ -158,7 +161,7 @@ def position_of(
     """
     if named is not None:
         return _number(known, named[0]), _number(known, named[1])
-    frame = read_frame(connection, newest.segments[-1], Deadline())
+    frame = read_frame(connection, newest.segments[-1], deadline or Deadline())
     position = motion_in(frame, known, EventOptions()).position
     if position is None:
         numbers = [name for name, signal in known.items() if signal.is_number]

@@ -45,6 +45,10 @@ _FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
 _LONGEST_MESSAGE: Final = 500
 _BUDGET_TOKENS: Final = 1_500
 _ANY_LINE: Final = LogFilter(None, Window(-math.inf, math.inf), "", "debug")
+_BELOW_LEVEL: Final = (
+    "no robot has recorded yet, and no line of Webots' console has the level {} or above: these "
+    "have a lower one"
+)
 _NONE_MATCHES: Final = (
     "no robot has recorded yet, and no line of Webots' console matches: leave out the level, the "
     "text and the source to see all of its lines"
@@ -100,9 +104,15 @@ def webots_get_logs(
             waiting = [] if is_any_live else waiting_lines(connection, asked, lines)
             if not waiting and (is_any_live or not waiting_lines(connection, _ANY_LINE, 1)):
                 raise
-        shown = _table(_newest_fitting(waiting), time_of_day=time_of_day)
-        hint = _NO_RUN_YET if waiting else _NONE_MATCHES
-        return LogsAnswer(lines=shown if waiting else None, matching=len(waiting), hint=hint)
+            # What a controller prints as it fails has no level of its own.
+            any_level = replace(asked, lowest_level=_ANY_LINE.lowest_level)
+            shown = waiting or waiting_lines(connection, any_level, lines)
+        hint = _BELOW_LEVEL.format(lowest) if shown else _NONE_MATCHES
+        return LogsAnswer(
+            lines=_table(_newest_fitting(shown), time_of_day=time_of_day) if shown else None,
+            matching=len(waiting),
+            hint=_NO_RUN_YET if waiting else hint,
+        )
 
 
 def _row(line: LogLine) -> dict[str, object]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import logging
 import socket
 import ssl
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import uvicorn
+from mcp.server import streamable_http
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect
@@ -106,6 +108,7 @@ def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) 
         CommandRefusedError: There is no valid token.
     """
     access_token()
+    logging.getLogger(streamable_http.__name__).addFilter(_is_news)
     with closing(_listening(place)) as listener:
         config = uvicorn.Config(
             guarded_app(server, place),
@@ -131,6 +134,11 @@ def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) 
         running.run([listener])
     if not running.started:
         raise CommandRefusedError("the server did not start; what it wrote above says why")
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Whether a line of the SDK is worth a line on stderr: a client that left is not."""
+    return not (record.exc_info and isinstance(record.exc_info[1], ClientDisconnect))
 
 
 def guarded_app(server: MCPServer, place: Place, most_sessions: int = MOST_SESSIONS) -> ASGIApp:
@@ -201,10 +209,19 @@ def gate(app: ASGIApp, place: Place) -> ASGIApp:
             if not admitted:
                 refusal = {"WWW-Authenticate": "Bearer", "Connection": "close"}
                 return await PlainTextResponse(_STRANGER, 401, refusal)(scope, receive, send)
-            return await _follow(app, scope, receive, send)
+            return await _follow(app, _lowered(scope), receive, send)
         await app(scope, receive, send)
 
     return admit
+
+
+def _lowered(scope: Scope) -> Scope:
+    """The request with its hosts in lower case, in which the SDK knows them: they have no case."""
+    headers = [
+        (name, value.lower() if name in (b"host", b"origin") else value)
+        for name, value in scope["headers"]
+    ]
+    return {**scope, "headers": headers}
 
 
 async def _follow(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:

@@ -340,6 +340,8 @@ _NOBODY_ASKS_FOR: Final = 1_000
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
 _TOOL_PREFIX: Final = "webots_"
+_BOXES: Final = ("params", "parameters", "values", "arguments", "args")  # of names and values
+_LONGEST_ARGUMENT: Final = 60  # characters of one in a call that is shown shortened
 _LONGEST_CALL: Final = 300  # characters of a call that is shown as an example
 _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
 
@@ -465,18 +467,34 @@ class CheckedTool(Tool):
         """Which argument the tool does not have, and what was perhaps meant."""
         names = [name for name in arguments if name in unknown]
         listed, inside = list(self.parameters["properties"]), self.of_controller
-        said = f"unknown argument {shown_value(names[0])}"
-        is_typo = any(perhaps_meant(name, listed) for name in names)
-        if inside and inside not in arguments and not is_typo:
-            lacking = [name for name in self.parameters.get("required", ()) if name != inside]
-            call = {name: "..." for name in lacking if name not in arguments}
-            call |= {n: compact_json(v) for n, v in arguments.items() if n not in unknown}
-            call[inside] = compact_json({name: arguments[name] for name in names})
-            shown = ", ".join(f"{name}={value}" for name, value in call.items())
-            if len(shown) > _LONGEST_CALL:
-                shown = f"{inside}={{...}}"
-            return f"{said}: names of the controller go into `{inside}`: {self.name}({shown})"
-        return f"{said}: there is {', '.join(harmless_first(names[0], listed)) or 'none'}"
+        typo = next((name for name in names if perhaps_meant(name, listed)), None)
+        said = f"unknown argument {shown_value(typo or names[0])}"
+        if inside and inside not in arguments and typo is None:
+            own = {name: value for name, value in arguments.items() if name not in unknown}
+            call = self._call(own, inside, _unboxed({name: arguments[name] for name in names}))
+            return f"{said}: names of the controller go into `{inside}`: {call}"
+        near = harmless_first(typo or names[0], listed)
+        return f"{said}: there is {', '.join(near) or 'none'}"
+
+    def _call(self, own: Mapping[str, Any], inside: str, values: Mapping[str, Any]) -> str:
+        """A call with all that the tool requires; values that would make it too long are dots."""
+        required = self.parameters.get("required", ())
+        lacking = {each: "..." for each in required if each != inside and each not in own}
+        given = {name: compact_json(value) for name, value in own.items()}
+        whole = lacking | given | {inside: compact_json(values)}
+        if sum(map(len, whole.values())) > _LONGEST_CALL:
+            short = {
+                n: value if len(value) <= _LONGEST_ARGUMENT else "..." for n, value in given.items()
+            }
+            whole = lacking | short | {inside: "{...}"}
+        return f"{self.name}({', '.join(f'{name}={value}' for name, value in whole.items())})"
+
+
+def _unboxed(values: dict[str, Any]) -> dict[str, Any]:
+    """Names of the controller with their values, also where another tool's argument held them."""
+    (name, value), *others = values.items()
+    is_box = not others and name in _BOXES and isinstance(value, dict)
+    return cast("dict[str, Any]", value) if is_box else values
 
 
 class ToolServer(MCPServer):
@@ -519,7 +537,7 @@ class ToolServer(MCPServer):
         listed = [tool.name for tool in self._tool_manager.list_tools()]
         known = {*listed, *self._unlisted} - {*self._withheld}
         bare = (each.removeprefix(_TOOL_PREFIX) for each in sorted(known))
-        near = perhaps_meant(name.removeprefix(_TOOL_PREFIX), bare)
+        near = perhaps_meant(name.lower().removeprefix(_TOOL_PREFIX), bare)
         meant = " or ".join(f"{_TOOL_PREFIX}{each}" for each in near)
         offer = f"Did you mean {meant}?" if meant else "tools/list names all tools."
         return f"There is no tool {shown_value(name)}. {offer}"

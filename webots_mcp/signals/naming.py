@@ -60,13 +60,13 @@ ELSEWHERE: Final = frozenset((
 OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
 _SEEN: Final = f"{WORLD}."
 PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
-# Words of actions that ask for the same, whatever their letters; and words that say no more.
-# Words of actions and of arguments that mean the same.
+# Words of actions and of arguments that mean the same, whatever their letters.
 _SAME_MEANING: Final = (
     {"pause", "stop", "halt", "freeze"}, {"resume", "start", "play", "continue", "unpause"},
     {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport", "move", "place", "change"},
     {"add", "node", "spawn"}, {"drive", "move", "go", "goto"},
     {"duration", "for", "length", "period", "s", "seconds", "time"},
+    {"action", "command"}, {"condition", "until"},
 )  # fmt: skip
 # Words of actions, commands and options that lose something: none is ever offered as a correction.
 _DESTRUCTIVE: Final = frozenset((
@@ -319,27 +319,35 @@ def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]
     return get_close_matches(spelled, harmless, most)
 
 
-def describe_unknown(given: Iterable[str], known: Sequence[str] | None, of: str) -> str | None:
-    """Return the error of parameters that an action does not take, with the ones that it takes.
+def misfit_of_parameters(
+    given: Iterable[str], known: Sequence[str] | None, required: Iterable[str], action: str
+) -> str | None:
+    """Return the error of parameters that an action does not take, or that it lacks.
 
     Args:
         given: The names that were given.
         known: The names of its parameters; None where any name may be given.
-        of: The action.
+        required: Those that must be given.
+        action: Its name.
 
     Returns:
-        None where there is no such parameter.
+        None where the names fit.
     """
-    unknown = [] if known is None else [name for name in given if name not in known]
-    if not unknown:
+    if known is None:
         return None
-    word = "parameter" if len(unknown) == 1 else "parameters"
-    text = f"action {of!r} takes no {word} {', '.join(f'{name!r:.80}' for name in unknown[:5])}"
+    names = list(given)
+    unknown = [name for name in names if name not in known]
+    missing = [name for name in required if name not in names]
+    if not unknown and not missing:
+        return None
+    wrong, fault = (unknown, "takes no") if unknown else (missing, "needs the")
+    word = "parameter" if len(wrong) == 1 else "parameters"
+    text = f"action {action!r} {fault} {word} {', '.join(f'{name!r:.80}' for name in wrong[:5])}"
     if not known:
         return f"{text}: it takes none"
     from difflib import get_close_matches
 
-    near = get_close_matches(unknown[0], known, 1, 0.5)
+    near = get_close_matches(unknown[0], known, 1, 0.5) if unknown else []
     offer = f". Did you mean {near[0]!r}? It" if near else ": it"
     return f"{text}{offer} takes {', '.join(map(repr, known))}"
 

@@ -18,12 +18,16 @@ from __future__ import annotations
 
 import keyword
 import math
+import os
 import re
+import signal
+import socket
 import sys
+import threading
 import time
 import unicodedata
 from collections.abc import Callable, Collection, Generator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -38,6 +42,8 @@ PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is
 LONGEST_PERIOD_MS: Final = 60_000
 
 _ROUND_S: Final = 0.01  # of wall time
+_END_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP")
+_GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to come round
 _TRIAL_S: Final = 1.0  # of wall time in which time ought to have moved
 _RECORD_AGAIN_S: Final = 3600.0  # of wall time: old events are purged
 _MOST_CONTACTS: Final = 30
@@ -65,18 +71,26 @@ class StepPace:
     Args:
         robot: The observer's own Supervisor.
         period_ms: The step that it makes where it makes one.
+        world_waits: Whether the world waits for the observer's steps.
     """
 
-    def __init__(self, robot: Any, period_ms: int) -> None:
+    def __init__(self, robot: Any, period_ms: int, *, world_waits: bool) -> None:
         self._robot = robot
         self._period_ms = period_ms
-        self._may_pump = not robot.getSynchronization()
+        self._may_pump = not world_waits
         self._tells_time: bool | None = None
         self._time_s = float(robot.getTime())
         self._stood_since_s = time.monotonic()
 
-    def go_on(self) -> bool:
-        """One round; False where Webots wants the controller to end."""
+    def go_on(self, *, may_step: bool = True) -> bool:
+        """One round; False where Webots wants the controller to end.
+
+        Args:
+            may_step: Whether it may make a step, which a command that counts steps forbids.
+        """
+        if not may_step:
+            self._stood_since_s = time.monotonic()
+            return self._robot.step(0) != -1
         is_fast = self._robot.simulationGetMode() == self._robot.SIMULATION_MODE_FAST
         if not self._may_pump or self._tells_time is False or is_fast:
             return self._robot.step(self._period_ms) != -1
@@ -118,6 +132,16 @@ class ObserverBridge(MCPBridge):
         self._session.clock.step_s = self._session.simulation.basic_time_step_s
 
     @property
+    def world_waits(self) -> bool:
+        """Whether the world waits for the observer's steps, by its own field."""
+        return self._session.simulation.waits_for_robot
+
+    @property
+    def steps_world(self) -> bool:
+        """Whether a command counts the observer's steps, for which the world waits meanwhile."""
+        return self._session.simulation.world_is_waiting
+
+    @property
     def mode_name(self) -> str:
         """The mode in which the simulation is seen to be."""
         return self._session.simulation.mode_name
@@ -154,10 +178,66 @@ def observe(robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:
     Raises:
         CommandRefusedError: The robot has no supervisor's rights.
     """
-    observer = Observer(robot, period_ms, **options)
-    with observer.bridge, closing(observer.custom_data):
-        while observer.go_on():
-            pass
+    with EndSignals() as signals:
+        observer = Observer(robot, period_ms, **options)
+        with observer.bridge, closing(observer.custom_data):
+            while signals.received is None and observer.go_on():
+                pass
+
+
+class EndSignals:
+    """Lets SIGINT, SIGTERM and SIGHUP end the observer's loop between two rounds.
+
+    Webots' library would end the process at once, and a world that waits for the observer's steps
+    would wait on. A loop that does not come round, because it is blocked in a step, is ended after
+    `_GRACE_S`: a signal's handler runs in no other thread, but the system wakes one.
+
+    Attributes:
+        received: The signal; None as long as there was none.
+    """
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._over = threading.Event()
+        self._before: dict[int, Any] = {}
+        self._sockets = socket.socketpair()
+        self._wakes_before = -1
+
+    def __enter__(self) -> EndSignals:
+        if threading.current_thread() is threading.main_thread():
+            reader, writer = self._sockets
+            writer.setblocking(False)
+            names = (name for name in _END_SIGNALS if hasattr(signal, name))
+            for number in (getattr(signal, name) for name in names):
+                self._before[number] = signal.signal(number, self._receive)
+                if hasattr(signal, "siginterrupt"):  # Webots' library takes EINTR for an error
+                    signal.siginterrupt(number, False)
+            self._wakes_before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+            threading.Thread(target=self._watch, args=(reader,), daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        if self._before:
+            signal.set_wakeup_fd(self._wakes_before)
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+        for each in self._sockets:
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
+        if self.received is not None:
+            signal.signal(self.received, signal.SIG_DFL)
+            signal.raise_signal(self.received)
+
+    def _receive(self, number: int, _: object) -> None:
+        self.received = number
+
+    def _watch(self, reader: socket.socket) -> None:
+        with suppress(OSError):
+            while number := reader.recv(1):
+                if number[0] in self._before and not self._over.wait(_GRACE_S):
+                    os._exit(128 + number[0])
 
 
 class Observer:
@@ -177,7 +257,7 @@ class Observer:
         self.bridge.count_steps_by_time()
         self.world = ObservedWorld(robot, self._period_ms, self._warn)
         self.custom_data = self.bridge.read_custom_data()
-        self._pace = StepPace(robot, self._period_ms)
+        self._pace = StepPace(robot, self._period_ms, world_waits=self.bridge.world_waits)
         self._due_s = -math.inf
         self._mode = -1
         self._record_again_s = math.inf
@@ -185,7 +265,7 @@ class Observer:
 
     def go_on(self) -> bool:
         """One round; False where Webots wants the controller to end."""
-        if not self._pace.go_on():
+        if not self._pace.go_on(may_step=not self.bridge.steps_world):
             return False
         try:
             self._look()

@@ -172,3 +172,13 @@ def controllers_in(world: Path) -> list[str]:
     words = _WORDS.findall(world.read_text("utf-8", "replace"))
     named = (after[1:-1] for word, after in pairwise(words) if word == "controller")
     return list(dict.fromkeys(name for name in named if name))
+
+
+def names_a_supervisor(world: Path) -> bool:
+    """Whether a world file gives a robot the rights of a Supervisor.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    words = _WORDS.findall(world.read_text("utf-8", "replace"))
+    return ("supervisor", "TRUE") in pairwise(words)

@@ -6,6 +6,7 @@ import argparse
 import signal
 import sys
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
@@ -13,9 +14,11 @@ from types import FrameType
 from webots_mcp.standin import Simulation, StandInError
 from webots_mcp.standin.simulation import ConsoleRecorder
 
+_ALL_ENDED_S = 1.0  # without a controller; a reload is without one for milliseconds
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until the time is over, a supervisor quits, or Ctrl-C or SIGTERM arrives.
+    """Run until the time or the last controller ends, a supervisor quits, or Ctrl-C or SIGTERM.
 
     Returns:
         The exit status of `run_world`.
@@ -36,7 +39,7 @@ def run_world(
     Args:
         world: A .wbt file.
         mode: pause, realtime or fast.
-        duration_s: It ends after so much simulated time.
+        duration_s: It ends after so much simulated time; None: with its last controller.
         controllers: Files that control robots, by name, instead of what the world says.
         recorder: Keeps what is printed.
 
@@ -68,9 +71,17 @@ def run_world(
 
 
 def _wait(simulation: Simulation, stopped: threading.Event, duration_s: float | None) -> None:
+    led_s = time.monotonic()  # when a controller was last seen that can act
+
     def is_over() -> bool:
-        timed_out = duration_s is not None and simulation.time_s >= duration_s
-        return timed_out or stopped.is_set() or not simulation.is_running
+        nonlocal led_s
+        if stopped.is_set() or not simulation.is_running:
+            return True
+        if duration_s is not None:
+            return simulation.time_s >= duration_s
+        if simulation.can_go_on:
+            led_s = time.monotonic()
+        return time.monotonic() - led_s > _ALL_ENDED_S
 
     simulation.wait_for(is_over, timeout_s=float("inf"))
 

@@ -195,6 +195,11 @@ class Controller(Seat):
         return self.process is not None and self.process.exit_code is None
 
     @property
+    def may_act(self) -> bool:
+        """Whether it runs or is connected, or a person may still start it."""
+        return self.is_running or self.connection is not None or self._is_extern
+
+    @property
     def was_started(self) -> bool:
         """Whether there is nothing to start any more."""
         return self.process is not None or self.file is None

@@ -158,6 +158,12 @@ class Simulation(Driver):
         return self.exit_status is None
 
     @property
+    def can_go_on(self) -> bool:
+        """Whether a controller runs or may still come, or there never was one."""
+        started = [each for each in self.controllers if each.process is not None]
+        return not started or any(each.may_act for each in self.controllers)
+
+    @property
     def failure(self) -> int | None:
         """The exit status of the first controller that ended with an error by itself.
 

@@ -50,7 +50,7 @@ from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import trends
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
-from webots_mcp.signals.naming import describe_unknown, flatten, perhaps_meant
+from webots_mcp.signals.naming import flatten, misfit_of_parameters, perhaps_meant
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
 from webots_mcp.store.reading.segment import Subject
@@ -88,7 +88,7 @@ _BLOCK_SOUGHT_EVERY_S: Final = 0.25
 # while it waits: the command then expires soon after the deadline.
 _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
-_WITHDRAWN: Final = "{}; the command was withdrawn and will not run"
+_WITHDRAWN: Final = "the command was withdrawn and will not run"
 
 
 class Dispatcher:
@@ -106,6 +106,7 @@ class Dispatcher:
         params: Mapping[str, Any] | None = None,
         *,
         claiming_s: float = math.inf,
+        block_noticed_s: float = BLOCK_NOTICED_S,
     ) -> CommandAnswer:
         """Send a command, wait until it is final or the time is up, and report its outcome.
 
@@ -119,6 +120,7 @@ class Dispatcher:
             timeout_s: How long to wait for the outcome, in wall seconds.
             params: Its parameters, plain JSON.
             claiming_s: How long to wait for a controller to claim it, if less, in wall seconds.
+            block_noticed_s: After which time it is asked whether its loop is blocked.
 
         Raises:
             NotAllowedError: A rule of the project forbids it.
@@ -129,9 +131,22 @@ class Dispatcher:
         started_s = time.monotonic()
         claiming_s = min(claiming_s, timeout_s)
         sent = await self._send(robot, action, params or {}, claiming_s)
-        command = await self._outcome(sent, claiming_s, started_s + timeout_s)
+        until_s = started_s + timeout_s
+        command = await self._outcome(sent, claiming_s, block_noticed_s, until_s)
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
+
+    async def name_mode_afterwards(self, answer: CommandAnswer) -> None:
+        """Correct the mode in an answer that is given some time after its command was done."""
+
+        def correct(command_id: int) -> None:
+            with self._recording.reader() as connection:
+                command = fetch_command(connection, command_id)
+                view = look(connection, robot_name(connection, command.robot_id))
+                _name_mode_afterwards(view, command, answer)
+
+        if answer.command_id is not None:
+            await to_thread.run_sync(correct, answer.command_id)
 
     async def wait(self, command_id: int, timeout_s: float) -> CommandAnswer:
         """Continue to wait for a command that was sent before; it is not cancelled at the deadline.
@@ -159,9 +174,11 @@ class Dispatcher:
                     await to_thread.run_sync(self._leave, sent)
             raise
 
-    async def _outcome(self, command: Command, claiming_s: float, until_s: float) -> Command:
+    async def _outcome(
+        self, command: Command, claiming_s: float, block_noticed_s: float, until_s: float
+    ) -> Command:
         try:
-            command = await self._watch(command.id, claiming_s, withdraws=True)
+            command = await self._watch(command.id, claiming_s, block_noticed_s, withdraws=True)
             command = await to_thread.run_sync(self._at_the_deadline, command)
             if command.is_final:
                 return command
@@ -190,10 +207,15 @@ class Dispatcher:
             )
 
     async def _watch(
-        self, command_id: int, timeout_s: float, *, withdraws: bool = False
+        self,
+        command_id: int,
+        timeout_s: float,
+        block_noticed_s: float = BLOCK_NOTICED_S,
+        *,
+        withdraws: bool = False,
     ) -> Command:
         started_s = time.monotonic()
-        next_report_s, next_search_s = _REPORT_INTERVAL_S, BLOCK_NOTICED_S
+        next_report_s, next_search_s = _REPORT_INTERVAL_S, block_noticed_s
         with self._recording.reader() as connection:
             while not (command := fetch_command(connection, command_id)).is_final:
                 waited_s = time.monotonic() - started_s
@@ -219,6 +241,7 @@ class Dispatcher:
         if command.is_final:
             return command
         self._recording.settle()
+        withdraw_if_blocked(self._recording, command)
         return self._cancel(command.id, "no controller claimed it in time; it will not run")
 
     def _leave(self, command: Command) -> None:
@@ -263,7 +286,12 @@ def withdraw_if_blocked(recording: Recording, command: Command) -> bool:
     if block is None:
         return False
     with recording.writer() as connection:
-        return CommandQueue(connection).cancel(command.id, _WITHDRAWN.format(block.why))
+        return CommandQueue(connection).cancel(command.id, f"{block.why}; {_WITHDRAWN}")
+
+
+def is_withdrawn(answer: CommandAnswer) -> bool:
+    """Whether a command was withdrawn because its loop was known to be blocked."""
+    return (answer.error or "").endswith(_WITHDRAWN)
 
 
 def is_held_up(recording: Recording, command: Command) -> bool:
@@ -337,7 +365,8 @@ def _name_mode_afterwards(view: View, command: Command, answer: CommandAnswer) -
         answer.result = cast("dict[str, Any]", answer.result) | {"mode": mode}
     when = "now" if status == "done" else "once that has been done"
     note = f"command {later_id} ({action}) came after it: the mode is {mode} {when}"
-    answer.hint = "; ".join(filter(None, (answer.hint, note)))
+    if note not in (answer.hint or ""):
+        answer.hint = "; ".join(filter(None, (answer.hint, note)))
 
 
 def _error(command: Command) -> str | None:
@@ -756,12 +785,13 @@ def _require_action(view: View, action: str) -> None:
 
 
 def _require_parameters(view: View, action: str, params: Mapping[str, Any]) -> None:
-    """Refuse parameters that a built-in action does not take; the bridge would refuse them too."""
+    """Refuse parameters that do not fit a built-in action; the bridge would refuse them too."""
     built_in = BUILT_IN_ACTIONS.get(action)
     if built_in is None or (view.session and action in view.session.actions):
         return
-    if unknown := describe_unknown(params, built_in.parameters, action):
-        raise InvalidInputError(unknown)
+    misfit = misfit_of_parameters(params, built_in.parameters, built_in.required, action)
+    if misfit is not None:
+        raise InvalidInputError(misfit)
 
 
 def _require_live(view: View) -> Session:

@@ -44,7 +44,12 @@ from webots_mcp.simulator.orders import (
     why_not_obeyed,
 )
 from webots_mcp.simulator.starting import Start
-from webots_mcp.steering.dispatch import Dispatcher, find_target
+from webots_mcp.steering.dispatch import (
+    BLOCK_NOTICED_S,
+    Dispatcher,
+    find_target,
+    is_withdrawn,
+)
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.policy import LAUNCH
 from webots_mcp.store.recording import Recording, View, look
@@ -74,11 +79,21 @@ class Request:
     started_s: float = field(default_factory=time.monotonic, init=False)
 
     async def _sent(
-        self, robot: str | None, action: str, params: Mapping[str, Any], claiming_s: float
+        self,
+        robot: str | None,
+        action: str,
+        params: Mapping[str, Any],
+        claiming_s: float,
+        block_noticed_s: float = BLOCK_NOTICED_S,
     ) -> CommandAnswer:
         """The outcome of a command, which the controller must claim within `claiming_s`."""
         answer = await self.dispatcher.ask(
-            robot, action, self._left_s, params, claiming_s=claiming_s
+            robot,
+            action,
+            self._left_s,
+            params,
+            claiming_s=claiming_s,
+            block_noticed_s=block_noticed_s,
         )
         answer.waited_s = self._waited_s
         return answer
@@ -173,22 +188,27 @@ class Attempt(Request):
             InvalidInputError: There is no such robot, or several are possible.
             CommandRefusedError: No route works; each is named with the reason.
         """
-        situation = await self._assess()
+        situation, withdrawn = await self._assess(), None
         if situation.silent is None:
             answer = await self._by_bridge(situation, CLAIMING_S)
             if answer.outcome not in UNCLAIMED:
                 return answer
+            withdrawn = answer if is_withdrawn(answer) else None
             situation = await self._assess()
-        if situation.silent is None:
+        silent = situation.silent or (withdrawn and withdrawn.error)
+        if silent is None:
             return await self._by_bridge(situation)
-        self.failed_routes["bridge"] = situation.silent
+        self.failed_routes["bridge"] = silent
         for route in (self._by_observer, self._by_websocket, self._by_keyboard):
             answer = await route(situation)
             if answer is not None:
                 return answer
         if not situation.can_command:
             raise CommandRefusedError(_no_route(self.order, self._failed_routes()))
-        return await self._by_bridge(situation)
+        if withdrawn is not None:  # its loop was blocked a moment ago: it is not asked again
+            return self._with_failed_routes(withdrawn)
+        noticed_s = max(BLOCK_NOTICED_S - self._waited_s, 0.0)
+        return await self._by_bridge(situation, block_noticed_s=noticed_s)
 
     async def _assess(self) -> Situation:
         found = await to_thread.run_sync(assess, self.recording, self.robot, self.order)
@@ -198,17 +218,26 @@ class Attempt(Request):
         why = f"no live controller records from the Webots at port {self.port}"
         return Situation(None, False, why, named, Moment(None, None), is_there=True)
 
-    async def _by_bridge(self, situation: Situation, claiming_s: float = math.inf) -> CommandAnswer:
+    async def _by_bridge(
+        self,
+        situation: Situation,
+        claiming_s: float = math.inf,
+        block_noticed_s: float = BLOCK_NOTICED_S,
+    ) -> CommandAnswer:
         """Send a command to the controller, and wait for it as long as there is time.
 
         Args:
             situation: What is known of the robot.
             claiming_s: How long to wait for its loop to claim the command, in wall seconds.
+            block_noticed_s: After which time it is asked whether its loop is blocked.
         """
-        answer = await self._sent(self.robot, self.order, self.params, claiming_s)
+        answer = await self._sent(self.robot, self.order, self.params, claiming_s, block_noticed_s)
         if situation.robot is not None and situation.robot == situation.observer:
             return await self._done_by_observer(situation, answer)
         answer.route = "bridge" if answer.outcome == "done" else None
+        return self._with_failed_routes(answer)
+
+    def _with_failed_routes(self, answer: CommandAnswer) -> CommandAnswer:
         others = {name: why for name, why in self.failed_routes.items() if name != "bridge"}
         if answer.outcome != "done" and others:
             answer.failed_routes = others
@@ -239,6 +268,7 @@ class Attempt(Request):
         if self.order not in ("pause", "step"):
             answer.evidence = await self._shown(situation, _EVIDENCE_S)
             answer.hint = answer.hint if answer.evidence else _NOTHING_SEEN
+            await self.dispatcher.name_mode_afterwards(answer)
         return answer
 
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:

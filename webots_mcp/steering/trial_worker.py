@@ -163,8 +163,10 @@ class TrialWorker(threading.Thread):
                 return known
             view = self._borrow(connection)
             former = fetch_trial_set(connection, self.set_id).former_values or "{}"
-            asked = self._asked(json.loads(former) | trial.values)
-            request_id = permit(self._recording, ACTION, asked)
+        asked = self._asked(json.loads(former) | trial.values)
+        # Outside of a transaction: a refusal is recorded by another connection.
+        request_id = permit(self._recording, ACTION, asked)
+        with self._job.writer() as connection:
             begun = begin_trial(connection, trial) if trial.status == "waiting" else trial
             return CommandQueue(connection).enqueue(
                 view.robot.id,

@@ -162,10 +162,12 @@ def make_chunks(
     """
     _delete_left_behind(connection, pause_s)
     rows = 0
+    ended = connection.execute(_ENDED).fetchall()  # one scan, however many rounds follow
     while rows < budget_rows:
         mark = watermark(connection)
         last = connection.execute(_LAST_ID, (mark, _IDS_AT_ONCE)).fetchone()[0]
-        runs = dict.fromkeys(connection.execute(_ENDED).fetchall(), _NO_IDS)
+        runs = dict.fromkeys(ended, _NO_IDS)
+        ended = []  # from the next round on only where they have new rows
         if last is not None:
             for *run, first_id, last_id in connection.execute(_WITH_NEW_ROWS, (mark, last)):
                 runs[tuple(run)] = (first_id, last_id)

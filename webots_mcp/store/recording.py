@@ -59,7 +59,15 @@ from webots_mcp.store.journal_intake import (
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
-from webots_mcp.store.robots import Robot, Session, Status, ask_stuck, judge, stopped_for
+from webots_mcp.store.robots import (
+    Robot,
+    Session,
+    Status,
+    ask_stuck,
+    console_trouble,
+    judge,
+    stopped_for,
+)
 from webots_mcp.store.run_rows import Run, State, current_run, newest_state
 
 GETTING_STARTED: Final = (
@@ -124,9 +132,14 @@ class View:
             "sim_time_s": None if sim_time_s is None else round(sim_time_s, 4),
             "age_s": None if wall_time_s is None else self.age_s(wall_time_s),
             "status": self.status.text,
-            "why": self.status.why,
+            "why": self._why(),
             **storage(self.connection),
         }
+
+    def _why(self) -> str | None:
+        """Why time stands still; of a robot that is gone also what a later start has said."""
+        trouble = None if self.robot.live else console_trouble(self.connection)
+        return "; ".join(filter(None, (self.status.why, trouble))) or None
 
     def position_by(self) -> dict[str, Any]:
         """Who saw where the robot is, where it does not know that itself: for what tells of it."""

@@ -124,9 +124,15 @@ class Session:
         return self.host == host_name() and process_alive(*process)
 
 
+# Of the newest Webots, unless a controller has begun to record since. What a controller printed
+# comes first: its traceback ends with the reason, and Webots itself only says that it exited.
 _CONSOLE_TROUBLE: Final = (
-    "SELECT substr(message, 1, 200) FROM console_line WHERE level IN ('warning', 'error', "
-    "'critical') ORDER BY id DESC LIMIT 1"
+    "WITH trouble AS (SELECT id, instance, source, message FROM console_line WHERE level IN "
+    "('warning', 'error', 'critical') AND wall_time_s > "
+    "(SELECT coalesce(max(started_wall_time_s), 0) FROM session)) "
+    "SELECT substr(message, 1, 200) FROM trouble WHERE id IN (SELECT max(id) FROM trouble WHERE "
+    "instance = (SELECT instance FROM trouble ORDER BY id DESC LIMIT 1) GROUP BY source) "
+    "ORDER BY source = 'console' DESC, id"
 )
 _COLUMNS: Final = columns_of(Session)
 _NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
@@ -252,16 +258,17 @@ def nothing_recorded(connection: sqlite3.Connection) -> str:
 
 
 def console_trouble(connection: sqlite3.Connection) -> str | None:
-    """Return the newest warning of Webots' console that belongs to no run; None without any.
+    """Return the newest warnings of Webots' console that belong to no run; None without any.
 
-    A controller that fails before its bridge exists leaves nothing else.
+    A controller that fails before its bridge exists leaves nothing else. What was said before the
+    newest session began is left out: a controller has recorded since.
     """
-    row = connection.execute(_CONSOLE_TROUBLE).fetchone()
-    if row is None:
+    said = [repr(message) for (message,) in connection.execute(_CONSOLE_TROUBLE).fetchall()]
+    if not said:
         return None
     return (
-        f"Webots' console says {row[0]!r}: a controller may have failed before it recorded "
-        "anything. webots_get_logs shows the console"
+        f"Webots' console says {' and '.join(said)}: a controller may have failed before it "
+        "recorded anything. webots_get_logs shows the console"
     )
 
 
@@ -514,6 +521,10 @@ _SILENCES: Final = (
     "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
     f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}"
 )
+_SLOW_STEPS: Final = 3.0  # usual steps that one may last before the world counts as standing
+_USUAL_STEP: Final = (
+    "SELECT sum(step_wait_wall_s) / nullif(sum(steps), 0) FROM run WHERE session_id = ?"
+)
 PRESS_PLAY: Final = (
     "press play in Webots if it is paused there: only a person can resume it while the controller "
     "is inside step(); else check what its loop is waiting for"
@@ -591,6 +602,8 @@ def _block_in_code(
                 return None
             held_up = _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
             return Block(held_up, _FREE_IT)
+        if session.silent_s(now_s) < _SLOW_STEPS * _usual_step_s(connection, session):
+            return None
         return Block(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
     if not stacks.is_hang:
         return Block(_AWAITS_PERSON.format(stacks.place), "let it go on")
@@ -598,6 +611,12 @@ def _block_in_code(
         return None
     hang = _hang(connection, session, now_s)
     return Block(hang, _FREE_IT) if hang and _is_sure(connection, session, now_s) else None
+
+
+def _usual_step_s(connection: sqlite3.Connection, session: Session) -> float:
+    """How long the loop has waited in a step on average, in wall seconds; 0 before it is known."""
+    (usual_s,) = connection.execute(_USUAL_STEP, (session.id,)).fetchone()
+    return usual_s or 0.0
 
 
 def _is_sure(connection: sqlite3.Connection, session: Session, now_s: float) -> bool:
@@ -693,6 +712,8 @@ def _why_standing(
     connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
 ) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
+    if session.host == host_name() and is_stopped(session.pid):
+        return _STOPPED_PROCESS.format(session.pid)
     if _has_lost_simulator(session):
         return CONNECTION_LOST.format(session.pid)
     if inside := handler_at_work(connection, session, now_s):

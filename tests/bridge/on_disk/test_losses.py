@@ -27,6 +27,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
+from webots_mcp.database.waiting_file import adopt
 from webots_mcp.standin import InProcessSupervisor
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")
@@ -296,3 +297,43 @@ def test_a_controller_without_a_file_descriptor_left_ends_its_session_in_silence
     assert ended.stderr == ""
     assert filed.rows("SELECT end_reason FROM session") == ["finished"]
     assert numbers(filed) == [0]
+
+
+_LOGS_WHILE_IT_CLOSES = """
+import sys, threading
+from webots_mcp import MCPBridge
+from webots_mcp.standin import InProcessSupervisor
+
+def log(said):
+    while not over.is_set():
+        bridge.log("a line")
+        said.append(1)
+
+robot = InProcessSupervisor("rover")
+for _ in range(10):
+    bridge, over, said = MCPBridge(robot, sys.argv[1]), threading.Event(), [[] for _ in range(6)]
+    threads = [threading.Thread(target=log, args=(each,)) for each in said]
+    for thread in threads:
+        thread.start()
+    try:
+        while sum(map(len, said)) < 200:
+            pass
+        bridge.close()
+    finally:
+        over.set()
+    for thread in threads:
+        thread.join()
+    print(sum(map(len, said)), bridge.stats().rows_dropped)
+"""
+
+
+def test_threads_may_log_while_the_bridge_closes(file: Path, filed: Recording) -> None:
+    line = [sys.executable, "-c", _LOGS_WHILE_IT_CLOSES, str(file.parent)]
+    ended = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    counts = [tuple(map(int, told.split())) for told in ended.stdout.splitlines()]
+    assert len(counts) == 10
+    with closing(connect(file, "writer")) as connection:
+        adopt(connection, file)  # what the last moment has left in files
+    recorded = filed.rows("SELECT count(*) FROM log WHERE message = 'a line'")[0]
+    assert recorded == sum(said - dropped for said, dropped in counts)

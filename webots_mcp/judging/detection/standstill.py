@@ -58,6 +58,7 @@ SWAY_NOISE: Final = 3.5  # deviations in each coordinate: noise alone comes to 1
 MOSTLY: Final = 0.5
 TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
 BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
+JUDGED_AT_ONCE: Final = 500_000  # rows, between two looks at the deadline
 _HEADING_ROWS: Final = 5  # at each end, whose median is its heading
 
 
@@ -471,9 +472,25 @@ def judge_standstills(
         parts = [np.searchsorted(here, asked).tolist() for here in rows]
         there = [track.part(*part) for track, part in zip(tracks, parts, strict=True)]
         return Findings([], None if places else _nearest(there, search), unseen)
-    events = Standings(frame, motion, options, long, noise, uses).judged()
+    events = list[Judged]()
+    for batch in _batches(long):
+        if search.deadline.passed:
+            since_s = batch[0].times[0]
+            unseen.append(f"{NO_TIME}; standstills from {since_s:.3f} s on were not judged")
+            break
+        events += Standings(frame, motion, options, batch, noise, uses).judged()
     cut = ["time limit reached before it was known in which modes it moves"] if uses.is_cut else []
     return Findings(events, None, unseen, cut)
+
+
+def _batches(places: Sequence[Place]) -> Iterator[Sequence[Place]]:
+    """The standstills in order, each time so many that they have about `JUDGED_AT_ONCE` rows."""
+    start, rows = 0, 0
+    for at, place in enumerate(places):
+        rows += len(place.rows)
+        if rows >= JUDGED_AT_ONCE or at == len(places) - 1:
+            yield places[start : at + 1]
+            start, rows = at + 1, 0
 
 
 def _places(track: Track, rows: Indexes, frame: Frame, search: Search) -> Iterator[Place]:

@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -43,6 +44,7 @@ HOST: Final = LOOPBACK[0]
 MOST_TABS: Final = 20  # each reads the recording five times a second
 ORDERS: Final = ("pause", "resume", "step", "reset")
 _TAB_S: Final = 15.0  # for so long a tab counts as open after it asked
+MOST_CONNECTIONS: Final = 160  # a browser has at most 6 for each of the tabs
 _IDLE_S: Final = 60.0  # for the next request of a connection, and to write an answer
 _REQUEST_S: Final = 10.0  # from the first byte of a request to its last
 _MOST_BYTES: Final = 100_000  # of a request
@@ -90,6 +92,8 @@ class PageServer(ThreadingHTTPServer):
         self.chunk_maker = ChunkMaker(recording)
         self._tabs: dict[str, float] = {}  # when each has asked last, on the monotonic clock
         self._said: set[str] = set()
+        self._waiting: dict[socket.socket, float] = {}  # since when each has asked for nothing
+        self._open = 0
         self._lock = threading.Lock()
 
     @property
@@ -106,6 +110,40 @@ class PageServer(ThreadingHTTPServer):
         finally:
             self.chunk_maker.stop()
             self.server_close()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread of its own; above the limit, the idlest one is closed."""
+        with self._lock:
+            self._open += 1
+            idlest = min(self._waiting, key=self._waiting.__getitem__, default=None)
+            if self._open <= MOST_CONNECTIONS or idlest is None:
+                idlest = None
+            else:
+                del self._waiting[idlest]
+            is_refused = self._open > MOST_CONNECTIONS and idlest is None
+            self._waiting[request] = time.monotonic()
+        if is_refused:  # all are being answered
+            self.shutdown_request(request)
+            return
+        if idlest is not None:
+            with suppress(OSError):  # it was closed meanwhile
+                idlest.shutdown(socket.SHUT_RDWR)  # its thread ends
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._lock:
+            self._open -= 1
+            self._waiting.pop(request, None)
+        super().shutdown_request(request)
+
+    def waits(self, connection: socket.socket, *, is_idle: bool) -> None:
+        """A connection waits for a request from now on, or is being answered."""
+        with self._lock:
+            if is_idle:
+                self._waiting[connection] = time.monotonic()
+            else:
+                self._waiting.pop(connection, None)
 
     def has_room_for(self, tab: str) -> bool:
         """Whether a tab is one of those that are open, or may be opened."""
@@ -203,6 +241,7 @@ class _Request(BaseHTTPRequestHandler):
 
     def handle_one_request(self) -> None:
         """Wait for a request; once it has begun, all of it has to come soon."""
+        self._page.waits(self.connection, is_idle=True)
         self._reading.begin()
         super().handle_one_request()
 
@@ -210,6 +249,7 @@ class _Request(BaseHTTPRequestHandler):
         """Read the headers; what has a body of no certain length is refused."""
         if not super().parse_request():
             return False
+        self._page.waits(self.connection, is_idle=False)
         self.connection.settimeout(self.timeout)  # again, to write the answer
         lengths = self.headers.get_all("Content-Length") or ["0"]
         is_sure = len(lengths) == 1 and lengths[0].isascii() and lengths[0].isdecimal()

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.contract import WORLD_ENDING, WORLD_FOLDER
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.setup.doctor import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
@@ -20,6 +21,7 @@ from webots_mcp.simulator.project import (
     ProjectController,
     controllers_of,
     has_observer,
+    names_a_supervisor,
     offer_observer,
     writes_states,
 )
@@ -27,15 +29,20 @@ from webots_mcp.store.recording import View
 from webots_mcp.store.robots import live_observer
 from webots_mcp.store.signals import registered
 
-_NO_PROJECT: Final = "this is no Webots project, whose controllers could be examined"
-_NONE: Final = "the project has no controllers that Webots would start"
+_NO_PROJECT: Final = (
+    "this folder is in no Webots project: run 'webots-mcp doctor' in the folder of one"
+)
+_NONE: Final = (
+    "the project has no controllers that Webots would start; the code of extern ones lies elsewhere"
+)
 
 
-@check("Controllers", well=_NO_PROJECT)
+@check("Controllers")
 def controllers(subject: Examined) -> Iterator[Diagnosis]:
     """Which record, which lack the two lines, and whose Python lacks the package."""
     project = find_project(subject.project)
     if project is None:
+        yield unclear(_NO_PROJECT)
         return
     findings = list(_of_each(subject, project)) or [ok(_NONE)]
     seen = "; ".join(each.seen for each in findings)  # those that record are named as well
@@ -100,12 +107,27 @@ def supervisor(subject: Examined) -> Iterator[Diagnosis]:
         if view.session is not None and view.session.has_bridge and not view.session.supervisor:
             yield _of_robot(view)
     project = find_project(subject.project)
-    if recording or project is None:
+    if recording:
         return
-    for each in [] if has_observer(project) else controllers_of(project):
+    if project is None:
+        yield unclear(_NO_PROJECT)
+    elif not has_observer(project):
+        yield from _of_project(project)
+
+
+def _of_project(project: Path) -> Iterator[Diagnosis]:
+    """Which of its robots lack a supervisor's rights, by its code, else by its worlds."""
+    known = controllers_of(project)
+    for each in known:
         if each.is_python and is_plain_robot(each.file):
             seen = f"the robot of {each.name} {NO_SUPERVISOR}. {NO_POSITION_OF_ITS_OWN}"
             yield warning(seen, offer_observer(project))
+    for world in [] if known else sorted((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}")):
+        if not names_a_supervisor(world):
+            seen = f"no Robot of {world.relative_to(project)} has 'supervisor TRUE': each"
+            yield warning(
+                f"{seen} {NO_SUPERVISOR}. {NO_POSITION_OF_ITS_OWN}", offer_observer(project, world)
+            )
 
 
 def _of_robot(view: View) -> Diagnosis:

@@ -441,7 +441,7 @@ def _observed_pose(
     if found is None:
         return {}
     around = Segment(found.run_id, segment.start_s - MARGIN_S, segment.end_s + MARGIN_S)
-    return poses_of(found.key, read_frame(connection, around, deadline))
+    return poses_of(found.key, read_frame(connection, around, deadline).usable)
 
 
 def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> float | None:

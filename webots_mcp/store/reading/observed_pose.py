@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, median, np
 from webots_mcp.contract import OBSERVER, WORLD_EVENT
@@ -19,9 +19,6 @@ from webots_mcp.signals.naming import OBSERVED, WORLD, find_position
 from webots_mcp.signals.register import kind_of, unit_of
 from webots_mcp.store.chunks import IS_ABSENT, IS_NUMBER, Decoded, StateColumns, signals_in
 from webots_mcp.store.signals import Signal, registered, seen_with, with_roles
-
-if TYPE_CHECKING:
-    from webots_mcp.store.reading.frame import Frame
 
 Derived = Mapping[str, Callable[[Array], Decoded]]
 """Signals that no row of a run holds, by name: their values at some simulation times."""
@@ -134,12 +131,17 @@ def _name_of(part: str) -> str:
     return f"{OBSERVED}.{part}"
 
 
-def poses_of(key: str, frame: Frame) -> Derived:
-    """Return the pose of a robot at any time, by the rows in which an observer saw it."""
+def poses_of(key: str, usable: Callable[[str], tuple[Array, Array]]) -> Derived:
+    """Return the pose of a robot at any time, by the rows in which an observer saw it.
+
+    Args:
+        key: The robot's word in the observer's signals.
+        usable: Times and values of a signal of the observer, as `Frame.usable` gives them.
+    """
 
     def of(part: str) -> Callable[[Array], Decoded]:
         name = f"{WORLD}.{key}.{part}"
-        return lambda times: _decoded(_between(*frame.usable(name), times, turns=part == _HEADING))
+        return lambda times: _decoded(_between(*usable(name), times, turns=part == _HEADING))
 
     return {_name_of(part): of(part) for part in _PARTS}
 

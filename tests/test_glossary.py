@@ -31,9 +31,9 @@ def test_words_without_a_technical_meaning_are_in_no_plain_package() -> None:
     any_word = "|".join(re.findall(r"`(\w+)`", words))
     retired = re.compile(rf"\b({any_word})\b", re.IGNORECASE)
     assert retired.search("The journal is told.")
-    for package in re.findall(r"`(\w+)`", packages):
-        place = _ROOT / "webots_mcp" / package
-        modules = list(place.rglob("*.py")) or [place.with_suffix(".py")]
+    for package in re.findall(r"`([\w/]+)`", packages):
+        modules = list((_ROOT / "webots_mcp" / package).rglob("*.py"))
+        assert modules, package
         for module in modules:
             assert not retired.findall(module.read_text("utf-8")), module
 

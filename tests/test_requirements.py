@@ -24,9 +24,9 @@ ASK = "from webots_mcp.extras.requirements import checkout; print(checkout())"
 
 def installed_from(folder: Path, origin: dict[str, object]) -> str:
     """What a package says that pip put into a folder, and noted where it was from."""
-    (folder / "webots_mcp").mkdir(parents=True)
-    for name in ("__init__.py", "requirements.py"):
-        text = (PACKAGE / name).read_text("utf-8") if name != "__init__.py" else ""
+    (folder / "webots_mcp" / "extras").mkdir(parents=True)
+    for name in ("__init__.py", "extras/__init__.py", "extras/requirements.py"):
+        text = (PACKAGE / name).read_text("utf-8") if name.endswith("requirements.py") else ""
         (folder / "webots_mcp" / name).write_text(text, "utf-8")
     about = folder / "webots_mcp-1.dist-info"
     about.mkdir()

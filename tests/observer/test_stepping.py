@@ -94,7 +94,7 @@ def test_a_breakpoint_ends_the_steps_at_the_state_that_it_holds_in(
     at_s = recording.rows("SELECT max(sim_time_s) FROM state")[0]
     with closing(connect(watching.database, "writer")) as connection:
         condition = parse_condition("world.ROVER.x_m > -100")
-        set_breakpoint(connection, 1, condition, "pause", 1, "test")
+        set_breakpoint(connection, 1, condition.text, "pause", 1, "test")
     recording.send("arm_breakpoints", time_to_live_s=600)
     command_id = recording.send("step", steps=100_000, time_to_live_s=600)
     with resumed_once(recording, command_id):

@@ -126,7 +126,7 @@ def test_an_error_that_the_package_does_not_explain_keeps_its_frames(
         """
     )
     said = pytester.runpytest_subprocess("-p", "no:cacheprovider").stdout.str()
-    assert "testing.py:" in said
+    assert "recording.py:" in said
 
 
 def test_a_marker_that_no_parameter_takes_fails_its_test(pytester: pytest.Pytester) -> None:
@@ -257,7 +257,7 @@ def test_a_run_that_does_not_use_the_plugin_does_not_pay_for_it(pytester: pytest
         def test_nothing_is_loaded(pytestconfig):
             assert pytestconfig.pluginmanager.has_plugin("webots_mcp")
             loaded = [name for name in sys.modules if name.startswith("webots_mcp.")]
-            assert loaded == ["webots_mcp.testing.pytest_plugin"]
+            assert loaded == ["webots_mcp.testing", "webots_mcp.testing.pytest_plugin"]
             assert "sqlite3" not in sys.modules
             assert "WEBOTS_MCP_STRICT" not in os.environ
             assert not any("standin" in folder for folder in sys.path)

@@ -31,7 +31,7 @@ _THREAD: Final = re.compile(
 _CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
 _FOLDERS: Final = re.compile(r".*[/\\]")
 # Folders whose files are no controller's own: this package's, and Python's.
-LIBRARIES: Final = (f"{Path(__file__).parent}{os.sep}", f"{Path(os.__file__).parent}{os.sep}")
+LIBRARIES: Final = (f"{Path(__file__).parents[1]}{os.sep}", f"{Path(os.__file__).parent}{os.sep}")
 INSTALLED: Final = re.compile(
     r"[/\\](?:site|dist)-packages[/\\]|[/\\]lib[/\\]controller[/\\]python[/\\]|^<frozen "
 )

@@ -64,7 +64,7 @@ def checkout() -> str:
 
     The word CHECKOUT, for a person to replace, where that is not known or not there any more.
     """
-    above = Path(__file__).parents[1]
+    above = Path(__file__).parents[2]
     if (above / "pyproject.toml").is_file():
         return str(above)
     try:

@@ -1,4 +1,8 @@
-"""Pictures of a recording: signals over time, the way of a robot, and trials; PNG or SVG."""
+"""Pictures of a recording: signals over time, the path of a robot, and trials; PNG or SVG.
+
+Questions, the command line, page and report draw with these modules. They read through `store` and
+`judging`, and know nothing of answers or tools.
+"""
 
 from __future__ import annotations
 

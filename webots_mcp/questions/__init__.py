@@ -1,4 +1,8 @@
-"""The questions that can be asked of a recording, and of the simulation behind it."""
+"""The questions that can be asked of a recording, and of the simulation behind it.
+
+Each is one declaration: its arguments, the function that answers, and its answer. The server
+publishes them as tools and the command line as commands; nothing else imports them.
+"""
 
 from __future__ import annotations
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording, write_lock
 from webots_mcp import MCPBridge
-from webots_mcp.signals.register import ADDED_AT_ONCE, MAX_SIGNALS
+from webots_mcp.signals.register import ADDED_AT_ONCE, MAX_SIGNALS, Seen, SignalNames, places
 from webots_mcp.standin import InProcessSupervisor
 
 MOTION = "SELECT x_m, y_m, yaw_rad, mode, speed, commanded_speed FROM robot_now"
@@ -69,6 +72,38 @@ def test_many_names_are_entered_some_with_each_row_and_never_too_many(
     for _ in range(1500 // ADDED_AT_ONCE):
         bridge.publish(second)
     assert recording.rows(count) == [MAX_SIGNALS]
+
+
+def test_names_beyond_the_limit_cost_no_search_for_their_places() -> None:
+    state = {f"name{n}": n for n in range(20 * MAX_SIGNALS)}
+    text, names, calls = json.dumps(state), SignalNames(), 0
+
+    def count(_frame: FrameType, event: str, _value: object) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    before = sys.getprofile()
+    sys.setprofile(count)
+    try:
+        names.look(state, text, lambda _: True)
+    finally:
+        sys.setprofile(before)
+    assert MAX_SIGNALS < calls < len(state)
+
+
+def test_names_stand_where_the_last_value_of_that_name_does() -> None:
+    state: dict[str, Any] = {
+        "a": {"b": 1, "c.d": [1, 2], "": 3}, "a.b": 2, "a.c": {"d": {"0": 4}}, ".": 5, "": {"": 6},
+        "long": [0.5] * 40, "long.mean": 7, "lo": 8, "e.f": {"g": {"h.i": None}},
+    }  # fmt: skip
+    entered = dict[str, Seen]()
+
+    def enter(some: dict[str, Seen]) -> bool:
+        entered.update(some)
+        return True
+
+    SignalNames().look(state, json.dumps(state), enter)
+    assert {name: each[:2] for name, each in entered.items()} == places(state)
 
 
 def test_names_wait_while_another_process_writes(robot: InProcessSupervisor, file: Path) -> None:

@@ -89,14 +89,20 @@ def test_every_command_that_reads_reads_it_and_says_how(artifact: Path, tmp_path
     assert (tmp_path / "x.csv").read_text().count("\n") == 51
 
 
-def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) -> None:
+async def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) -> None:
+    """Rows of a bridge that was killed, and the journal of a controller in C."""
     assert isinstance(recorded.database, Path)
     recorded.close()
     waiting_path(recorded.database, new_uuid()).touch()
+    journal = waiting_path(recorded.database, new_uuid())
+    journal.with_name(f"{journal.stem}-0001{journal.suffix}").touch()
     with unprivileged.unwritable(recorded.database.parent):
         ended = run("-m", "webots_mcp", "runs", "--database", str(recorded.database))
+        async with Client(serve(recorded.database, "--read-only")) as client:
+            answer = await ask(client, "webots_get_robot_state")
     assert ended.returncode == 0
-    assert "without the rows in 1 waiting files" in ended.stdout
+    for said in (ended.stdout, answer["storage"]):
+        assert "without the rows in 2 waiting files" in said
 
 
 async def test_a_read_only_server_answers_from_it_and_says_how(artifact: Path) -> None:

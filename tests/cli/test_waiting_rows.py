@@ -63,3 +63,18 @@ def test_an_export_of_a_locked_database_says_how_many_rows_it_lacks(
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "loses no rows" in line]
         assert "warn" in line and "3 rows of controllers that have ended wait" in line
     assert len((folder / "a.jsonl").read_text().splitlines()) == 1
+
+
+def test_an_answer_whose_time_is_up_before_all_rows_are_in_says_how_many_wait(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webots_mcp.store.recording.BUDGET_S", 0.0)
+    assert main(["runs", "--data-dir", str(folder)]) == 0
+    assert "3 rows of controllers that have ended wait" in "".join(capsys.readouterr())
+    monkeypatch.undo()
+    assert main(["runs", "--data-dir", str(folder)]) == 0
+    assert "are not in this answer" not in "".join(capsys.readouterr())
+    assert [*folder.glob("*waiting*")] == []
+    with closing(sqlite3.connect(folder / "webots.db")) as connection:
+        counts = "SELECT row_count, (SELECT count(*) FROM state) FROM run"
+        assert connection.execute(counts).fetchall() == [(4, 4)]

@@ -121,6 +121,22 @@ def test_a_reader_that_may_not_write_says_what_waits(tmp_path: Path) -> None:
             assert len(rows(tmp_path, "state")) == 2
 
 
+def test_an_answer_whose_time_is_up_names_the_journal_of_which_rows_are_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header, run, state, *_ = (FILES[0].parent / "cut_line.jsonl").read_text().splitlines()
+    states = [state.replace("[2,", f"[{number},", 1) for number in range(2, 302)]
+    part(tmp_path).write_text("\n".join([header, run, *states, ""]))
+    monkeypatch.setattr("webots_mcp.store.recording.BUDGET_S", 0.0)
+    with Recording(tmp_path / "webots.db", tmp_path).view() as view:
+        assert f"newer rows of {part(tmp_path).name}" in view.header()["storage"]
+        assert 0 < len(rows(tmp_path, "state")) < 300
+    monkeypatch.undo()
+    with Recording(tmp_path / "webots.db", tmp_path).view() as view:
+        assert "storage" not in view.header()
+    assert len(rows(tmp_path, "state")) == 300
+
+
 def test_what_there_is_no_time_for_waits_also_where_there_are_many_journals(
     tmp_path: Path,
 ) -> None:

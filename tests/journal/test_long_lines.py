@@ -8,7 +8,8 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from contextlib import closing
+import threading
+from contextlib import closing, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import pytest
 from tests.journal.test_conformance import part
 from tests.journal.test_unfit_values import HEADER, RUN, RUN_VALUES
 from tests.waiting import wait_for
+from webots_mcp.errors import DatabaseError
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.recording import Recording
 
@@ -67,6 +69,49 @@ def peak_memory_bytes(process: subprocess.Popen[Any]) -> int:
         return 0
     found = re.search(r"^VmHWM:\s+(\d+) kB$", status, re.MULTILINE)
     return int(found[1]) * 1024 if found else 0
+
+
+def test_an_intake_waits_for_that_of_another_thread_no_longer_than_its_budget(
+    folder: Path,
+) -> None:
+    recording = Recording(folder / "webots.db", folder)
+    recording.create()
+    taken_in: list[int] = []
+
+    def take_in_all() -> None:
+        with suppress(DatabaseError), recording.writer() as connection:
+            connection.set_progress_handler(ending.is_set, 100)
+            take_in_journals(connection, folder / "webots.db")
+
+    ending = threading.Event()
+    other = threading.Thread(target=take_in_all)
+    other.start()
+    try:
+        wait_for(lambda: states(folder) > 0)
+        with recording.writer() as connection:
+            take_in_journals(connection, folder / "webots.db", budget_s=0.0)
+        taken_in.append(states(folder))
+    finally:
+        ending.set()
+        other.join()
+    assert 0 < taken_in[0] < LINES
+
+
+def test_a_server_looks_after_the_database_while_it_takes_in_a_long_journal(folder: Path) -> None:
+    Recording(folder / "webots.db", folder).create()
+    lease = "SELECT until_wall_time_s FROM lease WHERE name = 'maintainer'"
+    arguments = [sys.executable, "-m", "webots_mcp", "serve", "--data-dir", str(folder)]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}
+    with subprocess.Popen(arguments, stderr=subprocess.DEVNULL, **pipes) as process:
+        try:
+            wait_for(lambda: states(folder) > 0)
+            with closing(sqlite3.connect(folder / "webots.db")) as connection:
+                before = connection.execute(lease).fetchall()
+                wait_for(lambda: connection.execute(lease).fetchall() != before)
+            taken_in = states(folder)
+        finally:
+            process.kill()
+    assert 0 < taken_in < LINES
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")

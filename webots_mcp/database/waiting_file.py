@@ -658,9 +658,9 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO, until_s: float) 
         unfit += taken.unfit
         if time.monotonic() > until_s:
             return count, False
-    if count:
-        for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
-            connection.execute(_SET_ROWS, counted)
+    # Also where all entries were in: who wrote them may have ended before it came to this.
+    for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
+        connection.execute(_SET_ROWS, counted)
     if unfit:
         warn(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
     return count, True

@@ -64,7 +64,7 @@ from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
-from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, take_in_journals
 from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.recording import OpenReaders, Recording
@@ -162,7 +162,7 @@ def _lifespan(
             ask(connection, unasked)
             unasked.clear()
         if isinstance(recording.database, Path):
-            take_in_journals(connection, recording.database)
+            take_in_journals(connection, recording.database, MAINTAINER_BUDGET_S)
         project.look(connection)
         reap_if_dead(connection)
         make_chunks(connection, pause_s=_PAUSE_S)

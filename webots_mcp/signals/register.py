@@ -483,16 +483,22 @@ class SignalNames:
 
     def _take(self, text: str) -> None:
         state = cast("dict[str, Any]", json.loads(text))
-        found, now_s = places(state), time.time()
-        for name, value in flatten(state).items():
-            if name not in self._known and len(self._known) >= MAX_SIGNALS:
+        values, now_s = flatten(state), time.time()
+        told = dict[str, tuple[Kind, bool]]()
+        room = MAX_SIGNALS - len(self._known)
+        for name, value in values.items():
+            is_new = name not in self._known
+            if is_new and room <= 0:
                 continue
             kind, is_whole = before = self._known.get(name, ("null", True))
-            kind = widen(kind, kind_of(name, value, ends_pose=ends_pose(name, found)))
+            kind = widen(kind, kind_of(name, value, ends_pose=ends_pose(name, values)))
             is_whole = is_whole and (value is None or type(value) is int)
-            if name not in self._known or (kind, is_whole) != before:
-                self._known[name] = kind, is_whole
-                self._waiting[name] = Seen(*found[name], kind, is_whole, now_s)
+            if is_new or (kind, is_whole) != before:
+                room -= is_new
+                told[name] = kind, is_whole
+        found = places(_part_with(told, state))
+        self._waiting |= {name: Seen(*found[name], *each, now_s) for name, each in told.items()}
+        self._known |= told
 
     def _enter(self, enter: Callable[[dict[str, Seen]], bool]) -> None:
         some = dict(islice(self._waiting.items(), ADDED_AT_ONCE))
@@ -506,6 +512,13 @@ class SignalNames:
         self._known.clear()
         self._waiting.clear()
         return ()
+
+
+def _part_with(names: Iterable[str], state: dict[str, Any]) -> dict[str, Any]:
+    """Of a state the items that have leaves of these names: few, where it is very long."""
+    parts = (name.split(".") for name in names)
+    keys = {".".join(each[:n]) for each in parts for n in range(1, len(each) + 1)}
+    return {key: value for key, value in state.items() if key in keys}
 
 
 MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode

@@ -14,6 +14,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -21,6 +22,7 @@ from webots_mcp.database.connection import FAILURES, LONGEST_WRITE_S, FrozenConn
 from webots_mcp.database.liveness import holder_of
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import DatabaseError, warn
+from webots_mcp.signals.register import MAX_SIGNALS
 from webots_mcp.store.chunks import (
     ABSENT,
     EXACT_INTEGERS,
@@ -350,9 +352,13 @@ def _signals_of(
 ) -> dict[str, Signal]:
     """The robot's signals by name; what some rows tell of them is entered."""
     known = registered(connection, robot_id)
+    room = max(0, MAX_SIGNALS - len(known))
     fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
-    if fresh:
-        known = enter_signals(connection, robot_id, seen_in(columns, fresh))
+    # A state may have many times more names than there is room for.
+    entered = [name for name in fresh if name in known]
+    entered += islice((name for name in fresh if name not in known), room)
+    if entered:
+        known = enter_signals(connection, robot_id, seen_in(columns, entered))
     return known
 
 

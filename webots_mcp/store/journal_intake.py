@@ -26,8 +26,8 @@ import sqlite3
 import stat
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from hashlib import sha256
@@ -50,6 +50,7 @@ from webots_mcp.signals import register as signal_register
 from webots_mcp.signals.naming import flatten
 
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
+MAINTAINER_BUDGET_S: Final = 1.0  # in each of its rounds, so that its lease does not run out
 LONGEST_LINE_BYTES: Final = 4_000_000
 _BATCH_BYTES: Final = 1_000_000  # of lines that are in memory at once; one line may be longer
 _DEEPEST: Final = 100  # levels of a state: SQLite reads 1,000, Python's calls end before
@@ -229,13 +230,15 @@ def take_in_journals(
     Args:
         connection: A writer in autocommit mode and in no transaction.
         database: Its file.
-        budget_s: Of wall time.
+        budget_s: Of wall time, also of waiting for another thread that takes them in.
 
     Raises:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.
     """
     until_s = time.monotonic() + budget_s
-    with _lock:
+    with _turn(budget_s) as is_ours:
+        if not is_ours:
+            return
         journals = journal_parts(database)
         for path in _places.keys() - {path for parts in journals.values() for path in parts}:
             if path.parent == database.parent:
@@ -247,6 +250,18 @@ def take_in_journals(
             all(_take_in_part(connection, database, uuid, path, until_s) for path in parts)
             if time.monotonic() > until_s:
                 return
+
+
+@contextmanager
+def _turn(budget_s: float) -> Generator[bool]:
+    """Whether no other thread takes journals in, or ends with it in that time."""
+    timeout_s = -1 if budget_s == math.inf else min(max(budget_s, 0.0), threading.TIMEOUT_MAX)
+    is_ours = _lock.acquire(timeout=timeout_s)
+    try:
+        yield is_ours
+    finally:
+        if is_ours:
+            _lock.release()
 
 
 def _take_in_part(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import random
 import sqlite3
+import sys
 from contextlib import closing
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.signals.register import MAX_SIGNALS
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import GROUP_ROWS, chunk_whole_run, make_chunks
 from webots_mcp.store.reading.frame import Frame, read_frame
@@ -340,6 +343,29 @@ def test_the_chunks_of_a_run_cost_the_same_however_many_rows_others_have(
     recorder.end_run("reset")
     assert make_chunks(empty, 100_000).done
     assert steps_of_a_new_run() < 1.5 * among_few
+
+
+def test_names_beyond_the_limit_are_not_looked_at(empty: sqlite3.Connection) -> None:
+    recorder, calls = start_run(empty), 0
+    state = {f"name{n}": n for n in range(20 * MAX_SIGNALS)}
+    recorder.publish(0.1, {"name7": None, "mode": "go"})
+    recorder.publish(0.2, state)
+    recorder.end_run("finished")
+
+    def count(_frame: FrameType, event: str, _value: object) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    before = sys.getprofile()
+    sys.setprofile(count)
+    try:
+        assert make_chunks(empty).done
+    finally:
+        sys.setprofile(before)
+    names = [name for (name,) in empty.execute("SELECT name FROM signal")]
+    assert len(names) == MAX_SIGNALS
+    assert {"mode", *list(state)[: MAX_SIGNALS - 1]} == set(names)
+    assert calls < 20 * len(state)  # to read them, and for names that there is room for
 
 
 def test_many_new_runs_are_each_looked_at_once(empty: sqlite3.Connection) -> None:

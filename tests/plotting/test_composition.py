@@ -33,6 +33,7 @@ from webots_mcp.plotting.curves import (
     headings,
     thinned,
 )
+from webots_mcp.plotting.intervals import Interval, at_resolution
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.store.chunk_making import chunk_whole_run
@@ -339,3 +340,21 @@ def test_events_beyond_those_that_are_drawn_are_counted(record: Record) -> None:
     )
     _, notes = compose_signals(connection, [whole(connection)], ["n"])
     assert "10 events of kind log up to 0.090 s are not drawn" in notes
+
+
+def test_of_many_short_intervals_the_longest_in_a_pixel_stands_for_it() -> None:
+    flips = [Interval("on" if n % 2 else "off", n * 0.1, n * 0.1 + 0.1) for n in range(10_000)]
+    rare = Interval("rare", 500.0, 500.01)
+    long = Interval("long", 1000.0, 1500.0)
+    shown = at_resolution([*flips, rare, long], 2.0)
+    assert long in shown
+    assert len(shown) <= 501
+    assert {each.value for each in shown} <= {"on", "off", "long"}
+    drawn = sorted((each.start_s, each.end_s) for each in shown)
+    assert drawn[0][0] == 0.0
+    assert all(before[1] == after[0] for before, after in pairwise(drawn))
+
+
+def test_intervals_that_a_picture_can_show_stay_as_they_are() -> None:
+    intervals = [Interval("a", 0.0, 5.0), Interval("b", 5.0, 9.0)]
+    assert at_resolution(intervals, 1.0) == intervals

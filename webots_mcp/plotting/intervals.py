@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -62,6 +63,29 @@ def lane_of(columns: ChangeColumns, run: RunHistory, end_s: float) -> Lane:
     present = {interval.value for interval in intervals}
     shown = [value for value in dict.fromkeys([*known, OTHER_VALUES]) if value in present]
     return Lane(columns.name, intervals, shown, values[len(known) :])
+
+
+def at_resolution(intervals: Sequence[Interval], step_s: float) -> Sequence[Interval]:
+    """The intervals as a picture with one pixel per `step_s` can show them.
+
+    Of those that are shorter than a step and begin in the same one, the value that lasts longest
+    there stands for the whole step.
+    """
+    wide = [each for each in intervals if each.end_s - each.start_s >= step_s]
+    lasting: dict[int, dict[str, float]] = {}
+    for each in intervals:
+        if (lasts_s := each.end_s - each.start_s) < step_s:
+            values = lasting.setdefault(math.floor(each.start_s / step_s), {})
+            values[each.value] = values.get(each.value, 0.0) + lasts_s
+    narrow = list[Interval]()
+    for step, values in sorted(lasting.items()):
+        value = max(values, key=values.__getitem__)
+        start_s, end_s = step * step_s, (step + 1) * step_s
+        if narrow and narrow[-1].value == value and narrow[-1].end_s == start_s:
+            narrow[-1] = replace(narrow[-1], end_s=end_s)
+        else:
+            narrow.append(Interval(value, start_s, end_s))
+    return [*narrow, *wide]
 
 
 def merged_notes(lanes: Sequence[Lane]) -> list[str]:

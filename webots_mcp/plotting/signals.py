@@ -35,7 +35,7 @@ from webots_mcp.plotting.canvas import (
     wrapped,
 )
 from webots_mcp.plotting.curves import Curve, Panel, by_choice, by_scale, by_signal, curve_of
-from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
+from webots_mcp.plotting.intervals import Interval, Lane, at_resolution, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     LINE_PX,
     Entry,
@@ -457,7 +457,7 @@ class _Painter:
     def _ground(self, frame: Frame) -> None:
         """Modes and gaps, over the whole height behind the curves."""
         bands = self._plot.bands
-        for each in bands.intervals if bands else ():
+        for each in _shown(bands.intervals, frame) if bands else ():
             box = (*self._stretch(frame, each), frame.height)
             paint_area(self._canvas, self._styles[each.value], box, _BAND_OPACITY)
         self._hatch(frame)
@@ -484,7 +484,7 @@ class _Painter:
         self._open(frame)
         for row, lane in enumerate(plot.rows):
             top = frame.top + (row + 0.1) * row_px
-            for each in lane.intervals:
+            for each in _shown(lane.intervals, frame):
                 left, _, width = self._stretch(frame, each)
                 box = (left, top, width, 0.8 * row_px)
                 if row < len(plot.lanes):
@@ -563,6 +563,14 @@ def _named(curve: Curve, panel: Panel) -> str:
 def line_through(x: Any, y: Any) -> str:
     """The path through places in pixels."""
     return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+
+
+def _shown(intervals: Sequence[Interval], frame: Frame) -> Sequence[Interval]:
+    """The intervals that are drawn: one for each pixel where there are many more than pixels."""
+    if len(intervals) <= 2 * frame.width:
+        return intervals
+    low, high = frame.x
+    return at_resolution(intervals, (high - low) / frame.width)
 
 
 def _has_room(frame: Frame, interval: Interval) -> bool:

@@ -381,7 +381,10 @@ class _Painter:
         spots: list[tuple[Place, str]] = []
         for piece in path.pieces():
             part = Path(piece, None, frozenset())
+            begin_s, end_s = piece[0].time_s, piece[-1].time_s
             for interval in modes.intervals:
+                if interval.end_s < begin_s or end_s < interval.start_s:
+                    continue
                 held = part.between(interval.start_s, interval.end_s)
                 stretches[interval.value].append(held)
                 if len(held) > 1 and extent(held) < spot:

@@ -50,6 +50,38 @@ _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
 
 _PACKAGE: Final = Path(__file__).parent
 C_HEADER: Final = _PACKAGE / "webots_mcp.h"  # by which controllers in C and C++ record
+OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers
+CUSTOM_DATA: Final = "customData"  # the kind of a robot that the observer records from this field
+OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
+WORLD_EVENT: Final = "world"  # the event with the robots and solids that an observer sees
+MODE_EVENT: Final = "mode"  # the event with the simulation mode that an observer sees
+LOOK_AT: Final = "look_at"  # its action
+MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
+KEEP_LAST_S: Final = 5.0  # before a moment, kept at full rate
+HANG_AFTER_S: Final = 3.0  # of wall time without a sign of life of the loop
+KEEP_AFTER_S: Final = 2.0  # after it
+LOOPING: Final = ("step", "run")  # actions that let the loop come round; one is under way at most
+ENDING: Final = ("load_world", "quit")  # actions that are done when the controller ends
+SEE_STEPS: Final = (
+    "call bridge.publish({...}) and bridge.get_command() in every round of the loop, or "
+    "MCPBridge.attach(robot) before anything takes or replaces robot.step"
+)
+UNSEEN: Final = f"the controller's loop steps in a way that the bridge does not see: {SEE_STEPS}"
+UNMOVED: Final = (
+    "the bridge has not seen simulation time advance since it began: the simulation is paused in "
+    "Webots, the controller has not reached its loop, or its loop steps in a way that the bridge "
+    f"does not see; then {SEE_STEPS}"
+)
+ENDED_BY: Final = "the controller ended by"  # an exception, as it is logged
+MAX_RUN_S: Final = 1e6  # of simulation time, of one `run` command
+COMMAND_TIME_TO_LIVE_S: Final = 10.0
+HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive
+HEARTBEAT_LATE_S: Final = 2.0  # a session silent for longer is not looping
+REMOTE_SILENCE_S: Final = 10.0  # one on another host, whose process cannot be asked, is dead then
+ISSUED_TIME_TO_LIVE_S: Final = 60.0  # how long a reload may take until it counts as lost
+MAX_STEPS: Final = 100_000
+MOST_NAME_CHARACTERS: Final = 200  # of a robot
+BY_PROCESS: Final = " process "  # in an instance that names no simulator
 
 
 class BuiltInAction(NamedTuple):
@@ -97,21 +129,9 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "remove_node": BuiltInAction(("path",), ("path",)),
 }
 
-OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers
-CUSTOM_DATA: Final = "customData"  # the kind of a robot that the observer records from this field
-OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
-WORLD_EVENT: Final = "world"  # the event with the robots and solids that an observer sees
-MODE_EVENT: Final = "mode"  # the event with the simulation mode that an observer sees
-LOOK_AT: Final = "look_at"  # its action
 
 BreakpointAction = Literal["pause", "log", "keep"]
 BREAKPOINT_ACTIONS: Final[tuple[BreakpointAction, ...]] = get_args(BreakpointAction)
-MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
-KEEP_LAST_S: Final = 5.0  # before a moment, kept at full rate
-HANG_AFTER_S: Final = 3.0  # of wall time without a sign of life of the loop
-KEEP_AFTER_S: Final = 2.0  # after it
-LOOPING: Final = ("step", "run")  # actions that let the loop come round; one is under way at most
-ENDING: Final = ("load_world", "quit")  # actions that are done when the controller ends
 Pace = Literal["fast", "real_time"]  # of a `run` command
 Then = Literal["pause", "go_on", "as_before"]  # what it does at its end
 RunEnd = Literal[
@@ -122,25 +142,6 @@ RunEnd = Literal[
     "interrupted",
     "condition failed",
 ]
-SEE_STEPS: Final = (
-    "call bridge.publish({...}) and bridge.get_command() in every round of the loop, or "
-    "MCPBridge.attach(robot) before anything takes or replaces robot.step"
-)
-UNSEEN: Final = f"the controller's loop steps in a way that the bridge does not see: {SEE_STEPS}"
-UNMOVED: Final = (
-    "the bridge has not seen simulation time advance since it began: the simulation is paused in "
-    "Webots, the controller has not reached its loop, or its loop steps in a way that the bridge "
-    f"does not see; then {SEE_STEPS}"
-)
-ENDED_BY: Final = "the controller ended by"  # an exception, as it is logged
-MAX_RUN_S: Final = 1e6  # of simulation time, of one `run` command
-
-COMMAND_TIME_TO_LIVE_S: Final = 10.0
-HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive
-HEARTBEAT_LATE_S: Final = 2.0  # a session silent for longer is not looping
-REMOTE_SILENCE_S: Final = 10.0  # one on another host, whose process cannot be asked, is dead then
-ISSUED_TIME_TO_LIVE_S: Final = 60.0  # how long a reload may take until it counts as lost
-MAX_STEPS: Final = 100_000
 
 
 def find_log_level(level: object) -> LogLevel | None:
@@ -155,9 +156,6 @@ def find_log_level(level: object) -> LogLevel | None:
     if isinstance(level, bool) or not isinstance(level, (int, float)) or level != level:
         return None
     return LOG_LEVELS[int(min(max(level, 10), 50)) // 10 - 1]
-
-
-MOST_NAME_CHARACTERS: Final = 200  # of a robot
 
 
 def recorded_name(name: str) -> str:
@@ -178,9 +176,6 @@ def host_name() -> str:
     import socket  # only where needed: it is a tenth of the bridge's import time
 
     return socket.gethostname()
-
-
-BY_PROCESS: Final = " process "  # in an instance that names no simulator
 
 
 def instance_of(environment: Mapping[str, str], parent: int) -> str:

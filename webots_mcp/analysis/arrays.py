@@ -36,6 +36,8 @@ _ORDER: Final = 4
 # standard deviation, and a normal variable has a median magnitude of 0.6745 of it.
 _GAIN: Final = 0.6745 * 70**0.5
 LEAST_ROWS: Final = 3 * _ORDER
+GAP_INTERVALS: Final = 3.0  # a gap is longer than so many usual intervals
+ANOTHER_RATE: Final = 5  # so many long intervals one after the other are no gaps
 
 
 def inner(one: Array, other: Array) -> float:
@@ -138,10 +140,6 @@ def runs_alike(numbers: Array, times: Array) -> Runs:
 
 
 # -- how regularly rows were recorded, and where some are missing ----------------------------------
-
-
-GAP_INTERVALS: Final = 3.0  # a gap is longer than so many usual intervals
-ANOTHER_RATE: Final = 5  # so many long intervals one after the other are no gaps
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,18 @@ _CERTAIN_RAMP: Final = 50.0  # variances of the noise: a ramp that explains more
 _EXACT_ROWS: Final = 0.25  # an end whose deviation is less is exact enough
 _ROUNDING_M: Final = 1e-6
 _MOST_AT_ONCE: Final = 2**20  # positions
+DRIFT_SHARE: Final = 0.15  # of the radius: who came farther between its first and last third moves
+CERTAIN: Final = 4.0  # standard errors
+SAME_COURSE: Final = 1.25  # times the noise: the residual of a motion that explains all rows
+REST_SHARE: Final = 0.5  # of the speed next to it: a part that is certainly slower is a rest
+CERTAINLY_SLOWER: Final = 3.0  # standard errors: the ramps next to it are certain already
+# So many times its own length before and after a stretch is looked for the same motion.
+_AROUND: Final = ((1, 1), (0, 2), (2, 0), (0, 5), (5, 0))
+MOST_AROUND: Final = 5
+_MEANS: Final = 30  # of neighbouring rows, that a line is laid through
+_FINE_MEANS: Final = 120  # in which a rest is looked for
+_BORDERS: Final = 25  # at which a rest between two ramps may begin and end
+_MOST_TWITCHES: Final = 12
 
 
 class Standstill(NamedTuple):
@@ -318,20 +330,6 @@ def _is_same_ramp(track: Track, end: Indexes, rows: Indexes, wider: _Ramps) -> F
 
 
 # -- whether it goes on slowly while it stays about a place, and where it rests then ---------------
-
-
-DRIFT_SHARE: Final = 0.15  # of the radius: who came farther between its first and last third moves
-CERTAIN: Final = 4.0  # standard errors
-SAME_COURSE: Final = 1.25  # times the noise: the residual of a motion that explains all rows
-REST_SHARE: Final = 0.5  # of the speed next to it: a part that is certainly slower is a rest
-CERTAINLY_SLOWER: Final = 3.0  # standard errors: the ramps next to it are certain already
-# So many times its own length before and after a stretch is looked for the same motion.
-_AROUND: Final = ((1, 1), (0, 2), (2, 0), (0, 5), (5, 0))
-MOST_AROUND: Final = 5
-_MEANS: Final = 30  # of neighbouring rows, that a line is laid through
-_FINE_MEANS: Final = 120  # in which a rest is looked for
-_BORDERS: Final = 25  # at which a rest between two ramps may begin and end
-_MOST_TWITCHES: Final = 12
 
 
 class Rows:

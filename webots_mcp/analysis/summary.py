@@ -14,6 +14,19 @@ from webots_mcp.analysis.arrays import Array, Indexes, inner, np
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction
 _LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
+TIME_BINS: Final = 8
+SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
+MOST_SPIKES_SHARE: Final = 0.05  # of the values: more of them are how the signal is
+FLAT_BAND: Final = 0.005  # of the range: what moves less is at rest
+LEAST_RESTING: Final = 3  # rows
+STEP_SHARE: Final = 0.5  # of all that it moves, between two rests
+MOST_CHANCE: Final = 0.002  # that any of the figures compared at once differs among like runs
+MIN_EFFECT_SD: Final = 1.0  # a difference that matters, in standard deviations between like runs
+MOST_REPEATED: Final = 10  # runs of each group: who asks for more of them has no answer
+_OUTSIDE: Final = 0.1  # how often an interval does not hold the difference
+_LEAST_RUNS: Final = 4  # of each group, that tell how much they differ, and no two clusters
+_DUST: Final = 1e-9  # of the largest figure: what differs by less differs by rounding
+MOST_CHANCE_OF_BEST: Final = 0.01  # that a set is called better than the next one, and is not
 
 
 class Summary(NamedTuple):
@@ -157,14 +170,6 @@ def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:
 # -- what it does over time: slope, spikes, rest, slow change --------------------------------------
 #
 # Each function takes arrays: times that do not fall and as many values, all finite, at least one.
-
-
-TIME_BINS: Final = 8
-SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
-MOST_SPIKES_SHARE: Final = 0.05  # of the values: more of them are how the signal is
-FLAT_BAND: Final = 0.005  # of the range: what moves less is at rest
-LEAST_RESTING: Final = 3  # rows
-STEP_SHARE: Final = 0.5  # of all that it moves, between two rests
 
 
 @dataclass(frozen=True)
@@ -326,14 +331,6 @@ def unwrap(angles: Array, turn: float = math.tau) -> Array:
 
 
 # Whether groups of runs differ by more than like runs do.
-
-
-MOST_CHANCE: Final = 0.002  # that any of the figures compared at once differs among like runs
-MIN_EFFECT_SD: Final = 1.0  # a difference that matters, in standard deviations between like runs
-MOST_REPEATED: Final = 10  # runs of each group: who asks for more of them has no answer
-_OUTSIDE: Final = 0.1  # how often an interval does not hold the difference
-_LEAST_RUNS: Final = 4  # of each group, that tell how much they differ, and no two clusters
-_DUST: Final = 1e-9  # of the largest figure: what differs by less differs by rounding
 
 
 class Spread(NamedTuple):
@@ -602,7 +599,6 @@ def _student_quantile(freedom: float) -> float:
 
 
 Best = Literal["highest", "lowest"]
-MOST_CHANCE_OF_BEST: Final = 0.01  # that a set is called better than the next one, and is not
 
 
 class Outcome(NamedTuple):

@@ -35,6 +35,16 @@ _DIGITS: Final = 4
 _DECIMALS: Final = 3
 _DUST: Final = 1e-12
 _ODD_NUMBERS: Final = ("nan", "inf", "-inf")
+ANSWER_TOKENS: Final = 2_000
+LARGE_ANSWER_TOKENS: Final = 10_000  # where it was said how much: clients warn of longer answers
+BUDGET_TOKENS: Final = 1_250  # of rows; the header, notes and verdicts have what is left
+_BESIDE_TOKENS: Final = ANSWER_TOKENS - BUDGET_TOKENS
+_HEADER_TOKENS: Final = 150  # with a hint
+_FOR_A_PERSON_TOKENS: Final = 10_000_000
+LONGEST_NAME: Final = 80
+_LONGEST_NOTE: Final = 300
+_MOST_NOTES: Final = 5
+MOST_RUNS: Final = 5  # of which one answer tells
 
 
 @dataclass(frozen=True)
@@ -239,16 +249,7 @@ def _counts(others: list[Any]) -> dict[str, int]:
     return {name: names.count(name) for name in dict.fromkeys(names)}
 
 
-ANSWER_TOKENS: Final = 2_000
-LARGE_ANSWER_TOKENS: Final = 10_000  # where it was said how much: clients warn of longer answers
-BUDGET_TOKENS: Final = 1_250  # of rows; the header, notes and verdicts have what is left
-_BESIDE_TOKENS: Final = ANSWER_TOKENS - BUDGET_TOKENS
-_HEADER_TOKENS: Final = 150  # with a hint
-_FOR_A_PERSON_TOKENS: Final = 10_000_000
 _AT_LENGTH: Final = (Limits(items=2000, text=20_000, keys=1000, depth=20),)
-LONGEST_NAME: Final = 80
-_LONGEST_NOTE: Final = 300
-_MOST_NOTES: Final = 5
 
 _A = TypeVar("_A", bound=Answer)
 _T = TypeVar("_T")
@@ -390,8 +391,6 @@ def some(names: Sequence[str], most: int = 10) -> str:
 
 
 # -- the range of time that was asked about --
-
-MOST_RUNS: Final = 5  # of which one answer tells
 
 
 def range_in(view: View, scope: Scope) -> TimeRange:

@@ -61,6 +61,7 @@ _known: Final[dict[str, Action]] = {
     "add_node": add_node,
     "remove_node": remove_node,
 }
+POLL_INTERVAL_S: Final = 0.005
 
 
 def begin(session: Session, command: ClaimedCommand) -> Progress:
@@ -503,9 +504,6 @@ def _wait_for_picture(file: Path) -> Generator[None, None, tuple[int, int, int]]
 
 
 # -- serving the queue -----------------------------------------------------------------------------
-
-
-POLL_INTERVAL_S: Final = 0.005
 
 
 class Control:

@@ -33,6 +33,10 @@ _MOST_ERROR_CHARACTERS: Final = 1000
 
 # Condition, action, hits; of an expectation its name, what is expected, and during what.
 Asks = tuple[str, str, int, "str | None", "str | None", "str | None"]
+_KEEPING: Final = ("pause", "keep")  # a pause is for looking at what led to it
+_CANNOT_PAUSE: Final = (
+    "the robot is not a Supervisor: set its field `supervisor` to TRUE in the world file"
+)
 
 
 class Breakpoint:
@@ -334,12 +338,6 @@ class Breakpoints:
             known = each.evaluator.names_in(state)
             for text in each.condition.describe_unknown(known):
                 self._journal.log("warning", "bridge", f"{each.called}: {text}")
-
-
-_KEEPING: Final = ("pause", "keep")  # a pause is for looking at what led to it
-_CANNOT_PAUSE: Final = (
-    "the robot is not a Supervisor: set its field `supervisor` to TRUE in the world file"
-)
 
 
 def _armed(number: int | None, condition: Condition, action: str, after_hits: int) -> Breakpoint:

@@ -34,6 +34,8 @@ _PATIENCE_S: Final = 0.02  # how long a print waits for the thread that is recor
 _POLLS: Final = os.name == "posix"  # Windows has no select() for pipes
 
 Record = Callable[[str, Sequence[str]], object]
+MOST_LINES_PER_S: Final = 500  # of wall time
+_MOST_LINE_BYTES: Final = 40_000  # a log row has the first 10,000 characters
 
 
 class Capture:
@@ -318,10 +320,6 @@ def _enlarge(pipe: int) -> None:
 
 
 # -- printed lines: up to 500 a second -------------------------------------------------------------
-
-
-MOST_LINES_PER_S: Final = 500  # of wall time
-_MOST_LINE_BYTES: Final = 40_000  # a log row has the first 10,000 characters
 
 
 class PrintedLines:

@@ -29,6 +29,8 @@ Progress = Generator[None, None, object]
 _MOST_NAMED: Final = 10
 
 _INTERRUPTED: Final = "the controller was interrupted before the command began; it was not run"
+_MOST_NAME_CHARACTERS: Final = 100
+_MOST_DOC_CHARACTERS: Final = 4000
 
 
 def whole_number(params: dict[str, Any], name: str, least: int, most: int, *, default: int) -> int:
@@ -197,9 +199,6 @@ def _name_replaced(replaced: Mapping[str, str]) -> str | None:
 
 
 Handler = Callable[[dict[str, Any]], object]
-
-_MOST_NAME_CHARACTERS: Final = 100
-_MOST_DOC_CHARACTERS: Final = 4000
 
 
 class Handlers:

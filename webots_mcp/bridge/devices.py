@@ -25,6 +25,8 @@ _MOST_READ: Final = 64  # objects of which the nearest are chosen: each is a cal
 _WGS84: Final = 1  # GPS.WGS84: degrees, not metres
 
 Failed = Callable[[str, Exception], object]
+MOST_READING_US: Final = 100.0  # per call, on average, for rows that go to the ring buffer only
+_READINGS: Final = 9  # their median counts, so that a single interrupted reading does not
 
 
 class Rule(NamedTuple):
@@ -262,10 +264,6 @@ RULES: Final[dict[str, Rule]] = {
 
 
 # -- how often devices are read --------------------------------------------------------------------
-
-
-MOST_READING_US: Final = 100.0  # per call, on average, for rows that go to the ring buffer only
-_READINGS: Final = 9  # their median counts, so that a single interrupted reading does not
 
 
 class DeviceReader:

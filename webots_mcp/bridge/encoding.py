@@ -79,6 +79,37 @@ _C_NUMBERS: Final = frozenset("bBhHiIlLqQfdg?v")
 _C_CHARACTERS: Final = frozenset("cu")
 _C_ADDRESSES: Final = frozenset("zZPXO")
 _UNKNOWN_LENGTH: Final = "pointer of unknown length"
+MAX_ROOM: Final = MOST_ITEMS
+ROOM_OF_A_VALUE: Final = 5  # an item of an array of numbers takes 1
+MAX_DEPTH: Final = 20
+MAX_BYTES: Final = 1024
+MAX_TEXT_BYTES: Final = 100_000
+MAX_TEXTS_BYTES: Final = 300_000  # of all texts of a row
+MAX_KEYS_BYTES: Final = 150_000  # of all keys of a row
+MAX_KEY_CHARACTERS: Final = 200
+MAX_NAMED: Final = 1000
+_TOP_KEYS: Final = 1000  # of a state that has more keys than there is room for
+_MOST_PATHS_CHARACTERS: Final = 50_000  # of all paths of a row
+_MOST_REASON_CHARACTERS: Final = 200
+_LONGEST_ESCAPE: Final = 6  # bytes of JSON for one character, as in \u0000
+_MOST_KEY_BITS: Final = 1000  # the text of a longer integer takes long to make
+# For all objects of a row together, since converting them runs code of unknown cost. Processor
+# time: by the wall clock, another process that runs in between would cost values.
+LONGEST_S: Final = 0.01
+# Numpy's type codes. Half and single floats are not here: orjson writes them with fewer digits.
+_ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")
+MAX_ROW_BYTES: Final = 1_000_000
+MAX_PLAIN_VALUES: Final = MAX_ROOM // ROOM_OF_A_VALUE
+_CHARACTERS_OF_A_VALUE: Final = 16  # a text takes the room of one more value for each so many
+_SHORT_KEY_CHARACTERS: Final = 60
+_MOST_SHORT_KEYS: Final = 10_000
+# Types that take the room of one value and need no further check.
+_LEAVES: Final = frozenset((float, bool, type(None)))
+_SHORT_ARRAY: Final = 16
+_MANY: Final = (dict, list, tuple, set, frozenset, deque)
+_NON_FINITE: Final = frozenset(("nan", "inf", "-inf"))
+_MOST_NON_FINITE_PATHS: Final = 64
+_LONGEST_PATH_CHARACTERS: Final = 500
 
 
 class NoCounterpartError(TypeError):
@@ -242,25 +273,6 @@ def _fields(data: Any) -> Iterable[str]:
 def _bounded(items: Iterable[Any]) -> Iterable[Any]:
     """As many items as `len` says: an object's own iterator may be endless."""
     return islice(items, min(MOST_ITEMS, item_count(items) or MOST_ITEMS))
-
-
-MAX_ROOM: Final = MOST_ITEMS
-ROOM_OF_A_VALUE: Final = 5  # an item of an array of numbers takes 1
-MAX_DEPTH: Final = 20
-MAX_BYTES: Final = 1024
-MAX_TEXT_BYTES: Final = 100_000
-MAX_TEXTS_BYTES: Final = 300_000  # of all texts of a row
-MAX_KEYS_BYTES: Final = 150_000  # of all keys of a row
-MAX_KEY_CHARACTERS: Final = 200
-MAX_NAMED: Final = 1000
-_TOP_KEYS: Final = 1000  # of a state that has more keys than there is room for
-_MOST_PATHS_CHARACTERS: Final = 50_000  # of all paths of a row
-_MOST_REASON_CHARACTERS: Final = 200
-_LONGEST_ESCAPE: Final = 6  # bytes of JSON for one character, as in \u0000
-_MOST_KEY_BITS: Final = 1000  # the text of a longer integer takes long to make
-# For all objects of a row together, since converting them runs code of unknown cost. Processor
-# time: by the wall clock, another process that runs in between would cost values.
-LONGEST_S: Final = 0.01
 
 
 # Where a value is: a linked list, since most places are never named and need no path text.
@@ -608,28 +620,12 @@ def _reason(error: Exception) -> str:
 # -- their JSON ------------------------------------------------------------------------------------
 
 
-# Numpy's type codes. Half and single floats are not here: orjson writes them with fewer digits.
-_ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")
-
 orjson: Any
 try:
     import orjson
 except ImportError:
     orjson = None
 
-MAX_ROW_BYTES: Final = 1_000_000
-MAX_PLAIN_VALUES: Final = MAX_ROOM // ROOM_OF_A_VALUE
-_CHARACTERS_OF_A_VALUE: Final = 16  # a text takes the room of one more value for each so many
-_SHORT_KEY_CHARACTERS: Final = 60
-_MOST_SHORT_KEYS: Final = 10_000
-# Types that take the room of one value and need no further check.
-_LEAVES: Final = frozenset((float, bool, type(None)))
-_SHORT_ARRAY: Final = 16
-_MANY: Final = (dict, list, tuple, set, frozenset, deque)
-
-_NON_FINITE: Final = frozenset(("nan", "inf", "-inf"))
-_MOST_NON_FINITE_PATHS: Final = 64
-_LONGEST_PATH_CHARACTERS: Final = 500
 
 # Keys that were checked before: every row has the same ones, so most checks are one set operation.
 _short_keys: set[object] = set()

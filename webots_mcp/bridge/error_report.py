@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 _LONGEST_WARNING = 2000
+_LONGEST_TEXT: Final = 2000  # of what an error says
 
 
 class ErrorReport:
@@ -46,9 +47,6 @@ class ErrorReport:
         if self._strict:
             raise error
         self.warn(f"{method} {type(error).__name__}", f"{method} failed: {describe(error)}")
-
-
-_LONGEST_TEXT: Final = 2000  # of what an error says
 
 
 def cut(text: str, most_characters: int) -> str:

@@ -36,6 +36,13 @@ _MOST_REASON_CHARACTERS: Final = 200
 _ROWS_AT_ONCE: Final = 100
 _ENCODING_AT_ONCE_S: Final = 0.0005
 _CHARACTERS_AT_ONCE: Final = 200_000
+MAX_RING_BYTES: Final = 8_000_000
+_ROW_BYTES: Final = 400  # of a row in addition to its state: a tuple, three numbers, its place
+LONGEST_SIDE_PX: Final = 160
+MOST_FRAMES: Final = 78  # of all cameras together: 8 MB, were they square
+_MOST_FRAMES_PER_S: Final = 100.0
+_EARLY_S: Final = 1e-9  # tolerance: summed floating-point steps may fall a little short
+_METHODS: Final = ("getName", "getSamplingPeriod", "getWidth", "getHeight", "getImage")
 
 
 class Stretch:
@@ -313,10 +320,6 @@ class Keeper:
             self._unwritten.popleft()
 
 
-MAX_RING_BYTES: Final = 8_000_000
-_ROW_BYTES: Final = 400  # of a row in addition to its state: a tuple, three numbers, its place
-
-
 class RingRow(NamedTuple):
     """A call of `publish` that may be kept.
 
@@ -399,13 +402,6 @@ class Ring:
         row = self._rows.popleft()
         self.size_bytes -= row.size_bytes
         self.starts_s = self._rows[0].sim_time_s if self._rows else row.sim_time_s
-
-
-LONGEST_SIDE_PX: Final = 160
-MOST_FRAMES: Final = 78  # of all cameras together: 8 MB, were they square
-_MOST_FRAMES_PER_S: Final = 100.0
-_EARLY_S: Final = 1e-9  # tolerance: summed floating-point steps may fall a little short
-_METHODS: Final = ("getName", "getSamplingPeriod", "getWidth", "getHeight", "getImage")
 
 
 class Frame(NamedTuple):

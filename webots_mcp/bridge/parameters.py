@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database
 
 V = TypeVar("V", float, int, bool, str)
+SETTERS: Final = ("command", "trial")  # the kinds that a command may name
+_MOST_NAMED: Final = 5
 
 
 class Parameter(Generic[V]):
@@ -91,7 +93,6 @@ class _Held:
         return (self.declaration.name, value, int(is_default), *self.setter)
 
 
-SETTERS: Final = ("command", "trial")  # the kinds that a command may name
 CODE: Final = Setter("code")
 _ENVIRONMENT: Final = Setter("environment")
 
@@ -276,9 +277,6 @@ def _next(values: Mapping[str, Value | None]) -> dict[str, Any]:
         for name, value in values.items()
     ]
     return {"rows": json.dumps(rows, ensure_ascii=False)}
-
-
-_MOST_NAMED: Final = 5
 
 
 class StartValues:

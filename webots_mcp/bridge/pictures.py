@@ -27,6 +27,14 @@ MOST_FRAMES: Final = 50  # of a camera that are kept
 _LONGEST_NAME_BYTES: Final = 80  # of a robot or a device, in the name of a file
 _PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_TAIL: Final = b"IEND\xaeB`\x82"
+_MOST_NAMED: Final = 10
+_LONGEST_SIDE_PX: Final = 320
+_SHORTEST_WIDTH_PX: Final = 160  # of a small image, which is magnified
+_TOP_VIEW_PX: Final = 360
+_MOST_RAYS: Final = 20_000
+_POINT_PX: Final = 3
+_SHADES: Final = 256
+_RAMP: Final = ((220, 30, 30), (250, 220, 40), (40, 190, 80), (30, 60, 200))  # near to far
 
 
 class Album:
@@ -194,9 +202,6 @@ def _next_number(kept: deque[str]) -> int:
 # -- pictures of a device --------------------------------------------------------------------------
 
 
-_MOST_NAMED: Final = 10
-
-
 class Picture(NamedTuple):
     """A picture of a device's newest measurement.
 
@@ -271,15 +276,6 @@ def _kind(device: Any) -> str:
 # -- distances as pictures -------------------------------------------------------------------------
 # A range finder's image is coloured, near red and far blue; a lidar's points are drawn as seen
 # from above, since its own image is often a single row.
-
-
-_LONGEST_SIDE_PX: Final = 320
-_SHORTEST_WIDTH_PX: Final = 160  # of a small image, which is magnified
-_TOP_VIEW_PX: Final = 360
-_MOST_RAYS: Final = 20_000
-_POINT_PX: Final = 3
-_SHADES: Final = 256
-_RAMP: Final = ((220, 30, 30), (250, 220, 40), (40, 190, 80), (30, 60, 200))  # near to far
 
 
 def draw_depths(device: Any) -> tuple[Canvas, str]:

@@ -96,6 +96,7 @@ _LOST: Final = ("no such table", "FOREIGN KEY")  # in SQLite's error where a tab
 Result = TypeVar("Result")
 
 _of_parents: list[sqlite3.Connection | None] = []
+_HOLDER: Final = "holder"
 
 
 class Recorder:
@@ -661,7 +662,6 @@ def _patiently(act: Callable[[], Result]) -> Result:
 # -- the connection lock -----------------------------------------------------------------------
 
 this_call: Final = sys._getframe  # pyright: ignore[reportPrivateUsage]
-_HOLDER: Final = "holder"
 
 
 class ConnectionLock:

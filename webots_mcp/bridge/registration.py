@@ -25,6 +25,38 @@ from webots_mcp.database.liveness import process_identity
 from webots_mcp.database.pauses import PAUSED, STEPPING_WORLD
 from webots_mcp.database.waiting_file import enter_robot, enter_session
 
+_KIND: Final = "SELECT kind FROM robot WHERE name = ?"
+# A successor in the same Webots within seconds means a reload; so does one after an issued reload
+# command. A predecessor that was killed counts only where Webots starts the controllers: Webots
+# kills one that does not end within a second, while an extern one was killed by a person.
+_RELOADED: Final = (
+    "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = :robot) "
+    "AND instance = :instance AND coalesce(ended_wall_time_s, last_seen_wall_time_s) > :earliest "
+    "AND (:in_webots OR end_reason <> 'crashed') "
+    "UNION SELECT 1 FROM command WHERE robot_id = :robot "
+    "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
+)
+# A controller that is not a Supervisor cannot distinguish a reload from another quit by Webots, so
+# it ended as `finished`. Its successor, which Webots started, shows that it was a reload.
+_RELOADED_SESSION: Final = (
+    "UPDATE session SET end_reason = 'reload' WHERE end_reason = 'finished' "
+    "AND id = (SELECT max(id) FROM session WHERE robot_id = ?)"
+)
+_RELOADED_RUN: Final = (
+    "UPDATE run SET end_reason = 'reload' WHERE end_reason = 'finished' "
+    "AND id = (SELECT max(id) FROM run WHERE robot_id = ?)"
+)
+_PAUSED_MODE: Final = (
+    "SELECT coalesce(mode_before_pause, 'real_time') FROM session "
+    "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? "
+    "AND pause_state = ?"
+)
+_LEFT_WAITING: Final = (
+    "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) "
+    "AND instance = ? AND pause_state = ?"
+)
+_LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
+
 # -- the identity of a process ---------------------------------------------------------------------
 
 
@@ -151,38 +183,6 @@ def _head(git: Path) -> str | None:
     lines = packed.read_text("utf-8").splitlines() if packed.exists() else []
     return next((line.split()[0] for line in lines if line.endswith(f" {ref}")), None)
 
-
-_KIND: Final = "SELECT kind FROM robot WHERE name = ?"
-# A successor in the same Webots within seconds means a reload; so does one after an issued reload
-# command. A predecessor that was killed counts only where Webots starts the controllers: Webots
-# kills one that does not end within a second, while an extern one was killed by a person.
-_RELOADED: Final = (
-    "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = :robot) "
-    "AND instance = :instance AND coalesce(ended_wall_time_s, last_seen_wall_time_s) > :earliest "
-    "AND (:in_webots OR end_reason <> 'crashed') "
-    "UNION SELECT 1 FROM command WHERE robot_id = :robot "
-    "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
-)
-# A controller that is not a Supervisor cannot distinguish a reload from another quit by Webots, so
-# it ended as `finished`. Its successor, which Webots started, shows that it was a reload.
-_RELOADED_SESSION: Final = (
-    "UPDATE session SET end_reason = 'reload' WHERE end_reason = 'finished' "
-    "AND id = (SELECT max(id) FROM session WHERE robot_id = ?)"
-)
-_RELOADED_RUN: Final = (
-    "UPDATE run SET end_reason = 'reload' WHERE end_reason = 'finished' "
-    "AND id = (SELECT max(id) FROM run WHERE robot_id = ?)"
-)
-_PAUSED_MODE: Final = (
-    "SELECT coalesce(mode_before_pause, 'real_time') FROM session "
-    "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? "
-    "AND pause_state = ?"
-)
-_LEFT_WAITING: Final = (
-    "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) "
-    "AND instance = ? AND pause_state = ?"
-)
-_LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 
 # Sessions of this process. Its pid alone does not identify it: in a container pids repeat.
 _own_sessions: set[int] = set()

@@ -51,6 +51,34 @@ SOLIDS: Final = frozenset(
 )
 """Base types that are a Solid or one of its subclasses: they have a `name` and a velocity."""
 
+MOST_SEARCHED: Final = 1000  # nodes, for a name
+MOST_FIELDS: Final = 100  # of one node
+_MOST_NAMED: Final = 20
+_LONGEST_PATH: Final = 500
+_SLICE_S: Final = 0.005  # the time that reading may take in one round of the controller's loop
+_HEAD: Final = re.compile(
+    r"\s*/?(?:root\s*[./]\s*(?=children))?(?:(?:DEF|USE)\s+)?"
+    r'(?:"(?P<quoted>[^"]+)"|(?P<plain>[^."\[/][^.\[/]*))'
+)
+_STEP: Final = re.compile(
+    r"\s*(?:\[\s*(?P<index>-?\d+)\s*\]|[./]\s*(?P<place>\d+)(?=[./\[]|$)|[./]\s*(?P<name>[^.\[\]/]+))"
+)
+_HOW: Final = "write a path such as ROVER.translation, BALL.children[0].appearance or #12.name"
+_MOST_CHARACTERS: Final = 2_600  # of an answer's rows; the server would shorten more
+_MOST_SHOWN: Final = 50  # entries of a field
+_FIRST_ENTRIES: Final = 3  # of a field among others
+_LONGEST_TEXT: Final = 80  # of a field among others
+_USUAL_DEPTH: Final = 2
+_MOST_AT_THE_TOP: Final = 200
+_MOST_PATTERNS: Final = 20
+_MOST_NEAR: Final = 10  # types or names that are listed where none matches
+MOST_ENTRIES: Final = 200  # of a field that are set at once: each is a request to Webots
+MOST_CHARACTERS: Final = 10_000  # of one text
+_LARGEST_FLOAT: Final = 3.4028234e38  # beyond it Webots refuses a number
+_TOLERANCE: Final = 1e-6  # relative: Webots may store a value in single precision
+# Fields that name programs that Webots runs: it searches each in its folder of the project.
+_PROGRAMS: Final = ("controller", "window", "remoteControl", "physics")
+
 
 class SceneNode(NamedTuple):
     """A node and its position in the tree.
@@ -226,22 +254,6 @@ def entries(field: Any) -> Iterator[tuple[int | None, Any]]:
 # A path begins with a DEF name, the name of a robot or another Solid, the type of a node at the
 # top of the tree (`WorldInfo`), `root`, or `#` and a node's number. Names of fields and indices in
 # brackets follow. For a path that leads nowhere the error lists the nearest existing names.
-
-
-MOST_SEARCHED: Final = 1000  # nodes, for a name
-MOST_FIELDS: Final = 100  # of one node
-
-_MOST_NAMED: Final = 20
-_LONGEST_PATH: Final = 500
-_SLICE_S: Final = 0.005  # the time that reading may take in one round of the controller's loop
-_HEAD: Final = re.compile(
-    r"\s*/?(?:root\s*[./]\s*(?=children))?(?:(?:DEF|USE)\s+)?"
-    r'(?:"(?P<quoted>[^"]+)"|(?P<plain>[^."\[/][^.\[/]*))'
-)
-_STEP: Final = re.compile(
-    r"\s*(?:\[\s*(?P<index>-?\d+)\s*\]|[./]\s*(?P<place>\d+)(?=[./\[]|$)|[./]\s*(?P<name>[^.\[\]/]+))"
-)
-_HOW: Final = "write a path such as ROVER.translation, BALL.children[0].appearance or #12.name"
 
 
 class Pace:
@@ -533,16 +545,6 @@ def some(names: Sequence[str], total: int | None = None) -> str:
 # They ask Webots from within the controller's loop, for a few milliseconds per round.
 
 
-_MOST_CHARACTERS: Final = 2_600  # of an answer's rows; the server would shorten more
-_MOST_SHOWN: Final = 50  # entries of a field
-_FIRST_ENTRIES: Final = 3  # of a field among others
-_LONGEST_TEXT: Final = 80  # of a field among others
-_USUAL_DEPTH: Final = 2
-_MOST_AT_THE_TOP: Final = 200
-_MOST_PATTERNS: Final = 20
-_MOST_NEAR: Final = 10  # types or names that are listed where none matches
-
-
 def get_scene(session: Session, command: ClaimedCommand) -> Progress:
     """The nodes of the tree, or below a `path`, that match `types` and `names`."""
     params, robot = command.params, session.simulation.robot
@@ -729,17 +731,6 @@ def _patterns(params: dict[str, Any], name: str) -> list[str]:
 # -- values of fields ------------------------------------------------------------------------------
 # Webots' package accepts exact types only and reports others by printing, so every value is
 # checked here first.
-
-
-MOST_ENTRIES: Final = 200  # of a field that are set at once: each is a request to Webots
-MOST_CHARACTERS: Final = 10_000  # of one text
-
-_LARGEST_FLOAT: Final = 3.4028234e38  # beyond it Webots refuses a number
-_TOLERANCE: Final = 1e-6  # relative: Webots may store a value in single precision
-
-
-# Fields that name programs that Webots runs: it searches each in its folder of the project.
-_PROGRAMS: Final = ("controller", "window", "remoteControl", "physics")
 
 
 class _RefusedError(ValueError):

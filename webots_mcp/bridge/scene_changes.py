@@ -50,6 +50,10 @@ _PUT_BACK_PROTO: Final = (
     "puts it back if the world declares its PROTO as IMPORTABLE EXTERNPROTO; else a reload does"
 )
 _SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
+# Physics has changed these since a command set them, and Webots' own reset restores them.
+_MOVED_BY_PHYSICS: Final = ("translation", "rotation", "battery")
+MOST_EDITS: Final = 200  # that are put back
+_TOO_MANY: Final = f"does not undo it: at most {MOST_EDITS} changes are remembered"
 
 
 def set_field(session: Session, command: ClaimedCommand) -> Progress:
@@ -314,10 +318,6 @@ def _position(
     return None
 
 
-# Physics has changed these since a command set them, and Webots' own reset restores them.
-_MOVED_BY_PHYSICS: Final = ("translation", "rotation", "battery")
-
-
 class FieldEdit(NamedTuple):
     """A field, or an entry of one, that was set.
 
@@ -387,10 +387,6 @@ def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
 # -- what a reset has to undo ----------------------------------------------------------------------
 # A reset by Webots restores poses and removes added nodes. It does not restore other fields and
 # removed nodes: that is done here, as long as the controller's process lives.
-
-
-MOST_EDITS: Final = 200  # that are put back
-_TOO_MANY: Final = f"does not undo it: at most {MOST_EDITS} changes are remembered"
 
 
 class SceneEdits:

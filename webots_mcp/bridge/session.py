@@ -33,6 +33,7 @@ _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or w
 _UNSEEN_S: Final = 1.0  # of simulation time; less may be one step whose end an interrupt hid
 _BYTES_OF_A_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
 _UNMOVED_S: Final = 10.0  # of wall time
+_WHAT: Final = "the attached step"
 
 
 class Throttle:
@@ -406,9 +407,6 @@ def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
 # controller has computed its reaction to the last step. Where the controller publishes by itself,
 # the bridge does not publish a second time: the devices' values become part of the controller's
 # own row.
-
-
-_WHAT: Final = "the attached step"
 
 
 class Attachment:

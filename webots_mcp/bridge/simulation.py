@@ -21,6 +21,12 @@ _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
 _LONGEST_WAIT_S: Final = 0.1  # for the moment at which a step is due
 _PROMPT_S: Final = 0.002  # of wall time that a step takes which was due when it was asked for
 _INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers
+QUIT: Final = -1
+_VEHICLE: Final = "vehicle"  # the package
+_GUARD: Final = "_webots_mcp_guard"  # of a robot; None of its class
+_METER: Final = "_webots_mcp_meter"  # likewise
+_MARK: Final = "_webots_mcp_asks"  # of a method
+_EPSILON_S: Final = 1e-9
 
 
 class Simulation:
@@ -232,14 +238,7 @@ def _may_supervise(robot: Any) -> bool:
 # step as before.
 
 
-QUIT: Final = -1
-
 Method = Callable[..., int]
-
-_VEHICLE: Final = "vehicle"  # the package
-_GUARD: Final = "_webots_mcp_guard"  # of a robot; None of its class
-_METER: Final = "_webots_mcp_meter"  # likewise
-_MARK: Final = "_webots_mcp_asks"  # of a method
 
 
 class Step(NamedTuple):
@@ -432,9 +431,6 @@ class LoopMeter:
     def times(self) -> LoopTimes | None:
         """Of the run so far; None where no round of it was seen."""
         return LoopTimes(self._own_s, self._step_s, self._steps) if self._steps > 0 else None
-
-
-_EPSILON_S: Final = 1e-9
 
 
 class Clock:

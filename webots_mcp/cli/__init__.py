@@ -39,6 +39,11 @@ _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 _OFFER: Final = re.compile(r' Did you mean "?([^\s"?]+)"?\?')
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
+_HELP: Final = """Flight recorder and remote control for Webots simulations.
+
+Controllers record into one SQLite database, an AI assistant reads it and steers the simulation
+over MCP. Try `webots-mcp demo` first; `webots-mcp COMMAND --help` explains a command.
+"""
 
 
 def names() -> list[str]:
@@ -189,12 +194,6 @@ def _discard_output() -> None:
 
 
 # -- commands as cyclopts knows them --
-
-_HELP: Final = """Flight recorder and remote control for Webots simulations.
-
-Controllers record into one SQLite database, an AI assistant reads it and steers the simulation
-over MCP. Try `webots-mcp demo` first; `webots-mcp COMMAND --help` explains a command.
-"""
 
 
 def app_for(argv: Sequence[str]) -> App:

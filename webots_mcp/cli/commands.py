@@ -10,6 +10,8 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.extras.plugins import plugin_commands
 
+_STEERING: Final = "webots_mcp.cli.steering"
+
 
 class Command(NamedTuple):
     """Where a command is found: a question, or a function whose parameters are its options."""
@@ -28,7 +30,6 @@ NOW, PAST, STEER, DATA, SETUP = (
 )  # fmt: skip
 GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
 _Q: Final = "webots_mcp.questions"
-_STEERING: Final = "webots_mcp.cli.steering"
 _OF_THE_CORE: Final = {
     "events": Command(PAST, f"{_Q}.events", "webots_find_events"),
     "check": Command(PAST, "webots_mcp.cli.judging", "check"),

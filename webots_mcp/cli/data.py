@@ -58,6 +58,10 @@ if TYPE_CHECKING:
 else:
     _Format = Literal[("csv", "jsonl", *(each.name for each in export_formats()), "zip")]
 
+_ALL: Final = Range()
+_STDOUT: Final = Path("-")
+_UNLIMITED: Final = Limits()
+
 
 class _Written(NamedTuple):
     """What came of an export; of a table on stdout only what there is to know about it."""
@@ -66,11 +70,6 @@ class _Written(NamedTuple):
     text: str
     data: dict[str, Any]
     notes: tuple[str, ...] = ()
-
-
-_ALL: Final = Range()
-_STDOUT: Final = Path("-")
-_UNLIMITED: Final = Limits()
 
 
 def export(

@@ -46,6 +46,17 @@ _ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
     "not looked at": ("error", "errors"),
     "not applicable": ("skipped", "skipped"),
 }
+_WAITING: Final = Waiting()
+_FRAME: Final = re.compile(r"(.*) \((.*):(\d+)\)$")
+_OURS: Final = str(Path(__file__).parents[1])
+_SHOWN: Final = 12
+_IN_STEP: Final = ("waiting in step()", None)
+_BRIDGE: Final = ("in the bridge", None)
+_OTHER: Final = ("in no file of the controller", None)
+_NOT_PERMITTED: Final = (
+    "py-spy may not look into process {}: allow it with 'sudo sysctl kernel.yama.ptrace_scope=0' "
+    "on Linux, with --cap-add SYS_PTRACE for a container, or ask as root (macOS)"
+)
 
 
 def check(
@@ -163,7 +174,6 @@ def _checks_in(answer: dict[str, Any]) -> list[dict[str, Any]]:
 By = list[Literal["reset", "reload", "process"]] | None
 _Names = list[str] | None
 _World = Path | None
-_WAITING: Final = Waiting()
 
 
 def diff(
@@ -312,17 +322,6 @@ def _answer(found: Sequence[Parting]) -> dict[str, Any]:
 
 
 # -- what takes the time ---------------------------------------------------------------------------
-
-_FRAME: Final = re.compile(r"(.*) \((.*):(\d+)\)$")
-_OURS: Final = str(Path(__file__).parents[1])
-_SHOWN: Final = 12
-_IN_STEP: Final = ("waiting in step()", None)
-_BRIDGE: Final = ("in the bridge", None)
-_OTHER: Final = ("in no file of the controller", None)
-_NOT_PERMITTED: Final = (
-    "py-spy may not look into process {}: allow it with 'sudo sysctl kernel.yama.ptrace_scope=0' "
-    "on Linux, with --cap-add SYS_PTRACE for a container, or ask as root (macOS)"
-)
 
 
 def profile(

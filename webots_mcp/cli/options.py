@@ -46,6 +46,11 @@ else:  # cyclopts 4, the last for Python 3.10: options have no words for their v
 
 _TOO_LARGE: Final = 2**63  # for SQLite, and no id that it has given
 _NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
+# Not owed to a value in a row: reading past invalid rows would not help.
+_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
+_MAKING_CHUNKS_S: Final = 300.0  # a million rows of 40 values take 100 s
+_BACK: Final = "default"
+_RUNS: Final = "outlive"
 
 
 def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
@@ -121,10 +126,7 @@ def _no_constant(name: str) -> float:
 # -- which recording, which part of it, and how it is opened --
 
 _Given = ParamSpec("_Given")
-# Not owed to a value in a row: reading past invalid rows would not help.
-_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
-_MAKING_CHUNKS_S: Final = 300.0  # a million rows of 40 values take 100 s
 Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
 Robot: TypeAlias = Annotated[
     str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
@@ -325,9 +327,6 @@ def make_chunks_first(recording: Recording) -> None:
 
 
 # -- how much is kept --
-
-_BACK: Final = "default"
-_RUNS: Final = "outlive"
 
 
 def _option(name: str, text: str) -> Parameter:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 _AS_BEFORE: Final = Limits()
 _URL: Final = "WEBOTS_CONTROLLER_URL"
+_LOOK_EVERY_S: Final = 0.2
+_EXTERN_HERE: Final = "--robot NAME=FILE runs one"
+MAX_PORT: Final = 65_535
 
 
 def serve(
@@ -286,10 +289,6 @@ def _connect_to(url: str | None, robot: str) -> str:
 
 
 # -- starting Webots --
-
-_LOOK_EVERY_S: Final = 0.2
-_EXTERN_HERE: Final = "--robot NAME=FILE runs one"
-MAX_PORT: Final = 65_535
 
 
 def launch(

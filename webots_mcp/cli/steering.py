@@ -51,6 +51,9 @@ if TYPE_CHECKING:
 _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
 _WEBOTS: Final = ToWebots()
+_RANK_EVERY_S: Final = 1.0
+_WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
+_WHERE: Final = Where()
 
 
 def pause(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
@@ -255,9 +258,6 @@ def _request_row(request: dict[str, Any]) -> list[Any]:
 
 # -- trials of a plan file, each in a simulator of its own --
 
-_RANK_EVERY_S: Final = 1.0
-_WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
-
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -299,7 +299,6 @@ class TrialOptions:
 
 
 _DEFAULTS: Final = TrialOptions()
-_WHERE: Final = Where()
 
 
 def trials(

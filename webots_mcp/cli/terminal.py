@@ -32,6 +32,45 @@ from webots_mcp.signals.naming import spelled_out
 
 _INTERVAL_S: Final = 0.1  # between two states of the line of progress
 _PLAIN_INTERVAL_S: Final = 3.0  # between two lines where no line can be rewritten
+_GRACE_S: Final = 0.5  # for giving back the lease and for commands that nobody waits for any more
+_LONGEST_END_S: Final = 2.5  # of a command that cleans up; then it ends as it is
+_WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIGTERM"}
+_UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
+_NOT_ON: Final = r"(?![\w'\"])"
+_OTHERS: Final = {  # by tool: those that are answered by a command of another name or function
+    "get_full_state": "tail", "get_robot_state": "tail", "monitor": "tail",
+    "breakpoint": "breakpoint", "list_commands breakpoints": "breakpoint",
+    "list_commands parameters": "parameters", "set_parameters": "parameters",
+    "list_commands outcome": "wait", "list_runs trials": "trials", "run_trials": "trials",
+    "plot": "plot", "report": "report",
+    "simulation_control": "send", "world_reset": "send reset",
+}  # fmt: skip
+_FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
+    "start the server with --data-dir or --database": "give --data-dir or --database",
+    "the resource webots://schema": "'.schema' in the sqlite3 shell",
+}
+_TOOL: Final = re.compile(
+    r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
+)
+_CODE: Final = re.compile(r"(\b(?:bridge\.\w+|MCPBridge)\([^()]*\))")  # of a controller
+_PARAGRAPH: Final = 100  # characters of a line of text, where the terminal has more
+_SHORT: Final = 48
+_INDENT: Final = "  "
+_ENDLESS: Final = 100_000
+_GAP: Final = 2  # between columns
+_LONGEST_WORD: Final = 24  # that no column folds, such as a time
+_HEAD: Final = {
+    "robot": "{}",
+    "run_id": "run {}",
+    "sim_time_s": "at {} s",
+    "status": "{}",
+    "age_s": "{} s old",
+}
+_TIMES: Final = ("sim_time_s", "since_s")  # lists of them
+_CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
+_AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
+_OF_TABLE: Final = ("columns", "rows", "in_every_row")
+_NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
 
 
 class _SpelledOut:
@@ -153,10 +192,6 @@ async def show_progress(progress: float, total: float | None, text: str) -> None
 
 Handler: TypeAlias = Callable[[int, "FrameType | None"], None]
 
-_GRACE_S: Final = 0.5  # for giving back the lease and for commands that nobody waits for any more
-_LONGEST_END_S: Final = 2.5  # of a command that cleans up; then it ends as it is
-_WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIGTERM"}
-
 
 @contextlib.contextmanager
 def ending_by_signals(*, is_process: bool) -> Generator[None]:
@@ -271,24 +306,6 @@ def _exit(number: int) -> None:
 # The questions call their arguments as the MCP tools do. Of the command that runs it is known by
 # which option each is typed. Hints that name a tool name the command that answers the same.
 
-_UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
-_NOT_ON: Final = r"(?![\w'\"])"
-_OTHERS: Final = {  # by tool: those that are answered by a command of another name or function
-    "get_full_state": "tail", "get_robot_state": "tail", "monitor": "tail",
-    "breakpoint": "breakpoint", "list_commands breakpoints": "breakpoint",
-    "list_commands parameters": "parameters", "set_parameters": "parameters",
-    "list_commands outcome": "wait", "list_runs trials": "trials", "run_trials": "trials",
-    "plot": "plot", "report": "report",
-    "simulation_control": "send", "world_reset": "send reset",
-}  # fmt: skip
-_FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
-    "start the server with --data-dir or --database": "give --data-dir or --database",
-    "the resource webots://schema": "'.schema' in the sqlite3 shell",
-}
-_TOOL: Final = re.compile(
-    r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
-)
-_CODE: Final = re.compile(r"(\b(?:bridge\.\w+|MCPBridge)\([^()]*\))")  # of a controller
 _running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 
 
@@ -376,25 +393,6 @@ def _command_for(found: re.Match[str]) -> str:
 #
 # Tables fit the terminal, by folding their cells; in a pipe each row is one line. Notes are wrapped
 # and never cut.
-
-_PARAGRAPH: Final = 100  # characters of a line of text, where the terminal has more
-_SHORT: Final = 48
-_INDENT: Final = "  "
-_ENDLESS: Final = 100_000
-_GAP: Final = 2  # between columns
-_LONGEST_WORD: Final = 24  # that no column folds, such as a time
-_HEAD: Final = {
-    "robot": "{}",
-    "run_id": "run {}",
-    "sim_time_s": "at {} s",
-    "status": "{}",
-    "age_s": "{} s old",
-}
-_TIMES: Final = ("sim_time_s", "since_s")  # lists of them
-_CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
-_AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
-_OF_TABLE: Final = ("columns", "rows", "in_every_row")
-_NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
 
 
 def print_answer(answer: Mapping[str, Any]) -> None:

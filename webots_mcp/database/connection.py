@@ -45,6 +45,38 @@ _ABOUT_A_VALUE: Final = (
 
 # All that a statement may raise because of the database.
 FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemError)
+SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
+_MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
+_TOKENS: Final = re.compile(
+    r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
+)
+_OF_COLUMNS: Final = re.compile(
+    r'CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
+    r'(, ?"?\w+"?( (ASC|DESC))?)*\)',
+    re.IGNORECASE,
+)
+_INDEX: Final = re.compile(r"CREATE (UNIQUE )?INDEX")
+_OBJECTS: Final = (
+    "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
+    "FROM {}.sqlite_master WHERE sql IS NOT NULL"
+)
+# SQLite's own, which our questions use: a table or view of that name would be read in their place.
+_OF_SQLITE: Final = re.compile(r"pragma_|json_(each|tree)$|sqlite_")
+_OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
+_NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
+OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
+OPENING_TIMEOUT_MS: Final = 5000
+LONGEST_READ_S: Final = 60.0  # of a statement of a reader
+_STEPS_PER_LOOK: Final = 1_000_000  # of SQLite's virtual machine: some 20 ms
+CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
+_MOST_DESCRIPTORS: Final = 1024
+# Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
+# so only the maintainer checkpoints; NORMAL costs the last commits at a power cut, never the file.
+_PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
+    "loop": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
+    "writer": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
+    "reader": ("query_only=ON",),
+}
 
 
 def never_wait(connection: sqlite3.Connection) -> None:
@@ -220,28 +252,6 @@ def is_unwritable(error: Exception) -> bool:
 # runs may hang on it. Further objects that a person has added are left alone.
 
 
-SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
-
-_MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
-_TOKENS: Final = re.compile(
-    r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
-)
-_OF_COLUMNS: Final = re.compile(
-    r'CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
-    r'(, ?"?\w+"?( (ASC|DESC))?)*\)',
-    re.IGNORECASE,
-)
-_INDEX: Final = re.compile(r"CREATE (UNIQUE )?INDEX")
-_OBJECTS: Final = (
-    "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
-    "FROM {}.sqlite_master WHERE sql IS NOT NULL"
-)
-# SQLite's own, which our questions use: a table or view of that name would be read in their place.
-_OF_SQLITE: Final = re.compile(r"pragma_|json_(each|tree)$|sqlite_")
-_OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
-_NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
-
-
 def schema_version(connection: sqlite3.Connection) -> int:
     """The schema version of a database of ours; 0 for an empty file.
 
@@ -387,26 +397,12 @@ def _spelled(sql: str) -> list[str]:
 
 Role = Literal["loop", "writer", "reader"]
 
-OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
-OPENING_TIMEOUT_MS: Final = 5000
-LONGEST_READ_S: Final = 60.0  # of a statement of a reader
-_STEPS_PER_LOOK: Final = 1_000_000  # of SQLite's virtual machine: some 20 ms
-CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
-_MOST_DESCRIPTORS: Final = 1024
 
 # SQLite remembers in the process' own memory which files it has open and locked. A fork copies that
 # memory, but not the locks: a connection that the child opens to the same file believes to hold
 # locks that it does not have, and destroys the database under its parent.
 # Device and inode; None where this process was forked and has not looked yet.
 _inherited: set[tuple[int, int]] | None = set()
-
-# Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
-# so only the maintainer checkpoints; NORMAL costs the last commits at a power cut, never the file.
-_PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
-    "loop": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
-    "writer": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
-    "reader": ("query_only=ON",),
-}
 
 
 class ReadingConnection(sqlite3.Connection):

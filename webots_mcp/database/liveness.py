@@ -84,6 +84,28 @@ _SESSIONS_OF: Final = (
     "WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
 _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
+_LOCAL_STATES: Final = {"01": False, "08": True}  # of tcp(7): established; the other end has closed
+LEASE_S: Final = 30.0
+# One that ends later was taken before the clock was set back. It is not one lease from now: the
+# holder may renew after the asker looked at the clock and before its statement reads the row.
+_TIMES: Final = 2
+_TAKE: Final = (
+    "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (:name, :holder, :until) "
+    "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
+    "WHERE holder = :holder OR until_wall_time_s NOT BETWEEN :now AND :latest "
+    "OR :forced OR holder LIKE :outranked"
+)
+_RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?"
+_GIVE_BACK: Final = "DELETE FROM lease WHERE name = ? AND holder = ?"
+_HOLDER: Final = "SELECT holder FROM lease WHERE name = ? AND until_wall_time_s BETWEEN ? AND ?"
+_HELD: Final = (
+    "SELECT name FROM lease WHERE substr(name, 1, length(:prefix)) = :prefix "
+    "AND until_wall_time_s BETWEEN :now AND :latest ORDER BY name"
+)
+_LOST: Final = (
+    "{} was taken over by another process{}, since this one had not renewed its lease for {:g} s: "
+    "it wrote nothing more"
+)
 
 
 def is_living(
@@ -182,9 +204,6 @@ def is_stopped(pid: int) -> bool:
         return _linux_stat(pid)[0] in (b"T", b"t")
     except (OSError, IndexError):
         return False
-
-
-_LOCAL_STATES: Final = {"01": False, "08": True}  # of tcp(7): established; the other end has closed
 
 
 def has_lost_simulator(pid: int, instance: str) -> bool:
@@ -432,29 +451,6 @@ def end_runs(
 # The holder renews its lease while it works. Where it does not any more, whatever the reason, the
 # lease runs out and another takes it. A holder that was only stopped finds out at its next write:
 # what it writes for the job, it writes with the lease in the same transaction (`still_held`).
-
-
-LEASE_S: Final = 30.0
-# One that ends later was taken before the clock was set back. It is not one lease from now: the
-# holder may renew after the asker looked at the clock and before its statement reads the row.
-_TIMES: Final = 2
-_TAKE: Final = (
-    "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (:name, :holder, :until) "
-    "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
-    "WHERE holder = :holder OR until_wall_time_s NOT BETWEEN :now AND :latest "
-    "OR :forced OR holder LIKE :outranked"
-)
-_RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?"
-_GIVE_BACK: Final = "DELETE FROM lease WHERE name = ? AND holder = ?"
-_HOLDER: Final = "SELECT holder FROM lease WHERE name = ? AND until_wall_time_s BETWEEN ? AND ?"
-_HELD: Final = (
-    "SELECT name FROM lease WHERE substr(name, 1, length(:prefix)) = :prefix "
-    "AND until_wall_time_s BETWEEN :now AND :latest ORDER BY name"
-)
-_LOST: Final = (
-    "{} was taken over by another process{}, since this one had not renewed its lease for {:g} s: "
-    "it wrote nothing more"
-)
 
 
 class Lease(NamedTuple):

@@ -75,6 +75,52 @@ _OF_RUN: Final = (
     "SELECT kind, wall_time_s FROM event WHERE run_id = ? "
     f"AND kind IN ('{PAUSE}', '{RESUME}') ORDER BY id"
 )
+OF_CONTROLLER: Final = "controller"  # `created_by` of those that the controller's own code has set
+# Those end with their session.
+OF_PROJECT: Final = "project"  # of those of its file
+_MEANT: Final = "(b.robot_id = r.id OR b.robot_name IN ('*', r.name))"
+_OF_ROBOT: Final = (
+    f"FROM robot r JOIN breakpoint b ON {_MEANT} LEFT JOIN session s ON s.id = b.session_id "
+    f"WHERE r.id = ? AND (b.created_by IS NOT '{OF_CONTROLLER}' "
+    "OR (s.id IS NOT NULL AND s.ended_wall_time_s IS NULL))"
+)
+# What a bridge arms; texts come as bytes, because one that is no UTF-8 would fail the statement.
+ARMED: Final = (
+    "SELECT b.id, CAST(b.condition AS BLOB), CAST(b.action AS BLOB), b.after_hits, "
+    "CAST(b.name AS BLOB), CAST(b.expects AS BLOB), CAST(b.during AS BLOB) "
+    f"FROM robot r JOIN breakpoint b ON {_MEANT} "
+    "WHERE r.id = :robot AND b.enabled AND typeof(b.after_hits) = 'integer' "
+    f"AND (b.created_by IS NOT '{OF_CONTROLLER}' OR b.session_id = :session) "
+    "ORDER BY b.id LIMIT :most"
+)
+# What was expected of a run: by its controller's code, and by the project.
+EXPECTED: Final = (
+    "SELECT b.expects, b.during, b.name, b.created_by FROM run u JOIN robot r ON r.id = u.robot_id "
+    f"JOIN breakpoint b ON {_MEANT} WHERE u.id = ? AND b.expects IS NOT NULL "
+    f"AND (b.created_by IS NOT '{OF_CONTROLLER}' OR b.session_id = u.session_id) ORDER BY b.id"
+)
+_LISTED: Final = (
+    "SELECT b.id, r.id, b.condition, b.action, b.after_hits, b.enabled, b.hit_count, "
+    f"b.created_wall_time_s, b.created_by, b.error {_OF_ROBOT} ORDER BY b.id"
+)
+_IDS: Final = f"SELECT b.id {_OF_ROBOT} ORDER BY b.id"
+_COUNT: Final = f"SELECT count(*) {_OF_ROBOT} AND b.enabled"
+_LIKE: Final = (
+    f"SELECT b.id {_OF_ROBOT} AND b.enabled AND b.condition = ? AND b.action = ? "
+    "AND b.after_hits = ? AND b.expects IS NULL"
+)
+# Of a controller's own code with its session, else without one.
+SET: Final = (
+    "INSERT INTO breakpoint (robot_id, session_id, condition, action, after_hits, "
+    "created_wall_time_s, created_by, name, expects, during) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id"
+)
+_REMOVE: Final = "DELETE FROM breakpoint WHERE id = ? AND robot_id = ? RETURNING id"
+_NEWEST_HIT: Final = (
+    "SELECT e.run_id, e.sim_time_s FROM event e JOIN run u ON u.id = e.run_id "
+    "WHERE u.robot_id = ? AND e.kind IN ('breakpoint', 'violation') "
+    "AND json_extract(e.data, '$.breakpoint_id') = ? ORDER BY e.id DESC LIMIT 1"
+)
 
 
 class Cause(NamedTuple):
@@ -143,54 +189,6 @@ def paused_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> 
 
 
 # The stored breakpoints: conditions that a robot's bridge asks of each published state.
-
-
-OF_CONTROLLER: Final = "controller"  # `created_by` of those that the controller's own code has set
-# Those end with their session.
-OF_PROJECT: Final = "project"  # of those of its file
-_MEANT: Final = "(b.robot_id = r.id OR b.robot_name IN ('*', r.name))"
-_OF_ROBOT: Final = (
-    f"FROM robot r JOIN breakpoint b ON {_MEANT} LEFT JOIN session s ON s.id = b.session_id "
-    f"WHERE r.id = ? AND (b.created_by IS NOT '{OF_CONTROLLER}' "
-    "OR (s.id IS NOT NULL AND s.ended_wall_time_s IS NULL))"
-)
-# What a bridge arms; texts come as bytes, because one that is no UTF-8 would fail the statement.
-ARMED: Final = (
-    "SELECT b.id, CAST(b.condition AS BLOB), CAST(b.action AS BLOB), b.after_hits, "
-    "CAST(b.name AS BLOB), CAST(b.expects AS BLOB), CAST(b.during AS BLOB) "
-    f"FROM robot r JOIN breakpoint b ON {_MEANT} "
-    "WHERE r.id = :robot AND b.enabled AND typeof(b.after_hits) = 'integer' "
-    f"AND (b.created_by IS NOT '{OF_CONTROLLER}' OR b.session_id = :session) "
-    "ORDER BY b.id LIMIT :most"
-)
-# What was expected of a run: by its controller's code, and by the project.
-EXPECTED: Final = (
-    "SELECT b.expects, b.during, b.name, b.created_by FROM run u JOIN robot r ON r.id = u.robot_id "
-    f"JOIN breakpoint b ON {_MEANT} WHERE u.id = ? AND b.expects IS NOT NULL "
-    f"AND (b.created_by IS NOT '{OF_CONTROLLER}' OR b.session_id = u.session_id) ORDER BY b.id"
-)
-_LISTED: Final = (
-    "SELECT b.id, r.id, b.condition, b.action, b.after_hits, b.enabled, b.hit_count, "
-    f"b.created_wall_time_s, b.created_by, b.error {_OF_ROBOT} ORDER BY b.id"
-)
-_IDS: Final = f"SELECT b.id {_OF_ROBOT} ORDER BY b.id"
-_COUNT: Final = f"SELECT count(*) {_OF_ROBOT} AND b.enabled"
-_LIKE: Final = (
-    f"SELECT b.id {_OF_ROBOT} AND b.enabled AND b.condition = ? AND b.action = ? "
-    "AND b.after_hits = ? AND b.expects IS NULL"
-)
-# Of a controller's own code with its session, else without one.
-SET: Final = (
-    "INSERT INTO breakpoint (robot_id, session_id, condition, action, after_hits, "
-    "created_wall_time_s, created_by, name, expects, during) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id"
-)
-_REMOVE: Final = "DELETE FROM breakpoint WHERE id = ? AND robot_id = ? RETURNING id"
-_NEWEST_HIT: Final = (
-    "SELECT e.run_id, e.sim_time_s FROM event e JOIN run u ON u.id = e.run_id "
-    "WHERE u.robot_id = ? AND e.kind IN ('breakpoint', 'violation') "
-    "AND json_extract(e.data, '$.breakpoint_id') = ? ORDER BY e.id DESC LIMIT 1"
-)
 
 
 class StoredBreakpoint(NamedTuple):

@@ -162,31 +162,6 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (run_id, call) DO NOTHING"
     ),
 }
-
-
-class Entry(NamedTuple):
-    """One write of a session.
-
-    Attributes:
-        number: Rising within the session; what was taken in once is known by it.
-        kind: Which of `STATEMENTS`.
-        run: UUID of the run that it belongs to.
-        values: Of the statement.
-    """
-
-    number: int
-    kind: Kind
-    run: str | None
-    values: Values
-
-
-def bind(run_id: int | None, session_id: int | None, values: Values) -> Values:
-    """The values of a statement, with the ids of its run and session."""
-    if isinstance(values, dict):
-        return {"run": run_id, "session": session_id, **values}
-    return values if run_id is None else (run_id, *values)
-
-
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
 FORMAT: Final = 1  # of the file; versions that know another one leave the file alone
 _LONGEST_HEADER_BYTES: Final = 16_000_000
@@ -195,7 +170,6 @@ _VERSION: Final = "webots_mcp_waiting"
 _NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
 _LOCKED_BYTE: Final = 1 << 40  # far beyond the end: Windows refuses to read what is locked
 _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
-
 _SESSION_OF: Final = "SELECT id, last_adopted_entry FROM session WHERE uuid = ?"
 _ADOPTED: Final = "SELECT last_adopted_entry FROM session WHERE id = ?"
 _SET_ADOPTED: Final = "UPDATE session SET last_adopted_entry = ? WHERE id = ?"
@@ -237,19 +211,40 @@ _NEW_SESSION: Final = (
     f"VALUES (:robot_id, :{', :'.join(SESSION_COLUMNS)}) ON CONFLICT (uuid) "
     "DO UPDATE SET ended_wall_time_s = NULL, end_reason = NULL"
 )
-
 # What refuses a row whatever state the database is in: its own content.
 _UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeEncodeError, OverflowError)
-
 # What a file that was damaged, or made by others, raises while it is read.
 _OF_THE_FILE: Final = (
     OSError, ValueError, TypeError, LookupError, RecursionError, SessionGoneError,
 )  # fmt: skip
-
 # At the end of the name of a journal's part: the session's UUID and the number of the part.
 _PART: Final = re.compile(
     r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
 )
+
+
+class Entry(NamedTuple):
+    """One write of a session.
+
+    Attributes:
+        number: Rising within the session; what was taken in once is known by it.
+        kind: Which of `STATEMENTS`.
+        run: UUID of the run that it belongs to.
+        values: Of the statement.
+    """
+
+    number: int
+    kind: Kind
+    run: str | None
+    values: Values
+
+
+def bind(run_id: int | None, session_id: int | None, values: Values) -> Values:
+    """The values of a statement, with the ids of its run and session."""
+    if isinstance(values, dict):
+        return {"run": run_id, "session": session_id, **values}
+    return values if run_id is None else (run_id, *values)
+
 
 _strange: set[Path] = set()
 

@@ -32,6 +32,16 @@ from webots_mcp.store.signals import Signal
 
 
 _DUST: Final = 1e-9  # of a signal's largest value: what varies by less does not vary
+COMPARE_DEADLINE_S: Final = 5.0
+MOST_COMPARED: Final = 10
+MOST_SETS: Final = 5  # of a trial set
+_AS_LONG: Final = 1.01  # times the compared stretch: the ends of like runs differ by a few rows
+_CODE_OF_RUNS: Final = (
+    "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
+    "WHERE r.robot_id = ? "
+    "AND (r.row_count > 0 OR EXISTS (SELECT 1 FROM state WHERE run_id = r.id)) "
+    "ORDER BY r.id DESC"
+)
 
 
 @dataclass(frozen=True)
@@ -185,19 +195,6 @@ def only_in(differences: Sequence[Difference], groups: Sequence[str]) -> dict[st
         for each in differences
         if any(each.count) and 0 in each.count
     }
-
-
-COMPARE_DEADLINE_S: Final = 5.0
-MOST_COMPARED: Final = 10
-MOST_SETS: Final = 5  # of a trial set
-_AS_LONG: Final = 1.01  # times the compared stretch: the ends of like runs differ by a few rows
-
-_CODE_OF_RUNS: Final = (
-    "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.robot_id = ? "
-    "AND (r.row_count > 0 OR EXISTS (SELECT 1 FROM state WHERE run_id = r.id)) "
-    "ORDER BY r.id DESC"
-)
 
 
 @dataclass(frozen=True)

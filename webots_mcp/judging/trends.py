@@ -70,6 +70,7 @@ _DUST: Final = 1e-12  # of a value: what adding leaves of it
 
 Shape = Literal["constant", "rising", "falling", "oscillating", "resting", "varying"]
 Monotonic = Literal["rising", "falling"]
+TOO_LARGE: Final = "its numbers are beyond 1e100"
 
 
 @dataclass(frozen=True)
@@ -492,9 +493,6 @@ def _swinging(trend: Trend, unit: str) -> str:
     others = f" (longest of {len(trend.swings)})" if trend.swings[1:] else ""
     stretch = f"from {shown_time(swing.start_s):g} to {shown_time(swing.end_s):g} s"
     return f"oscillated {stretch}{others}: {how}"
-
-
-TOO_LARGE: Final = "its numbers are beyond 1e100"
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,40 @@ _CIVIDIS: Final = (
     "#FEE838",
 )  # fmt: skip
 SCALES: Final = {"time": _VIRIDIS, "score": _CIVIDIS}
+MOST_VALUES: Final = 2 * len(AREAS)
+MOST_PANELS: Final = 3
+MOST_LANES: Final = 4
+WIDTH_PX: Final = 900
+HEIGHT_PX: Final = 500
+LEAST_WIDTH_PX: Final = 400
+LEAST_HEIGHT_PX: Final = 300
+MOST_PX: Final = 2000
+ROW_PX: Final = 17
+TEXT_PX: Final = 11.0  # the size of usual letters
+_BESIDE_PX: Final = 200  # what stands beside an axis, about
+_PANEL_PX: Final = 110
+_TITLE_AND_LEGEND_PX: Final = 150
+_BUCKET_PX: Final = 3  # in fewer pixels the band of extremes would hide behind the line
+_LONGEST_NAME: Final = 24
+_LEAST_SPAN: Final = 1e-11  # of the values: less is what rounding leaves of a constant
+_FLAT: Final = 0.05  # of a constant value is shown above and below it
+# Widths of letters in em, of the widest of the usual fonts, so that texts have room in all.
+_NARROW: Final = frozenset("ijlftr|.,:;'!()[]/\\ -")
+_BROAD: Final = frozenset("mwMW@%…")
+# The last one comes with Pillow, for a computer without any font.
+_FAMILIES: Final = "DejaVu Sans, Segoe UI, Helvetica Neue, Arial, Liberation Sans, Aileron"
+_UNSEEN: Final = ("Cc", "Cf", "Zs", "Zl", "Zp", "Mn", "Me")  # spaces, controls, marks on letters
+_NO_CHARACTER: Final = "\U0010ffff"  # no font has it
+_CELL_PX: Final = 24
+_SHOWN_TEXTS: Final = 3
+_HATCHES: Final = (
+    '<defs><pattern id="hatch-gap" width="6" height="6" patternUnits="userSpaceOnUse">'
+    '<path d="M-1 7L7-1M-1 1L1-1M5 7L7 5" stroke="#A0A0A0" stroke-width=".8"/></pattern>'
+    '<pattern id="hatch-unread" width="7" height="7" patternUnits="userSpaceOnUse">'
+    f'<path d="M0 0L7 7M0 7L7 0" stroke="{LINES[1]}" stroke-opacity=".6" stroke-width=".8"/>'
+    '</pattern><pattern id="hatch-dots" width="6" height="6" patternUnits="userSpaceOnUse">'
+    '<circle cx="3" cy="3" r="1" fill="#333333"/></pattern></defs>'
+)
 
 
 class Area(NamedTuple):
@@ -54,7 +88,6 @@ class Area(NamedTuple):
 
 
 MERGED: Final = Area("#DDDDDD", dotted=False)
-MOST_VALUES: Final = 2 * len(AREAS)
 
 
 def area_styles(values: Iterable[str]) -> dict[str, Area]:
@@ -84,41 +117,6 @@ def scaled(share: float, scale: str) -> str:
 
 
 ImageFormat = Literal["png", "svg"]
-
-MOST_PANELS: Final = 3
-MOST_LANES: Final = 4
-WIDTH_PX: Final = 900
-HEIGHT_PX: Final = 500
-LEAST_WIDTH_PX: Final = 400
-LEAST_HEIGHT_PX: Final = 300
-MOST_PX: Final = 2000
-ROW_PX: Final = 17
-TEXT_PX: Final = 11.0  # the size of usual letters
-_BESIDE_PX: Final = 200  # what stands beside an axis, about
-_PANEL_PX: Final = 110
-_TITLE_AND_LEGEND_PX: Final = 150
-_BUCKET_PX: Final = 3  # in fewer pixels the band of extremes would hide behind the line
-_LONGEST_NAME: Final = 24
-_LEAST_SPAN: Final = 1e-11  # of the values: less is what rounding leaves of a constant
-_FLAT: Final = 0.05  # of a constant value is shown above and below it
-
-# Widths of letters in em, of the widest of the usual fonts, so that texts have room in all.
-_NARROW: Final = frozenset("ijlftr|.,:;'!()[]/\\ -")
-_BROAD: Final = frozenset("mwMW@%…")
-# The last one comes with Pillow, for a computer without any font.
-_FAMILIES: Final = "DejaVu Sans, Segoe UI, Helvetica Neue, Arial, Liberation Sans, Aileron"
-_UNSEEN: Final = ("Cc", "Cf", "Zs", "Zl", "Zp", "Mn", "Me")  # spaces, controls, marks on letters
-_NO_CHARACTER: Final = "\U0010ffff"  # no font has it
-_CELL_PX: Final = 24
-_SHOWN_TEXTS: Final = 3
-_HATCHES: Final = (
-    '<defs><pattern id="hatch-gap" width="6" height="6" patternUnits="userSpaceOnUse">'
-    '<path d="M-1 7L7-1M-1 1L1-1M5 7L7 5" stroke="#A0A0A0" stroke-width=".8"/></pattern>'
-    '<pattern id="hatch-unread" width="7" height="7" patternUnits="userSpaceOnUse">'
-    f'<path d="M0 0L7 7M0 7L7 0" stroke="{LINES[1]}" stroke-opacity=".6" stroke-width=".8"/>'
-    '</pattern><pattern id="hatch-dots" width="6" height="6" patternUnits="userSpaceOnUse">'
-    '<circle cx="3" cy="3" r="1" fill="#333333"/></pattern></defs>'
-)
 
 
 @dataclass(frozen=True)

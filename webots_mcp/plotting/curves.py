@@ -20,6 +20,11 @@ from webots_mcp.store.signals import Signal
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum
 _BREAK: Point = (math.nan, math.nan, math.nan, math.nan)
+MOST_CURVES: Final = 5  # more bands on top of each other are mud
+_LEAST_SHARE: Final = 0.07  # of the axis; a curve that moves less would look flat
+MOST_PLACES: Final = 20_000  # of a way; a picture has a thousandth as many pixels
+_LEAP: Final = 10.0  # times the speed that 95 % of the steps keep to
+_FINENESS: Final = 1 / 2000  # of the larger side: what lies nearer is the same pixel
 
 
 @dataclass(frozen=True)
@@ -80,10 +85,6 @@ def _with_breaks(points: Sequence[Point], run: RunHistory, *, angle: bool) -> li
             broken.append(_BREAK)
         broken.append(after)
     return broken
-
-
-MOST_CURVES: Final = 5  # more bands on top of each other are mud
-_LEAST_SHARE: Final = 0.07  # of the axis; a curve that moves less would look flat
 
 
 @dataclass
@@ -177,11 +178,6 @@ def by_choice(
 
 
 # Where a robot went: the rows of a run as points in the plane, and where they stand out.
-
-
-MOST_PLACES: Final = 20_000  # of a way; a picture has a thousandth as many pixels
-_LEAP: Final = 10.0  # times the speed that 95 % of the steps keep to
-_FINENESS: Final = 1 / 2000  # of the larger side: what lies nearer is the same pixel
 
 
 class Place(NamedTuple):

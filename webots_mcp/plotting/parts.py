@@ -37,6 +37,30 @@ Known = dict[str, Signal]
 MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze
 MOST_RUNS: Final = 10  # each with a colour and dashes of its own
 _SHOWN_PARAMETERS: Final = 3
+MOST_EVENTS: Final = 500
+MOST_LANES: Final = 5  # in one picture
+TITLE_PX: Final = 13.0
+LINE_PX: Final = 16.0  # from line to line
+_SWATCH_PX: Final = 26.0
+_GAP_PX: Final = 14.0
+_MOST_HEIGHT: Final = 0.25  # of the picture
+_BAR_PX: Final = 12.0
+_BAR_STEPS: Final = 64
+SCALE_PX: Final = 78.0  # what a scale of colours takes
+_STAR: Final = "M" + "L".join(
+    f"{r * math.sin(i * math.pi / 5):.2f} {-r * math.cos(i * math.pi / 5):.2f}"
+    for i, r in enumerate([1.2, 0.5] * 5)
+) + "Z"  # fmt: skip
+SHAPES: Final = {
+    "circle": "M-1 0A1 1 0 1 1 1 0A1 1 0 1 1-1 0Z",
+    "square": "M-.9-.9H.9V.9H-.9Z",
+    "diamond": "M0-1.2L.7 0 0 1.2-.7 0Z",
+    "cross": "M-1-.6L-.6-1 0-.4.6-1 1-.6.4 0 1 .6 .6 1 0 .4-.6 1-1 .6-.4 0Z",
+    "plus": "M-.35-1H.35V-.35H1V.35H.35V1H-.35V.35H-1V-.35H-.35Z",
+    "triangle": "M0-1.1L1 .8H-1Z",
+    "star": _STAR,
+    "arrow": "M1 0L-.9.9V-.9Z",
+}
 
 
 @dataclass(frozen=True)
@@ -235,10 +259,6 @@ def mode_signal(known: Known, wanted: str | None) -> str | None:
     return signal.name
 
 
-MOST_EVENTS: Final = 500
-MOST_LANES: Final = 5  # in one picture
-
-
 def event_lanes(
     connection: sqlite3.Connection,
     part: Part,
@@ -347,15 +367,6 @@ def stuck_mark(
 
 
 # What surrounds axes: titles, ticks, marks, and a legend in as many rows as it needs.
-
-
-TITLE_PX: Final = 13.0
-LINE_PX: Final = 16.0  # from line to line
-_SWATCH_PX: Final = 26.0
-_GAP_PX: Final = 14.0
-_MOST_HEIGHT: Final = 0.25  # of the picture
-_BAR_PX: Final = 12.0
-_BAR_STEPS: Final = 64
 
 
 Sample: TypeAlias = "Callable[[Canvas, float, float], None]"
@@ -526,25 +537,7 @@ def paint_scale(
     canvas.text(0, 0, label, anchor="middle", transform=f"translate({x:g} {y:.1f}) rotate(-90)")
 
 
-SCALE_PX: Final = 78.0  # what a scale of colours takes
-
-
 # Marks --------------------------------------------------------------------------------------------
-
-_STAR: Final = "M" + "L".join(
-    f"{r * math.sin(i * math.pi / 5):.2f} {-r * math.cos(i * math.pi / 5):.2f}"
-    for i, r in enumerate([1.2, 0.5] * 5)
-) + "Z"  # fmt: skip
-SHAPES: Final = {
-    "circle": "M-1 0A1 1 0 1 1 1 0A1 1 0 1 1-1 0Z",
-    "square": "M-.9-.9H.9V.9H-.9Z",
-    "diamond": "M0-1.2L.7 0 0 1.2-.7 0Z",
-    "cross": "M-1-.6L-.6-1 0-.4.6-1 1-.6.4 0 1 .6 .6 1 0 .4-.6 1-1 .6-.4 0Z",
-    "plus": "M-.35-1H.35V-.35H1V.35H.35V1H-.35V.35H-1V-.35H-.35Z",
-    "triangle": "M0-1.1L1 .8H-1Z",
-    "star": _STAR,
-    "arrow": "M1 0L-.9.9V-.9Z",
-}
 
 
 def paint_mark(

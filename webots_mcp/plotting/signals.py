@@ -64,6 +64,14 @@ from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
 _EVENTS_SHARE: Final = 0.4  # of the time, whatever the curves take
+_SMALL_PX: Final = 9.5  # of the letters in rows of intervals
+_TICK_PX: Final = 70.0  # between the labels of the time axis, and
+_LEVEL_PX: Final = 20.0  # between those of the others, at least
+_RIGHT_PX: Final = 16.0
+_BELOW_PX: Final = 24.0  # the labels of the time axis
+_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
+_BAND_OPACITY: Final = 0.35
+_LINES_THROUGH: Final = 30  # more instants would be a curtain
 
 
 def plot_signals(
@@ -253,16 +261,6 @@ def _nothing(parts: Sequence[Part]) -> str:
     return f"nothing to draw: none of the signals has a value in {title_of(parts)}" + (
         f" ({notes})" if notes else ""
     )
-
-
-_SMALL_PX: Final = 9.5  # of the letters in rows of intervals
-_TICK_PX: Final = 70.0  # between the labels of the time axis, and
-_LEVEL_PX: Final = 20.0  # between those of the others, at least
-_RIGHT_PX: Final = 16.0
-_BELOW_PX: Final = 24.0  # the labels of the time axis
-_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
-_BAND_OPACITY: Final = 0.35
-_LINES_THROUGH: Final = 30  # more instants would be a curtain
 
 
 @dataclass(frozen=True)

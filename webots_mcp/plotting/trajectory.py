@@ -66,6 +66,15 @@ from webots_mcp.store.signals import Signal
 
 _FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
 _SIGNALS_SHARE: Final = 0.5  # of the time; the rest is for the way, and for when it was stuck
+_ARROWS: Final = 9
+_TICK_PX: Final = 50.0  # between ticks, at least
+_ON_THE_SPOT: Final = 0.03  # of the size of the whole way
+_LEAST_SIZE: Final = 0.02  # of the picture, in the unit of the position
+_MARGIN: Final = 0.06
+_COLOURS: Final = 64  # of a way that is coloured by time
+_MANY: Final = 10  # marks of a kind; more are drawn smaller
+_SHAPES: Final = ("circle", "cross", "plus", "triangle", "star")  # the first is around the others
+_OBSTACLE: Final = {"fill": "#B8B8B8", "fill_opacity": 0.55, "stroke_width": 0.8}
 
 
 def plot_trajectory(
@@ -220,17 +229,6 @@ def _cut(tracks: Sequence[Track]) -> list[str]:
         for track in tracks
         if track.path.places and not track.path.is_whole
     ]
-
-
-_ARROWS: Final = 9
-_TICK_PX: Final = 50.0  # between ticks, at least
-_ON_THE_SPOT: Final = 0.03  # of the size of the whole way
-_LEAST_SIZE: Final = 0.02  # of the picture, in the unit of the position
-_MARGIN: Final = 0.06
-_COLOURS: Final = 64  # of a way that is coloured by time
-_MANY: Final = 10  # marks of a kind; more are drawn smaller
-_SHAPES: Final = ("circle", "cross", "plus", "triangle", "star")  # the first is around the others
-_OBSTACLE: Final = {"fill": "#B8B8B8", "fill_opacity": 0.55, "stroke_width": 0.8}
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,14 @@ from webots_mcp.plotting.signals import line_through
 from webots_mcp.signals.naming import listed, nearest_first
 from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, trials_of
 
+_MOST_TOLD_CELLS: Final = 60  # more texts in a grid would not fit
+_DARK: Final = 0.5  # of the colour scale: on darker cells texts are white
+_BELOW_PX: Final = 42.0
+_RING: Final[dict[str, Any]] = {"fill": "none", "stroke": LINES[1], "stroke_width": 2.4}
+_DOT: Final[dict[str, Any]] = {"fill": INK}
+_MEAN: Final[dict[str, Any]] = {"fill": LINES[0]}
+_FAILED: Final[dict[str, Any]] = {"fill": LINES[1]}
+
 
 def plot_trials(
     connection: sqlite3.Connection,
@@ -110,15 +118,6 @@ def _chosen(trials: Sequence[Trial], names: Sequence[str]) -> list[str]:
 def _outcome(trial: Trial, names: Sequence[str]) -> Outcome:
     values: dict[str, Any] = {name: trial.values.get(name) for name in names}
     return Outcome(values, trial.score, trial.error, pruned=trial.status == "pruned")
-
-
-_MOST_TOLD_CELLS: Final = 60  # more texts in a grid would not fit
-_DARK: Final = 0.5  # of the colour scale: on darker cells texts are white
-_BELOW_PX: Final = 42.0
-_RING: Final[dict[str, Any]] = {"fill": "none", "stroke": LINES[1], "stroke_width": 2.4}
-_DOT: Final[dict[str, Any]] = {"fill": INK}
-_MEAN: Final[dict[str, Any]] = {"fill": LINES[0]}
-_FAILED: Final[dict[str, Any]] = {"fill": LINES[1]}
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,11 @@ Force = Annotated[bool, Field(description="Press Webots' keys where nothing else
 _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
 _USUAL_WAIT_S: Final[dict[Order, float]] = {"reload": _RELOAD_WAIT_S, "step": MAX_WAIT_S}
+_STARTING_S: Final = 60.0  # Webots downloads what it has not cached
+_WORLD_WAIT_S: Final = 30.0
+_LOOK_EVERY_S: Final = 0.2
+_LONGEST_LINE: Final = 200
+_RUN_WAIT_S: Final = 60.0
 
 
 @question("Control the simulation", DESTROYS, core=True)
@@ -119,10 +124,6 @@ async def webots_reset_controller_state(
 
 # -- Webots itself: started on a world, another world in it, ended --
 
-_STARTING_S: Final = 60.0  # Webots downloads what it has not cached
-_WORLD_WAIT_S: Final = 30.0
-_LOOK_EVERY_S: Final = 0.2
-_LONGEST_LINE: Final = 200
 
 World = Annotated[str, Field(max_length=1000, description="A .wbt file.")]
 
@@ -249,8 +250,6 @@ def _described(launched: Launch) -> dict[str, Any]:
 
 
 # -- running until something is the case --
-
-_RUN_WAIT_S: Final = 60.0
 
 
 @question(

@@ -36,6 +36,16 @@ Path = Annotated[
 ]
 _Count = Annotated[int, Field(ge=1, le=24)]
 _Start = Annotated[int, Field(ge=0)]
+_WAIT_S: Final = 15.0  # of wall time
+_NO_SUPERVISOR: Final = (
+    "no live controller can read the scene of {}: set the field 'supervisor' of a Robot node to "
+    "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
+    "by webots-mcp init --observer WORLD"
+)
+_NONE_LIVE: Final = (
+    "no controller of {} is live (robot {!r}: {}): start the simulation, then ask again; "
+    "webots_get_world_info has what was recorded"
+)
 
 
 @question(
@@ -127,17 +137,6 @@ async def webots_remove_node(
 
 
 # -- asking any live Supervisor of the simulation --
-
-_WAIT_S: Final = 15.0  # of wall time
-_NO_SUPERVISOR: Final = (
-    "no live controller can read the scene of {}: set the field 'supervisor' of a Robot node to "
-    "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
-    "by webots-mcp init --observer WORLD"
-)
-_NONE_LIVE: Final = (
-    "no controller of {} is live (robot {!r}: {}): start the simulation, then ask again; "
-    "webots_get_world_info has what was recorded"
-)
 
 
 async def _ask(

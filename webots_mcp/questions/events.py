@@ -39,6 +39,8 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
+DEFAULT_LIMIT: Final = 50
+
 
 def _as_kind(name: str) -> str:
     if name not in kind_names():
@@ -62,7 +64,6 @@ TimelineKinds = Annotated[
     list[Annotated[str, AfterValidator(_as_kind)]] | None,
     Field(description="Of those of webots_find_events; by default all that were stored."),
 ]
-DEFAULT_LIMIT: Final = 50
 
 
 @question(

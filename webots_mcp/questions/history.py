@@ -64,6 +64,11 @@ from webots_mcp.store.series import (
 )
 
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
+_SHOWN_GAPS: Final = 10
+_CELL_TOKENS: Final = 15  # of a bucket of a numeric signal: min, max, mean and last
+_SIGNAL_TOKENS: Final = 60  # of a signal, beside its buckets
+DEFAULT_LIMIT: Final = 20
+_ASK_FOR_OTHERS: Final = "signals=['...'] asks for others, limit for more"
 
 
 @question(
@@ -148,10 +153,6 @@ def _hint(start: int, end: int, total: int) -> str | None:
 
 
 # -- signals over time --
-
-_SHOWN_GAPS: Final = 10
-_CELL_TOKENS: Final = 15  # of a bucket of a numeric signal: min, max, mean and last
-_SIGNAL_TOKENS: Final = 60  # of a signal, beside its buckets
 
 
 @question(
@@ -381,9 +382,6 @@ def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
 
 
 # -- what each signal did, in words --
-
-DEFAULT_LIMIT: Final = 20
-_ASK_FOR_OTHERS: Final = "signals=['...'] asks for others, limit for more"
 
 
 @question(

@@ -89,6 +89,36 @@ _READ: Final = "the observer, from customData: it has no bridge and takes no com
 _ROBOT_COLUMNS: Final = (
     "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
 )  # fmt: skip
+_LONGEST_TEXT: Final = 320
+_BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
+_PUBLISH: Final = (
+    "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
+    "controller's loop every 5th is by default (throttle_interval), or each one with force=True"
+)
+_EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND row_count > 0"
+_PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
+_EVENTS: Final = 10
+_EVENTS_TOKENS: Final = 250
+_PAGE: Final = 500  # members, items or characters where it was not said how many
+_SHOWN_NAMES: Final = 6
+_MARGIN_TOKENS: Final = 200  # for hints
+_SHOWN_REPLACED: Final = 20
+_NULL: Final = "the value at this path is null"  # which an answer leaves out
+_SHOWN_DEVICES: Final = 30
+_ERROR_CHARACTERS: Final = 300
+# Webots device classes that are not sensors.
+_NO_SENSORS: Final = (
+    "Brake", "Connector", "Display", "Emitter", "LED", "LinearMotor", "Motor", "Muscle", "Pen",
+    "Propeller", "RotationalMotor", "Skin", "Speaker", "Track", "VacuumGripper",
+)  # fmt: skip
+_WORDS: Final = (
+    "sensor", "lidar", "gps", "imu", "inertial", "compass", "gyro", "accel", "encoder", "touch",
+    "bumper", "distance", "range", "radar", "sonar", "light", "altimeter", "camera", "odometry",
+    "battery", "force", "contact", "scan",
+)  # fmt: skip
+_MOST_ITEMS: Final = 64  # of an array, each of which may be a device
+_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 @question("List the robots", READS, command="status", core=True)
@@ -305,9 +335,6 @@ def _companions(view: View) -> list[list[str]]:
 
 # -- why nothing works --
 
-_LONGEST_TEXT: Final = 320
-_BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
-
 
 @question("Diagnose the set-up", READS, core=True)
 def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
@@ -347,22 +374,6 @@ def _by_reason(checked: Sequence[Checked]) -> dict[str, str]:
             names.setdefault(cut_text(finding.seen, _LONGEST_TEXT), []).append(check.name)
     return {reason: ", ".join(those) for reason, those in names.items()}
 
-
-_PUBLISH: Final = (
-    "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
-    "controller's loop every 5th is by default (throttle_interval), or each one with force=True"
-)
-_EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND row_count > 0"
-_PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
-_EVENTS: Final = 10
-_EVENTS_TOKENS: Final = 250
-_PAGE: Final = 500  # members, items or characters where it was not said how many
-_SHOWN_NAMES: Final = 6
-_MARGIN_TOKENS: Final = 200  # for hints
-_SHOWN_REPLACED: Final = 20
-_NULL: Final = "the value at this path is null"  # which an answer leaves out
-_SHOWN_DEVICES: Final = 30
-_ERROR_CHARACTERS: Final = 300
 
 PagePath = Annotated[
     str,
@@ -637,20 +648,6 @@ def _no_sensors(state: dict[str, Any]) -> str:
 
 
 # -- sensor values in a published state --
-
-# Webots device classes that are not sensors.
-_NO_SENSORS: Final = (
-    "Brake", "Connector", "Display", "Emitter", "LED", "LinearMotor", "Motor", "Muscle", "Pen",
-    "Propeller", "RotationalMotor", "Skin", "Speaker", "Track", "VacuumGripper",
-)  # fmt: skip
-_WORDS: Final = (
-    "sensor", "lidar", "gps", "imu", "inertial", "compass", "gyro", "accel", "encoder", "touch",
-    "bumper", "distance", "range", "radar", "sonar", "light", "altimeter", "camera", "odometry",
-    "battery", "force", "contact", "scan",
-)  # fmt: skip
-_MOST_ITEMS: Final = 64  # of an array, each of which may be a device
-_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
-_WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:

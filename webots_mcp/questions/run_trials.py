@@ -72,6 +72,16 @@ _LOOK_EVERY_S: Final = 0.05
 _REPORT_EVERY_S: Final = 1.0
 
 _Value = float | int | bool | str
+CANCELLED: Final = "it was cancelled"
+_TABLE_TOKENS: Final = 1_250
+_IN_SIMULATORS: Final = (
+    "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
+)
+_FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
+_LONGEST_WHY: Final = 120
+_RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
+_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
+_MOST_NAMED_RUNS: Final = 5
 
 
 def _require_sets(given: Any) -> Any:
@@ -270,18 +280,6 @@ async def _wait(recording: Recording, caller: Caller, set_id: int, timeout_wall_
                 report_s += _REPORT_EVERY_S
                 await caller.report(*progress_of(connection, set_id))
             await anyio.sleep(_LOOK_EVERY_S)
-
-
-CANCELLED: Final = "it was cancelled"
-_TABLE_TOKENS: Final = 1_250
-_IN_SIMULATORS: Final = (
-    "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
-)
-_FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
-_LONGEST_WHY: Final = 120
-_RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
-_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
-_MOST_NAMED_RUNS: Final = 5
 
 
 # -- answers ----------------------------------------------------------------------------------

@@ -74,6 +74,26 @@ _NOT_ASKED: Final = (
 _ARMING_WAIT_S: Final = 5.0
 _NO_PARAMS: Final[Mapping[str, Any]] = {}
 _LONGEST_CONDITION: Final = 300
+COMMAND_COLUMNS: Final = (
+    "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
+)  # fmt: skip
+_WAIT_S: Final = 10.0
+_ACTIONS_TOKENS: Final = 500
+_DOCSTRINGS: Final = (2_000, 400, 200, 100, 50, 25)  # characters of each
+_MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
+    'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, 201, 200) '
+    "FROM session, json_each(actions) WHERE session.id = {} AND key = 'NAME'\") has more of one"
+)
+_COMMANDS_TOKENS: Final = 1_100
+_LONGEST_TEXT: Final = 200
+SET_WAIT_S: Final = 10.0
+_ACTION: Final = "set_parameters"
+_MOST_NEAR: Final = 5
+_NONE: Final = (
+    'this run has none: declare one in the controller with kp = bridge.parameter("kp", 2.0, '
+    "low=0.0, high=10.0) and read kp.value in its loop"
+)
+_TAKES_NONE: Final = "this robot has no bridge: it takes no commands, and has no parameters"
 
 
 @question("Set a breakpoint", CHANGES)
@@ -219,20 +239,6 @@ def _breakpoint_row(view: View, each: stored.StoredBreakpoint) -> list[Any]:
     ]
 
 
-COMMAND_COLUMNS: Final = (
-    "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
-)  # fmt: skip
-_WAIT_S: Final = 10.0
-_ACTIONS_TOKENS: Final = 500
-_DOCSTRINGS: Final = (2_000, 400, 200, 100, 50, 25)  # characters of each
-_MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
-    'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, 201, 200) '
-    "FROM session, json_each(actions) WHERE session.id = {} AND key = 'NAME'\") has more of one"
-)
-_COMMANDS_TOKENS: Final = 1_100
-_LONGEST_TEXT: Final = 200
-
-
 @question(
     "Send a command",
     DESTROYS,
@@ -354,9 +360,6 @@ def _shown_actions(actions: Mapping[str, str]) -> dict[str, str]:
 
 When = Literal["now", "reset"]
 
-SET_WAIT_S: Final = 10.0
-_ACTION: Final = "set_parameters"
-
 
 async def set_parameters(
     recording: Recording,
@@ -391,16 +394,6 @@ def settable(recording: Recording, robot: str | None) -> dict[str, Declared]:
     with recording.reader() as connection:
         session = find_target(connection, robot, _ACTION).session
         return declared_by(connection, session.id) if session else {}
-
-
-_MOST_NEAR: Final = 5
-_NONE: Final = (
-    'this run has none: declare one in the controller with kp = bridge.parameter("kp", 2.0, '
-    "low=0.0, high=10.0) and read kp.value in its loop"
-)
-
-
-_TAKES_NONE: Final = "this robot has no bridge: it takes no commands, and has no parameters"
 
 
 def _none(view: View) -> str:

@@ -49,6 +49,8 @@ _LONGEST_SIDE_PX: Final = 1000
 _MAX_SENT_BYTES: Final = 4_000_000  # more than such a picture has pixels: it holds something else
 _JPEG_QUALITY: Final = 85
 _GAP_PX: Final = 4
+_END_WAIT_S: Final = 8.0
+_SAME_S: Final = 0.001  # answers have times to the millisecond
 
 
 @question("Get the camera picture", READS, core=True)
@@ -185,9 +187,6 @@ def _no_frame(view: View, camera: str) -> str:
 
 
 # -- the end of a run ------------------------------------------------------------------------------
-
-_END_WAIT_S: Final = 8.0
-_SAME_S: Final = 0.001  # answers have times to the millisecond
 
 
 async def show_end(recording: Recording, dispatcher: Dispatcher, answer: RunAnswer) -> None:

@@ -22,6 +22,9 @@ TOKEN_VARIABLE: Final = "WEBOTS_MCP_TOKEN"  # of clients that ask over HTTP
 _BOM: Final = "\ufeff"
 # Folders of environments that uv makes for one command and clears away with its cache.
 _PASSING: Final = re.compile(r"(archive|builds|environments)-v\d+")
+_STRING: Final = r'"(?:\\.|[^"\\\n])*"'
+_COMMENT: Final = re.compile(rf"{_STRING}|(//[^\n]*|/\*.*?\*/)", re.DOTALL)
+_TRAILING_COMMA: Final = re.compile(rf"{_STRING}|(,)(?=\s*[}}\]])")
 
 
 class Client(NamedTuple):
@@ -201,11 +204,6 @@ def ignore_file(data_dir: Path) -> FileChange:
     file = data_dir / ".gitignore"
     before = read(file)
     return FileChange(file, before, b"*\n" if before is None else before)
-
-
-_STRING: Final = r'"(?:\\.|[^"\\\n])*"'
-_COMMENT: Final = re.compile(rf"{_STRING}|(//[^\n]*|/\*.*?\*/)", re.DOTALL)
-_TRAILING_COMMA: Final = re.compile(rf"{_STRING}|(,)(?=\s*[}}\]])")
 
 
 def object_in(text: str) -> dict[str, Any]:

@@ -40,6 +40,7 @@ except Exception as error:
 print()
 print(json.dumps(said))
 """
+_BY_HAND: Final = "start it in a terminal, or choose another in Webots' preferences"
 
 
 class Chosen(NamedTuple):
@@ -202,9 +203,6 @@ def look_into(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpret
     except OSError as error:
         return Interpreter(**settings, error=f"it cannot be started: {error}", fix=_BY_HAND)
     return _judge(settings, ended)
-
-
-_BY_HAND: Final = "start it in a terminal, or choose another in Webots' preferences"
 
 
 def _judge(settings: dict[str, str], ended: subprocess.CompletedProcess[bytes]) -> Interpreter:

@@ -39,6 +39,24 @@ _ADDED: Final = re.compile(
 )
 
 _Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
+COPY_SUFFIX: Final = "_observed"
+CONTROLLER: Final = b'''"""The observer of webots-mcp: it records where all robots are."""
+
+from webots_mcp.simulator.observer import main
+
+main()
+'''
+# Without synchronization the world does not wait for it, and a pause by hand does not stop it:
+# see docs/webots.md.
+_ROBOT: Final = """Robot {{
+  name "{name}"
+  controller "{controller}"
+  supervisor TRUE
+  synchronization FALSE
+}}
+"""
+_HEADER: Final = b"#VRML_SIM "
+_TOKEN: Final = re.compile(rb'"(?:\\.|[^"\\])*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 
 
 class AlreadyPatchedError(InvalidInputError):
@@ -453,25 +471,6 @@ def _is_proven(before: ast.Module, patched: bytes, attach: str) -> bool:
 
 
 # -- the observer in a world ----------------------------------------------------------------------
-
-COPY_SUFFIX: Final = "_observed"
-CONTROLLER: Final = b'''"""The observer of webots-mcp: it records where all robots are."""
-
-from webots_mcp.simulator.observer import main
-
-main()
-'''
-# Without synchronization the world does not wait for it, and a pause by hand does not stop it:
-# see docs/webots.md.
-_ROBOT: Final = """Robot {{
-  name "{name}"
-  controller "{controller}"
-  supervisor TRUE
-  synchronization FALSE
-}}
-"""
-_HEADER: Final = b"#VRML_SIM "
-_TOKEN: Final = re.compile(rb'"(?:\\.|[^"\\])*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 
 
 def with_observer(world: bytes, *, extern: bool = False) -> bytes:

@@ -42,6 +42,47 @@ MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counte
 MAX_YAW_RAD: Final = 3.2  # the last item of a pose that goes beyond is no yaw
 
 _END_OF_POSE: Final = re.compile(r"(^|[._])(?:pose|odom|odometry)\.([235])$")
+PLACES: Final = ("", *(str(place) for place in range(2, 10)))  # in line for a role
+_TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps)|\.v)*$"  # `_v` is in volts
+_COMMANDED: Final = re.compile(
+    r"(^|[._])(commanded|command|cmd|cmd_vel(\.linear)?(\.0)?|target_speed"
+    rf"|(speed|velocity)[._](setpoint|target|ref)){_TAIL}"
+)
+_SPEED: Final = re.compile(rf"(^|[._])(speed|velocity|linear){_TAIL}")
+_WHEEL: Final = re.compile(
+    r"(^|[._])(wheels?|(left|right)_motors?|motors?[._]?(left|right|\d)?)([._]|$)"
+)
+_NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no robot
+    r"(^|[._])(position|pos|angle|encoders?|ticks?|odo\w*|distance|torque|force|current|power"
+    r"|temp\w*|radius|base|track|width|slip|contact|max|min|limit|gain|count|volt\w*"
+    r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
+)
+_SIDE: Final = r"(\d|[lr]|(front|rear|back)?_?(left|right))"
+_COMMANDED_WHEEL: Final = re.compile(
+    rf"(^|[._])(commands?|cmds?|commanded|target_speeds?)[._]{_SIDE}([._](speed|velocity|rad_s))*$"
+)
+_ANGLES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
+_THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
+_HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*")
+_ALTITUDE: Final = ("altitude", "alt")
+_MOTIONS: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
+_KEPT: Final = 4096  # names whose motion is remembered
+MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
+MOST_CHOICES: Final = 20  # that a number which names a mode has
+ADDED_AT_ONCE: Final = 50  # in one statement, which holds the write lock for half a millisecond
+_OF_ROBOT: Final = (
+    "SELECT name, kind, unit, role, max - min FROM signal "
+    "WHERE robot_id = ? AND typeof(name) = 'text' ORDER BY id"
+)
+_COLUMNS: Final = "robot_id, name, path, reduction, first_seen_wall_time_s, kind, unit, role"
+_ADD: Final = f"INSERT OR IGNORE INTO signal ({_COLUMNS}) VALUES "
+_MARKS: Final = "(?, ?, ?, ?, ?, ?, ?, ?)"
+_CHANGE: Final = "UPDATE signal SET kind = ?, unit = ?, role = ? WHERE robot_id = ? AND name = ?"
+MOST_KEYS: Final = 1000  # of a state that are compared
+_MOST_SHAPES: Final = 64  # keys made of ids or times would make every state a new one
+MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode
+_LONGEST_TEXT: Final = 1000  # characters; a longer text is not a mode either
+_UNSEEN: Final = object()
 
 
 class Place(NamedTuple):
@@ -158,34 +199,6 @@ def unit_of(name: str, kind: Kind) -> str | None:
 # The robot's other names decide as well: `pose.0` is x only beside `pose.1`. Where several signals
 # fit, a run may have the second alone, as its code was another: so each has a place in line, `x`
 # before `x2` (with `y2`, `z2`) up to `x9`, and the first that is there counts.
-
-
-PLACES: Final = ("", *(str(place) for place in range(2, 10)))  # in line for a role
-
-_TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps)|\.v)*$"  # `_v` is in volts
-_COMMANDED: Final = re.compile(
-    r"(^|[._])(commanded|command|cmd|cmd_vel(\.linear)?(\.0)?|target_speed"
-    rf"|(speed|velocity)[._](setpoint|target|ref)){_TAIL}"
-)
-_SPEED: Final = re.compile(rf"(^|[._])(speed|velocity|linear){_TAIL}")
-_WHEEL: Final = re.compile(
-    r"(^|[._])(wheels?|(left|right)_motors?|motors?[._]?(left|right|\d)?)([._]|$)"
-)
-_NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no robot
-    r"(^|[._])(position|pos|angle|encoders?|ticks?|odo\w*|distance|torque|force|current|power"
-    r"|temp\w*|radius|base|track|width|slip|contact|max|min|limit|gain|count|volt\w*"
-    r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
-)
-_SIDE: Final = r"(\d|[lr]|(front|rear|back)?_?(left|right))"
-_COMMANDED_WHEEL: Final = re.compile(
-    rf"(^|[._])(commands?|cmds?|commanded|target_speeds?)[._]{_SIDE}([._](speed|velocity|rad_s))*$"
-)
-_ANGLES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
-_THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
-_HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*")
-_ALTITUDE: Final = ("altitude", "alt")
-_MOTIONS: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
-_KEPT: Final = 4096  # names whose motion is remembered
 
 
 def decide_roles(
@@ -335,20 +348,6 @@ def first_in(role: str, roles: Container[str]) -> str | None:
     return next((f"{role}{place}" for place in PLACES if f"{role}{place}" in roles), None)
 
 
-MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
-MOST_CHOICES: Final = 20  # that a number which names a mode has
-ADDED_AT_ONCE: Final = 50  # in one statement, which holds the write lock for half a millisecond
-
-_OF_ROBOT: Final = (
-    "SELECT name, kind, unit, role, max - min FROM signal "
-    "WHERE robot_id = ? AND typeof(name) = 'text' ORDER BY id"
-)
-_COLUMNS: Final = "robot_id, name, path, reduction, first_seen_wall_time_s, kind, unit, role"
-_ADD: Final = f"INSERT OR IGNORE INTO signal ({_COLUMNS}) VALUES "
-_MARKS: Final = "(?, ?, ?, ?, ?, ?, ?, ?)"
-_CHANGE: Final = "UPDATE signal SET kind = ?, unit = ?, role = ? WHERE robot_id = ? AND name = ?"
-
-
 class Seen(NamedTuple):
     """What some values of a signal tell of it.
 
@@ -440,10 +439,6 @@ def write_changes(connection: sqlite3.Connection, robot_id: int, changes: Change
 # What a recorder looks at in each state: names that are new, and changes of what the robot does.
 
 
-MOST_KEYS: Final = 1000  # of a state that are compared
-_MOST_SHAPES: Final = 64  # keys made of ids or times would make every state a new one
-
-
 class SignalNames:
     """What the register has of this session's names.
 
@@ -519,11 +514,6 @@ def _part_with(names: Iterable[str], state: dict[str, Any]) -> dict[str, Any]:
     parts = (name.split(".") for name in names)
     keys = {".".join(each[:n]) for each in parts for n in range(1, len(each) + 1)}
     return {key: value for key, value in state.items() if key in keys}
-
-
-MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode
-_LONGEST_TEXT: Final = 1000  # characters; a longer text is not a mode either
-_UNSEEN: Final = object()
 
 
 class StateChanges:

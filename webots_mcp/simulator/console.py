@@ -70,6 +70,7 @@ _UNSURE: Final = "; it was started without --stream: if no lines appear, start i
 
 
 _JOB: Final = "console of "
+_WORLD: Final = "SELECT EXISTS (SELECT 1 FROM run WHERE world = ?)"
 
 
 def job_of(instance: Instance) -> str:
@@ -476,9 +477,6 @@ def _state(instance: Instance, recording: Recording, connection: sqlite3.Connect
 # A Webots belongs to a recording where a living session of the recording runs in it; or where it
 # was started with a world of the recording's project, or with one that was recorded here before,
 # unless its controllers record elsewhere.
-
-
-_WORLD: Final = "SELECT EXISTS (SELECT 1 FROM run WHERE world = ?)"
 
 
 def own_webots(recording: Recording) -> list[Instance]:

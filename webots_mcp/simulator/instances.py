@@ -39,6 +39,11 @@ _PROGRAM_FOLDERS: Final[dict[str, tuple[str, ...]]] = {
 _RESOURCES: Final = {"darwin": ("Contents/Resources", "Contents/resources", "resources")}
 _LIBRARIES: Final = {"darwin": ("Contents/lib", "lib")}
 _VERSION: Final = re.compile(r"R\d{4}[a-z]\w*(?:[ -]\w+)*")
+DEFAULT_PORT: Final = 1234
+PORTS_TRIED: Final = 11  # Webots takes the next one where a port is taken, ten times
+# `webots` is a script that starts `webots-bin`, on Windows `webots` and `webotsw` start it.
+_PROGRAMS: Final = ("webots", "webots-bin", "webotsw")
+_INTERPRETERS: Final = ("sh", "bash", "dash", "zsh", "python")
 
 
 @dataclass(frozen=True)
@@ -148,14 +153,6 @@ def _version(home: Path, platform: str) -> str | None:
         found = _VERSION.search(text)
         return found.group() if found else text.strip() or None
     return None
-
-
-DEFAULT_PORT: Final = 1234
-PORTS_TRIED: Final = 11  # Webots takes the next one where a port is taken, ten times
-
-# `webots` is a script that starts `webots-bin`, on Windows `webots` and `webotsw` start it.
-_PROGRAMS: Final = ("webots", "webots-bin", "webotsw")
-_INTERPRETERS: Final = ("sh", "bash", "dash", "zsh", "python")
 
 
 @dataclass(frozen=True)

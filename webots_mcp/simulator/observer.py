@@ -52,6 +52,15 @@ _NO_RIGHTS: Final = (
     "the observer needs a robot with 'supervisor TRUE': {!r} is none. 'webots-mcp init --observer "
     "WORLD' adds one to a copy of a world"
 )
+_MOVED_M: Final = 0.001
+_TURNED_RAD: Final = 0.01
+_NO_WORD: Final = re.compile(r"\W")
+_LONGEST_WORD: Final = 60  # characters
+MOST_ROBOTS: Final = 200
+MOST_SOLIDS: Final = 100
+_WALK_S: Final = 0.004  # of wall time in one look
+_REST_S: Final = 5.0  # of wall time between two walks
+_STALE_M: Final = 0.01
 
 
 def checked_period(period_ms: int) -> int:
@@ -348,16 +357,7 @@ def _contact(contact: Any, robot: Any) -> list[Any]:
     return [*point, None if node is None else node.getDef() or node.getTypeName()]
 
 
-_MOVED_M: Final = 0.001
-_TURNED_RAD: Final = 0.01
-_NO_WORD: Final = re.compile(r"\W")
-_LONGEST_WORD: Final = 60  # characters
-MOST_ROBOTS: Final = 200
-MOST_SOLIDS: Final = 100
-_WALK_S: Final = 0.004  # of wall time in one look
-_REST_S: Final = 5.0  # of wall time between two walks
 Seen: TypeAlias = "dict[str, dict[str, dict[str, float | None]]]"
-_STALE_M: Final = 0.01
 
 
 class BodyPose(NamedTuple):

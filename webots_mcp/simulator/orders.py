@@ -49,6 +49,14 @@ _SAID_TO_ALL: Final = ("stdout:", "stderr:", "robot")  # also without --stream
 _LONGEST_WORDS: Final = 200
 _LONGEST_OTHER: Final = 60
 RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
+_PRESSING_TIMEOUT_S: Final = 10.0
+_ON_MACOS: Final = (
+    "allow the program that runs this under System Settings, Privacy & Security, Accessibility"
+)
+_ON_WINDOWS: Final = (
+    "it needs exactly one window of Webots, and Windows' leave to bring it to the front"
+)
+_TITLE: Final = "Webots R20"  # "<world> (<project>) - Webots R2023b"
 
 
 class WebotsAddress(NamedTuple):
@@ -271,16 +279,6 @@ def console_lines(text: str) -> Iterator[WebotsLine]:
 
 def _left_s(until_s: float) -> float:
     return max(until_s - time.monotonic(), 0.001)
-
-
-_PRESSING_TIMEOUT_S: Final = 10.0
-_ON_MACOS: Final = (
-    "allow the program that runs this under System Settings, Privacy & Security, Accessibility"
-)
-_ON_WINDOWS: Final = (
-    "it needs exactly one window of Webots, and Windows' leave to bring it to the front"
-)
-_TITLE: Final = "Webots R20"  # "<world> (<project>) - Webots R2023b"
 
 
 class Key(NamedTuple):

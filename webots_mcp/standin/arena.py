@@ -17,6 +17,9 @@ _LIGHTS: Final = ("DirectionalLight", "PointLight")
 _SLIDING_FRICTION: Final = 1.0
 """Coulomb friction of everything on the floor, Webots' default."""
 
+_MOTORS = ("RotationalMotor", "LinearMotor")
+_JOINTS = ("HingeJoint", "SliderJoint")
+
 
 @dataclass(frozen=True)
 class SceneColors:
@@ -340,10 +343,6 @@ def _color(numbers: Sequence[float]) -> Color:
 
 
 # Motors turn wheels, and wheels move a robot ------------------------------------------------------
-
-
-_MOTORS = ("RotationalMotor", "LinearMotor")
-_JOINTS = ("HingeJoint", "SliderJoint")
 
 
 @dataclass

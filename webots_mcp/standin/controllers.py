@@ -25,6 +25,11 @@ _TERMINATION_S: Final = 1.0
 _LAST_LINES_S: Final = 0.5
 """How long its last lines are waited for: a grandchild may hold the pipes open."""
 
+_NOBODY: Final = ("", "<none>", "void", "<generic>")
+_EXTERN: Final = "<extern>"
+_INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
+_EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
+
 
 class ControllerProcess:
     """A running controller; what it prints is passed on line by line, with the stream's name."""
@@ -119,12 +124,6 @@ class Connection:
             return None
         self._inbox.feed(data)
         return [*iter(self._inbox.take, None)]
-
-
-_NOBODY: Final = ("", "<none>", "void", "<generic>")
-_EXTERN: Final = "<extern>"
-_INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
-_EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
 
 
 class PrintLine(Protocol):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SIZE_PX: Final = (800, 600)
 _MARGIN_PX: Final = 20
 _FORMATS: Final = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+_LIGHT: Final = (0.8, 0.6)
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,6 @@ def _rgb(color: Color) -> tuple[int, int, int]:
 # Pictures of cameras, one ray per column of pixels ------------------------------------------------
 
 
-_LIGHT: Final = (0.8, 0.6)
 """Where the light comes from, so that the sides of a box differ."""
 
 

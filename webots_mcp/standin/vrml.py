@@ -39,6 +39,11 @@ _TOKEN: Final = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]
 _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
 _NAME: Final = re.compile(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z")
 _WORDS: Final[dict[str, bool | None]] = {"TRUE": True, "FALSE": False, "NULL": None}
+HOME_VARIABLE: Final = "WEBOTS_HOME"
+BUILT_IN: Final = sorted(file.stem for file in DATA.glob("*.proto"))
+_OF_WEBOTS: Final = re.compile(
+    r"(?:webots://|https://raw\.githubusercontent\.com/cyberbotics/webots/[^/]+/)(projects/.+)"
+)
 
 
 class FieldDefinition(NamedTuple):
@@ -424,13 +429,7 @@ def _shown(value: Value) -> str:
 # Files that are templates in JavaScript are not read.
 
 
-HOME_VARIABLE: Final = "WEBOTS_HOME"
-BUILT_IN: Final = sorted(file.stem for file in DATA.glob("*.proto"))
 """The names of those that need no file of Webots."""
-
-_OF_WEBOTS: Final = re.compile(
-    r"(?:webots://|https://raw\.githubusercontent\.com/cyberbotics/webots/[^/]+/)(projects/.+)"
-)
 
 
 @dataclass(frozen=True)

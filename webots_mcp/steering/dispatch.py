@@ -89,6 +89,42 @@ _BLOCK_SOUGHT_EVERY_S: Final = 0.25
 _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
 _WITHDRAWN: Final = "the command was withdrawn and will not run"
+# Commands that set the mode of the simulation; a `run` sets what its `then` says.
+_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
+_LATER: Final = (
+    "SELECT id, action, status, params, result FROM command WHERE id > :id AND status IN "
+    "('pending', 'claimed', 'done') AND action IN ('pause', 'step', 'resume', 'fast', 'run') "
+    "AND robot_id IN (SELECT o.robot_id FROM session o JOIN session s ON s.instance = o.instance "
+    "WHERE s.id = :session AND o.ended_wall_time_s IS NULL) ORDER BY id DESC LIMIT 1"
+)
+ACTION: Final = "run"
+_ROWS_AROUND: Final = 6
+_STATE_TOKENS: Final = 400
+_TRENDS_TOKENS: Final = 450
+_EVENTS_TOKENS: Final = 400
+_CELL_TOKENS: Final = 16  # of a row before the end
+_SHOWN_SIGNALS: Final = 8
+_SHOWN_EVENTS: Final = 12
+_MOST_COLUMNS: Final = 8
+_REMEMBERED_S: Final = 60.0  # how far back rows are read to see whether a condition holds already
+_MOST_REMEMBERED_ROWS: Final = 4_000
+_RUNS_SEARCHED: Final = 5
+_OF_SESSION: Final = (
+    "SELECT id, started_sim_time_s, last_sim_time_s, started_wall_time_s FROM run "
+    "WHERE session_id = ? ORDER BY id DESC LIMIT 1"
+)
+_BEGUN_BY: Final = "SELECT max(id) FROM run WHERE session_id = ? AND started_wall_time_s <= ?"
+_LAST_ROWS: Final = (
+    "SELECT sim_time_s, data FROM state WHERE run_id = ? AND sim_time_s <= ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+_NEWEST_RUNS: Final = "SELECT id FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT ?"
+_SHOWN_ACTIONS: Final = 30
+_MAKE_OBSERVER: Final = "'webots-mcp init --observer WORLD' adds one to a world"
+_MAKE_ONE: Final = (
+    "set the field 'supervisor' of its Robot node to TRUE and create it with Supervisor() instead "
+    "of Robot()"
+)
 
 
 class Dispatcher:
@@ -337,16 +373,6 @@ def shown_result(command: Command, budget_tokens: int = RESULT_BUDGET_TOKENS) ->
     return shorten(command.decoded_result(), budget_tokens, WHOLE).value
 
 
-# Commands that set the mode of the simulation; a `run` sets what its `then` says.
-_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
-_LATER: Final = (
-    "SELECT id, action, status, params, result FROM command WHERE id > :id AND status IN "
-    "('pending', 'claimed', 'done') AND action IN ('pause', 'step', 'resume', 'fast', 'run') "
-    "AND robot_id IN (SELECT o.robot_id FROM session o JOIN session s ON s.instance = o.instance "
-    "WHERE s.id = :session AND o.ended_wall_time_s IS NULL) ORDER BY id DESC LIMIT 1"
-)
-
-
 def _name_mode_afterwards(view: View, command: Command, answer: CommandAnswer) -> None:
     """Correct the mode in the answer of a command that a later one has followed meanwhile."""
     if command.action not in _MODES or command.status not in ("done", "failed"):
@@ -431,31 +457,6 @@ def _after_no_answer(view: View) -> str:
     if silent_s > HEARTBEAT_LATE_S:
         return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"
     return "its loop runs but did not claim it in time: ask again with a longer timeout_wall_s"
-
-
-ACTION: Final = "run"
-_ROWS_AROUND: Final = 6
-_STATE_TOKENS: Final = 400
-_TRENDS_TOKENS: Final = 450
-_EVENTS_TOKENS: Final = 400
-_CELL_TOKENS: Final = 16  # of a row before the end
-_SHOWN_SIGNALS: Final = 8
-_SHOWN_EVENTS: Final = 12
-_MOST_COLUMNS: Final = 8
-_REMEMBERED_S: Final = 60.0  # how far back rows are read to see whether a condition holds already
-_MOST_REMEMBERED_ROWS: Final = 4_000
-_RUNS_SEARCHED: Final = 5
-
-_OF_SESSION: Final = (
-    "SELECT id, started_sim_time_s, last_sim_time_s, started_wall_time_s FROM run "
-    "WHERE session_id = ? ORDER BY id DESC LIMIT 1"
-)
-_BEGUN_BY: Final = "SELECT max(id) FROM run WHERE session_id = ? AND started_wall_time_s <= ?"
-_LAST_ROWS: Final = (
-    "SELECT sim_time_s, data FROM state WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
-)
-_NEWEST_RUNS: Final = "SELECT id FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT ?"
 
 
 # -- before it is sent ------------------------------------------------------------------------
@@ -723,13 +724,6 @@ def _last_rows(view: View, command: Command, progress: Progress, end_s: float) -
 
 
 # -- the robot whose controller is to run a command --
-
-_SHOWN_ACTIONS: Final = 30
-_MAKE_OBSERVER: Final = "'webots-mcp init --observer WORLD' adds one to a world"
-_MAKE_ONE: Final = (
-    "set the field 'supervisor' of its Robot node to TRUE and create it with Supervisor() instead "
-    "of Robot()"
-)
 
 
 def find_target(connection: sqlite3.Connection, robot: str | None, action: str) -> View:

@@ -59,6 +59,25 @@ from webots_mcp.store.robots import Session, find_holder, list_robots, live_obse
 CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # a loop that has just stopped is detected within it
 UNCLAIMED: Final = ("cancelled", "expired")
 LEAST_S: Final = 0.1  # that each route gets
+_POLL_S: Final = 0.05
+_EVIDENCE_S: Final = 3.0  # a heartbeat shows within half a second that simulation time advances
+_RESTART_S: Final = 5.0  # until a controller that Webots restarts has recorded
+_NOTHING_SEEN: Final = (
+    "the recording does not show it yet: simulation time also stands still while a controller "
+    "hangs, or while an extern one has not been started"
+)
+_NONE_LIVES: Final = "none of the recorded robots has a live controller"
+_NO_FORCE: Final = "not tried: it presses keys in Webots' window, which needs force=true"
+_WORLD_POLL_S: Final = 0.1
+_GONE_S: Final = 5.0  # from the end of its controllers to that of Webots
+_NONE_IS_OURS: Final = "no Webots that was started by this server runs"
+_OURS_IS_ANOTHER: Final = (
+    "this robot is not in the Webots that was started by this server (without robot it is ended)"
+)
+_NOT_RECORDED_YET: Final = (
+    "no controller has recorded in it yet: its robots may have no bridge, or the simulation is "
+    "paused; check webots_get_logs and webots_diagnose"
+)
 
 
 @dataclass
@@ -124,17 +143,6 @@ class Request:
     @property
     def _left_s(self) -> float:
         return max(self.timeout_s - (time.monotonic() - self.started_s), LEAST_S)
-
-
-_POLL_S: Final = 0.05
-_EVIDENCE_S: Final = 3.0  # a heartbeat shows within half a second that simulation time advances
-_RESTART_S: Final = 5.0  # until a controller that Webots restarts has recorded
-_NOTHING_SEEN: Final = (
-    "the recording does not show it yet: simulation time also stands still while a controller "
-    "hangs, or while an extern one has not been started"
-)
-_NONE_LIVES: Final = "none of the recorded robots has a live controller"
-_NO_FORCE: Final = "not tried: it presses keys in Webots' window, which needs force=true"
 
 
 class Moment(NamedTuple):
@@ -609,17 +617,6 @@ def _ignore(line: WebotsLine) -> None:
 
 
 # -- opening another world in a Webots that runs, and ending it --
-
-_WORLD_POLL_S: Final = 0.1
-_GONE_S: Final = 5.0  # from the end of its controllers to that of Webots
-_NONE_IS_OURS: Final = "no Webots that was started by this server runs"
-_OURS_IS_ANOTHER: Final = (
-    "this robot is not in the Webots that was started by this server (without robot it is ended)"
-)
-_NOT_RECORDED_YET: Final = (
-    "no controller has recorded in it yet: its robots may have no bridge, or the simulation is "
-    "paused; check webots_get_logs and webots_diagnose"
-)
 
 
 @dataclass

@@ -24,6 +24,17 @@ _MOST_SEED: Final = 2**63
 _STEPS_TOLERANCE: Final = 1e-9
 _GRID: Final = "grid"
 _REQUIRED: Final = ("world", "score")
+_NUMBER: Final = (int, float)
+_RANGE_KINDS: Final[dict[str, Any]] = {
+    "low": _NUMBER, "high": _NUMBER, "step": _NUMBER, "log": bool, "choices": list,
+}  # fmt: skip
+_KINDS: Final[dict[str, Any]] = {
+    "world": str, "score": str, "parameters": list, "best": str, "for_s": (int, float),
+    "until": str, "repeats": int, "robot": str, "timeout_s": (int, float), "prune": str,
+    "ranges": dict, "sets": int, "seed": int, _GRID: dict,
+}  # fmt: skip
+_WRITTEN: Final = {_GRID: "[grid]", "parameters": "[[parameters]]", "ranges": "[ranges]"}
+_HOW_MANY: Final = "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or [ranges] to search"
 
 
 @dataclass(frozen=True)
@@ -301,16 +312,3 @@ def _as_plain(ranges: dict[str, Range]) -> dict[str, Any]:
         name: {key: value for key, value in asdict(each).items() if value not in (None, False)}
         for name, each in ranges.items()
     }
-
-
-_NUMBER: Final = (int, float)
-_RANGE_KINDS: Final[dict[str, Any]] = {
-    "low": _NUMBER, "high": _NUMBER, "step": _NUMBER, "log": bool, "choices": list,
-}  # fmt: skip
-_KINDS: Final[dict[str, Any]] = {
-    "world": str, "score": str, "parameters": list, "best": str, "for_s": (int, float),
-    "until": str, "repeats": int, "robot": str, "timeout_s": (int, float), "prune": str,
-    "ranges": dict, "sets": int, "seed": int, _GRID: dict,
-}  # fmt: skip
-_WRITTEN: Final = {_GRID: "[grid]", "parameters": "[[parameters]]", "ranges": "[ranges]"}
-_HOW_MANY: Final = "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or [ranges] to search"

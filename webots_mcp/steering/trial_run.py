@@ -82,6 +82,11 @@ _DECLARED: Final = "SELECT name, low, high, choices FROM parameter WHERE robot_i
 
 Command = Callable[[str], CommandLine]
 Ending: TypeAlias = Literal["for_s", "until", "prune"]
+FOLDER: Final = "trials"
+_MOST_THREADS: Final = 1000  # each waits for one trial
+_PATIENCE_S: Final = 0.5  # between two checks whether the caller wants to stop
+_STATES: Final = {"done": "COMPLETE", "failed": "FAIL", "pruned": "PRUNED"}
+_UNDER_WAY: Final = "RUNNING"
 
 
 class StoppedError(Exception):
@@ -410,11 +415,6 @@ class TrialWatch:
 
 # -- a set of trials ---------------------------------------------------------------------------
 
-FOLDER: Final = "trials"
-_MOST_THREADS: Final = 1000  # each waits for one trial
-_PATIENCE_S: Final = 0.5  # between two checks whether the caller wants to stop
-_STATES: Final = {"done": "COMPLETE", "failed": "FAIL", "pruned": "PRUNED"}
-_UNDER_WAY: Final = "RUNNING"
 
 Report = Callable[[Trial, Result], object]
 

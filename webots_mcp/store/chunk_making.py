@@ -132,6 +132,17 @@ _DELETE_CHUNKS: Final = (  # unless its maker has ended in the meantime what it 
     "FROM row_group WHERE id = ? AND is_complete = 0) LIMIT 20)"
 )
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
+LEAST_ROWS: Final = 2000  # a question reads fewer as they are
+_BATCH_ROWS: Final = 2000
+_PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
+_LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
+    "SELECT max(0, (SELECT coalesce(max(id), 0) FROM state) - :mark - (SELECT "
+    "coalesce(sum(row_count), 0) FROM row_group WHERE is_complete = 1 AND max_state_id > :mark))"
+)
+_PAGE_HEAD_BYTES: Final = 8
+_CELL_HEAD_BYTES: Final = 7  # pointer, length and id
+_LINK_BYTES: Final = 4  # to the next page of a long row
+INDEX_BYTES: Final = 21  # an entry (run_id, sim_time_s, id) of a time index, measured
 
 
 class Made(NamedTuple):
@@ -429,15 +440,6 @@ def _delete_left_behind(connection: sqlite3.Connection, pause_s: float) -> None:
 # it.
 
 
-LEAST_ROWS: Final = 2000  # a question reads fewer as they are
-_BATCH_ROWS: Final = 2000
-_PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
-_LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
-    "SELECT max(0, (SELECT coalesce(max(id), 0) FROM state) - :mark - (SELECT "
-    "coalesce(sum(row_count), 0) FROM row_group WHERE is_complete = 1 AND max_state_id > :mark))"
-)
-
-
 def make_missing_chunks(
     recording: Recording,
     progress: Callable[[int, int], object] | None = None,
@@ -524,12 +526,6 @@ def _say(rows: int, why: str) -> str:
 # The rows of a table fill its pages in the order of their ids. One that does not fit the rest of a
 # page begins the next, and what is too long for a page lies on pages of its own (SQLite, Database
 # File Format, section 1.6: B-tree Pages).
-
-
-_PAGE_HEAD_BYTES: Final = 8
-_CELL_HEAD_BYTES: Final = 7  # pointer, length and id
-_LINK_BYTES: Final = 4  # to the next page of a long row
-INDEX_BYTES: Final = 21  # an entry (run_id, sim_time_s, id) of a time index, measured
 
 
 def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:

@@ -41,6 +41,53 @@ _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NOTHING: Final = "none"  # no row holds a number
 _NUMBERS: Final = frozenset({int, float})
 _HOW_TO_INSTALL: Final = "install it: pip install --only-binary pcodec 'pcodec>=1.0'"
+LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
+SIM_TIMES: Final = 0  # in the place of a signal's id
+WALL_TIMES: Final = -1
+STATE_IDS: Final = -2
+_GROUPS: Final = (
+    "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
+    "FROM row_group WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? "
+    "AND end_sim_time_s >= ? ORDER BY start_sim_time_s, end_sim_time_s, id"
+)
+_IN_CHUNKS: Final = (
+    "SELECT max(end_sim_time_s), max(max_state_id) FROM row_group WHERE run_id = :run "
+    "AND is_complete = 1"
+)
+_LAST_AT: Final = (
+    "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
+    "AND end_sim_time_s = ?"
+)
+IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
+    "typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= "
+    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'state')"
+)
+_WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
+_OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
+_PLACES: Final = (
+    "SELECT id, start_sim_time_s, end_sim_time_s, row_count, max_state_id FROM row_group "
+    "WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? "
+    "ORDER BY start_sim_time_s"
+)
+_LONG_STEPS: Final = f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?"
+_VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
+_FEW_VALUES: Final = f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))"
+_FEW: Final = 0.25  # of the groups between two: they are asked for one by one
+_SIGNALS_IN: Final = "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0"
+_SEEN: Final = ("signal", "row_group", "chunk", "watermark")
+_COPIED: Final = ("robot", "session", "run", *_SEEN)
+_OTHERS: Final = (
+    "SELECT type, name FROM main.sqlite_master WHERE type = 'view' OR type = 'table' AND name "
+    f"NOT IN {_COPIED} AND name NOT LIKE 'sqlite_%'"
+)
+_LAST_IDS: Final = (
+    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
+    "INSERT INTO main.sqlite_sequence SELECT * FROM recorded.sqlite_sequence WHERE name = 'state'",
+)
+_UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may have the number of a deleted one
+_MARK: Final = f"SELECT state_id FROM main.watermark WHERE name = 'chunk' AND {IS_MARK}"
+_LAST_ID: Final = "SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE is_complete = 1"
 
 
 class Absent:
@@ -269,9 +316,6 @@ def _decompress(encoded: Encoded, into: Array) -> None:
 # What the numbers of one signal in one chunk come to, so that a reader can leave it closed.
 
 
-LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
-
-
 class Statistics(NamedTuple):
     """Columns of the table `chunk`; None where there is no number, as of texts.
 
@@ -333,9 +377,6 @@ def _without_numbers(values: Decoded, rows: int) -> Statistics:
 
 
 # State rows turned into columns: the values of each signal, one for each row.
-
-
-STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
 
 
 @dataclass
@@ -418,40 +459,7 @@ def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]
 # The chunks of a run as they are stored: which groups of rows there are, and what is in them.
 
 
-SIM_TIMES: Final = 0  # in the place of a signal's id
-WALL_TIMES: Final = -1
-STATE_IDS: Final = -2
-
-_GROUPS: Final = (
-    "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
-    "FROM row_group WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? "
-    "AND end_sim_time_s >= ? ORDER BY start_sim_time_s, end_sim_time_s, id"
-)
-_IN_CHUNKS: Final = (
-    "SELECT max(end_sim_time_s), max(max_state_id) FROM row_group WHERE run_id = :run "
-    "AND is_complete = 1"
-)
-_LAST_AT: Final = (
-    "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
-    "AND end_sim_time_s = ?"
-)
-IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
-    "typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= "
-    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'state')"
-)
-_WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
-_OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
-_PLACES: Final = (
-    "SELECT id, start_sim_time_s, end_sim_time_s, row_count, max_state_id FROM row_group "
-    "WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? "
-    "ORDER BY start_sim_time_s"
-)
 _STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
-_LONG_STEPS: Final = f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?"
-_VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
-_FEW_VALUES: Final = f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))"
-_FEW: Final = 0.25  # of the groups between two: they are asked for one by one
-_SIGNALS_IN: Final = "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0"
 
 
 class Group(NamedTuple):
@@ -567,22 +575,6 @@ def values_in(
 #
 # The file is a recording without states, which are read from the other one; a reader sees its
 # groups, chunks and signals in the place of those of the recording. It goes when the process ends.
-
-
-_SEEN: Final = ("signal", "row_group", "chunk", "watermark")
-_COPIED: Final = ("robot", "session", "run", *_SEEN)
-_OTHERS: Final = (
-    "SELECT type, name FROM main.sqlite_master WHERE type = 'view' OR type = 'table' AND name "
-    f"NOT IN {_COPIED} AND name NOT LIKE 'sqlite_%'"
-)
-_LAST_IDS: Final = (
-    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
-    "INSERT INTO main.sqlite_sequence SELECT * FROM recorded.sqlite_sequence WHERE name = 'state'",
-)
-
-_UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may have the number of a deleted one
-_MARK: Final = f"SELECT state_id FROM main.watermark WHERE name = 'chunk' AND {IS_MARK}"
-_LAST_ID: Final = "SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE is_complete = 1"
 
 
 class _Made(NamedTuple):

@@ -69,6 +69,56 @@ _encode: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).enc
 
 StoredRow = tuple[int, float, float, str, "str | None"]
 _Tree = dict[Any, Any]
+CHUNK_ROWS: Final = 2000  # read in one short transaction each: no checkpoint waits for an export
+_IN_SEGMENT: Final = (
+    "run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
+    "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
+)
+_CHUNK: Final = (
+    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
+    "AND id <= :last_id AND (sim_time_s > :start_s OR id > :after_id) "
+    "ORDER BY sim_time_s, id LIMIT :limit"
+)
+# Where there are kept stretches, with negative ids for what only they have. Of several calls in one
+# step wall time gives the order.
+_AFTER_WALL: Final = "(sim_time_s > :start_s OR wall_time_s > :after_wall_s)"
+_CHUNK_WITH_KEPT: Final = (
+    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
+    f"AND id <= :last_id AND {_AFTER_WALL} UNION ALL "
+    f"SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state WHERE {_IN_SEGMENT} "
+    f"AND id <= :last_kept_id AND {_AFTER_WALL} ORDER BY sim_time_s, wall_time_s LIMIT :limit"
+)
+_COUNT: Final = (
+    "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
+)
+_LAST_ID: Final = "SELECT coalesce(max(id), 0) FROM {table}"
+_NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+_LARGEST_INT: Final = 2**63 - 1
+_PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
+    float: "num", str: "text", bool: "bool", type(None): "null",
+}  # fmt: skip
+_STATE: Final = "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE id = ?"
+_TIME: Final = "SELECT sim_time_s FROM state WHERE id = ?"
+_OWN: Final = (
+    ExportFormat("csv", ("csv",), "webots_mcp.store.export:write_csv", passes=2, is_text=True),
+    ExportFormat(
+        "jsonl",
+        ("jsonl", "json", "ndjson"),
+        "webots_mcp.store.export:write_json_lines",
+        is_text=True,
+    ),
+)
+_ALL: Final = (*_OWN, *export_formats())
+FORMATS: Final = {each.name: each for each in _ALL if not each.for_viewers}  # of tables
+FOR_VIEWERS: Final = {each.name: each for each in _ALL if each.for_viewers}
+BUNDLE: Final = "zip"
+_SPELLED: Final = ("bool", "text", "numbers")
+_FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
+_OF_TRIAL: Final = (
+    "trial_set_id", "number", "run_id", "status", "score", "ended_by", "ended_sim_time_s", "error",
+    "started_wall_time_s", "finished_wall_time_s",
+)  # fmt: skip
+_OF_PARAMETERS: Final = ("rank", "mean", "least", "greatest", "scores", "pruned", "failed")
 
 
 class _WhyNone(NamedTuple):
@@ -225,40 +275,6 @@ def _listed(name: str, values: Decoded, places: Indexes) -> list[Any]:
 
 Progress = Callable[[int, int], object]
 ColumnKind = Literal["null", "bool", "int", "num", "text", "numbers"]
-
-CHUNK_ROWS: Final = 2000  # read in one short transaction each: no checkpoint waits for an export
-
-_IN_SEGMENT: Final = (
-    "run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
-    "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
-)
-_CHUNK: Final = (
-    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
-    "AND id <= :last_id AND (sim_time_s > :start_s OR id > :after_id) "
-    "ORDER BY sim_time_s, id LIMIT :limit"
-)
-# Where there are kept stretches, with negative ids for what only they have. Of several calls in one
-# step wall time gives the order.
-_AFTER_WALL: Final = "(sim_time_s > :start_s OR wall_time_s > :after_wall_s)"
-_CHUNK_WITH_KEPT: Final = (
-    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
-    f"AND id <= :last_id AND {_AFTER_WALL} UNION ALL "
-    f"SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state WHERE {_IN_SEGMENT} "
-    f"AND id <= :last_kept_id AND {_AFTER_WALL} ORDER BY sim_time_s, wall_time_s LIMIT :limit"
-)
-_COUNT: Final = (
-    "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
-)
-_LAST_ID: Final = "SELECT coalesce(max(id), 0) FROM {table}"
-_NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
-_LARGEST_INT: Final = 2**63 - 1
-_PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
-    float: "num", str: "text", bool: "bool", type(None): "null",
-}  # fmt: skip
-
-
-_STATE: Final = "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE id = ?"
-_TIME: Final = "SELECT sim_time_s FROM state WHERE id = ?"
 
 
 class Recorded(NamedTuple):
@@ -572,21 +588,6 @@ class Exported(NamedTuple):
     notes: Sequence[str] = ()
 
 
-_OWN: Final = (
-    ExportFormat("csv", ("csv",), "webots_mcp.store.export:write_csv", passes=2, is_text=True),
-    ExportFormat(
-        "jsonl",
-        ("jsonl", "json", "ndjson"),
-        "webots_mcp.store.export:write_json_lines",
-        is_text=True,
-    ),
-)
-_ALL: Final = (*_OWN, *export_formats())
-FORMATS: Final = {each.name: each for each in _ALL if not each.for_viewers}  # of tables
-FOR_VIEWERS: Final = {each.name: each for each in _ALL if each.for_viewers}
-BUNDLE: Final = "zip"
-
-
 def export(
     connection: sqlite3.Connection,
     wanted: TimeRange | TrialTable,
@@ -704,8 +705,6 @@ def format_of(file: Path) -> str:
 # Rows as CSV and as JSON lines.
 
 
-_SPELLED: Final = ("bool", "text", "numbers")
-_FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
 _encode_export: Final = json.JSONEncoder(
     ensure_ascii=False, allow_nan=False, separators=(",", ":")
 ).encode
@@ -782,13 +781,6 @@ def _finite(value: Any) -> Any:
 
 
 # The trials of a set as a flat table: one row per trial, with the figures of its parameters.
-
-
-_OF_TRIAL: Final = (
-    "trial_set_id", "number", "run_id", "status", "score", "ended_by", "ended_sim_time_s", "error",
-    "started_wall_time_s", "finished_wall_time_s",
-)  # fmt: skip
-_OF_PARAMETERS: Final = ("rank", "mean", "least", "greatest", "scores", "pruned", "failed")
 
 
 @dataclass(frozen=True)

@@ -21,27 +21,6 @@ from webots_mcp.store.run_rows import columns_of
 
 COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it is worth
 OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
-
-
-@dataclass(frozen=True)
-class LogLine:
-    """A line that the controller or the bridge logged, or of Webots' console.
-
-    Attributes:
-        run_id: None for a line of the console that waits for a run, as is its time.
-    """
-
-    id: int
-    run_id: int | None
-    sim_time_s: float | None
-    wall_time_s: float
-    level: str
-    source: str
-    message: str
-    logger: str | None
-
-
-_COLUMNS: Final = columns_of(LogLine)
 _RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
 _SAYING: Final = (
     "(:text = '' OR instr(lower(message), :text) > 0) "
@@ -83,6 +62,74 @@ _WAITING: Final = (
 )
 _LONGEST_FOLLOWED_TEXT: Final = 400  # of a state, log line or result; the database has it whole
 _MOST_FOLLOWED_LINES: Final = 500  # of one kind in one look
+_ASKED: Final = "'#' || t.id, t.action"
+_SETTLED_S: Final = "t.finished_wall_time_s"
+MOST_WAITING: Final = 500  # of one Webots; the newest are kept
+_KEPT_WAITING_S: Final = 7 * 86_400.0
+_EARLY_S: Final = 1.0  # a run may begin before the line that its controller starts
+_MOST_RUNS: Final = 50
+_MOST_SESSIONS: Final = 500
+_MOST_RECORDED: Final = 2_000  # newest rows of bridges that a line is compared with
+_MOST_LOGGED: Final = 500
+_COMPARED_S: Final = 60.0  # a line that is as late is not taken for what a bridge recorded
+_MESSAGE: Final = 10_000  # characters, as of a bridge's row
+_PRINTED: Final = ("stdout", "stderr")  # loggers that are none
+_STARTING: Final = re.compile(r"INFO: (.+?): Starting controller: ")
+_NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
+_SESSIONS: Final = (
+    "SELECT id, robot_id, controller FROM session WHERE instance = ? "
+    f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_MOST_SESSIONS}"
+)
+_RUNS: Final = (
+    "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s, "
+    "r.last_wall_time_s "
+    f"FROM ({_SESSIONS}) s JOIN run r ON r.session_id = s.id JOIN robot b ON b.id = s.robot_id "
+    f"WHERE r.started_wall_time_s >= ? ORDER BY r.id DESC LIMIT {_MOST_RUNS}"
+)
+_SIM_TIME: Final = (
+    "SELECT coalesce((SELECT sim_time_s FROM state WHERE run_id = :run AND wall_time_s <= :wall "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1), "
+    "iif(last_wall_time_s <= :wall, last_sim_time_s, started_sim_time_s)) FROM run WHERE id = :run"
+)
+_RECORDED: Final = (
+    "SELECT l.id, l.message, l.logger, b.name, s.controller FROM log l "
+    "JOIN run r ON r.id = l.run_id JOIN session s ON s.id = r.session_id "
+    "JOIN robot b ON b.id = r.robot_id WHERE l.id > ? AND l.wall_time_s >= ? "
+    f"AND s.instance = ? AND l.source IN ('controller', 'bridge') "
+    f"ORDER BY l.id DESC LIMIT {_MOST_RECORDED}"
+)
+_IS_FOLLOWED: Final = (
+    "SELECT EXISTS (SELECT 1 FROM console_line WHERE instance = ? AND wall_time_s >= ?)"
+)
+_FORGET: Final = "DELETE FROM console_line WHERE id = ?"
+_FORGET_OLDEST: Final = (
+    "DELETE FROM console_line WHERE instance = :instance AND id <= (SELECT id FROM console_line "
+    f"WHERE instance = :instance ORDER BY id DESC LIMIT 1 OFFSET {MOST_WAITING})"
+)
+_FORGET_PAST: Final = (
+    "DELETE FROM console_line WHERE (instance = ? AND wall_time_s < ?) OR wall_time_s < ?"
+)
+
+
+@dataclass(frozen=True)
+class LogLine:
+    """A line that the controller or the bridge logged, or of Webots' console.
+
+    Attributes:
+        run_id: None for a line of the console that waits for a run, as is its time.
+    """
+
+    id: int
+    run_id: int | None
+    sim_time_s: float | None
+    wall_time_s: float
+    level: str
+    source: str
+    message: str
+    logger: str | None
+
+
+_COLUMNS: Final = columns_of(LogLine)
 
 
 def _news_of(source: str, cursor: str, columns: str, text: str) -> str:
@@ -107,10 +154,8 @@ def _cut(text: str) -> str:
     return f"substr({text}, 1, {_LONGEST_FOLLOWED_TEXT})"
 
 
-_ASKED: Final = "'#' || t.id, t.action"
 _OUTCOME: Final = _cut("coalesce(t.error, t.result)")
 _SAID: Final = f"iif(t.source IN {OF_CONSOLE}, t.source || ': ', '') || {_cut('t.message')}"
-_SETTLED_S: Final = "t.finished_wall_time_s"
 # Kind of news: which cursor it moves, and the rows after that cursor.
 _NEWS: Final = {
     "state": _news_in("state", "'state'", _cut("t.data")),
@@ -269,41 +314,6 @@ def _joined(*parts: object) -> str:
 # recorded, or why it never did.
 
 
-MOST_WAITING: Final = 500  # of one Webots; the newest are kept
-_KEPT_WAITING_S: Final = 7 * 86_400.0
-_EARLY_S: Final = 1.0  # a run may begin before the line that its controller starts
-_MOST_RUNS: Final = 50
-_MOST_SESSIONS: Final = 500
-_MOST_RECORDED: Final = 2_000  # newest rows of bridges that a line is compared with
-_MOST_LOGGED: Final = 500
-_COMPARED_S: Final = 60.0  # a line that is as late is not taken for what a bridge recorded
-_MESSAGE: Final = 10_000  # characters, as of a bridge's row
-_PRINTED: Final = ("stdout", "stderr")  # loggers that are none
-_STARTING: Final = re.compile(r"INFO: (.+?): Starting controller: ")
-_NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
-
-_SESSIONS: Final = (
-    "SELECT id, robot_id, controller FROM session WHERE instance = ? "
-    f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_MOST_SESSIONS}"
-)
-_RUNS: Final = (
-    "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s, "
-    "r.last_wall_time_s "
-    f"FROM ({_SESSIONS}) s JOIN run r ON r.session_id = s.id JOIN robot b ON b.id = s.robot_id "
-    f"WHERE r.started_wall_time_s >= ? ORDER BY r.id DESC LIMIT {_MOST_RUNS}"
-)
-_SIM_TIME: Final = (
-    "SELECT coalesce((SELECT sim_time_s FROM state WHERE run_id = :run AND wall_time_s <= :wall "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1), "
-    "iif(last_wall_time_s <= :wall, last_sim_time_s, started_sim_time_s)) FROM run WHERE id = :run"
-)
-_RECORDED: Final = (
-    "SELECT l.id, l.message, l.logger, b.name, s.controller FROM log l "
-    "JOIN run r ON r.id = l.run_id JOIN session s ON s.id = r.session_id "
-    "JOIN robot b ON b.id = r.robot_id WHERE l.id > ? AND l.wall_time_s >= ? "
-    f"AND s.instance = ? AND l.source IN ('controller', 'bridge') "
-    f"ORDER BY l.id DESC LIMIT {_MOST_RECORDED}"
-)
 _COLUMNS_console_lines: Final = "wall_time_s, level, source, message, logger"
 _ADD: Final = (
     f"INSERT INTO log (run_id, sim_time_s, {_COLUMNS_console_lines}) VALUES (?, ?, ?, ?, ?, ?, ?)"
@@ -313,17 +323,6 @@ _WAIT: Final = (
 )
 _WAITING_console_lines: Final = (
     f"SELECT id, {_COLUMNS_console_lines} FROM console_line WHERE instance = ? ORDER BY id"
-)
-_IS_FOLLOWED: Final = (
-    "SELECT EXISTS (SELECT 1 FROM console_line WHERE instance = ? AND wall_time_s >= ?)"
-)
-_FORGET: Final = "DELETE FROM console_line WHERE id = ?"
-_FORGET_OLDEST: Final = (
-    "DELETE FROM console_line WHERE instance = :instance AND id <= (SELECT id FROM console_line "
-    f"WHERE instance = :instance ORDER BY id DESC LIMIT 1 OFFSET {MOST_WAITING})"
-)
-_FORGET_PAST: Final = (
-    "DELETE FROM console_line WHERE (instance = ? AND wall_time_s < ?) OR wall_time_s < ?"
 )
 
 

@@ -133,6 +133,67 @@ _TAKE_RESULT: Final = (
 _RUNS: Final = (
     "SELECT n.uuid, n.id FROM source.run r JOIN main.run n ON n.uuid = r.uuid ORDER BY r.id"
 )
+_PIECE_BYTES: Final = 1_000_000
+# Rows that are all alike become a fiftieth of their size; who unpacks to far more wants to harm.
+_MOST_TIMES: Final = 100
+_HARMLESS_BYTES: Final = 100_000_000
+_LINK: Final = 0o120000  # of a file's type in Unix, as archives keep it
+END_SESSIONS: Final = (  # with the last of their runs that is here
+    "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run "
+    "WHERE session_id = session.id), end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
+)
+_DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+# Ids between the first and the last row of a run; other robots could not have recorded more.
+_MOST_IDS: Final = 2**40
+_IDS: Final = (
+    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
+    "SELECT max_state_id FROM source.row_group WHERE run_id = :run "
+    f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
+    f"AND signal_id = {STATE_IDS})"
+)
+_LAST_HERE: Final = "SELECT coalesce(max(seq), 0) FROM main.sqlite_sequence WHERE name = 'state'"
+_RESERVE: Final = (
+    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
+    "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
+)
+_SIGNALS: Final = (
+    "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
+    "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+    f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} "
+    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id"
+)
+_MAP: Final = "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
+_FILL_MAP: Final = (
+    "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
+    "ON n.robot_id = :here AND n.name = s.name "
+    "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+    f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})"
+)
+_GROUP: Final = (
+    "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, lost_value_count, "
+    "stored_row_bytes, chunk_bytes, "
+    "is_complete"
+)
+_GROUPS: Final = "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1"
+_COPY_GROUP: Final = (
+    f"INSERT INTO main.row_group (run_id, last_state_id, max_state_id, {_GROUP}) "
+    f"SELECT :run, last_state_id + :shift, max_state_id + :shift, {_GROUP} "
+    "FROM source.row_group WHERE id = :group"
+)
+_PACKED: Final = "codec, numbers, codes, labels"
+_VALUES: Final = f"{', '.join(Statistics._fields)}, {_PACKED}"
+_COPY_CHUNKS: Final = (
+    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
+    f"SELECT :here, :run, m.here, {_VALUES} FROM source.chunk c "
+    "JOIN temp.signal_here m ON m.there = c.signal_id WHERE c.group_id = :group"
+)
+_STATE_IDS: Final = (
+    f"SELECT {_PACKED} FROM source.chunk WHERE group_id = ? AND signal_id = {STATE_IDS}"
+)
+_INSERT: Final = (
+    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
+    f"VALUES ({', '.join('?' * (3 + len(_VALUES.split(','))))})"
+)
 
 
 def merge(
@@ -405,18 +466,6 @@ def _copy_image_rows(connection: sqlite3.Connection, run_id: int, run: int, run_
 # One run as a file to send: a ZIP archive with a small recording of its own and its pictures.
 
 
-_PIECE_BYTES: Final = 1_000_000
-# Rows that are all alike become a fiftieth of their size; who unpacks to far more wants to harm.
-_MOST_TIMES: Final = 100
-_HARMLESS_BYTES: Final = 100_000_000
-_LINK: Final = 0o120000  # of a file's type in Unix, as archives keep it
-END_SESSIONS: Final = (  # with the last of their runs that is here
-    "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run "
-    "WHERE session_id = session.id), end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
-)
-_DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
-
-
 def write_bundle(
     connection: sqlite3.Connection,
     database: Path,
@@ -571,59 +620,6 @@ def _is_link(entry: zipfile.ZipInfo) -> bool:
 # The other recording is attached as `source`. Its signals are found here by their names, or
 # entered. Row groups name state rows by ids, also those that are gone: so all ids of the run rise
 # alike here, beyond those that were ever given, and what came before what remains so.
-
-
-# Ids between the first and the last row of a run; other robots could not have recorded more.
-_MOST_IDS: Final = 2**40
-_IDS: Final = (
-    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
-    "SELECT max_state_id FROM source.row_group WHERE run_id = :run "
-    f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
-    f"AND signal_id = {STATE_IDS})"
-)
-_LAST_HERE: Final = "SELECT coalesce(max(seq), 0) FROM main.sqlite_sequence WHERE name = 'state'"
-_RESERVE: Final = (
-    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
-    "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
-)
-_SIGNALS: Final = (
-    "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
-    "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} "
-    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id"
-)
-_MAP: Final = "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
-_FILL_MAP: Final = (
-    "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
-    "ON n.robot_id = :here AND n.name = s.name "
-    "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})"
-)
-_GROUP: Final = (
-    "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, lost_value_count, "
-    "stored_row_bytes, chunk_bytes, "
-    "is_complete"
-)
-_GROUPS: Final = "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1"
-_COPY_GROUP: Final = (
-    f"INSERT INTO main.row_group (run_id, last_state_id, max_state_id, {_GROUP}) "
-    f"SELECT :run, last_state_id + :shift, max_state_id + :shift, {_GROUP} "
-    "FROM source.row_group WHERE id = :group"
-)
-_PACKED: Final = "codec, numbers, codes, labels"
-_VALUES: Final = f"{', '.join(Statistics._fields)}, {_PACKED}"
-_COPY_CHUNKS: Final = (
-    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
-    f"SELECT :here, :run, m.here, {_VALUES} FROM source.chunk c "
-    "JOIN temp.signal_here m ON m.there = c.signal_id WHERE c.group_id = :group"
-)
-_STATE_IDS: Final = (
-    f"SELECT {_PACKED} FROM source.chunk WHERE group_id = ? AND signal_id = {STATE_IDS}"
-)
-_INSERT: Final = (
-    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
-    f"VALUES ({', '.join('?' * (3 + len(_VALUES.split(','))))})"
-)
 
 
 def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> int:

@@ -33,6 +33,7 @@ SQLModel.metadata.naming_convention = {
 STATISTICS = Statistics._fields
 _KEEP_IDS = {"sqlite_autoincrement": True}
 _UUID = "random (version 4); names the row among those of all machines"
+_HAS_ROLE = text("role IS NOT NULL")
 
 
 def _id() -> Any:
@@ -176,9 +177,6 @@ class State(SQLModel, table=True):
     replaced: str | None = _text(
         "JSON object: path of a replaced value to what it was (nan, inf, ...)"
     )
-
-
-_HAS_ROLE = text("role IS NOT NULL")
 
 
 class Signal(SQLModel, table=True):

@@ -47,6 +47,38 @@ _VALUES: Final = (
     "SELECT run_id, name, sim_time_s, value, is_default, set_by, command_id FROM parameter_value "
     "WHERE run_id IN (SELECT value FROM json_each(?)) ORDER BY id"
 )
+_NEW_SET: Final = (
+    "INSERT INTO trial_set (uuid, plan, created_wall_time_s, robot_id) VALUES (?, ?, ?, ?) "
+    "RETURNING id"
+)
+_NEW_TRIAL: Final = (
+    "INSERT INTO trial (trial_set_id, uuid, number, parameters, status) "
+    "VALUES (?, ?, ?, ?, 'waiting')"
+)
+_NEWEST: Final = "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)"
+_OF_ROBOT: Final = "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC"
+_STOP: Final = "UPDATE trial_set SET stop_reason = ? WHERE id = ?"
+_BORROW: Final = "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?"
+_WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
+_FORGET: Final = "UPDATE trial SET pid = NULL, process = NULL WHERE trial_set_id = ?"
+_BEGIN: Final = (
+    "UPDATE trial SET status = 'running', started_wall_time_s = ?, pid = ?, process = ? "
+    "WHERE id = ?"
+)
+_PUT_BACK: Final = (
+    "UPDATE trial SET status = 'waiting', started_wall_time_s = NULL, pid = NULL, process = NULL "
+    "WHERE id = ? AND status = 'running'"
+)
+_FINISH: Final = (
+    "UPDATE trial SET status = :status, run_id = :run_id, score = :score, ended_by = :ended_by, "
+    "ended_sim_time_s = :ended_sim_time_s, error = :error, finished_wall_time_s = :now, "
+    "pid = NULL, process = NULL WHERE id = :id"
+)
+_LABEL: Final = "UPDATE run SET label = coalesce(label, ?) WHERE id = ?"
+_PROGRESS: Final = (
+    "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial WHERE trial_set_id = "
+    "t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) FROM trial t WHERE trial_set_id = ?"
+)
 
 
 class Declared(NamedTuple):
@@ -218,36 +250,6 @@ def _text(value: Value) -> str:
 # Trial sets and their trials: what is planned, what goes on, and what came of it.
 
 
-_NEW_SET: Final = (
-    "INSERT INTO trial_set (uuid, plan, created_wall_time_s, robot_id) VALUES (?, ?, ?, ?) "
-    "RETURNING id"
-)
-_NEW_TRIAL: Final = (
-    "INSERT INTO trial (trial_set_id, uuid, number, parameters, status) "
-    "VALUES (?, ?, ?, ?, 'waiting')"
-)
-_NEWEST: Final = "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)"
-_OF_ROBOT: Final = "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC"
-_STOP: Final = "UPDATE trial_set SET stop_reason = ? WHERE id = ?"
-_BORROW: Final = "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?"
-_WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
-_FORGET: Final = "UPDATE trial SET pid = NULL, process = NULL WHERE trial_set_id = ?"
-_BEGIN: Final = (
-    "UPDATE trial SET status = 'running', started_wall_time_s = ?, pid = ?, process = ? "
-    "WHERE id = ?"
-)
-_PUT_BACK: Final = (
-    "UPDATE trial SET status = 'waiting', started_wall_time_s = NULL, pid = NULL, process = NULL "
-    "WHERE id = ? AND status = 'running'"
-)
-_FINISH: Final = (
-    "UPDATE trial SET status = :status, run_id = :run_id, score = :score, ended_by = :ended_by, "
-    "ended_sim_time_s = :ended_sim_time_s, error = :error, finished_wall_time_s = :now, "
-    "pid = NULL, process = NULL WHERE id = :id"
-)
-_LABEL: Final = "UPDATE run SET label = coalesce(label, ?) WHERE id = ?"
-
-
 @dataclass(frozen=True)
 class TrialSet:
     """Runs with chosen parameters. Columns as in `store.models`; two are JSON text."""
@@ -337,10 +339,6 @@ _SET: Final = f"SELECT {columns_of(TrialSet)} FROM trial_set WHERE id = ?"
 _NEXT: Final = (
     f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? AND status IN ('running', "
     "'waiting') ORDER BY status = 'waiting', number LIMIT 1"
-)
-_PROGRESS: Final = (
-    "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial WHERE trial_set_id = "
-    "t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) FROM trial t WHERE trial_set_id = ?"
 )
 _TRIALS: Final = f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? ORDER BY number"
 

@@ -110,6 +110,12 @@ _PATHS: Final = {  # of the pictures that go with rows
 }
 _IN_USE: Final = "SELECT 1 FROM image WHERE path = ? LIMIT 1"
 _MOST_FAILURES: Final = 200
+INTERVAL_S: Final = 2.0
+PLANNING_SHARE: Final = 0.02  # of the time: looking at ten million rows takes a second
+BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
+# What stays free in the file for the rows to come: a fortieth of it, but no more than 10 MB.
+SPARE_SHARE: Final = 40
+MOST_SPARE_PAGES: Final = 2500
 
 
 @dataclass
@@ -393,14 +399,6 @@ class _Purge:
 
 
 # Retention as a maintainer's work: a plan every few seconds, carried out a little at a time.
-
-
-INTERVAL_S: Final = 2.0
-PLANNING_SHARE: Final = 0.02  # of the time: looking at ten million rows takes a second
-BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
-# What stays free in the file for the rows to come: a fortieth of it, but no more than 10 MB.
-SPARE_SHARE: Final = 40
-MOST_SPARE_PAGES: Final = 2500
 
 
 class Upkeep:

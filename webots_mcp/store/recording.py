@@ -97,6 +97,16 @@ _NOT_IN: Final = (
     "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
     "writable folder and open the copy with webots-mcp serve to include them"
 )
+_ENDED: Final = {
+    "crashed": "its controller crashed or was killed",
+    "finished": "its controller finished",
+    "superseded": "another bridge took its robot over",
+}
+_RENEW_EVERY_S: Final = 3.0
+_UNSTORABLE: Final = (
+    TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
+    MalformedRowError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -396,13 +406,6 @@ def _of_earlier_run(run: Run, now_s: float) -> Status:
     return Status(stopped_for(now_s - ended_s), f"this is an earlier run; {how}")
 
 
-_ENDED: Final = {
-    "crashed": "its controller crashed or was killed",
-    "finished": "its controller finished",
-    "superseded": "another bridge took its robot over",
-}
-
-
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     """What an answer says of the file that it was read from, and of rows that are not in it."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
@@ -476,8 +479,6 @@ def _explain(error: Exception, database: Database) -> str:
 # Jobs that one process at a time does in a recording, as long as it holds their lease.
 
 
-_RENEW_EVERY_S: Final = 3.0
-
 _log = logging.getLogger(__name__)
 
 
@@ -538,12 +539,6 @@ class Job:
 
 # What no bridge writes. Other programs may write to a recording, and SQLite takes any value in any
 # column: a question that meets one is asked again past it (`invalid_rows`).
-
-
-_UNSTORABLE: Final = (
-    TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
-    MalformedRowError,
-)  # fmt: skip
 
 
 def is_over_a_value(error: Exception) -> bool:

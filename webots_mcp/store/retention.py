@@ -21,6 +21,25 @@ KEPT: Final = (
     "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *'))"
 )
 _MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
+SERVE: Final = "serve"
+KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image")
+_KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
+_NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
+_READ: Final = (
+    "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
+    "FROM retention_limit"
+)
+_SET: Final = (
+    "INSERT OR REPLACE INTO retention_limit "
+    "(kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?)"
+)
+_RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
+_PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
+_BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
+_SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
+NO_LIMIT: Final = "all"  # is kept
+_ROWS: Final = {"row": 1, "rows": 1}
 
 
 @dataclass(frozen=True)
@@ -119,21 +138,6 @@ def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: b
 
 Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""
-
-SERVE: Final = "serve"
-KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image")
-_KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
-_NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
-_READ: Final = (
-    "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
-    "FROM retention_limit"
-)
-_SET: Final = (
-    "INSERT OR REPLACE INTO retention_limit "
-    "(kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?)"
-)
-_RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
 
 
 class Setting(NamedTuple):
@@ -246,13 +250,6 @@ def _text(value: Limit | float) -> str:
 
 
 # Limits as a person writes them: `500MB,30d`, `100000rows`, `all`.
-
-
-_PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
-_BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
-_SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
-NO_LIMIT: Final = "all"  # is kept
-_ROWS: Final = {"row": 1, "rows": 1}
 
 
 def option_of(kind: str) -> str:

@@ -71,6 +71,14 @@ _FRAMES: Final = (
     f"SELECT run_id, sum({_FILE_BYTES}) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
 )
 _COLUMNS: Final = "SELECT name, type, pk FROM pragma_table_info(?)"
+# Those that were created during a kept run stay with it.
+OLD_COMMANDS: Final = (
+    f"FROM command c WHERE robot_id = :robot_id AND status IN {FINAL_STATUSES} "
+    "AND created_wall_time_s < :before_s AND NOT EXISTS (SELECT 1 FROM run "
+    f"WHERE robot_id = c.robot_id AND {KEPT} "
+    "AND c.created_wall_time_s BETWEEN started_wall_time_s AND last_wall_time_s)"
+)
+_COMMAND_BYTES: Final = 400
 
 
 class Run(NamedTuple):
@@ -235,16 +243,6 @@ def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:
         "free_in_file_bytes": free_pages * page_bytes,
         "log_beside_bytes": log.stat().st_size if file and log.exists() else 0,
     }
-
-
-# Those that were created during a kept run stay with it.
-OLD_COMMANDS: Final = (
-    f"FROM command c WHERE robot_id = :robot_id AND status IN {FINAL_STATUSES} "
-    "AND created_wall_time_s < :before_s AND NOT EXISTS (SELECT 1 FROM run "
-    f"WHERE robot_id = c.robot_id AND {KEPT} "
-    "AND c.created_wall_time_s BETWEEN started_wall_time_s AND last_wall_time_s)"
-)
-_COMMAND_BYTES: Final = 400
 
 
 @dataclass(frozen=True)

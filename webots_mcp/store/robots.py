@@ -60,6 +60,131 @@ from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, Unknown
 from webots_mcp.signals.naming import SOLIDS, WORLD
 from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
 
+# Of the newest Webots, unless a controller has begun to record since. What a controller printed
+# comes first: its traceback ends with the reason, and Webots itself only says that it exited.
+_CONSOLE_TROUBLE: Final = (
+    "WITH trouble AS (SELECT id, instance, source, message FROM console_line WHERE level IN "
+    "('warning', 'error', 'critical') AND wall_time_s > "
+    "(SELECT coalesce(max(started_wall_time_s), 0) FROM session)) "
+    "SELECT substr(message, 1, 200) FROM trouble WHERE id IN (SELECT max(id) FROM trouble WHERE "
+    "instance = (SELECT instance FROM trouble ORDER BY id DESC LIMIT 1) GROUP BY source) "
+    "ORDER BY source = 'console' DESC, id"
+)
+_ALL: Final = (
+    "SELECT id, name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s "
+    "FROM robot ORDER BY id"
+)
+_KIND: Final = "SELECT kind FROM robot WHERE id = ?"
+_NAME: Final = "SELECT name FROM robot WHERE id = ?"
+_SHOWN_NAMES: Final = 20
+_BESIDE: Final = (
+    "SELECT r.id, b.name FROM session s JOIN robot b ON b.id = s.robot_id "
+    "JOIN run r ON r.session_id = s.id JOIN session me ON me.id = :session "
+    f"WHERE b.kind = '{OBSERVER}' AND s.instance = me.instance "
+    "AND r.started_wall_time_s <= :last AND r.last_wall_time_s >= :first "
+    "ORDER BY r.id DESC LIMIT 1"
+)
+_SEEN: Final = (
+    "SELECT data FROM event WHERE run_id IN (SELECT id FROM run WHERE session_id = "
+    f"(SELECT session_id FROM run WHERE id = ?)) AND kind = '{WORLD_EVENT}' AND run_id <= ? "
+    "ORDER BY id DESC LIMIT 1"
+)
+NEVER_SEEN: Final = "never seen"
+RUNNING: Final = "running"
+STARTING: Final = "starting"
+_CLAIMED: Final = (
+    "SELECT id, action, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
+    "WHERE robot_id = ? AND session_id = ? "
+    "AND status = 'claimed' ORDER BY id DESC"
+)
+_STILL_MOVING_S: Final = 1.0
+_WRITING_S: Final = 0.1  # after a signal
+_SLOWEST_STILL_MOVING_S: Final = 15.0
+_UNPUBLISHED_S: Final = 5.0  # of wall time without a row
+_UNPUBLISHED_INTERVALS: Final = 10.0  # of the usual time between two rows
+_UNPUBLISHED: Final = (
+    "its loop runs, but for {:.1f} s of simulation time it recorded no state: is bridge.publish() "
+    "still called in the loop?"
+)
+_ENDED: Final = {
+    "finished": "its controller finished",
+    "reload": "the world was reloaded and no new controller session has appeared yet",
+    "crashed": "its controller process is gone without having finished (killed or crashed)",
+    "superseded": "a newer session took its place",
+}
+_ENDED_BY: Final = (
+    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
+    "AND level = 'error' AND source = 'controller' AND message GLOB ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_HUNG: Final = (
+    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
+    f"AND logger = '{LOGGER}' AND wall_time_s > ? ORDER BY id DESC LIMIT 1"
+)
+_MOST_ERROR_CHARACTERS: Final = 300
+_READ_NO_MORE: Final = (
+    "it was recorded by the observer from its customData: the observer ended, or the robot is gone"
+)
+_RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
+# From inside these look alike; `diagnosis.webots_checks` looks at it from outside.
+SILENT: Final = (
+    "its controller process lives but its loop is silent: paused by hand in Webots, at a "
+    "breakpoint, another controller looping, or an extern controller missing; from inside the "
+    "simulation these look alike"
+)
+_WAITING: Final = (
+    "the database takes no rows: those of its controller wait in {0} next to it, for {1:.0f} s now "
+    "(is the disk full, or does another program hold a lock?); what is shown here is older"
+)
+_LEFT_WAITING: Final = (
+    "its last rows wait in {} next to the database, until a server that may write there (not "
+    "--read-only) takes them in: what is shown here is older"
+)
+WAITING_IN_STEP: Final = (
+    "its loop waits in step(): paused by hand in Webots or at a breakpoint, another controller "
+    "holds the world up, or an extern one is missing; from inside the simulation these look alike"
+)
+CONNECTION_LOST: Final = (
+    "Webots has gone: it has closed its connection to the controller (process {}), which waits for "
+    "its answer in step()"
+)
+_STOPPED_PROCESS: Final = "its controller (process {}) is stopped, by a signal or a debugger"
+_AWAITS_PERSON: Final = "its loop waits for a person, in a debugger or for a key or click, in {}"
+_HELD_UP_BY: Final = "its loop waits in step(), as the whole world does, for {}: {}"
+_STARTED: Final = "its controller has just started; simulation time has not moved yet"
+_NOT_STARTED: Final = (
+    "its controller has started, but simulation time has not moved since: the simulation may be "
+    "paused in Webots, or the controller has not reached its loop"
+)
+_SEEN_MODE: Final = (
+    "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN "
+    f"(SELECT id FROM run WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1"
+)
+_STANDING: Final = (
+    "its loop is alive but simulation time stands still: paused by the controller's own code, or "
+    "it calls step(0) only"
+)
+_BEGINNING_S: Final = 10.0  # in which a first step may take long: Webots loads, or compiles shaders
+_SURE_OF_HANG: Final = 2.0  # limits of the bridge, or of the silences from which it came back
+_MOST_SILENCES: Final = 20
+_SILENCES: Final = (
+    "SELECT l.wall_time_s, (SELECT s.wall_time_s FROM state s WHERE s.run_id = l.run_id "
+    "AND s.sim_time_s >= l.sim_time_s AND s.wall_time_s > l.wall_time_s "
+    "ORDER BY s.sim_time_s, s.id LIMIT 1) FROM log l "
+    "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
+    f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}"
+)
+_SLOW_STEPS: Final = 3.0  # usual steps that one may last before the world counts as standing
+_USUAL_STEP: Final = (
+    "SELECT sum(step_wait_wall_s) / nullif(sum(steps), 0) FROM run WHERE session_id = ?"
+)
+PRESS_PLAY: Final = (
+    "press play in Webots if it is paused there: only a person can resume it while the controller "
+    "is inside step(); else check what its loop is waiting for"
+)
+_RESUME_BY: Final = "webots_simulation_control('resume') resumes it"
+_FREE_IT: Final = "mend that line, or end the controller and start it again"
+
 # Controller processes: who they are, and whether they still live.
 
 
@@ -124,16 +249,6 @@ class Session:
         return self.host == host_name() and process_alive(*process)
 
 
-# Of the newest Webots, unless a controller has begun to record since. What a controller printed
-# comes first: its traceback ends with the reason, and Webots itself only says that it exited.
-_CONSOLE_TROUBLE: Final = (
-    "WITH trouble AS (SELECT id, instance, source, message FROM console_line WHERE level IN "
-    "('warning', 'error', 'critical') AND wall_time_s > "
-    "(SELECT coalesce(max(started_wall_time_s), 0) FROM session)) "
-    "SELECT substr(message, 1, 200) FROM trouble WHERE id IN (SELECT max(id) FROM trouble WHERE "
-    "instance = (SELECT instance FROM trouble ORDER BY id DESC LIMIT 1) GROUP BY source) "
-    "ORDER BY source = 'console' DESC, id"
-)
 _COLUMNS: Final = columns_of(Session)
 _NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
@@ -181,27 +296,6 @@ def _session(row: tuple[Any, ...] | None) -> Session | None:
     values["supervisor"] = bool(values["supervisor"])
     values["extern"] = bool(values["extern"])
     return Session(**values)
-
-
-_ALL: Final = (
-    "SELECT id, name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s "
-    "FROM robot ORDER BY id"
-)
-_KIND: Final = "SELECT kind FROM robot WHERE id = ?"
-_NAME: Final = "SELECT name FROM robot WHERE id = ?"
-_SHOWN_NAMES: Final = 20
-_BESIDE: Final = (
-    "SELECT r.id, b.name FROM session s JOIN robot b ON b.id = s.robot_id "
-    "JOIN run r ON r.session_id = s.id JOIN session me ON me.id = :session "
-    f"WHERE b.kind = '{OBSERVER}' AND s.instance = me.instance "
-    "AND r.started_wall_time_s <= :last AND r.last_wall_time_s >= :first "
-    "ORDER BY r.id DESC LIMIT 1"
-)
-_SEEN: Final = (
-    "SELECT data FROM event WHERE run_id IN (SELECT id FROM run WHERE session_id = "
-    f"(SELECT session_id FROM run WHERE id = ?)) AND kind = '{WORLD_EVENT}' AND run_id <= ? "
-    "ORDER BY id DESC LIMIT 1"
-)
 
 
 @dataclass(frozen=True)
@@ -374,87 +468,6 @@ def _places(connection: sqlite3.Connection, run_id: int, run: Run) -> dict[str, 
 # Whether a robot's time is moving, judged from its session row, its process and its companions.
 
 
-NEVER_SEEN: Final = "never seen"
-RUNNING: Final = "running"
-STARTING: Final = "starting"
-
-_CLAIMED: Final = (
-    "SELECT id, action, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
-    "WHERE robot_id = ? AND session_id = ? "
-    "AND status = 'claimed' ORDER BY id DESC"
-)
-
-_STILL_MOVING_S: Final = 1.0
-_WRITING_S: Final = 0.1  # after a signal
-_SLOWEST_STILL_MOVING_S: Final = 15.0
-
-_UNPUBLISHED_S: Final = 5.0  # of wall time without a row
-_UNPUBLISHED_INTERVALS: Final = 10.0  # of the usual time between two rows
-_UNPUBLISHED: Final = (
-    "its loop runs, but for {:.1f} s of simulation time it recorded no state: is bridge.publish() "
-    "still called in the loop?"
-)
-
-_ENDED: Final = {
-    "finished": "its controller finished",
-    "reload": "the world was reloaded and no new controller session has appeared yet",
-    "crashed": "its controller process is gone without having finished (killed or crashed)",
-    "superseded": "a newer session took its place",
-}
-_ENDED_BY: Final = (
-    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
-    "AND level = 'error' AND source = 'controller' AND message GLOB ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_HUNG: Final = (
-    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
-    f"AND logger = '{LOGGER}' AND wall_time_s > ? ORDER BY id DESC LIMIT 1"
-)
-_MOST_ERROR_CHARACTERS: Final = 300
-_READ_NO_MORE: Final = (
-    "it was recorded by the observer from its customData: the observer ended, or the robot is gone"
-)
-_RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
-# From inside these look alike; `diagnosis.webots_checks` looks at it from outside.
-SILENT: Final = (
-    "its controller process lives but its loop is silent: paused by hand in Webots, at a "
-    "breakpoint, another controller looping, or an extern controller missing; from inside the "
-    "simulation these look alike"
-)
-_WAITING: Final = (
-    "the database takes no rows: those of its controller wait in {0} next to it, for {1:.0f} s now "
-    "(is the disk full, or does another program hold a lock?); what is shown here is older"
-)
-_LEFT_WAITING: Final = (
-    "its last rows wait in {} next to the database, until a server that may write there (not "
-    "--read-only) takes them in: what is shown here is older"
-)
-WAITING_IN_STEP: Final = (
-    "its loop waits in step(): paused by hand in Webots or at a breakpoint, another controller "
-    "holds the world up, or an extern one is missing; from inside the simulation these look alike"
-)
-CONNECTION_LOST: Final = (
-    "Webots has gone: it has closed its connection to the controller (process {}), which waits for "
-    "its answer in step()"
-)
-_STOPPED_PROCESS: Final = "its controller (process {}) is stopped, by a signal or a debugger"
-_AWAITS_PERSON: Final = "its loop waits for a person, in a debugger or for a key or click, in {}"
-_HELD_UP_BY: Final = "its loop waits in step(), as the whole world does, for {}: {}"
-_STARTED: Final = "its controller has just started; simulation time has not moved yet"
-_NOT_STARTED: Final = (
-    "its controller has started, but simulation time has not moved since: the simulation may be "
-    "paused in Webots, or the controller has not reached its loop"
-)
-_SEEN_MODE: Final = (
-    "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN "
-    f"(SELECT id FROM run WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1"
-)
-_STANDING: Final = (
-    "its loop is alive but simulation time stands still: paused by the controller's own code, or "
-    "it calls step(0) only"
-)
-
-
 class Status(NamedTuple):
     """What to say about a robot, and why where that helps."""
 
@@ -509,28 +522,6 @@ def judge(
     if moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s:
         return Status(RUNNING, _why_unpublished(connection, session, run))
     return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
-
-
-_BEGINNING_S: Final = 10.0  # in which a first step may take long: Webots loads, or compiles shaders
-_SURE_OF_HANG: Final = 2.0  # limits of the bridge, or of the silences from which it came back
-_MOST_SILENCES: Final = 20
-_SILENCES: Final = (
-    "SELECT l.wall_time_s, (SELECT s.wall_time_s FROM state s WHERE s.run_id = l.run_id "
-    "AND s.sim_time_s >= l.sim_time_s AND s.wall_time_s > l.wall_time_s "
-    "ORDER BY s.sim_time_s, s.id LIMIT 1) FROM log l "
-    "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
-    f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}"
-)
-_SLOW_STEPS: Final = 3.0  # usual steps that one may last before the world counts as standing
-_USUAL_STEP: Final = (
-    "SELECT sum(step_wait_wall_s) / nullif(sum(steps), 0) FROM run WHERE session_id = ?"
-)
-PRESS_PLAY: Final = (
-    "press play in Webots if it is paused there: only a person can resume it while the controller "
-    "is inside step(); else check what its loop is waiting for"
-)
-_RESUME_BY: Final = "webots_simulation_control('resume') resumes it"
-_FREE_IT: Final = "mend that line, or end the controller and start it again"
 
 
 class Block(NamedTuple):

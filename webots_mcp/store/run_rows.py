@@ -24,6 +24,47 @@ from webots_mcp.signals.naming import nearest_first
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+_NEWEST_RUN_IDS: Final = (
+    "SELECT id FROM run WHERE :robot_id IS NULL OR robot_id = :robot_id ORDER BY id DESC LIMIT 10"
+)
+_RUN_COUNT: Final = "SELECT count(*) FROM run WHERE robot_id = ?"
+_CHUNKS_END: Final = (
+    "SELECT max(end_sim_time_s) FROM row_group WHERE run_id = ? AND is_complete = 1"
+)
+_RECENT_TIMES: Final = (
+    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+# A blob is greater than any number or text: a time that is not a number is found too, and reported.
+_LATER_THAN_ANY: Final = b"\xff"
+PACE_ROWS: Final = 6
+PACE_WINDOW_S: Final = 5.0
+_PACE_WINDOW_ROWS: Final = 500
+# Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
+_ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
+OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
+STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
+_ROUND: Final = f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?"
+_SETS_PACE: Final = 0.8  # of a round's time
+_SHOWN_KEYS: Final = 20
+_SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
+_SHOWN_KEY_CHARACTERS: Final = 40
+PICTURES: Final = (".png", ".jpg", ".jpeg")
+MAX_FILE_BYTES: Final = 64_000_000
+MAX_PIXELS: Final = 50_000_000  # 200 MB in memory
+_SHOWN_PATH: Final = 100
+_OF_CAMERA: Final = f"kind IN ('camera', '{KEPT_FRAME}')"
+_NEWEST_FIRST: Final = "sim_time_s DESC"
+_NEAREST_FIRST: Final = "abs(sim_time_s - :at_s)"
+_KEPT_FRAMES: Final = (
+    f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
+    "AND sim_time_s BETWEEN ? AND ?"
+)
+_CAMERAS: Final = (
+    f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} AND run_id IN "
+    "(SELECT id FROM run WHERE robot_id = ?) GROUP BY run_id ORDER BY run_id DESC"
+)
+
 
 def columns_of(row: type[Any]) -> str:
     """What to select so that a row is the arguments of this dataclass."""
@@ -123,10 +164,6 @@ _RUN_COLUMNS: Final = columns_of(Run)
 _CURRENT_RUN: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
 _RUN_BY_ID: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE id = ?"
 _RUNS_OF_ROBOT: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id"
-_NEWEST_RUN_IDS: Final = (
-    "SELECT id FROM run WHERE :robot_id IS NULL OR robot_id = :robot_id ORDER BY id DESC LIMIT 10"
-)
-_RUN_COUNT: Final = "SELECT count(*) FROM run WHERE robot_id = ?"
 _STATE_COLUMNS: Final = columns_of(State)
 # Of a crash only a kept stretch has the newest state; it has a negative id.
 _NEWEST_STATE: Final = (
@@ -136,27 +173,6 @@ _NEWEST_STATE: Final = (
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1)) "
     "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
 ).format(columns=_STATE_COLUMNS, kept=_STATE_COLUMNS.partition(", ")[2])
-_CHUNKS_END: Final = (
-    "SELECT max(end_sim_time_s) FROM row_group WHERE run_id = ? AND is_complete = 1"
-)
-_RECENT_TIMES: Final = (
-    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
-)
-# A blob is greater than any number or text: a time that is not a number is found too, and reported.
-_LATER_THAN_ANY: Final = b"\xff"
-PACE_ROWS: Final = 6
-PACE_WINDOW_S: Final = 5.0
-_PACE_WINDOW_ROWS: Final = 500
-# Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
-_ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
-OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
-STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
-_ROUND: Final = f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?"
-_SETS_PACE: Final = 0.8  # of a round's time
-_SHOWN_KEYS: Final = 20
-_SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
-_SHOWN_KEY_CHARACTERS: Final = 40
 _EVENT_COLUMNS: Final = columns_of(Event)
 _NEWEST_EVENTS: Final = (
     f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT ?"
@@ -316,11 +332,6 @@ def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> li
 # Camera frames and screenshots: rows here, files in the data folder.
 
 
-PICTURES: Final = (".png", ".jpg", ".jpeg")
-MAX_FILE_BYTES: Final = 64_000_000
-MAX_PIXELS: Final = 50_000_000  # 200 MB in memory
-
-
 @dataclass(frozen=True)
 class StoredImage:
     """A picture that was recorded; `path` is relative to the data folder."""
@@ -341,11 +352,7 @@ class StoredImage:
         return inside(data_dir, self.path)
 
 
-_SHOWN_PATH: Final = 100
 _COLUMNS: Final = columns_of(StoredImage)
-_OF_CAMERA: Final = f"kind IN ('camera', '{KEPT_FRAME}')"
-_NEWEST_FIRST: Final = "sim_time_s DESC"
-_NEAREST_FIRST: Final = "abs(sim_time_s - :at_s)"
 _FRAMES: Final = (
     f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
     "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
@@ -353,14 +360,6 @@ _FRAMES: Final = (
 )
 _NEWEST: Final = (
     f"SELECT {_COLUMNS} FROM image WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_KEPT_FRAMES: Final = (
-    f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
-    "AND sim_time_s BETWEEN ? AND ?"
-)
-_CAMERAS: Final = (
-    f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} AND run_id IN "
-    "(SELECT id FROM run WHERE robot_id = ?) GROUP BY run_id ORDER BY run_id DESC"
 )
 
 

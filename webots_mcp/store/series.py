@@ -41,6 +41,9 @@ _NEWEST_WALL: Final = (
     "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
 )
+MOST_ROWS: Final = 1000
+_STATES: Final = "SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))"
+_KEPT_STATES: Final = "SELECT id, data FROM kept_state WHERE id IN (SELECT value FROM json_each(?))"
 
 
 @dataclass(frozen=True)
@@ -275,11 +278,6 @@ def _change_columns(signal: Signal, changes: Changes, newest_s: float, most: int
 
 
 # -- `query_rows`: the rows of a range as they are, page by page -----------------------------------
-
-
-MOST_ROWS: Final = 1000
-_STATES: Final = "SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))"
-_KEPT_STATES: Final = "SELECT id, data FROM kept_state WHERE id IN (SELECT value FROM json_each(?))"
 
 
 @dataclass(frozen=True)

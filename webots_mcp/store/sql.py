@@ -52,6 +52,44 @@ _LONGEST_ERROR: Final = 300
 _MISSING: Final = re.compile(r"no such (column|table): (\S+)")
 
 Cell = int | float | str | None
+LINE: Final = (sys.executable, "-m", __name__)
+# Modules are looked for here first, so that no file of the user's folder is taken for one.
+FOLDER: Final = Path(__file__).parents[2]  # which holds the package
+_MAX_HEAP_BYTES: Final = 400_000_000
+_TIMED_OUT: Final = 124  # the exit code of timeout(1): no other end of the process has it
+_GRACE_S: Final = 0.3  # SQLite's own deadline comes first: it keeps the rows that were found
+_OBJECTS: Final = (
+    "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "
+    "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
+)
+# What serves the recording itself: a question needs the names at most.
+_BOOKKEEPING: Final = (
+    "console_line",
+    "lease",
+    "watermark",
+    "recording",
+    "retention_limit",
+    "kept_state",
+    "row_group",
+    "chunk",
+)
+_BOOKKEEPING_COLUMNS: Final = (
+    "uuid",
+    "process",
+    "last_adopted_entry",
+    "last_seen_monotonic_s",
+    "mode_before_pause",
+    "is_chunked",
+)
+_COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
+_COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
+_RULES: Final = (
+    "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
+    "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
+    "fast by run_id and sim_time_s; for a long one use robot_statistics (min, max, mean of about "
+    "1,024 rows each, also of purged ones; not of rows in no chunk: the newest of a run that goes "
+    "on, up to 1,023, and the last of an ended one where they are fewer than 256)."
+)
 
 
 @dataclass(frozen=True)
@@ -277,15 +315,6 @@ def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) 
 # JSON on stdout.
 
 
-LINE: Final = (sys.executable, "-m", __name__)
-# Modules are looked for here first, so that no file of the user's folder is taken for one.
-FOLDER: Final = Path(__file__).parents[2]  # which holds the package
-
-_MAX_HEAP_BYTES: Final = 400_000_000
-_TIMED_OUT: Final = 124  # the exit code of timeout(1): no other end of the process has it
-_GRACE_S: Final = 0.3  # SQLite's own deadline comes first: it keeps the rows that were found
-
-
 @dataclass(frozen=True)
 class Statement:
     """What is asked; see `query_sql`. The database is a file, or the URL of a pool."""
@@ -369,40 +398,6 @@ def _ask(asked: Statement) -> Result:
 
 
 # -- the schema as a short text, read from the database itself -------------------------------------
-
-
-_OBJECTS: Final = (
-    "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "
-    "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
-)
-# What serves the recording itself: a question needs the names at most.
-_BOOKKEEPING: Final = (
-    "console_line",
-    "lease",
-    "watermark",
-    "recording",
-    "retention_limit",
-    "kept_state",
-    "row_group",
-    "chunk",
-)
-_BOOKKEEPING_COLUMNS: Final = (
-    "uuid",
-    "process",
-    "last_adopted_entry",
-    "last_seen_monotonic_s",
-    "mode_before_pause",
-    "is_chunked",
-)
-_COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
-_COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
-_RULES: Final = (
-    "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
-    "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
-    "fast by run_id and sim_time_s; for a long one use robot_statistics (min, max, mean of about "
-    "1,024 rows each, also of purged ones; not of rows in no chunk: the newest of a run that goes "
-    "on, up to 1,023, and the last of an ended one where they are fewer than 256)."
-)
 
 
 def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:

@@ -44,6 +44,12 @@ if TYPE_CHECKING:
 
 
 _SHOWN_STATE_CHARACTERS: Final = 500
+COMMAND_TIME_TO_LIVE_S: Final = 60.0  # a test on a busy machine is slower than a person
+_NO_LIMIT: Final = -1
+_UNFINISHED: Final = {
+    "pending": "no get_command() of its controller has come to it yet",
+    "claimed": "its handler has not returned yet",
+}
 
 
 class RecordedSignal:
@@ -240,14 +246,6 @@ def _shown(value: Value) -> str:
 
 
 # What a robot recorded, as a test asks about it, and the commands that a test sends.
-
-
-COMMAND_TIME_TO_LIVE_S: Final = 60.0  # a test on a busy machine is slower than a person
-_NO_LIMIT: Final = -1
-_UNFINISHED: Final = {
-    "pending": "no get_command() of its controller has come to it yet",
-    "claimed": "its handler has not returned yet",
-}
 
 
 class RobotRecording:

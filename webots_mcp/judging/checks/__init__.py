@@ -54,6 +54,29 @@ _OF_EVENTS: Final = 0.7  # of the time
 SLOW: Final = 0.9  # of real time
 _CELL_S: Final = 5.0  # of simulation time, over which the pace is measured
 _LONGEST_MESSAGE: Final = 120
+_MUCH: Final = 0.05  # of the run, or of its rows
+_HABIT: Final = 3  # so many times: its code does it
+_RESET_BY: Final = (
+    "SELECT count(*) FROM command WHERE session_id = :session AND status = 'done' "
+    "AND (action IN ('reset', 'reload', 'load_world', 'quit') "
+    "OR action = 'run' AND json_extract(params, '$.reset')) "
+    "AND claimed_wall_time_s BETWEEN :last - 30 AND :last + 30"
+)
+_ENDS_OF_SESSION: Final = (
+    "SELECT count(*) FROM run WHERE session_id = ? AND end_reason = 'reset' AND id <> ?"
+)
+_LOST: Final = "SELECT rows_waiting, last_error FROM session WHERE id = ?"
+_GOAL: Final = (
+    "SELECT json_extract(params, '$.until'), json_extract(result, '$.ended'), "
+    "json_extract(result, '$.advanced_s'), json_extract(result, '$.sim_time_s') FROM command "
+    "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
+    "AND json_extract(result, '$.run_id') = ? AND json_extract(params, '$.until') IS NOT NULL "
+    "ORDER BY id DESC LIMIT 1"
+)
+# A new check is a function and a line here: question, command, report, page and docs read it.
+_MOVES: Final = "the position; a commanded speed, speeds of wheels, or a mode"
+_AIMS: Final = "a target beside its measurement: `arm.target`, `arm.position`"
+_TWO: Final = "two positions of the robot, such as gps and odometry"
 
 
 def keeps_pace(run: RunUnderCheck) -> Finding:
@@ -80,10 +103,6 @@ def keeps_pace(run: RunUnderCheck) -> Finding:
     return Finding(
         "warn", evidence, since_s, None, f"webots_list_runs(cursor={run.info.run_id + 1})"
     )
-
-
-_MUCH: Final = 0.05  # of the run, or of its rows
-_HABIT: Final = 3  # so many times: its code does it
 
 
 def misses_no_steps(run: RunUnderCheck) -> Finding:
@@ -118,17 +137,6 @@ def logs_no_errors(run: RunUnderCheck) -> Finding:
     return Finding("fail" if errors else "warn", evidence, first.start_s, len(lines), more)
 
 
-_RESET_BY: Final = (
-    "SELECT count(*) FROM command WHERE session_id = :session AND status = 'done' "
-    "AND (action IN ('reset', 'reload', 'load_world', 'quit') "
-    "OR action = 'run' AND json_extract(params, '$.reset')) "
-    "AND claimed_wall_time_s BETWEEN :last - 30 AND :last + 30"
-)
-_ENDS_OF_SESSION: Final = (
-    "SELECT count(*) FROM run WHERE session_id = ? AND end_reason = 'reset' AND id <> ?"
-)
-
-
 def ends_well(run: RunUnderCheck) -> Finding:
     """Fails where its controller crashed; warns of a reset or reload that no command asked for."""
     reason, session = run.info.end_reason, run.info.session_id
@@ -155,9 +163,6 @@ def ends_well(run: RunUnderCheck) -> Finding:
         return Finding("pass", f"it ended by a reset, as {habit} others of its session")
     evidence = f"it ended by a {reason} that no command asked for: by hand, or by code"
     return Finding("warn", evidence, run.search.ended_s, 1, more)
-
-
-_LOST: Final = "SELECT rows_waiting, last_error FROM session WHERE id = ?"
 
 
 def loses_no_rows(run: RunUnderCheck) -> Finding:
@@ -240,15 +245,6 @@ def _violated(run: RunUnderCheck, each: Expectation, held: Adherence, evidence: 
     return Finding("fail", evidence, since_s, len(held.violations), more)
 
 
-_GOAL: Final = (
-    "SELECT json_extract(params, '$.until'), json_extract(result, '$.ended'), "
-    "json_extract(result, '$.advanced_s'), json_extract(result, '$.sim_time_s') FROM command "
-    "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
-    "AND json_extract(result, '$.run_id') = ? AND json_extract(params, '$.until') IS NOT NULL "
-    "ORDER BY id DESC LIMIT 1"
-)
-
-
 def reaches_goal(run: RunUnderCheck) -> Finding:
     """Fails where the condition of its last run command, or trial, did not come to hold."""
     asked = (run.robot_id, run.info.run_id)
@@ -263,10 +259,6 @@ def reaches_goal(run: RunUnderCheck) -> Finding:
 
 # -- all of them -----------------------------------------------------------------------------------
 
-# A new check is a function and a line here: question, command, report, page and docs read it.
-_MOVES: Final = "the position; a commanded speed, speeds of wheels, or a mode"
-_AIMS: Final = "a target beside its measurement: `arm.target`, `arm.position`"
-_TWO: Final = "two positions of the robot, such as gps and odometry"
 _JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
 CHECKS: Final[list[Check]] = [
     Check("moves when commanded", of_motion.moves_when_commanded, _MOVES, ("stuck", "standstill")),

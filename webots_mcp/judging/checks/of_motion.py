@@ -23,6 +23,23 @@ APART_S: Final = 3.0  # command and measurement for so long
 NO_COMMAND: Final = (
     "nothing says when it should move: publish commanded_m_s, the speeds of its wheels, or mode"
 )
+_OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
+_NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
+_NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
+_HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
+_SLIPS: Final = 0.5  # of the usual way per turn of the wheels
+_CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
+_NOISE_SHARE: Final = 0.1  # of the speed that it may take
+_CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
+_TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
+_LEAST_CELLS: Final = 10
+_SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
+_BY_WHEELS: Final = ("odom", "odometry")
+_FITTED: Final = 0.2  # of the way: so much of it lays one estimate over the other
+_LEAST_WAY_M: Final = 1.0
+_SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
+_WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
+_FAILS: Final = (0.15, 0.3)
 
 
 def moves_when_commanded(run: RunUnderCheck) -> Finding:
@@ -70,11 +87,6 @@ def _flies(run: RunUnderCheck) -> bool:
 
 
 # -- command and measurement -----------------------------------------------------------------------
-
-_OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
-_NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
-_NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
-_HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
 
 
 def follows_targets(run: RunUnderCheck) -> Finding:
@@ -150,15 +162,6 @@ def _between(values: Array, aims: Array, turn: float | None) -> Array:
 
 
 # -- wheels and motion -----------------------------------------------------------------------------
-
-_SLIPS: Final = 0.5  # of the usual way per turn of the wheels
-_CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
-_NOISE_SHARE: Final = 0.1  # of the speed that it may take
-_CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
-_TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
-_LEAST_CELLS: Final = 10
-_SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
-_BY_WHEELS: Final = ("odom", "odometry")
 
 
 def wheels_grip(run: RunUnderCheck) -> Finding:
@@ -239,12 +242,6 @@ def _ratios(
 
 
 # -- two estimates of one thing --------------------------------------------------------------------
-
-_FITTED: Final = 0.2  # of the way: so much of it lays one estimate over the other
-_LEAST_WAY_M: Final = 1.0
-_SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
-_WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
-_FAILS: Final = (0.15, 0.3)
 
 
 def estimates_agree(run: RunUnderCheck) -> Finding:

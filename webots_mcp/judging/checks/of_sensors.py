@@ -19,6 +19,15 @@ MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
 _MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first steps alone
 _LEAST_S: Final = 1.0  # as of what is missing
+_SET: Final = frozenset(
+    ("target", "setpoint", "goal", "desired", "commanded", "command", "cmd", "reference", "ref")
+)
+_RANGES: Final = frozenset(
+    ("distance", "range", "lidar", "sonar", "ir", "ds", "ps", "front", "left", "right", "rear")
+)
+_AT_LIMIT: Final = 0.05  # of the rows
+_MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
+_OFTEN_THE_SAME: Final = 3
 
 
 def sensors_speak(run: RunUnderCheck) -> Finding:
@@ -134,20 +143,10 @@ def _names_in(run: RunUnderCheck) -> _NamesIn:
     return names
 
 
-_SET: Final = frozenset(
-    ("target", "setpoint", "goal", "desired", "commanded", "command", "cmd", "reference", "ref")
-)
-
-
 def _words(name: str) -> set[str]:
     return {word for part in name.split(".") for word in words_of(part)}
 
 
-_RANGES: Final = frozenset(
-    ("distance", "range", "lidar", "sonar", "ir", "ds", "ps", "front", "left", "right", "rear")
-)
-_AT_LIMIT: Final = 0.05  # of the rows
-_MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
 
 
@@ -190,9 +189,6 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
             long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
             if len(long) >= _OFTEN and at.mean() >= _AT_LIMIT:
                 yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
-
-
-_OFTEN_THE_SAME: Final = 3
 
 
 def sensors_drop_nothing(run: RunUnderCheck) -> Finding:

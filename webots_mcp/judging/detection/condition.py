@@ -51,6 +51,15 @@ from webots_mcp.store.signals import Signal
 
 _MOST_VALUES: Final = 8
 _ROWS_BEFORE: Final = 20  # a range: what was there last, for `changed` and `rate`
+_FOLDING: Final = {"min": "minimum", "max": "maximum"}
+_MIRRORED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
+    ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE,
+    ast.Eq: ast.Eq, ast.NotEq: ast.NotEq,
+}  # fmt: skip
+NONE_EXPECTED: Final = (
+    "nothing is expected of this run: bridge.expect(...), webots-mcp.toml, or "
+    "webots_check_run(expect=[...])"
+)
 
 
 def condition_events(search: Search) -> Iterator[Event]:
@@ -156,13 +165,6 @@ CONDITION: Final = EventKind(
 # docs/conditions.md. A value is NaN where a row has no number. Integers beyond 2^53 are those of
 # 64-bit floats. Where a text stands in the place of a number, the closures themselves are asked,
 # row by row: they know in which row that is an error.
-
-
-_FOLDING: Final = {"min": "minimum", "max": "maximum"}
-_MIRRORED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
-    ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE,
-    ast.Eq: ast.Eq, ast.NotEq: ast.NotEq,
-}  # fmt: skip
 
 
 class _MixedKindsError(Exception):
@@ -567,12 +569,6 @@ def _verdicts(op: type[ast.cmpop], low: Array, high: Array, limit: float) -> tup
 
 
 # -- what shall hold -------------------------------------------------------------------------------
-
-
-NONE_EXPECTED: Final = (
-    "nothing is expected of this run: bridge.expect(...), webots-mcp.toml, or "
-    "webots_check_run(expect=[...])"
-)
 
 
 @dataclass(frozen=True)

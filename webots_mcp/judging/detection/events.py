@@ -53,6 +53,24 @@ _ROW_AT: Final = (  # of a run of which the table has all rows
 Place = tuple[float, int, float, str, int]
 MOST_ENTRIES: Final = 500
 _NO_CURSOR: Final = "{!r} is not a cursor: give the `cursor` of an answer unchanged"
+KINDS: Final[list[EventKind]] = [
+    stored.RUN,
+    stored.GAP,
+    stored.CHANGE,
+    standstill.STANDSTILL,
+    standstill.STUCK,
+    condition.CONDITION,
+    condition.VIOLATIONS,
+    sensors.MISSING,
+    sensors.FLAT,
+    jump.JUMP,
+    oscillation.OSCILLATION,
+    stored.COMMAND,
+    stored.LOG,
+    stored.NOTICED,
+    stored.KEPT,
+    stored.IMAGE,
+]
 
 
 @dataclass(frozen=True)
@@ -409,26 +427,6 @@ def _read_page_cursor(text: str) -> Place:
 # -- the registry of kinds: all that reports, counts or draws events reads it ----------------------
 #
 # A new kind is a file that holds an `EventKind`, and a line here.
-
-
-KINDS: Final[list[EventKind]] = [
-    stored.RUN,
-    stored.GAP,
-    stored.CHANGE,
-    standstill.STANDSTILL,
-    standstill.STUCK,
-    condition.CONDITION,
-    condition.VIOLATIONS,
-    sensors.MISSING,
-    sensors.FLAT,
-    jump.JUMP,
-    oscillation.OSCILLATION,
-    stored.COMMAND,
-    stored.LOG,
-    stored.NOTICED,
-    stored.KEPT,
-    stored.IMAGE,
-]
 
 
 def kind_named(name: str) -> EventKind:

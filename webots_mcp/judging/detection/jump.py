@@ -59,6 +59,14 @@ SWING_STEPS: Final = 3  # of one swing there are at least so many, none of them 
 MUCH_SMALLER: Final = 0.25  # between two turns of a swing the largest steps are at least half alike
 SWITCHED_SHARE: Final = 0.5  # of the half swings: so many have a jump where a swing is switched
 _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
+LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
+_ENDS_WITHIN: Final = 1.5  # periods
+# Sensors swing by nature while a robot drives.
+_SWINGING: Final = re.compile(
+    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
+    r"|position|odom|odometry|left|right|cmd|command\w*|error)([._]|$)",
+    re.IGNORECASE,
+)
 
 
 def jump_events(search: Search) -> Iterator[Event]:
@@ -399,17 +407,6 @@ JUMP: Final = EventKind(
 
 
 # -- `oscillation`: a signal that a robot moves with went to and fro regularly ---------------------
-
-
-LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
-_ENDS_WITHIN: Final = 1.5  # periods
-
-# Sensors swing by nature while a robot drives.
-_SWINGING: Final = re.compile(
-    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
-    r"|position|odom|odometry|left|right|cmd|command\w*|error)([._]|$)",
-    re.IGNORECASE,
-)
 
 
 def oscillation_events(search: Search) -> Iterator[Event]:

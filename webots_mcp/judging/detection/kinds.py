@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from webots_mcp.judging.detection.search import Search
 
 LEVELS: Final = LOG_LEVELS
+MOST_TIMES: Final = 3  # of a group that are named
+_SAME_LENGTH: Final = 0.05  # of the longest: so near each other they last equally long
+_NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass(frozen=True)
@@ -129,11 +132,6 @@ class EventOptions:
 
 
 # -- what a kind of event is: how it is found, reported, counted and drawn -------------------------
-
-
-MOST_TIMES: Final = 3  # of a group that are named
-_SAME_LENGTH: Final = 0.05  # of the longest: so near each other they last equally long
-_NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class NotSearchableError(NothingRecordedError):

@@ -38,6 +38,32 @@ TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
 SAMPLES: Final = 8  # parts of a run that tell how noisy it is
 SAMPLE_ROWS: Final = 1024  # of each
 IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
+ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
+LEAST_MOVED_M: Final = 0.3  # within so long: who drifts about a place does not move
+AWAY_S: Final = 20.0
+LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
+USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
+LEAST_VISITS: Final = 3
+EARLIER_RUNS: Final = 3
+MOST_ROWS: Final = 2_000_000  # of a run: its first ones
+_STANDS_SHARE: Final = 0.8  # of a visit
+_MOVES_SHARE: Final = 0.1  # of the samples of a visit, or of so many
+_ENOUGH: Final = 200
+_SAMPLE_S: Final = 0.5
+_FAST: Final = 0.9  # of the speeds while it moves are below what is called fast
+_PACE_S: Final = 1.0  # over so long a speed is measured; longer, by so much for each metre of noise
+_PACE_S_PER_M: Final = 100.0
+_EARLIER: Final = (
+    "SELECT id FROM run WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND id < ? "
+    "ORDER BY id DESC LIMIT ?"
+)
+FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
+MOST_NAMED: Final = 5
+NO_TIME: Final = "time limit reached: ask for this kind alone, or a shorter range"
+_ROW: Final = "SELECT wall_time_s FROM state WHERE run_id = ?"
+_LAST_ROW: Final = f"{_ROW} AND sim_time_s <= ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+_FIRST_ROW: Final = f"{_ROW} ORDER BY sim_time_s, id LIMIT 1"
+_OF_SEGMENT: Final = ("recorded", "frame")
 
 
 @dataclass(frozen=True)
@@ -227,28 +253,6 @@ def doubt_of_length(way: PathLength) -> str | None:
 # -- in which modes a robot moves and stands: seen in this run and in earlier ones -----------------
 
 
-ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
-LEAST_MOVED_M: Final = 0.3  # within so long: who drifts about a place does not move
-AWAY_S: Final = 20.0
-LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
-USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
-LEAST_VISITS: Final = 3
-EARLIER_RUNS: Final = 3
-MOST_ROWS: Final = 2_000_000  # of a run: its first ones
-_STANDS_SHARE: Final = 0.8  # of a visit
-_MOVES_SHARE: Final = 0.1  # of the samples of a visit, or of so many
-_ENOUGH: Final = 200
-_SAMPLE_S: Final = 0.5
-_FAST: Final = 0.9  # of the speeds while it moves are below what is called fast
-_PACE_S: Final = 1.0  # over so long a speed is measured; longer, by so much for each metre of noise
-_PACE_S_PER_M: Final = 100.0
-
-_EARLIER: Final = (
-    "SELECT id FROM run WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND id < ? "
-    "ORDER BY id DESC LIMIT ?"
-)
-
-
 @dataclass(frozen=True)
 class ModeUse:
     """What a robot did in a mode.
@@ -374,15 +378,6 @@ def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tup
 
 
 # -- a search --------------------------------------------------------------------------------------
-
-
-FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
-MOST_NAMED: Final = 5
-NO_TIME: Final = "time limit reached: ask for this kind alone, or a shorter range"
-_ROW: Final = "SELECT wall_time_s FROM state WHERE run_id = ?"
-_LAST_ROW: Final = f"{_ROW} AND sim_time_s <= ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-_FIRST_ROW: Final = f"{_ROW} ORDER BY sim_time_s, id LIMIT 1"
-_OF_SEGMENT: Final = ("recorded", "frame")
 
 
 @dataclass

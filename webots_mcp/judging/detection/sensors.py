@@ -40,6 +40,8 @@ MOST_OPENED: Final = 8  # chunks with most changes in which that is looked for
 HABITUAL_ROWS: Final = 10  # with the same value at other times: it comes back to it
 TARGET_WENT: Final = 0.1  # of the whole range of a target: so far it goes on, to show something
 LONGEST_READ_S: Final = 120.0  # of a rest: longer ones show it in their first part
+MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
+_INDEX: Final = re.compile(r"\.\d+$")  # items that go missing at once are reported as the array
 
 
 def flat_events(search: Search) -> Iterator[Event]:
@@ -313,10 +315,6 @@ FLAT: Final = EventKind(
 
 
 # -- `missing`: a signal that had a value has none -------------------------------------------------
-
-
-MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
-_INDEX: Final = re.compile(r"\.\d+$")  # items that go missing at once are reported as the array
 
 
 def missing_events(search: Search) -> Iterator[Event]:

@@ -60,6 +60,9 @@ TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows 
 BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
 JUDGED_AT_ONCE: Final = 500_000  # rows, between two looks at the deadline
 _HEADING_ROWS: Final = 5  # at each end, whose median is its heading
+NOISE_RANGE: Final = 6.0  # deviations of noise from the least of some hundred rows to the greatest
+SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
+MARGIN_ROWS: Final = 50_000  # before and after a range; all where a standstill takes more
 
 
 class Judged(NamedTuple):
@@ -365,11 +368,6 @@ class Standings:
             reach_m = math.hypot(np.ptp(place.x), np.ptp(place.y))
             said.append(f"it moved back and forth within {reach_m:.2g} m")
         return said
-
-
-NOISE_RANGE: Final = 6.0  # deviations of noise from the least of some hundred rows to the greatest
-SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
-MARGIN_ROWS: Final = 50_000  # before and after a range; all where a standstill takes more
 
 
 @dataclass(frozen=True)

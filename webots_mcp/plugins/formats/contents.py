@@ -73,6 +73,7 @@ _RUN: Final = (
     "FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?"
 )
 _PARAMETERS: Final = "SELECT name, value FROM parameter_value WHERE run_id = ? ORDER BY id"
+_GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
 
 
 @dataclass(frozen=True)
@@ -258,9 +259,6 @@ def _radians(value_of: Callable[[str], Any], heading: Signal) -> float:
 
 
 # Rows as Parquet, through the extra `parquet` (pyarrow).
-
-
-_GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
 
 
 def write_parquet(source: Table, sink: BinaryIO) -> None:

@@ -37,6 +37,24 @@ _PROFILE: Final = ""  # of no middleware
 _LEVELS: Final = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
 _NOT_IN_TOPICS: Final = re.compile(r"[^A-Za-z0-9_-]+")  # as message paths take them unquoted
 _NOT_IN_JSON: Final = re.compile("NaN|Infinity")  # Python reads them as numbers, viewers do not
+FIXED: Final[dict[str, Schema]] = json.loads(
+    Path(__file__).with_name("mcap_schemas.json").read_text("utf-8")
+)
+_SCALARS: Final = {bool: "boolean", int: "number", float: "number", str: "string"}
+# What a message path can say without quotes: others are plotted by hand.
+_PLAIN_PATH: Final = re.compile(r"\$(\.[A-Za-z_]\w*|\[\d+\])+")
+_MOST_PLOTTED: Final = 8
+_MOST_CAMERAS: Final = 4
+_GRID: Final = {
+    "layerId": "foxglove.Grid",
+    "instanceId": "grid",
+    "label": "Grid",
+    "visible": True,
+    "size": 10,
+    "divisions": 10,
+    "position": [0, 0, 0],
+    "rotation": [0, 0, 0],
+}
 
 
 def write_mcap(contents: Contents, sink: BinaryIO) -> Counter[str]:
@@ -296,12 +314,6 @@ def _object(**properties: Schema) -> Schema:
     return {"type": "object", "properties": properties}
 
 
-FIXED: Final[dict[str, Schema]] = json.loads(
-    Path(__file__).with_name("mcap_schemas.json").read_text("utf-8")
-)
-_SCALARS: Final = {bool: "boolean", int: "number", float: "number", str: "string"}
-
-
 @dataclass
 class Shape:
     """What values of one field were seen to be: of which types, and what is inside of them."""
@@ -352,21 +364,6 @@ class Shape:
 
 
 # -- the file, with a layout for Foxglove and Lichtblick that shows what it holds --------------
-
-# What a message path can say without quotes: others are plotted by hand.
-_PLAIN_PATH: Final = re.compile(r"\$(\.[A-Za-z_]\w*|\[\d+\])+")
-_MOST_PLOTTED: Final = 8
-_MOST_CAMERAS: Final = 4
-_GRID: Final = {
-    "layerId": "foxglove.Grid",
-    "instanceId": "grid",
-    "label": "Grid",
-    "visible": True,
-    "size": 10,
-    "divisions": 10,
-    "position": [0, 0, 0],
-    "rotation": [0, 0, 0],
-}
 
 
 def export_mcap(

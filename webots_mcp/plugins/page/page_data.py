@@ -59,6 +59,10 @@ _DEFECT: Final = (
     "a defect of webots-mcp, or rows that it did not write; webots-mcp view has written more about "
     "it to its terminal"
 )
+# Of runs that are over, by database and run: nothing that a check looks at changes any more.
+_LIGHTS: Final[dict[tuple[str, int, float], str]] = {}
+_OF_OUTCOME: Final = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}
+_NO_OUTCOME: Final = "⚪"  # not judged yet, or not to be judged
 
 
 @dataclass(frozen=True)
@@ -200,10 +204,6 @@ def run_title(run: RunInfo) -> str:
     return f"run {run.run_id}{label} · {began} · {run.duration_s:.1f} s"
 
 
-# Of runs that are over, by database and run: nothing that a check looks at changes any more.
-_LIGHTS: Final[dict[tuple[str, int, float], str]] = {}
-_OF_OUTCOME: Final = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}
-_NO_OUTCOME: Final = "⚪"  # not judged yet, or not to be judged
 _judges: Final = ThreadPoolExecutor(1, "webots-mcp lights")  # no look waits for a check
 
 

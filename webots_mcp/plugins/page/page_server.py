@@ -74,6 +74,9 @@ _HEADERS: Final = {  # no other page may show it, or be told its address; it loa
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+_PERIOD_S: Final = 1.0
+_WAIT_S: Final = 10.0
+_BY_PAGE: Final = Requester("webots-mcp view", VERSION, "page")
 
 
 class PageServer(ThreadingHTTPServer):
@@ -383,9 +386,6 @@ _QUESTIONS: Final = {"look": _look, "draw": _draw, "picture": _picture}
 # Making chunks while the page is served, where no server does: what is long is drawn whole.
 
 
-_PERIOD_S: Final = 1.0
-
-
 class ChunkMaker(threading.Thread):
     """Looks once a second whether there is something to put into chunks.
 
@@ -429,10 +429,6 @@ class ChunkMaker(threading.Thread):
 
 
 # What the buttons and inputs of the page do: the way that the tools' own commands go.
-
-
-_WAIT_S: Final = 10.0
-_BY_PAGE: Final = Requester("webots-mcp view", VERSION, "page")
 
 
 def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:

@@ -71,6 +71,48 @@ _LASTING: Final = re.compile(
 _PASSING: Final = ("08", "40", "53", "57", "58", "55P03", "25P03", "XX")
 _PRIVILEGE: Final = "42501"
 _THERE_ALREADY: Final = ("42P07", "42723")  # a table, a function
+OWNER: Final = "recording_uuid"
+VERSION: Final = "pool_version"
+_LOCK: Final = 7_463_962_947  # of whoever makes tables: any number that nobody else takes
+# What a pool has beside the tables of a recording.
+_OWN: Final = f"""
+CREATE TABLE {VERSION} AS SELECT '{SCHEMA_VERSION}' AS version_num;
+CREATE TABLE progress (
+  {OWNER} uuid NOT NULL,
+  name text NOT NULL,
+  value bigint NOT NULL,
+  PRIMARY KEY ({OWNER}, name)
+);
+COMMENT ON TABLE progress IS 'how far each recording was shipped';
+CREATE TABLE picture (
+  {OWNER} uuid NOT NULL,
+  path text NOT NULL,
+  content bytea NOT NULL,
+  PRIMARY KEY ({OWNER}, path)
+);
+ALTER TABLE picture ALTER content SET STORAGE EXTERNAL;
+COMMENT ON TABLE picture IS 'the files of image, where they were shipped';
+"""
+_VIEW: Final = re.compile(r"CREATE VIEW (\w+) AS\n.*?(?=;\n)", re.DOTALL)
+_NOW_S: Final = "extract(epoch FROM clock_timestamp())::double precision"
+_EPOCH_MS: Final = "210866760000000::double precision"  # from the first Julian day to 1970
+# As text, rounded to milliseconds by the same additions that SQLite's strftime makes.
+_UTC: Final = (
+    rf"to_char(to_timestamp((floor((\1) * 1000 + {_EPOCH_MS} + 0.5) - {_EPOCH_MS}) / 1000) "
+    "AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS.MS')"
+)
+SELECT_S: Final = 60
+_SHIPPER: Final = 1_463_962_947  # the seed of the lock of who ships a recording
+_REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
+# Of values, where a batch has one that PostgreSQL cannot hold; and of rows that are there already.
+_REFUSED: Final = (
+    psycopg.DataError, psycopg.IntegrityError, psycopg.errors.ProgramLimitExceeded,
+    psycopg.errors.StatementTooComplex,
+)  # fmt: skip
+_FETCHED: Final = 2000  # rows that are asked of the server at a time
+_AS_THEY_ARE: Final = ("bool", "int2", "int4", "int8", "oid", "float4", "float8", "bytea")
+_PARAMETER: Final = "08P01"  # one SQLSTATE of what the client did wrong: it gave no values
+_ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A", _PARAMETER)  # that a question has
 
 
 def connect(url: str, address: str) -> Connection:
@@ -139,30 +181,6 @@ def one_line(text: str) -> str:
 
 
 # -- tables -----------------------------------------------------------------------------------
-
-OWNER: Final = "recording_uuid"
-VERSION: Final = "pool_version"
-_LOCK: Final = 7_463_962_947  # of whoever makes tables: any number that nobody else takes
-
-# What a pool has beside the tables of a recording.
-_OWN: Final = f"""
-CREATE TABLE {VERSION} AS SELECT '{SCHEMA_VERSION}' AS version_num;
-CREATE TABLE progress (
-  {OWNER} uuid NOT NULL,
-  name text NOT NULL,
-  value bigint NOT NULL,
-  PRIMARY KEY ({OWNER}, name)
-);
-COMMENT ON TABLE progress IS 'how far each recording was shipped';
-CREATE TABLE picture (
-  {OWNER} uuid NOT NULL,
-  path text NOT NULL,
-  content bytea NOT NULL,
-  PRIMARY KEY ({OWNER}, path)
-);
-ALTER TABLE picture ALTER content SET STORAGE EXTERNAL;
-COMMENT ON TABLE picture IS 'the files of image, where they were shipped';
-"""
 
 
 def prepare(url: str, address: str) -> None:
@@ -259,15 +277,6 @@ def _column(column: sa.Column[Any], shipped: Table) -> sa.Column[Any]:
 
 # -- views ------------------------------------------------------------------------------------
 
-_VIEW: Final = re.compile(r"CREATE VIEW (\w+) AS\n.*?(?=;\n)", re.DOTALL)
-_NOW_S: Final = "extract(epoch FROM clock_timestamp())::double precision"
-_EPOCH_MS: Final = "210866760000000::double precision"  # from the first Julian day to 1970
-# As text, rounded to milliseconds by the same additions that SQLite's strftime makes.
-_UTC: Final = (
-    rf"to_char(to_timestamp((floor((\1) * 1000 + {_EPOCH_MS} + 0.5) - {_EPOCH_MS}) / 1000) "
-    "AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS.MS')"
-)
-
 
 def views() -> dict[str, str]:
     """The statements that make the views, by name."""
@@ -286,20 +295,6 @@ def _view_statements() -> Iterator[str]:
 
 
 # -- the pool --------------------------------------------------------------------------------------
-
-
-SELECT_S: Final = 60
-_SHIPPER: Final = 1_463_962_947  # the seed of the lock of who ships a recording
-_REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
-# Of values, where a batch has one that PostgreSQL cannot hold; and of rows that are there already.
-_REFUSED: Final = (
-    psycopg.DataError, psycopg.IntegrityError, psycopg.errors.ProgramLimitExceeded,
-    psycopg.errors.StatementTooComplex,
-)  # fmt: skip
-_FETCHED: Final = 2000  # rows that are asked of the server at a time
-_AS_THEY_ARE: Final = ("bool", "int2", "int4", "int8", "oid", "float4", "float8", "bytea")
-_PARAMETER: Final = "08P01"  # one SQLSTATE of what the client did wrong: it gave no values
-_ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A", _PARAMETER)  # that a question has
 
 
 class PostgresPool:

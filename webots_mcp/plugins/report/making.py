@@ -50,6 +50,28 @@ MOST_SIGNALS: Final = 16
 _ROOM: Final = Room(points=500, panels=12, lanes=8, rows=16)
 _ROOM_OF_A_MOMENT: Final = Room(points=200, panels=2, lanes=1, rows=0)
 _MOMENT_PX: Final = 700
+_MOST_BYTES: Final = 1_000_000  # of a world file: reading a larger one would take seconds
+_CORNERS: Final = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+_SIDES: Final = 24  # of what a circle is drawn as
+MOST_PICTURES: Final = 24  # of a run
+LONGEST_SIDE_PX: Final = 640
+_SMALL_BYTES: Final = 60_000  # such a file goes in as it is
+_JPEG_QUALITY: Final = 82
+_AROUND_BYTES: Final = 400  # of marks around a picture
+MAX_MB: Final = 10.0
+MIN_MB: Final = 2.0
+MOST_RUNS: Final = 2
+DEADLINE_S: Final = 12.0  # for all searches in values: a report may take a while
+_SHARE_OF_TEXTS: Final = 0.35  # of the room; then the figures have
+_SHARE_OF_FIGURES: Final = 0.7  # of the rest, and the pictures what remains
+_FRAME_BYTES: Final = 60_000  # style, script, headings, facts: all that is not shared out
+_TEMPLATES: Final = Path(__file__).parent / "templates"
+# Nothing may be loaded, whatever a text of the recording says; the script of the figures is inside.
+_POLICY: Final = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
+)
+FOLDER: Final = "reports"  # in the data folder
 
 
 @dataclass(frozen=True)
@@ -240,11 +262,6 @@ def _embedded(figures: Mapping[str, Figure]) -> Figures:
 # What stands in a robot's world: from the world file where it can be read, else as it was seen.
 
 
-_MOST_BYTES: Final = 1_000_000  # of a world file: reading a larger one would take seconds
-_CORNERS: Final = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-_SIDES: Final = 24  # of what a circle is drawn as
-
-
 def obstacles_of(
     connection: sqlite3.Connection, ranges: Sequence[TimeRange]
 ) -> tuple[Obstacle, ...]:
@@ -322,13 +339,6 @@ def _seen(connection: sqlite3.Connection, run: Run) -> tuple[Obstacle, ...]:
 # The pictures of a run: as many as have room, downscaled, inside the page.
 
 
-MOST_PICTURES: Final = 24  # of a run
-LONGEST_SIDE_PX: Final = 640
-_SMALL_BYTES: Final = 60_000  # such a file goes in as it is
-_JPEG_QUALITY: Final = 82
-_AROUND_BYTES: Final = 400  # of marks around a picture
-
-
 class Picture(NamedTuple):
     """A picture in the page: its data URI, and what it shows."""
 
@@ -396,14 +406,6 @@ def _content(file: Path) -> tuple[str, bytes]:
         scaled.save(buffer, "JPEG", quality=_JPEG_QUALITY)
     return "image/jpeg", buffer.getvalue()
 
-
-MAX_MB: Final = 10.0
-MIN_MB: Final = 2.0
-MOST_RUNS: Final = 2
-DEADLINE_S: Final = 12.0  # for all searches in values: a report may take a while
-_SHARE_OF_TEXTS: Final = 0.35  # of the room; then the figures have
-_SHARE_OF_FIGURES: Final = 0.7  # of the rest, and the pictures what remains
-_FRAME_BYTES: Final = 60_000  # style, script, headings, facts: all that is not shared out
 
 Progress = Callable[[int, int], None]
 
@@ -534,14 +536,6 @@ def _holds(page: Page) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-_TEMPLATES: Final = Path(__file__).parent / "templates"
-# Nothing may be loaded, whatever a text of the recording says; the script of the figures is inside.
-_POLICY: Final = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
-)
-
-
 @dataclass(frozen=True)
 class Page:
     """All that a report shows.
@@ -657,8 +651,6 @@ def write_report(file: Path, html: bytes, *, overwrite: bool = False) -> None:
 
 
 # -- the question ----------------------------------------------------------------------------------
-
-FOLDER: Final = "reports"  # in the data folder
 
 
 class ReportAnswer(NotedAnswer):

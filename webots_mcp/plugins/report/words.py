@@ -23,6 +23,13 @@ _LONGEST_VALUE: Final = 400  # of a value within one
 _NOTHING: Final = 1e-9  # of a signal's span: what is left when numbers cancel each other out
 _UNIT: Final = re.compile(r"(.+)_(s|m|rad)")
 _UNTOLD: Final = ("id", "image_id", "first_times_s")
+_ROW_BYTES: Final = 32  # of marks around a row
+_SHORT: Final = 24  # characters
+_CELL_BYTES: Final = 24  # of marks around a cell
+MOST_DIFFERENCES: Final = 30
+_MOST_SAID: Final = 5
+_SHARE_OF_TEXTS: Final = 0.1
+_LARGE: Final = ((0.8, "large"), (0.5, "medium"), (0.2, "small"))  # Cohen's words for his d
 
 
 def cut(text: str, longest: int = LONGEST_TEXT) -> str:
@@ -199,11 +206,6 @@ _WORDS: Final[Mapping[str, Callable[[Event], str]]] = {
 }
 
 
-_ROW_BYTES: Final = 32  # of marks around a row
-_SHORT: Final = 24  # characters
-_CELL_BYTES: Final = 24  # of marks around a cell
-
-
 class Row(NamedTuple):
     """Texts, and a mark that shows in the page: `warning`, `error` or nothing."""
 
@@ -279,11 +281,6 @@ def _is_number(text: str) -> bool:
 
 
 # -- two runs beside each other: the answer of `compare_runs`, in words too ------------------------
-
-MOST_DIFFERENCES: Final = 30
-_MOST_SAID: Final = 5
-_SHARE_OF_TEXTS: Final = 0.1
-_LARGE: Final = ((0.8, "large"), (0.5, "medium"), (0.2, "small"))  # Cohen's words for his d
 
 
 @dataclass(frozen=True)

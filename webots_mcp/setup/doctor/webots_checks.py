@@ -73,6 +73,12 @@ _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift
 _PLACES: Final = ("--data-dir", "--database")
 _INIT: Final = "run 'webots-mcp init' in the project"
 _OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
+_TIMEOUT_S: Final = 30.0
+_SHOWN_CHARACTERS: Final = 300
+_FIX: Final = (
+    "run the same command in a shell, see what it prints, and install webots-mcp again where a "
+    "package is missing or broken"
+)
 
 
 @check("Simulation", needs_recording=True, well="no robot has been recorded yet")
@@ -417,14 +423,6 @@ def _other_place(subject: Examined, arguments: list[str]) -> str | None:
             same = ours is not None and meant.resolve() == ours.resolve()
             return None if same else value
     return None
-
-
-_TIMEOUT_S: Final = 30.0
-_SHOWN_CHARACTERS: Final = 300
-_FIX: Final = (
-    "run the same command in a shell, see what it prints, and install webots-mcp again where a "
-    "package is missing or broken"
-)
 
 
 @check("Server", starts_process=True)

@@ -69,6 +69,9 @@ OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max
 GIVING_FLAGS: Final = ("changed", "missing")
 _ALWAYS_OR_NEVER: Final = "it would always be true or always be false"
 FUNCTIONS: Final = (*OF_NUMBERS, *GIVING_FLAGS, "rate", "displacement", "signal")
+MOST_CHARACTERS: Final = 100  # of a name
+_DURING: Final = re.compile(r"""(?:[^'"]|'[^']*'|"[^"]*")*?(?<=[\s)])(during)(?=[\s(])""")
+_WITHIN: Final = re.compile(r"(.*[^\s])\s+within\s+(\d+\.?\d*|\.\d+)\s*", re.DOTALL)
 
 
 def _as_it_is(value: Any) -> Any:
@@ -474,10 +477,6 @@ def _either(left: Holds, right: Holds) -> Holds:
 
 
 # -- what shall hold -------------------------------------------------------------------------------
-
-MOST_CHARACTERS: Final = 100  # of a name
-_DURING: Final = re.compile(r"""(?:[^'"]|'[^']*'|"[^"]*")*?(?<=[\s)])(during)(?=[\s(])""")
-_WITHIN: Final = re.compile(r"(.*[^\s])\s+within\s+(\d+\.?\d*|\.\d+)\s*", re.DOTALL)
 
 
 @dataclass(frozen=True)

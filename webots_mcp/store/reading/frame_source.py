@@ -46,6 +46,33 @@ _ROWS_OF: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s <= ? "
     "ORDER BY sim_time_s, id"
 )
+ROWS_AT_ONCE: Final = 1024  # between two looks at the deadline
+MOST_ROWS_CACHED: Final = 4096  # of one run; more are there only where nobody makes chunks
+MOST_RUNS_CACHED: Final = 16
+_IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
+_NEWEST: Final = (
+    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "ORDER BY sim_time_s, id"
+)
+_NEWEST_IN: Final = (
+    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND {_IN} AND (sim_time_s, id) > (?, ?) "
+    "ORDER BY sim_time_s, id"
+)
+_LATE: Final = (
+    f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
+    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
+)
+_FEWER_THAN: Final = (
+    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "LIMIT ?)"
+)
+_ONE_BETWEEN: Final = (  # came late into what was parsed before
+    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "AND (sim_time_s, id) < (?, ?) AND id > ?)"
+)
+_RUN: Final = "SELECT uuid FROM run WHERE id = ?"
+_FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
+_SHADOWED: Final = "SELECT EXISTS (SELECT 1 FROM temp.sqlite_master WHERE name = 'state')"
 
 
 class Unread(NamedTuple):
@@ -309,35 +336,6 @@ def _cut(values: Decoded, start: int, stop: int) -> Decoded:
 # Parsing them is what a question about a running robot costs, so that the newest are cached
 # between questions, and only what has come since is read.
 
-
-ROWS_AT_ONCE: Final = 1024  # between two looks at the deadline
-MOST_ROWS_CACHED: Final = 4096  # of one run; more are there only where nobody makes chunks
-MOST_RUNS_CACHED: Final = 16
-
-_IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
-_NEWEST: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "ORDER BY sim_time_s, id"
-)
-_NEWEST_IN: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND {_IN} AND (sim_time_s, id) > (?, ?) "
-    "ORDER BY sim_time_s, id"
-)
-_LATE: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
-    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
-)
-_FEWER_THAN: Final = (
-    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "LIMIT ?)"
-)
-_ONE_BETWEEN: Final = (  # came late into what was parsed before
-    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "AND (sim_time_s, id) < (?, ?) AND id > ?)"
-)
-_RUN: Final = "SELECT uuid FROM run WHERE id = ?"
-_FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
-_SHADOWED: Final = "SELECT EXISTS (SELECT 1 FROM temp.sqlite_master WHERE name = 'state')"
 
 Read = tuple[StateColumns, "float | None"]
 

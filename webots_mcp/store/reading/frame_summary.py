@@ -39,6 +39,9 @@ _SAMPLE_ROWS: Final = 2000
 _ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
 _NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
 _DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before a border is behind
+MOST_VALUES: Final = 20
+_FIRST_ROWS_BACK: Final = 1024  # that are looked at before a row, then each time more before those
+_MORE_BACK: Final = 4
 
 
 def reads_values(frame: Frame, signal: Signal) -> bool:
@@ -324,11 +327,6 @@ def _circular_means(
 
 
 # -- texts, flags and modes: when they change, and the time in each value --------------------------
-
-
-MOST_VALUES: Final = 20
-_FIRST_ROWS_BACK: Final = 1024  # that are looked at before a row, then each time more before those
-_MORE_BACK: Final = 4
 
 
 class Point(NamedTuple):

@@ -96,6 +96,8 @@ _SHOWN_ALIKE: Final = "SELECT min(time_s) FROM ({})".format(
 )
 USE_EVERY_ROW: Final = "; ask for such a stretch alone to use every row"
 MOST_RUNS: Final = 50  # that one range in wall time may hold
+_IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
+_LONGEST_SHOWN: Final = 80
 
 
 def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
@@ -449,10 +451,6 @@ def _cut(
 
 
 # -- wall times as a person gives them -------------------------------------------------------------
-
-
-_IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
-_LONGEST_SHOWN: Final = 80
 
 
 def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> float:

@@ -24,6 +24,30 @@ HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is
     "r.purged_rows > coalesce((SELECT sum(row_count - stored_row_count) FROM row_group "
     "WHERE run_id = r.id AND is_complete = 1), 0)"
 )
+QUESTION_DEADLINE_S: Final = 2.0
+_STEPS_PER_LOOK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
+MOST_STRETCHES: Final = 200  # newest of a range that are looked at
+MOST_ROWS: Final = 30_000  # of a range that is answered from each call
+_NAMED: Final = 2
+_IS_NUMBER: Final = "IN ('real', 'integer')"
+_STRETCHES: Final = (
+    "SELECT start_sim_time_s, end_sim_time_s, CAST(reason AS TEXT), wall_time_s FROM kept_stretch "
+    "WHERE run_id = ? AND end_sim_time_s >= ? AND start_sim_time_s < ? "
+    f"AND typeof(start_sim_time_s) {_IS_NUMBER} AND typeof(end_sim_time_s) {_IS_NUMBER} "
+    "ORDER BY start_sim_time_s DESC LIMIT ?"
+)
+# Of a stretch that was not ended, up to when its rows are there, which are written in order; and
+# whether rows that the throttle let through follow each other after that. NULL where it is whole.
+_WRITTEN: Final = (
+    "SELECT CASE WHEN (SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run "
+    "AND sim_time_s > time_s AND sim_time_s <= :end LIMIT 2)) = 2 THEN time_s END FROM ("
+    "SELECT coalesce(max(sim_time_s), :start) AS time_s FROM kept_state "
+    "WHERE run_id = :run AND sim_time_s BETWEEN :start AND :end) "
+    "WHERE EXISTS (SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
+    "WHERE r.id = :run AND r.last_sim_time_s < :end AND s.throttle_interval > 1)"
+)
+_IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
+_ROWS: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
 
 
 def shown_time(time_s: float) -> float:
@@ -89,9 +113,6 @@ class Segment:
 
 
 # -- a limit in wall time on what a question may cost ----------------------------------------------
-
-QUESTION_DEADLINE_S: Final = 2.0
-_STEPS_PER_LOOK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
 
 
 class Deadline:
@@ -167,31 +188,6 @@ def in_one_snapshot(
 # through. A range inside a stretch is answered from both. In a longer one means and counts are
 # those of the rows that were let through, of which there are equally many in each second; what
 # is about single states (extremes, changes, conditions) takes in both.
-
-
-MOST_STRETCHES: Final = 200  # newest of a range that are looked at
-MOST_ROWS: Final = 30_000  # of a range that is answered from each call
-_NAMED: Final = 2
-
-_IS_NUMBER: Final = "IN ('real', 'integer')"
-_STRETCHES: Final = (
-    "SELECT start_sim_time_s, end_sim_time_s, CAST(reason AS TEXT), wall_time_s FROM kept_stretch "
-    "WHERE run_id = ? AND end_sim_time_s >= ? AND start_sim_time_s < ? "
-    f"AND typeof(start_sim_time_s) {_IS_NUMBER} AND typeof(end_sim_time_s) {_IS_NUMBER} "
-    "ORDER BY start_sim_time_s DESC LIMIT ?"
-)
-# Of a stretch that was not ended, up to when its rows are there, which are written in order; and
-# whether rows that the throttle let through follow each other after that. NULL where it is whole.
-_WRITTEN: Final = (
-    "SELECT CASE WHEN (SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run "
-    "AND sim_time_s > time_s AND sim_time_s <= :end LIMIT 2)) = 2 THEN time_s END FROM ("
-    "SELECT coalesce(max(sim_time_s), :start) AS time_s FROM kept_state "
-    "WHERE run_id = :run AND sim_time_s BETWEEN :start AND :end) "
-    "WHERE EXISTS (SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.id = :run AND r.last_sim_time_s < :end AND s.throttle_interval > 1)"
-)
-_IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
-_ROWS: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
 
 
 class KeptStretch(NamedTuple):

@@ -13,16 +13,20 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from tests.recordings.rows import Recorded
 from tests.store.questions.test_outcomes import driving, measure, medians, record
 from webots_mcp import MCPBridge
+from webots_mcp.bridge import mcp_bridge
+from webots_mcp.database import liveness
 from webots_mcp.database.stacks import (
     FORMAT,
     SIGNAL,
     VERSION,
+    is_library,
     needs_signal,
     read_stacks,
     stacks_at,
@@ -261,3 +265,9 @@ def test_the_signal_is_only_for_a_silent_loop_whose_process_could_write_nothing(
     touched_s = time.time() - untouched_s
     os.utime(path, (touched_s, touched_s))
     assert needs_signal(path, silent_s) == is_needed
+
+
+@pytest.mark.parametrize("module", [mcp_bridge, liveness, json])
+def test_files_of_this_package_and_of_python_are_no_controllers_own(module: ModuleType) -> None:
+    assert is_library(str(module.__file__))
+    assert not is_library(__file__)

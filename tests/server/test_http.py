@@ -40,7 +40,7 @@ _INITIALIZE = {
     "clientInfo": {"name": "raw", "version": "1"},
 }
 _SERVE = """
-from webots_mcp import http_limits
+from webots_mcp.server import http_limits
 from webots_mcp.cli import main
 http_limits.BODY_S = {}
 raise SystemExit(main())

@@ -47,11 +47,6 @@ _STATUS: Final = 7
 _MASS: Final = "BALL.physics.mass"
 _PLACE: Final = "CRATE.translation"
 _BOX: Final = 'DEF PROVE_BOX Solid { translation 1 1 0.1 name "prove box" }'
-CHECKS: Final[dict[str, Callable[[Bench], object]]] = {
-    name.partition("_")[2].replace("_", " "): function
-    for name, function in list(globals().items())
-    if name.startswith(("check_", "running_", "streaming_"))
-}
 
 
 # -- starting it --
@@ -485,3 +480,10 @@ def check_trials(bench: Bench) -> None:
     sets = json.loads(done.stdout)["sets"]
     scores = {each["parameters"]["speed"]: each["scores"] for each in sets}
     require(scores == {1.0: [1.0], 2.0: [2.0]}, f"scores by speed: {scores}")
+
+
+CHECKS: Final[dict[str, Callable[[Bench], object]]] = {
+    name.partition("_")[2].replace("_", " "): function
+    for name, function in list(globals().items())
+    if name.startswith(("check_", "running_", "streaming_"))
+}

@@ -1,4 +1,4 @@
-"""Steps that an observer makes of a world: exactly so many, or the answer says why."""
+"""An observer makes exactly N steps of the world, or its answer explains why it did not."""
 
 from __future__ import annotations
 

@@ -103,15 +103,22 @@ async def test_while_a_person_has_paused_webots_every_command_is_withdrawn_and_n
     assert filed.rows("SELECT count(*) FROM run") == [1]
 
 
-async def test_what_a_controller_has_claimed_meanwhile_is_not_withdrawn(
-    soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
-) -> None:
+async def paused_in_webots(
+    start: Callable[..., Simulation], filed: Recording, data_dir: Path
+) -> tuple[Simulation, Store]:
+    """A robot that records, in a simulation that a person has paused."""
     simulation = start(LOOP, mode="realtime")
     simulation.wait_for(lambda: has_states(filed))
     database = data_dir / "webots.db"
     async with Client(create_server(database, data_dir)) as client:
         await paused_by_hand(simulation, client)
-    store = Store(database, data_dir)
+    return simulation, Store(database, data_dir)
+
+
+async def test_what_a_controller_has_claimed_meanwhile_is_not_withdrawn(
+    soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
+) -> None:
+    simulation, store = await paused_in_webots(start, filed, data_dir)
 
     def is_known() -> bool:
         with store.view() as view:
@@ -119,7 +126,7 @@ async def test_what_a_controller_has_claimed_meanwhile_is_not_withdrawn(
             return block is not None
 
     simulation.wait_for(is_known)
-    with closing(connect(database, "writer")) as connection:
+    with closing(connect(data_dir / "webots.db", "writer")) as connection:
         first, second = (CommandQueue(connection).enqueue(1, "note") for _ in range(2))
         connection.execute("UPDATE command SET status = 'claimed', session_id = 1 WHERE id = 1")
         assert not withdraw_if_blocked(store, first)
@@ -131,19 +138,14 @@ async def test_what_a_controller_has_claimed_meanwhile_is_not_withdrawn(
 async def test_a_step_that_takes_no_longer_than_others_is_not_taken_for_a_pause(
     soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
-    simulation = start(LOOP, mode="realtime")
-    simulation.wait_for(lambda: has_states(filed))
-    database = data_dir / "webots.db"
-    async with Client(create_server(database, data_dir)) as client:
-        await paused_by_hand(simulation, client)
-    store = Store(database, data_dir)
+    simulation, store = await paused_in_webots(start, filed, data_dir)
 
     def block() -> Block | None:
         with store.view() as view:
             return find_block(view.connection, view.session, view.run, view.now_s)
 
     simulation.wait_for(lambda: block() is not None)
-    with closing(connect(database, "writer")) as connection:
+    with closing(connect(data_dir / "webots.db", "writer")) as connection:
         connection.execute("UPDATE run SET steps = 10, step_wait_wall_s = 36000.0")
         assert block() is None
         connection.execute("UPDATE run SET steps = 10, step_wait_wall_s = 0.2")

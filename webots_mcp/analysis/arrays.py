@@ -36,8 +36,8 @@ _ORDER: Final = 4
 # standard deviation, and a normal variable has a median magnitude of 0.6745 of it.
 _GAIN: Final = 0.6745 * 70**0.5
 LEAST_ROWS: Final = 3 * _ORDER
-GAP_INTERVALS: Final = 3.0  # a gap is longer than so many usual intervals
-ANOTHER_RATE: Final = 5  # so many long intervals one after the other are no gaps
+GAP_INTERVALS: Final = 3.0  # a longer pause between two rows is a gap; in median intervals
+ANOTHER_RATE: Final = 5  # this many long intervals in a row are a slower rate, not gaps
 
 
 def inner(one: Array, other: Array) -> float:

@@ -69,7 +69,7 @@ def begin(session: Session, command: ClaimedCommand) -> Progress:
 
     Raises:
         CommandRefusedError: It needs a Supervisor and this robot is not one.
-        InvalidInputError: It does not take such a parameter, or lacks one.
+        InvalidInputError: A parameter is unknown or missing.
     """
     action = BUILT_IN_ACTIONS[command.action]
     if action.needs_supervisor:
@@ -189,7 +189,7 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
         return counted_steps
 
     def steps_until(count: int, go_on: Callable[[], bool], round_s: float) -> Generator[None]:
-        """Go on until so many steps are made, and yield for a heartbeat, rows and commands."""
+        """Step until `count` steps are made; yield in between for heartbeat, rows and commands."""
         nonlocal ended_by
         until_s = time.monotonic() + round_s
         while made() < count and watch.stepping == command.id and not ended_by:

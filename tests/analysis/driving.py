@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from webots_mcp.analysis.track import Track, track_of
+from webots_mcp.analysis.track import SmoothedTrack, track_of
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ def way(
 
 def noisy_track(
     phases: Sequence[tuple[float, float, float]], interval_s: float, noise_m: float, seed: int = 1
-) -> tuple[Track, float]:
+) -> tuple[SmoothedTrack, float]:
     """The track of a robot that goes through the phases, and how far it truly went."""
     times, x, y, length_m = way(phases, interval_s)
     noise = np.random.default_rng(seed).normal(0, noise_m, (2, len(times)))

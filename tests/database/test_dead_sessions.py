@@ -13,7 +13,7 @@ from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
 from webots_mcp.database.liveness import process_identity, reap
 from webots_mcp.database.waiting_file import FORMAT, adopt
-from webots_mcp.store.recording import look
+from webots_mcp.store.recording import view_robot
 
 STATUS = "SELECT status FROM command"
 NOBODY = 2**31  # no system gives that pid
@@ -86,10 +86,10 @@ def test_rows_that_a_dead_controller_left_beside_the_database_are_told_until_the
     robot.state(1.0, {"n": 1})
     recorded.connection.execute("UPDATE run SET uuid = 'r'")
     leave_waiting(recorded.database, [1, "state", "r", [2.0, time.time(), "{}", None]])
-    why = look(recorded.connection, None).status.why
+    why = view_robot(recorded.connection, None).status.why
     assert "killed or crashed); its last rows wait in webots.db-waiting-u.jsonl" in (why or "")
     adopt(recorded.connection, recorded.database)
-    assert "wait in" not in (look(recorded.connection, None).status.why or "")
+    assert "wait in" not in (view_robot(recorded.connection, None).status.why or "")
 
 
 @pytest.mark.skipif(process_identity(os.getpid()) is None, reason="needs the system's word")

@@ -18,7 +18,7 @@ from webots_mcp.database.maintenance import LEASE_S, Maintainer
 from webots_mcp.questions.robot_state import webots_list_robots
 from webots_mcp.setup.doctor import diagnose, subject_of
 from webots_mcp.setup.doctor.recording_checks import database as checked_database
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES ('maintainer', ?, ?)"
 HOLDER = "SELECT holder FROM lease"
@@ -116,7 +116,7 @@ def test_a_reader_of_another_program_that_holds_the_log_is_told_until_it_ends(
     monkeypatch.setattr("webots_mcp.database.maintenance.HELD_LOG_BYTES", 3_000_000)
     file = recorded.database
     assert isinstance(file, Path)
-    recording = Recording(file, file.parent)
+    recording = RecordingAccess(file, file.parent)
     robot = recorded.robot()
     maintainer = Maintainer(file, "server")
 

@@ -35,7 +35,7 @@ from webots_mcp.database.stacks import (
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.recording import look
+from webots_mcp.store.recording import view_robot
 from webots_mcp.store.run_rows import pace_of
 
 HEAD = {
@@ -193,7 +193,7 @@ def test_what_a_dead_process_left_is_logged_where_its_loop_had_been_silent(
     path = written(stacks_path(tmp_path / "webots.db", "gone"), "/p/nav.py:8:plan")
     os.utime(path, (robot.now + silent_s, robot.now + silent_s))
     said = "it was silent for more than 3 s in nav.py:8, plan()"
-    before = look(recorded.connection, None).status.why or ""
+    before = view_robot(recorded.connection, None).status.why or ""
     assert (said in before) == bool(rows)  # as nobody has taken it in yet
     assert adopt(recorded.connection, tmp_path / "webots.db") == rows
     found = recorded.connection.execute("SELECT level, message FROM log").fetchall()

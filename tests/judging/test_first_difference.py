@@ -22,7 +22,7 @@ from webots_mcp.judging.divergence import (
 )
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
 
@@ -353,7 +353,7 @@ def test_repeats_are_judged_against_the_first_and_so_are_trials(empty: sqlite3.C
     def noted(*run_ids: int) -> list[str]:
         set_id = create_trial_set(empty, '{"best": "highest"}', [{"speed": 1.0} for _ in run_ids])
         for trial, run_id in zip(trials_of(empty, set_id), run_ids, strict=True):
-            finish_trial(empty, trial, Result(run_id, 1.0, None, "for_s", 8.0))
+            finish_trial(empty, trial, TrialResult(run_id, 1.0, None, "for_s", 8.0))
         return repeats_noted(empty, set_id)
 
     (same,) = noted(1, 2)

@@ -26,7 +26,7 @@ from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import Caller, MergedQuestion, Question
 from webots_mcp.store.export import FOR_VIEWERS, FORMATS, export, export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 _STEP_S: Final = 0.016
 _ROWS: Final = 1500
@@ -86,7 +86,7 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 @pytest.mark.parametrize("asked", READING, ids=lambda each: each.name)
 def test_a_question_is_answered_or_refused_in_words(folder: Path, asked: Question) -> None:
-    recording = Recording(folder / "webots.db", folder, read_only=True)
+    recording = RecordingAccess(folder / "webots.db", folder, read_only=True)
     fields = asked.arguments.model_fields
     needed = {name: _TOLD[name] for name, field in fields.items() if field.is_required()}
     arguments = asked.arguments.model_validate(needed).model_dump()

@@ -108,7 +108,7 @@ class DamagedChunkError(DatabaseError):
     """A chunk cannot be read; the text says why."""
 
 
-class Encoded(NamedTuple):
+class EncodedChunk(NamedTuple):
     """The values of a signal as a row of the table `chunk` holds them.
 
     Attributes:
@@ -154,7 +154,7 @@ def decoded_of(values: Sequence[Recorded]) -> Decoded:
     return Decoded(numbers, codes, labels, float not in types and _is_exact(held))
 
 
-def encode(values: Sequence[Recorded]) -> Encoded:
+def encode(values: Sequence[Recorded]) -> EncodedChunk:
     """Compress the values of some rows; see `pack`.
 
     What is lost: integers beyond 2^53 become floats, texts are cut after 200 characters, and where
@@ -163,20 +163,20 @@ def encode(values: Sequence[Recorded]) -> Encoded:
     return pack(decoded_of(values))
 
 
-def pack(values: Decoded) -> Encoded:
+def pack(values: Decoded) -> EncodedChunk:
     """Compress values that are numbers and codes already."""
     if values.codes is None:
-        return Encoded(*_compressed(values.numbers, values.is_whole), None, None)
+        return EncodedChunk(*_compressed(values.numbers, values.is_whole), None, None)
     listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
     width = np.uint8 if len(listed) + FIRST_LABEL < 2**8 else np.uint16
-    return Encoded(
+    return EncodedChunk(
         *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
         zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
         json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
     )
 
 
-def decode(encoded: Encoded, rows: int) -> Decoded:
+def decode(encoded: EncodedChunk, rows: int) -> Decoded:
     """The values of some rows.
 
     Raises:
@@ -198,7 +198,7 @@ def decode(encoded: Encoded, rows: int) -> Decoded:
         raise DamagedChunkError(f"damaged: {error}") from error
 
 
-def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
+def _decode_coded(encoded: EncodedChunk, rows: int) -> Decoded:
     assert encoded.codes is not None
     raw = zlib.decompress(encoded.codes)
     width: Any = np.uint8 if len(raw) == rows else np.uint16
@@ -295,7 +295,7 @@ def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
     return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
 
 
-def _decompress(encoded: Encoded, into: Array) -> None:
+def _decompress(encoded: EncodedChunk, into: Array) -> None:
     if encoded.codec not in (_FLOATS, _INTEGERS):
         raise DamagedChunkError(
             f"compressed by {encoded.codec!r}, which this version of webots-mcp does not know"
@@ -462,7 +462,7 @@ def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]
 _STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
 
 
-class Group(NamedTuple):
+class ChunkGroup(NamedTuple):
     """Rows that follow each other, of which each signal has a chunk. Columns of `row_group`."""
 
     id: int
@@ -473,7 +473,7 @@ class Group(NamedTuple):
     row_count: int
 
 
-class Reached(NamedTuple):
+class ChunkProgress(NamedTuple):
     """Which rows of a run are in chunks: those up to a place, but for rows that came later.
 
     Attributes:
@@ -491,10 +491,10 @@ class Reached(NamedTuple):
 
 def groups_in(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
-) -> list[Group]:
+) -> list[ChunkGroup]:
     """The groups of a run that reach into [start_s, end_s), in order of time."""
     rows = connection.execute(_GROUPS, (run_id, end_s, start_s)).fetchall()
-    return list(map(Group._make, rows))
+    return list(map(ChunkGroup._make, rows))
 
 
 def groups_as_array(
@@ -506,13 +506,13 @@ def groups_as_array(
     return table[np.lexsort((table[:, 0], table[:, 2], table[:, 1]))]
 
 
-def reached(connection: sqlite3.Connection, run_id: int) -> Reached:
+def reached(connection: sqlite3.Connection, run_id: int) -> ChunkProgress:
     """Up to where a run is in chunks."""
     end_s, max_id = connection.execute(_IN_CHUNKS, {"run": run_id}).fetchone()
     if end_s is None:
-        return Reached(float("-inf"), 0, 0, 0)
+        return ChunkProgress(float("-inf"), 0, 0, 0)
     (last_id,) = connection.execute(_LAST_AT, (run_id, end_s)).fetchone()
-    return Reached(end_s, last_id, max(max_id, watermark(connection)), max_id)
+    return ChunkProgress(end_s, last_id, max(max_id, watermark(connection)), max_id)
 
 
 def watermark(connection: sqlite3.Connection) -> int:
@@ -566,7 +566,7 @@ def values_in(
         if rows is None:
             continue
         try:
-            yield group_id, decode(Encoded(*encoded), rows)
+            yield group_id, decode(EncodedChunk(*encoded), rows)
         except DamagedChunkError as error:
             yield group_id, error
 

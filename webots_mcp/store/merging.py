@@ -37,7 +37,7 @@ from webots_mcp.store.chunks import (
     STATE_IDS,
     WALL_TIMES,
     DamagedChunkError,
-    Encoded,
+    EncodedChunk,
     Statistics,
     decode,
     decoded_of,
@@ -47,7 +47,7 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.export import Progress
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.parameters import fetch_trial_set, is_at_work
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.signals import enter_signals
 
@@ -241,7 +241,7 @@ def merge(
         return dict(connection.execute(_RUNS).fetchall())
 
 
-def settled(database: Path) -> Recording:
+def settled(database: Path) -> RecordingAccess:
     """A recording with all rows that waited next to it, and its sessions ended that are over.
 
     A session of another host is over when its last heartbeat is more than 10 s old.
@@ -249,7 +249,7 @@ def settled(database: Path) -> Recording:
     Raises:
         DatabaseError: There is none, or it is none of ours.
     """
-    recording = Recording(database, database.parent)
+    recording = RecordingAccess(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
         take_in_journals(connection, database)
@@ -661,7 +661,7 @@ def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_
 
 def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
     """A chunk of ids that are so much greater."""
-    numbers = decode(Encoded(*packed), rows).numbers.tolist()
+    numbers = decode(EncodedChunk(*packed), rows).numbers.tolist()
     ids = [int(number) + shift for number in numbers]
     return *statistics_of(decoded_of(ids)), *encode(ids)
 

@@ -17,7 +17,7 @@ from webots_mcp.errors import CommandRefusedError
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.steering.dispatch import find_target
-from webots_mcp.store.recording import look
+from webots_mcp.store.recording import view_robot
 
 LOOP = """
 while robot.step(16) != -1:
@@ -142,7 +142,7 @@ def connect_extern(tmp_path: Path, data_dir: Path) -> Iterator[Connect]:
 
 def status(filed: Recording, robot: str) -> str:
     connection = connect(filed.database, "reader")
-    text = look(connection, robot).status.text
+    text = view_robot(connection, robot).status.text
     connection.close()
     return text
 
@@ -200,7 +200,7 @@ def test_the_reload_of_an_extern_controller_is_answered_when_its_process_has_end
         assert "start it by hand" in result["controller"]
         assert process.wait(10) == 0
         connection = connect(filed.database, "reader")
-        assert "start it by hand" in (look(connection, "rover").status.why or "")
+        assert "start it by hand" in (view_robot(connection, "rover").status.why or "")
         with pytest.raises(CommandRefusedError, match="start it by hand"):
             find_target(connection, "rover", "pause")
         connection.close()

@@ -246,10 +246,10 @@ def test_the_file_of_a_project_is_compiled_and_asked_by_the_bridges_of_its_robot
             "SELECT count(*) FROM event WHERE kind = 'violation'"
         ).fetchone() == (2,)
         watch = ProjectWatch(file.parent)
-        watch.look(connection)
+        watch.recompile_if_changed(connection)
         changed = FILE.replace("0.1", "0.01")
         (project / "webots-mcp.toml").write_text(changed)
-        watch.look(connection)
+        watch.recompile_if_changed(connection)
         assert lines(file)["keeps its distance"][0] == "pass"
         for text, line, why in (
             (FILE.replace("> 0.1", "> "), 4, "something is missing"),
@@ -260,7 +260,7 @@ def test_the_file_of_a_project_is_compiled_and_asked_by_the_bridges_of_its_robot
             (project / "webots-mcp.toml").write_text(text)
             with pytest.raises(InvalidInputError, match=f"toml, line {line}: .*{why}"):
                 read_project(project / "webots-mcp.toml")
-        watch.look(connection)  # changes nothing, and says so
+        watch.recompile_if_changed(connection)  # changes nothing, and says so
         assert "toml, line 5" in capsys.readouterr().err
         assert list(lines(file)) == ["keeps its distance"]
     where = ["--data-dir", str(file.parent)]

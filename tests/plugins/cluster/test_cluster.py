@@ -25,7 +25,7 @@ from webots_mcp import __version__
 from webots_mcp.plugins.cluster import dask_cluster as cluster
 from webots_mcp.plugins.cluster.dask_cluster import Needs, digest_of, packed, what_lacks
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.store.parameters import Result
+from webots_mcp.store.parameters import TrialResult
 
 Write = Callable[[str], Path]
 
@@ -179,7 +179,7 @@ def test_a_recording_that_is_too_large_to_return_fails_its_trial_and_says_what_t
     shutil.copytree(bridge_recording.parent, tmp_path / "trial")
     monkeypatch.setattr(cluster, "MOST_BYTES", 10)
 
-    returned = packed(Result(1, 1.0, None), tmp_path / "trial")
+    returned = packed(TrialResult(1, 1.0, None), tmp_path / "trial")
 
     assert (returned.recording, returned.result.run_id) == (None, None)
     assert returned.result.status == "failed"

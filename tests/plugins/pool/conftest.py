@@ -21,7 +21,7 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 
 class Shipped:
@@ -29,7 +29,7 @@ class Shipped:
 
     def __init__(self, folder: Path, connection: sqlite3.Connection, pool: Path) -> None:
         self.folder, self.pool, self.connection = folder, pool, connection
-        recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+        recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
         self.order = Order(recording, partial(open_pool, str(pool), ships=True))
 
     @cached_property

@@ -17,8 +17,8 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.plugins.pool.fetching import Fetched, fetch
 from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.recording import RecordingAccess
 
 POSTGRES = pytest.param("postgres", marks=pytest.mark.slow)
 IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", POSTGRES], indirect=True)
@@ -34,7 +34,7 @@ class Lab:
             create_schema(connection)
 
     def ship(self, database: Path, **options: Any) -> None:
-        recording = Recording(database, database.parent, read_only=True)
+        recording = RecordingAccess(database, database.parent, read_only=True)
         ship(Order(recording, partial(open_pool, self.url, ships=True), **options), Report())
 
     def fetch(self, **choice: Any) -> Fetched:
@@ -67,5 +67,5 @@ def short_runs(folder: Path) -> Generator[Recorded]:
         connection.execute("UPDATE parameter_value SET command_id = run_id")
         set_id = create_trial_set(connection, "{}", [{"kp": 1.0}, {"kp": 2.0}, {"kp": 3.0}])
         for trial, run_id in zip(trials_of(connection, set_id), (1, 2), strict=False):
-            finish_trial(connection, trial, Result(run_id, 1.5 * run_id, None))
+            finish_trial(connection, trial, TrialResult(run_id, 1.5 * run_id, None))
         yield recorded

@@ -21,7 +21,7 @@ from webots_mcp.plugins.pool.pool_interface import (
     table,
     tables,
 )
-from webots_mcp.store.chunks import SIM_TIMES, Encoded, Statistics, decode
+from webots_mcp.store.chunks import SIM_TIMES, EncodedChunk, Statistics, decode
 
 UUID = "0e7f2b1c-0000-4000-8000-000000000001"
 OTHER_UUID = "0e7f2b1c-0000-4000-8000-000000000002"
@@ -125,7 +125,7 @@ def chunk_values(rows: Iterable[Row]) -> dict[tuple[int, int], Any]:
     lengths = {c["group_id"]: c["row_count"] for c in chunks if c["signal_id"] == SIM_TIMES}
     found: dict[tuple[int, int], Any] = {}
     for chunk in chunks:
-        packed = Encoded(*(chunk[name] for name in Encoded._fields))
+        packed = EncodedChunk(*(chunk[name] for name in EncodedChunk._fields))
         values = decode(packed, lengths[chunk["group_id"]])
         codes = np.zeros(len(values.numbers), int) if values.codes is None else values.codes
         labels = [(type(each), each) for each in values.labels]

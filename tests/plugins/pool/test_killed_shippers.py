@@ -22,7 +22,7 @@ from webots_mcp.database.connection import connect
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +30,7 @@ KILLS = {"postgresql": 20, "parquet": 8}
 
 
 def order_of(folder: Path, url: str) -> Order:
-    recording = Recording(folder / "webots.db", folder, read_only=True)
+    recording = RecordingAccess(folder / "webots.db", folder, read_only=True)
     return Order(recording, functools.partial(open_pool, url, ships=True), full=True, pictures=True)
 
 

@@ -32,7 +32,7 @@ from webots_mcp.plugins.pool.pool_interface import BATCH_BYTES, is_whole, table
 from webots_mcp.plugins.pool.shipping import LAST_GROUP, Order, Report, Source, follow
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.merging import merge
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 
 def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Shipped) -> None:
@@ -285,8 +285,10 @@ def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
         "from webots_mcp.plugins.pool.pool_contents import open_pool; "
         "from webots_mcp.plugins.pool.shipping import Report; "
         "from webots_mcp.plugins.pool.shipping import Order, ship; "
-        "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "
-        "recording = Recording(folder / 'webots.db', folder, read_only=True); report = Report(); "
+        "from webots_mcp.store.recording import RecordingAccess; "
+        "folder, pool = map(Path, sys.argv[1:]); "
+        "recording = RecordingAccess(folder / 'webots.db', folder, read_only=True); "
+        "report = Report(); "
         "opened = functools.partial(open_pool, str(pool), ships=True); "
         f"ship(Order(recording, opened, full={full}), report); "
         "print(*report.notes)"
@@ -432,7 +434,7 @@ def test_a_recording_that_is_not_there_yet_is_waited_for_and_one_in_its_place_is
         with closing(connect(database, "writer")) as connection:
             connection.execute("UPDATE recording SET uuid = ?", (other,))
 
-    recording = Recording(database, database.parent, read_only=True)
+    recording = RecordingAccess(database, database.parent, read_only=True)
     opened: Any = lambda: BeforeWrite(shipped.order.open_pool(), replace_it)  # noqa: E731
     with pytest.raises(KeyboardInterrupt):
         follow(Order(recording, opened, full=True), Report(), hear, 0.0)

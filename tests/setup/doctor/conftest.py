@@ -12,7 +12,7 @@ import pytest
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.setup.doctor import Diagnosis, all_checks, diagnose, subject_of
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 Look = Callable[..., Diagnosis]
 
@@ -20,7 +20,7 @@ Look = Callable[..., Diagnosis]
 def found(file: Path, check: str, *server: str) -> Diagnosis:
     """What a check says of a recording; its server may be another program."""
     (asked,) = [each for each in all_checks(with_server=True) if each.name == check]
-    subject = subject_of(Recording(file, file.parent), "the test")
+    subject = subject_of(RecordingAccess(file, file.parent), "the test")
     subject = replace(subject, project=file.parent, server=server or subject.server)
     ((_, finding),) = diagnose(subject, (asked,))
     return finding

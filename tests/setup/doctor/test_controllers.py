@@ -12,7 +12,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.contract import DATABASE_NAME, OBSERVER, OBSERVER_NAME
 from webots_mcp.setup.doctor import Diagnosis, all_checks, diagnose, subject_of
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 PLAIN = "from controller import Robot\nrobot = Robot()\n"
 STEERS = "from controller import Supervisor\nrobot = Supervisor()\n"
@@ -39,7 +39,7 @@ def ask(project: Path) -> Ask:
     def one(check: str, *, probes_python: bool = False) -> Diagnosis:
         (asked,) = [each for each in all_checks() if each.name == check]
         folder = project / "mcp_data"
-        subject = subject_of(Recording(folder / DATABASE_NAME, folder), "the test")
+        subject = subject_of(RecordingAccess(folder / DATABASE_NAME, folder), "the test")
         ((_, finding),) = diagnose(replace(subject, probes_python=probes_python), (asked,))
         return finding
 

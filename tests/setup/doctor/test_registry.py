@@ -17,7 +17,7 @@ from webots_mcp.setup.doctor import (
     subject_of,
     worst,
 )
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 CHECKOUT = Path(__file__).parents[3]
 # What a machine without Webots, and a folder of no project and without clients, cannot have.
@@ -31,7 +31,7 @@ def test_each_check_has_its_part_of_the_page_and_each_part_its_check() -> None:
 
 
 def test_a_recording_of_a_robot_that_has_finished_is_well(bridge_recording: Path) -> None:
-    subject = subject_of(Recording(bridge_recording, bridge_recording.parent), "the test")
+    subject = subject_of(RecordingAccess(bridge_recording, bridge_recording.parent), "the test")
     bad = [each for each in diagnose(subject) if not each.is_well]
     assert {each.check.name for each in bad} <= ELSEWHERE, bad
     assert "wrong" not in {each.finding.verdict for each in bad}
@@ -41,7 +41,7 @@ def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None
     def fails(_: Examined) -> Iterator[Diagnosis]:
         raise PermissionError("nobody may look there")
 
-    subject = subject_of(Recording(tmp_path / "webots.db", tmp_path), "the test")
+    subject = subject_of(RecordingAccess(tmp_path / "webots.db", tmp_path), "the test")
     well = Link("Two", lambda _: iter(()), well="all well")
     several = Link("Three", lambda _: iter([Diagnosis("ok", "a"), Diagnosis("wrong", "b", "x")]))
     first, second, third = diagnose(subject, (Link("One", fails), well, several))

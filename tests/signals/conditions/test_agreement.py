@@ -76,7 +76,7 @@ def _found(connection: Any, run_id: int, text: str) -> Held:
     condition, frame = parse_condition(text), read_frame(connection, segment, Deadline())
     runs = where_held(condition, frame, ("x", "y"))
     values = values_at(condition, frame, None, runs)
-    return [(run.start_s, held) for run, held in zip(runs.each(), values, strict=True)]
+    return [(run.start_s, held) for run, held in zip(runs.spans(), values, strict=True)]
 
 
 def _hit(connection: Any, run_id: int, text: str) -> Held:

@@ -26,7 +26,7 @@ from webots_mcp.database.liveness import holder_of
 from webots_mcp.simulator import console
 from webots_mcp.simulator.console import follow_console, job_of
 from webots_mcp.simulator.instances import Instance
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 
 @pytest.fixture
@@ -42,9 +42,9 @@ def instance_at(port: int, pid: int | None = None) -> Instance:
     return Instance(process.pid, port, True, None, False, None, process.create_time())
 
 
-def recording_of(recorded: Recorded) -> Recording:
+def recording_of(recorded: Recorded) -> RecordingAccess:
     assert isinstance(recorded.database, Path)
-    return Recording(recorded.database, recorded.database.parent)
+    return RecordingAccess(recorded.database, recorded.database.parent)
 
 
 def begin_run(recorded: Recorded, port: int, name: str = "rover") -> None:
@@ -299,7 +299,7 @@ def test_a_killed_webots_ends_what_follows_it_and_its_successor_is_another(
 def test_a_database_that_comes_later_gets_what_was_said_before(tmp_path: Path) -> None:
     with WebotsServer(streams=False) as server:
         server.log("stdout", "first\n")
-        recording = Recording(tmp_path / "webots.db", tmp_path)
+        recording = RecordingAccess(tmp_path / "webots.db", tmp_path)
         with follow_console(instance_at(server.port), recording) as follower:
             wait_for(lambda: "no database" in (follower.problem or ""))
             recorded = Recorded(tmp_path / "webots.db")

@@ -17,7 +17,7 @@ from tests.simulator.conftest import started
 from tests.waiting import wait_for
 from webots_mcp.simulator.console import StandInConsole
 from webots_mcp.store.logs import MOST_WAITING
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 WORLD = """#VRML_SIM R2023b utf8
 WorldInfo { basicTimeStep 16 }
@@ -132,7 +132,7 @@ def test_logs_show_why_a_controller_failed_where_no_robot_records(
 
 def test_of_a_flood_all_lines_are_recorded_or_counted(tmp_path: Path) -> None:
     database = tmp_path / "webots.db"
-    with StandInConsole(Recording(database, tmp_path)) as console:
+    with StandInConsole(RecordingAccess(database, tmp_path)) as console:
         console.begin(1234)
         for number in range(3_000):
             console.put("stdout", f"[rover] line {number}")

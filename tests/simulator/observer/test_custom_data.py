@@ -16,7 +16,7 @@ from webots_mcp.questions.robot_state import webots_get_world_info
 from webots_mcp.setup.doctor import all_checks, diagnose, subject_of
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.steering.dispatch import find_target
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 WORLD = """#VRML_SIM R2025a utf8
 WorldInfo { basicTimeStep 16 }
@@ -34,7 +34,7 @@ class Robots:
         simulation = self.watching.simulation
         self.rover = InProcessSupervisor("rover", world=simulation)
         self.e_puck = InProcessSupervisor("e-puck", world=simulation)
-        self.recording = Recording(database, database.data_dir)
+        self.recording = RecordingAccess(database, database.data_dir)
         self.database = database
 
     def go_on(self, steps: int = 1, **texts: str) -> None:

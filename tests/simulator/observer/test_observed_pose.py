@@ -21,7 +21,7 @@ from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.catalogue import catalogue, list_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 SPEED_M_S: Final = 0.5
 DRIVES_S: Final = 20.0
@@ -50,7 +50,7 @@ class Seen:
 
     def __init__(self, folder: Path) -> None:
         self.rows = Recorded(folder / "webots.db")
-        self.recording = Recording(folder / "webots.db", folder)
+        self.recording = RecordingAccess(folder / "webots.db", folder)
         self.began_s = time.time() - LASTS_S
         self.rover = self._robot("rover", supervisor=0)
 

@@ -15,8 +15,8 @@ from tests.steering.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.questions.run_trials import set_facts
 from webots_mcp.steering.trial_plan import Range, Search, TrialPlan
 from webots_mcp.steering.trial_run import next_parameters
-from webots_mcp.store.parameters import Trial
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.parameters import TrialRecord
+from webots_mcp.store.recording import RecordingAccess
 
 Write = Callable[[str], Path]
 PARAMETERS = "SELECT parameters FROM trial ORDER BY number"
@@ -29,17 +29,17 @@ def a_plan(search: Search = "tpe", **more: Any) -> TrialPlan:
     return TrialPlan(score="last(x)", for_s=1.0, search=search, **given)
 
 
-def tried(plan: TrialPlan, score: Callable[[dict[str, Any]], float]) -> list[Trial]:
+def tried(plan: TrialPlan, score: Callable[[dict[str, Any]], float]) -> list[TrialRecord]:
     """All trials of a search, one after the other, with the scores that a robot would have got."""
-    trials: list[Trial] = []
+    trials: list[TrialRecord] = []
     while (values := next_parameters(plan, trials)) is not None:
         trials.append(a_trial(len(trials) + 1, values, score(values)))
     return trials
 
 
-def a_trial(number: int, values: dict[str, Any], score: float | None) -> Trial:
+def a_trial(number: int, values: dict[str, Any], score: float | None) -> TrialRecord:
     over = (None, score, "for_s", 1.0, None, None, None, None, None)
-    return Trial(number, 1, str(number), number, json.dumps(values), "done", *over)
+    return TrialRecord(number, 1, str(number), number, json.dumps(values), "done", *over)
 
 
 def hill(values: dict[str, Any]) -> float:
@@ -91,7 +91,7 @@ def test_a_search_runs_trials_and_ends_early_what_is_pruned(
     statuses = rows(project, "SELECT DISTINCT status, ended_by, run_id > 0, error FROM trial")
     assert sorted(statuses)[0] == ("done", "for_s", 1, None)
     assert sorted(statuses)[1][:3] == ("pruned", "prune", 1)
-    told = set_facts(Recording(project / "data" / "webots.db", project / "data"), None)
+    told = set_facts(RecordingAccess(project / "data" / "webots.db", project / "data"), None)
     assert (told["state"], told["trials"], told["pruned"]) == ("done", 3, pruned["pruned"])
     assert told["failed"] is None
     table = run("--search", "random").stdout
@@ -107,7 +107,7 @@ def test_a_search_that_was_killed_goes_on_as_if_it_had_not_been(
         wait_for_trial(project, 2, killed)
         killed.kill()
 
-    left = set_facts(Recording(project / "data" / "webots.db", project / "data"), None)
+    left = set_facts(RecordingAccess(project / "data" / "webots.db", project / "data"), None)
     assert left["state"] == "left"
     assert left["trials"] > left["over"]
     answer = json.loads(run("--search", "tpe", "--json").stdout)

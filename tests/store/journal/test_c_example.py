@@ -16,7 +16,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.contract import C_HEADER, bundled
 from webots_mcp.questions import all_questions
 from webots_mcp.standin import InProcessRobot
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 E_PUCK = bundled("examples") / "e_puck"
 CONTROLLERS = E_PUCK / "controllers"
@@ -62,7 +62,7 @@ def record_in_c(folder: Path, sensed: list[list[float]], program: Path) -> list[
 
 
 def answers(folder: Path) -> list[Any]:
-    recording = Recording(folder / "webots.db", folder)
+    recording = RecordingAccess(folder / "webots.db", folder)
     found: list[Any] = []
     for name, arguments in QUESTIONS:
         question = next(each for each in all_questions() if each.name == name)

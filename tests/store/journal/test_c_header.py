@@ -25,7 +25,7 @@ from webots_mcp.cli import main
 from webots_mcp.contract import C_HEADER
 from webots_mcp.database.waiting_file import journal_parts
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 HERE = Path(__file__).parent
 STRICT = ["-O1", "-Wall", "-Wextra", "-Werror", "-pedantic", "-DWMCP_PART_BYTES=30000"]
@@ -87,7 +87,7 @@ def end(process: subprocess.Popen[str]) -> None:
 
 def read(folder: Path, sql: str) -> list[Any]:
     """Through a recording, as a question reads."""
-    with Recording(folder / "webots.db", folder).reader() as connection:
+    with RecordingAccess(folder / "webots.db", folder).reader() as connection:
         return connection.execute(sql).fetchall()
 
 
@@ -193,7 +193,7 @@ def test_no_number_and_no_text_crashes_a_function_or_makes_a_line_that_does_not_
         command = [program, seed, "12", "150"]
         done = subprocess.run(command, env=environment, capture_output=True, check=False)
         assert (done.returncode, done.stdout, done.stderr) == (0, b"well\n", b"")
-        Recording(folder / "webots.db", folder).take_in()
+        RecordingAccess(folder / "webots.db", folder).take_in()
         assert journal_parts(folder / "webots.db") == {}
         assert read(folder, "SELECT count(*) > 0 FROM state") == [(1,)]
         whys = read(folder, "SELECT json_extract(data, '$.why') FROM event WHERE kind = 'dropped'")
@@ -241,11 +241,11 @@ READER = """
 import sys, time
 from pathlib import Path
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 folder = Path(sys.argv[1])
 print("ready", flush=True)
 while True:
-    Recording(folder / "webots.db", folder).take_in()
+    RecordingAccess(folder / "webots.db", folder).take_in()
     time.sleep(0.001)
 """
 
@@ -280,7 +280,7 @@ def test_kills_lose_nothing_and_double_nothing(start: Start, tmp_path: Path) -> 
         assert changes == [(len(found) // 50,)]
         assert read(folder, "SELECT count(*), max(uuid) FROM run")[0][0] == 1
         assert read(folder, "SELECT count(*) FROM session") == [(1,)]
-        with Recording(folder / "webots.db", folder).view() as view:
+        with RecordingAccess(folder / "webots.db", folder).view() as view:
             assert not view.robot.live and "killed or crashed" in (view.status.why or "")
 
 
@@ -292,7 +292,7 @@ def test_a_living_controller_is_live_and_its_complete_parts_are_deleted(
     assert len(read(tmp_path, "SELECT 1 FROM state")) == 2000
     (parts,) = journal_parts(tmp_path / "webots.db").values()
     assert len(parts) == 1 and int(parts[0].stem[-4:]) > 5
-    with Recording(tmp_path / "webots.db", tmp_path).view() as view:
+    with RecordingAccess(tmp_path / "webots.db", tmp_path).view() as view:
         assert view.robot.live and view.status.is_moving
         assert view.run and view.run.row_count == 2000 and view.run.ended_wall_time_s is None
     assert read(tmp_path, "SELECT typeof(process), instance FROM session")[0][0] == "text"

@@ -21,7 +21,7 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.database.waiting_file import journal_parts
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.journal_intake import take_in_journals
-from webots_mcp.store.recording import Recording, view_of
+from webots_mcp.store.recording import RecordingAccess, view_of
 from webots_mcp.store.robots import list_robots
 
 FILES = sorted((Path(__file__).parent / "conformance").glob("*.jsonl"))
@@ -60,7 +60,7 @@ def test_a_journal_comes_to_its_rows(
 ) -> None:
     """Written at once and left; or byte by byte, with a reader after each piece."""
     expected, data = json.loads(file.with_suffix(".json").read_text("utf-8")), file.read_bytes()
-    recording = Recording(tmp_path / "webots.db", tmp_path)
+    recording = RecordingAccess(tmp_path / "webots.db", tmp_path)
     with part(tmp_path).open("ab", buffering=0) as journal:
         fcntl.flock(journal, fcntl.LOCK_EX)
         size = len(data) // pieces if pieces > 1 else len(data)
@@ -86,7 +86,7 @@ def test_parts_are_taken_in_one_after_the_other_and_deleted_when_they_are_comple
     for number in range(1, 11):  # the tenth part is after the ninth
         text = "\n".join([header, run.replace("[1,", f"[{number},"), lines[number - 1], ""])
         part(tmp_path, number).write_text(text)
-    recording = Recording(tmp_path / "webots.db", tmp_path)
+    recording = RecordingAccess(tmp_path / "webots.db", tmp_path)
     with part(tmp_path, 10).open("ab") as living:
         fcntl.flock(living, fcntl.LOCK_EX)
         recording.take_in()
@@ -98,10 +98,10 @@ def test_no_part_is_read_before_one_that_cannot_be(tmp_path: Path) -> None:
     text = (FILES[0].parent / "cut_line.jsonl").read_text()
     part(tmp_path, 1).write_text(text.replace('waiting":1', 'waiting":9'))
     part(tmp_path, 2).write_text(text)
-    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
     assert rows(tmp_path, "state") == []
     part(tmp_path, 1).unlink()
-    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
     assert len(rows(tmp_path, "state")) == 1
 
 
@@ -111,13 +111,15 @@ def test_a_reader_that_may_not_write_says_what_waits(tmp_path: Path) -> None:
         fcntl.flock(living, fcntl.LOCK_EX)
         living.write(text)
         living.flush()
-        Recording(tmp_path / "webots.db", tmp_path).take_in()
+        RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
         living.write(text.splitlines()[-2].replace("[2,", "\n[3,") + "\n")
         living.flush()
-        with Recording(tmp_path / "webots.db", tmp_path, read_only=True).view() as view:
+        with RecordingAccess(tmp_path / "webots.db", tmp_path, read_only=True).view() as view:
             assert part(tmp_path).name in view.header()["storage"]
             assert len(rows(tmp_path, "state")) == 1
-        with Recording(tmp_path / "webots.db", tmp_path, read_only=True, asker="cli").reader():
+        with RecordingAccess(
+            tmp_path / "webots.db", tmp_path, read_only=True, asker="cli"
+        ).reader():
             assert len(rows(tmp_path, "state")) == 2
 
 
@@ -128,11 +130,11 @@ def test_an_answer_whose_time_is_up_names_the_journal_of_which_rows_are_missing(
     states = [state.replace("[2,", f"[{number},", 1) for number in range(2, 302)]
     part(tmp_path).write_text("\n".join([header, run, *states, ""]))
     monkeypatch.setattr("webots_mcp.store.recording.BUDGET_S", 0.0)
-    with Recording(tmp_path / "webots.db", tmp_path).view() as view:
+    with RecordingAccess(tmp_path / "webots.db", tmp_path).view() as view:
         assert f"newer rows of {part(tmp_path).name}" in view.header()["storage"]
         assert 0 < len(rows(tmp_path, "state")) < 300
     monkeypatch.undo()
-    with Recording(tmp_path / "webots.db", tmp_path).view() as view:
+    with RecordingAccess(tmp_path / "webots.db", tmp_path).view() as view:
         assert "storage" not in view.header()
     assert len(rows(tmp_path, "state")) == 300
 
@@ -168,7 +170,7 @@ def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(
         lines = (header, [1, "run", None, run], state, end)
         path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
         os.utime(path, (value, value))  # in this order
-    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
     assert [data for _, data, _ in rows(tmp_path, "state")] == ['{"x":1}']
     assert rows(tmp_path, "run") == [["1", "start", 1.0, 1, "finished"]]
 
@@ -184,7 +186,7 @@ def test_what_a_journal_dates_in_the_future_was_seen_when_it_was_taken_in(tmp_pa
         fcntl.flock(living, fcntl.LOCK_EX)
         living.write("".join(f"{json.dumps(line)}\n" for line in lines))
         living.flush()
-        recording = Recording(tmp_path / "webots.db", tmp_path)
+        recording = RecordingAccess(tmp_path / "webots.db", tmp_path)
         recording.take_in()
         with recording.reader() as connection:
             (robot,) = list_robots(connection, in_a_minute_s := time.time() + 60)
@@ -202,7 +204,7 @@ def test_a_journal_with_the_uuid_of_a_bridges_session_is_left_and_reported(
     header = {"webots_mcp_waiting": 1, "robot": {"name": "rover"}, "session": session}
     end = [9, "session end", None, {"reason": "finished", "now": 1.0}]
     journal.write_text(f"{json.dumps(header)}\n{json.dumps(end)}\n")
-    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
     assert journal.exists() and rows(tmp_path, "session") == [[None, 0]]
     assert "its session is that of a bridge" in capsys.readouterr().err
     bridge.close()

@@ -21,7 +21,7 @@ from tests.store.journal.test_unfit_values import HEADER, RUN, RUN_VALUES
 from tests.waiting import wait_for
 from webots_mcp.errors import DatabaseError
 from webots_mcp.store.journal_intake import take_in_journals
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 LINES = 30
 
@@ -44,7 +44,7 @@ def states(folder: Path) -> int:
 
 
 def test_an_intake_ends_with_its_budget_goes_on_later_and_says_what_is_left(folder: Path) -> None:
-    recording = Recording(folder / "webots.db", folder)
+    recording = RecordingAccess(folder / "webots.db", folder)
     recording.create()
     with recording.writer() as connection:
         counts = [0]
@@ -53,7 +53,7 @@ def test_an_intake_ends_with_its_budget_goes_on_later_and_says_what_is_left(fold
             counts.append(states(folder))
     assert all(after - before in (0, 1) for before, after in pairwise(counts))
     assert 0 < counts[-1] < LINES
-    unread = Recording(folder / "webots.db", folder, read_only=True)
+    unread = RecordingAccess(folder / "webots.db", folder, read_only=True)
     with unread.view() as view:
         assert part(folder).name in view.header()["storage"]
 
@@ -74,7 +74,7 @@ def peak_memory_bytes(process: subprocess.Popen[Any]) -> int:
 def test_an_intake_waits_for_that_of_another_thread_no_longer_than_its_budget(
     folder: Path,
 ) -> None:
-    recording = Recording(folder / "webots.db", folder)
+    recording = RecordingAccess(folder / "webots.db", folder)
     recording.create()
     taken_in: list[int] = []
 
@@ -98,7 +98,7 @@ def test_an_intake_waits_for_that_of_another_thread_no_longer_than_its_budget(
 
 
 def test_a_server_looks_after_the_database_while_it_takes_in_a_long_journal(folder: Path) -> None:
-    Recording(folder / "webots.db", folder).create()
+    RecordingAccess(folder / "webots.db", folder).create()
     lease = "SELECT until_wall_time_s FROM lease WHERE name = 'maintainer'"
     arguments = [sys.executable, "-m", "webots_mcp", "serve", "--data-dir", str(folder)]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}

@@ -15,7 +15,7 @@ import pytest
 from tests.store.journal.test_conformance import SESSION, part, rows
 from webots_mcp.cli import main
 from webots_mcp.store.journal_intake import take_in_journals
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 RUN = "11111111-2222-4333-8444-555555555555"
 HEADER: dict[str, Any] = {
@@ -52,7 +52,7 @@ def state(number: int, run: str = RUN) -> str:
 
 def take_in(folder: Path, *lines: str, start: bytes = b"") -> None:
     part(folder).write_bytes(start + "".join(f"{line}\n" for line in lines).encode())
-    Recording(folder / "webots.db", folder).take_in()
+    RecordingAccess(folder / "webots.db", folder).take_in()
 
 
 def query(folder: Path, sql: str) -> list[Any]:
@@ -160,7 +160,7 @@ def test_a_part_of_which_nothing_fits_is_kept_and_those_after_it_are_read(
     run = f'[1,"run",null,{json.dumps(RUN_VALUES)}]'
     part(tmp_path, 2).write_text(f"{json.dumps(HEADER)}\n{run}\n{state(2)}\n")
     for _ in range(2):
-        Recording(tmp_path / "webots.db", tmp_path).take_in()
+        RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
     assert numbers(tmp_path) == [2]
     assert part(tmp_path, 1).exists() and not part(tmp_path, 2).exists()
     main(["status", "--data-dir", str(tmp_path)])
@@ -236,7 +236,7 @@ def test_no_state_that_fits_is_lost_among_lines_that_do_not(seed: int, tmp_path:
         line = "[" + ",".join(fields) + "]"
         lines.append(line[: draw.randrange(len(line))] if draw.random() < 0.2 else line)
     data = "".join(f"{line}\n" for line in lines).encode()
-    recording, pieces = Recording(tmp_path / "webots.db", tmp_path), draw.choice([1, 3, 40])
+    recording, pieces = RecordingAccess(tmp_path / "webots.db", tmp_path), draw.choice([1, 3, 40])
     with part(tmp_path).open("ab", buffering=0) as journal:
         fcntl.flock(journal, fcntl.LOCK_EX)
         for start in range(0, len(data), len(data) // pieces + 1):

@@ -23,7 +23,7 @@ from tests.server.test_parameters import TunableDriver
 from webots_mcp.cli import main
 from webots_mcp.plugins.page.page_server import steer, tune
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 # What ends the robot of the test is never allowed, and always asked for.
 ENDING = ("quit", "reload", "load_world")
@@ -199,7 +199,7 @@ def is_allowed(rules: Rules | None, action: str, params: dict[str, Any]) -> bool
 def test_nothing_that_a_rule_forbids_is_done_by_any_route(
     robot: TunableDriver, file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recording = Recording(file, file.parent, asker="page")
+    recording = RecordingAccess(file, file.parent, asker="page")
     toml = file.parents[1] / "webots-mcp.toml"
     passed, refused = set[str](), set[str]()
 

@@ -26,7 +26,7 @@ from webots_mcp.server.mcp_server import INSTRUCTIONS, create_server
 from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.policy import LAUNCH, Policy, read_policy
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import LONGEST_ARGUMENTS, newest_requests
 
 pytestmark = pytest.mark.anyio
@@ -78,7 +78,7 @@ async def test_a_request_is_a_row_with_who_asked_how_for_what_and_what_became_of
         allow(project, "[allow]\n\nactions = ['run']  # no more\n")
         refusal = await fail(client, "webots_breakpoint", condition="steps > 1e9")
     assert await run("send", "run", "--database", str(file)) == 2
-    await to_thread.run_sync(steer, Recording(file, file.parent), "rover", "pause")
+    await to_thread.run_sync(steer, RecordingAccess(file, file.parent), "rover", "pause")
     page, line, forbidden, long, hidden, tuned = requests_in(file)
     assert (tuned["client"], tuned["client_version"]) == ("an assistant", "3.1")
     assert (tuned["transport"], tuned["tool"]) == ("stdio", "webots_set_parameters")
@@ -134,7 +134,7 @@ async def test_no_route_of_ours_erases_a_request(
     robot.join(60)
     robot.bridge.close()
     other = tmp_path_factory.mktemp("other") / "webots.db"
-    Recording(other, other.parent).create()
+    RecordingAccess(other, other.parent).create()
     settled(file)
     with closing(connect(other, "writer")) as connection:
         for _ in range(2):  # and again, which brings nothing new

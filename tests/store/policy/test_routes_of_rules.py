@@ -19,7 +19,7 @@ from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.plugins.page.page_server import ORDERS, steer, tune
 from webots_mcp.questions import all_questions
 from webots_mcp.store.policy import LAUNCH, TOOLS_OF_ACTIONS
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("robot")]
 
@@ -65,9 +65,9 @@ def command(*words: str) -> Route:
     return Route(f"webots-mcp {' '.join(words)}", ask)
 
 
-def page(do: Callable[[Recording], dict[str, Any]]) -> Route:
+def page(do: Callable[[RecordingAccess], dict[str, Any]]) -> Route:
     async def ask(_: Client, file: Path) -> None:
-        said = await to_thread.run_sync(do, Recording(file, file.parent))
+        said = await to_thread.run_sync(do, RecordingAccess(file, file.parent))
         assert not said["is_done"]
 
     return Route("the page", ask)

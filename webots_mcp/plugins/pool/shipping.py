@@ -51,7 +51,7 @@ from webots_mcp.plugins.pool.pool_interface import (
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.chunks import reached
 from webots_mcp.store.merging import settled
-from webots_mcp.store.recording import Recording, name_of
+from webots_mcp.store.recording import RecordingAccess, name_of
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
 THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not only the newest
@@ -104,7 +104,7 @@ class Order:
         pictures: The files of pictures as well.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     open_pool: Callable[[], Pool]
     full: bool = False
     pictures: bool = False
@@ -427,7 +427,7 @@ class Shipper:
             return
         ended = [each for each in source.ended_runs() if not is_whole(self._progress, each)]
         try:
-            with Recording(database, database.parent).writer() as connection:
+            with RecordingAccess(database, database.parent).writer() as connection:
                 while not make_chunks(connection, pause_s=_PAUSE_S).done:
                     pass
                 for run_id in ended:

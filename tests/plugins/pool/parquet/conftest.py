@@ -17,7 +17,7 @@ from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 RECORDINGS: Final = 50
 STARTED_S: Final = 1_700_000_000.0  # 2023-11-14, 22:13 in UTC: later recordings begin the next day
@@ -62,7 +62,7 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Many:
     databases = [record(folder / str(number), number) for number in range(RECORDINGS)]
     url = bucket.empty()  # a disk would have to be waited for a thousand times
     for database in databases:
-        recording = Recording(database, database.parent, read_only=True)
+        recording = RecordingAccess(database, database.parent, read_only=True)
         ship(Order(recording, partial(open_pool, url, ships=True), full=True), Report())
     bucket.copy_to(folder / "pool")
     return Many(folder / "pool", tuple(databases))

@@ -19,7 +19,7 @@ from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_interface import Batch, table
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import chunk_whole_run
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 STATES: list[tuple[dict[str, Any], dict[str, str] | None]] = [
     ({"x": 1, "mode": "go", "bumper": False, "run": 5, "odd": 1.5}, None),
@@ -49,7 +49,7 @@ def database(tmp_path: Path) -> Iterator[Recorded]:
 
 def shipped(pool: Path) -> Report:
     folder = pool.parent / "there"
-    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
     report = Report()
     ship(Order(recording, lambda: ParquetPool(str(pool), ships=True)), report)
     return report

@@ -154,6 +154,9 @@ SELECT r.name AS robot, g.run_id, s.name AS signal, g.start_sim_time_s AS start_
 FROM chunk c JOIN row_group g ON g.id = c.group_id AND g.is_complete
 JOIN signal s ON s.id = c.signal_id JOIN robot r ON r.id = s.robot_id;
 
+CREATE TRIGGER state_ids_stay AFTER DELETE ON state
+WHEN old.id > (SELECT coalesce(max(id), 0) FROM state)
+BEGIN UPDATE recording SET reserved_state_id = max(reserved_state_id, old.id); END;
 CREATE TRIGGER request_stays BEFORE DELETE ON request
 BEGIN SELECT RAISE(ABORT, 'requests are never deleted'); END;
 CREATE TRIGGER request_stays_as_it_was BEFORE UPDATE OF

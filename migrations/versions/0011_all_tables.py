@@ -3,7 +3,7 @@
 The number of a migration is the `PRAGMA user_version` that it brings. Before one comes after this,
 write out here what the models say today.
 
-Revision ID: 0010
+Revision ID: 0011
 Revises:
 """
 
@@ -17,10 +17,10 @@ from webots_mcp.store import models
 
 assert models.Robot  # importing the models filled the metadata
 
-revision = "0010"
+revision = "0011"
 down_revision = None
 
-VIEWS = Path(__file__).with_name("0010_views.sql")
+VIEWS = Path(__file__).with_name("0011_views.sql")
 
 
 def upgrade() -> None:

@@ -26,6 +26,7 @@ _CERTAIN_RAMP: Final = 50.0  # variances of the noise: a ramp that explains more
 _EXACT_ROWS: Final = 0.25  # an end whose deviation is less is exact enough
 _ROUNDING_M: Final = 1e-6
 _MOST_AT_ONCE: Final = 2**20  # positions
+LONGEST_CREEP: Final = 10.0  # shortest standstills: who takes longer to leave a place drifts
 DRIFT_SHARE: Final = 0.15  # of the radius: who came farther between its first and last third moves
 CERTAIN: Final = 4.0  # standard errors
 SAME_COURSE: Final = 1.25  # times the noise: the residual of a motion that explains all rows
@@ -78,12 +79,23 @@ def find_standstills(
         return []
     rows = Rows(track)
     firsts, lasts = _resting(track, rows, grid, stays, radius_m, is_over)
-    starts = _begins_of_rest(track, firsts, lasts, grid.rows)
     newest = len(track.times) - 1
+    starts = _near_coarse(track, firsts, _begins_of_rest(track, firsts, lasts, grid.rows), least_s)
     ends = newest - _begins_of_rest(track.reversed, newest - lasts, newest - firsts, grid.rows)
+    ends = _near_coarse(track, lasts, ends, least_s)
     long = track.times[ends] - track.times[starts] >= NEARLY * least_s
     near_m = SETTLED_SHARE * radius_m + 3 * track.left_m
     return _joined(track, rows, starts[long], ends[long], grid.rows, near_m)
+
+
+def _near_coarse(track: SmoothedTrack, coarse: Indexes, fine: Indexes, least_s: float) -> Indexes:
+    """The fine ends of standstills, but the coarse ones where these are far away.
+
+    A robot that turns in place, or sways, moves within its place: no ramp fits there, and its best
+    end may lie anywhere.
+    """
+    far = np.abs(track.times[fine] - track.times[coarse]) > least_s
+    return np.where(far, coarse, fine)
 
 
 def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s: float) -> float:
@@ -109,6 +121,7 @@ class _Grid(NamedTuple):
     y: Array
     window: int
     rows: int
+    least_s: float
 
 
 def _grid_of(track: SmoothedTrack, least_s: float) -> _Grid:
@@ -119,7 +132,7 @@ def _grid_of(track: SmoothedTrack, least_s: float) -> _Grid:
     times: Array = step_s * steps
     x, y = (np.interp(times, track.times, each) for each in (track.x, track.y))
     window = max(2, math.ceil(_NEAR_SHARE * least_s / step_s))
-    return _Grid(times, x, y, window, math.ceil(step_s / interval_s) if interval_s else 1)
+    return _Grid(times, x, y, window, math.ceil(step_s / interval_s) if interval_s else 1, least_s)
 
 
 def _stays(grid: _Grid, radius_m: float) -> Iterator[tuple[int, int]]:
@@ -172,7 +185,8 @@ def _resting(
     newest, slack = len(track.times) - 1, track.smoothed_rows // 2 + grid.rows
     firsts[(stays[:, 0] == 0) & (firsts <= slack)] = 0
     lasts[(stays[:, 1] == len(grid.times)) & (lasts >= newest - slack)] = newest
-    creeps = is_creep(rows, firsts, lasts + 1, radius_m, is_over)
+    slowest_m_s = radius_m / (LONGEST_CREEP * grid.least_s)
+    creeps = is_creep(rows, firsts, lasts + 1, radius_m, slowest_m_s, is_over)
     edges = np.searchsorted(track.times, np.append(grid.times, np.inf)[stays])
     touching = np.append(edges[1:, 0] == edges[:-1, 1], False)
     for at in np.flatnonzero(creeps).tolist():
@@ -379,9 +393,17 @@ class _Lines(NamedTuple):
 
 
 def is_creep(
-    rows: Rows, starts: Indexes, ends: Indexes, radius_m: float, is_over: Callable[[], bool]
+    rows: Rows,
+    starts: Indexes,
+    ends: Indexes,
+    radius_m: float,
+    slowest_m_s: float,
+    is_over: Callable[[], bool],
 ) -> Flags:
-    """Whether stretches within a place are of a motion, be it that it only shows around them."""
+    """Whether stretches within a place are of a motion, be it that it only shows around them.
+
+    What is slower than `slowest_m_s` is drift, not motion.
+    """
     own, lengths = _lines_through(rows, starts, ends), ends - starts
     creeps = np.zeros(len(starts), np.bool_)
     for before, after in ((0, 0), *_AROUND):
@@ -392,6 +414,7 @@ def is_creep(
             line = _lines_through(rows, from_row, to_row)
             moves = (to_row - from_row > lengths) & _is_one_motion(rows, line, radius_m)
             moves &= ~_is_slower(own, line)
+        moves &= line.speed_m_s >= slowest_m_s
         leaves = line.speed_m_s * line.lasts_s > radius_m
         for at in np.flatnonzero(moves & ~creeps).tolist():
             place = int(from_row[at]), int(to_row[at])

@@ -17,9 +17,9 @@ from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_source import NOT_READ
 from webots_mcp.store.runs import RunInfo
 
-Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at"]
+Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at", "not judged"]
 WORST_FIRST: Final[tuple[Outcome, ...]] = (
-    "fail", "not looked at", "warn", "pass", "not applicable",
+    "fail", "not looked at", "warn", "pass", "not judged", "not applicable",
 )  # fmt: skip
 _TIMED_OUT: Final = "time limit reached"
 

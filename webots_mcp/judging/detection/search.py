@@ -24,9 +24,11 @@ from webots_mcp.judging.detection.kinds import (
     NotAskedError,
     NotSearchableError,
 )
+from webots_mcp.signals.meaning import Quantity
 from webots_mcp.signals.naming import FARTHEST_M, listed, metres_in, unit_in
 from webots_mcp.signals.register import first_in, pair_in
 from webots_mcp.store.chunks import shown
+from webots_mcp.store.meanings import meanings_of
 from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
@@ -44,6 +46,7 @@ AWAY_S: Final = 20.0
 LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
 USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
 LEAST_VISITS: Final = 3
+_OF_MOTION: Final = ("speed", "turn rate", "wheel speed")
 EARLIER_RUNS: Final = 3
 MOST_ROWS: Final = 2_000_000  # of a run: its first ones
 _STANDS_SHARE: Final = 0.8  # of a visit
@@ -79,6 +82,7 @@ class Motion:
         wheels: Speeds of its wheels or driving motors, commanded or measured; `wheel_commands`
             are speeds that these should have.
         height: z: a robot that climbs does not stand still.
+        turn_command: How fast it should turn.
     """
 
     position: tuple[RegisteredSignal, RegisteredSignal] | None
@@ -89,6 +93,7 @@ class Motion:
     wheels: tuple[RegisteredSignal, ...] = ()
     height: RegisteredSignal | None = None
     wheel_commands: tuple[RegisteredSignal, ...] = ()
+    turn_command: RegisteredSignal | None = None
 
     @property
     def signals(self) -> list[RegisteredSignal]:
@@ -99,7 +104,10 @@ class Motion:
     @property
     def evidence(self) -> list[RegisteredSignal]:
         """All of them."""
-        others = filter(None, (self.height, self.commanded, self.speed, self.mode, self.heading))
+        others = filter(
+            None,
+            (self.height, self.commanded, self.turn_command, self.speed, self.mode, self.heading),
+        )
         return [*(self.position or ()), *others, *self.wheels, *self.wheel_commands]
 
 
@@ -133,24 +141,38 @@ def find_motion(
         found = first_in(role, signals)
         return signals[found] if found else None
 
-    def wheels(wanted: str) -> tuple[RegisteredSignal, ...]:
-        named = (own[name] for name, role in roles.items() if role == wanted)
-        return tuple(wheel for wheel in named if wheel != commanded)
+    meanings = meanings_of(own)
+
+    def meant(quantity: Quantity, *, sets: bool) -> list[RegisteredSignal]:
+        return [
+            own[name]
+            for name, meaning in meanings.items()
+            if meaning.quantity == quantity and meaning.sets == sets and meaning.role != "limit"
+        ]
 
     place = "" if position else pair_in(signals)
     if position is None:  # it may be missing in the rows that were seen
         ever = {role: known[name] for name, role in stored_roles(known).items()}
         position = _pair(signals, place) or _pair(ever, pair_in(ever))
     commanded = first("commanded_speed", options.commanded)
+    if options.commanded is None and (
+        commanded is None or commanded not in meant("speed", sets=True)
+    ):
+        commanded = next(iter(meant("speed", sets=True)), None)
+    speed = first("speed")
+    if speed is not None and meanings[speed.name].quantity != "speed":
+        speed = next(iter(meant("speed", sets=False)), None)
+    wheels, wheel_commands = (meant("wheel speed", sets=sets) for sets in (False, True))
     return Motion(
         position,
         commanded,
-        None if commanded else first("speed"),
+        None if commanded else speed,
         first("mode", options.mode),
         heading=first("yaw"),
-        wheels=wheels("wheel"),
+        wheels=tuple(each for each in wheels if each != commanded),
         height=signals.get(f"z{place}"),
-        wheel_commands=wheels("commanded_wheel"),
+        wheel_commands=tuple(each for each in wheel_commands if each != commanded),
+        turn_command=next(iter(meant("turn rate", sets=True)), None),
     )
 
 
@@ -175,7 +197,12 @@ def motion_in(frame: Frame, known: dict[str, RegisteredSignal], options: EventOp
         options: As for `find_motion`.
     """
     rows = [frame.rows(row, row + 1) for row in {0, len(frame) - 1}]
-    telling = [name for name, each in known.items() if options.position or each.role]
+    meanings = meanings_of(known)
+    telling = [
+        name
+        for name, each in known.items()
+        if options.position or each.role or meanings[name].quantity in _OF_MOTION
+    ]
     here = {name for name in telling if any(row.held(name).any() for row in rows)}
     return find_motion(known, options, here)
 

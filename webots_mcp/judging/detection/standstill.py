@@ -24,6 +24,7 @@ from webots_mcp.judging.detection.kinds import (
     NotSearchableError,
 )
 from webots_mcp.judging.detection.search import (
+    LEAST_VISITS,
     NO_TIME,
     ModeUse,
     ModeUses,
@@ -44,6 +45,10 @@ from webots_mcp.store.reading.frame import Frame
 # standstills are judged at once.
 
 
+# What one of a unit of speed is in m/s or rad/s.
+SPEED_UNITS: Final = {
+    "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "deg/s": math.pi / 180, "rpm": math.pi / 30,
+}  # fmt: skip
 WHEELS_TURN: Final = 0.1  # rad/s, or in whatever unit they are published
 ON_THE_SPOT: Final = 0.2  # of the fastest wheel: where the mean of all is less, none drives ahead
 COMMAND_NOISE: Final = 4.0  # deviations of a speed's own noise: what is less is no command
@@ -137,12 +142,25 @@ class Standings:
         least = 0.0
         if self.speed is not None and self.speed.name in frame:
             self.speeds = frame.numbers(self.speed.name)[rows]
-            least = max(options.min_commanded_m_s, COMMAND_NOISE * noise.of(self.speed.name))
+            least_m_s = options.min_commanded_m_s / SPEED_UNITS.get(self.speed.unit or "m/s", 1.0)
+            least = max(least_m_s, COMMAND_NOISE * noise.of(self.speed.name))
         self.told = np.abs(self.speeds) >= least
+        self.turn_speeds = np.full(len(rows), np.nan)
+        least_turn = 0.0
+        if (turning := motion.turn_command) is not None and turning.name in frame:
+            self.turn_speeds = frame.numbers(turning.name)[rows]
+            slowest = TURNED_RAD / CELL_S / SPEED_UNITS.get(turning.unit or "rad/s", 1.0)
+            least_turn = max(slowest, COMMAND_NOISE * noise.of(turning.name))
+        self.told_to_turn: Flags = np.abs(self.turn_speeds) >= least_turn
         # A speed whose name leaves open whether it is commanded or measured says so where it is 0.
         self.stops = (np.abs(self.speeds) < least) & (motion.commanded is not None)
+        self.stops &= ~self.told_to_turn
         wheels = motion.wheel_commands or motion.wheels
         self.wheels = [each for each in wheels if each.name in frame]
+        # Wheels whose name leaves it open and that have no noise at all were set, not measured.
+        self.wheels_are_commands = bool(motion.wheel_commands) or not any(
+            noise.of(each.name) for each in self.wheels
+        )
         turned = np.nan_to_num([frame.numbers(each.name)[rows] for each in self.wheels])
         turned = turned if self.wheels else np.zeros((1, len(rows)))
         self.fastest: Array = np.abs(turned).max(axis=0)
@@ -165,7 +183,9 @@ class Standings:
             self.turns |= turn & ~ahead
         self.sways = self._swaying()
         coded = None if motion.mode is None else frame.coded(motion.mode.name)
-        self.modes = np.zeros(len(rows), np.intp) if coded is None else coded.codes[rows]
+        self._frame_rows = rows
+        self._all_modes = np.zeros(len(frame), np.intp) if coded is None else coded.codes
+        self.modes = self._all_modes[rows]
         self.labels = [None] if coded is None else coded.labels
         self._by_mode = {code: self._moves_in(code) for code in self.codes(slice(None))}
         moves = [bool(self._by_mode.get(code, (None,))[0]) for code in range(len(self.labels))]
@@ -251,13 +271,20 @@ class Standings:
                 facts["turned_rad"] = round(median(course[-few:]) - median(course[:few]), 3)
         return facts
 
-    def judged(self) -> list[Judged]:
-        """Each standstill, what of it the robot was stuck for, and what that leaves of it."""
+    def judged(self, undecided: list[float]) -> list[Judged]:
+        """Each standstill, what of it the robot was stuck for, and what that leaves of it.
+
+        Args:
+            undecided: Takes the begins of standstills of which nothing recorded says whether the
+                robot should have moved.
+        """
         events = list[Judged]()
         hindered = np.zeros(len(self.times), np.bool_)  # it moved in its place for long enough
         for start, stop in self.spans(self.turns | self.sways, 0.0):
             hindered[start:stop] = True
         drives = self.told | (self.wheel_drives != 0) | self.in_moving_mode
+        if self.motion.heading is not None:  # else it is not known whether it turned
+            drives |= self.told_to_turn
         spans: dict[int, list[tuple[int, int]]] = {}
         for span in self.spans(drives & ~self.stops & ~hindered, BRIDGED_S):
             spans.setdefault(int(self.owner[span[0]]), []).append(span)
@@ -283,6 +310,8 @@ class Standings:
                 modeless = "" if self.motion.mode else "; if one holds the mode, give mode=NAME"
                 nothing = f"no published signal shows that it should have moved{modeless}"
                 details["why_not_stuck"] = "; ".join(against) or nothing
+            if not stuck and not self._is_decided(whole):
+                undecided.append(float(place.times[0]))
             events.append(self._event("standstill", whole.start, whole.stop, details))
             edges = [whole.start, *(edge for span in stuck for edge in span), whole.stop]
             for start, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -317,7 +346,10 @@ class Standings:
     def _shown(self, rows: slice) -> tuple[list[str], str | None]:
         """What shows that it should have moved in these rows; or why that is in doubt."""
         codes = self.codes(rows)
-        said = [why for code in codes for why in self._by_mode[code][:1] if why]
+        modes = np.bincount(self.modes[rows]) > MOSTLY * (rows.stop - rows.start)
+        said = [why for code in codes if modes[code] for why in self._by_mode[code][:1] if why]
+        if said and not self._moves_on(rows):
+            said = []
         told, wheels = self.told[rows], self.wheel_drives[rows] != 0
         speeds, is_measured = np.zeros(0), self.motion.commanded is None
         if self.speed is not None and told.sum() > TOLD_SHARE * len(told):
@@ -329,7 +361,17 @@ class Standings:
             said.append(f"wheels at {median(abs(turning)):.3g}{unit}")
             if wheels.sum() > told.sum():
                 speeds, is_measured = turning, not self.motion.wheel_commands
-        if self.in_moving_mode[rows].mean() >= MOSTLY or not len(speeds):
+        turning = self.told_to_turn[rows]
+        if (command := self.motion.turn_command) and turning.sum() > TOLD_SHARE * len(turning):
+            rates = self.turn_speeds[rows][turning]
+            said.append(f"{command.name} {median(rates):.3g}")
+            if turning.sum() > told.sum():
+                speeds, is_measured = rates, False
+        if not said:
+            return said, self._why_mode_is_not_enough(rows)
+        if not len(speeds):
+            return said, None
+        if self.in_moving_mode[rows].mean() >= MOSTLY and said[0].startswith(("in mode", "mode ")):
             return said, None
         # Speeds that are hardly beyond their noise, or go to and fro, are no command.
         middle = median(speeds)
@@ -341,9 +383,42 @@ class Standings:
             return said, None
         return said, f"commanded or measured speeds of {middle:.2g} are hardly beyond their noise"
 
+    def _moves_on(self, rows: slice) -> bool:
+        """Whether the robot moved on in the same mode after these rows, or always does so.
+
+        A robot that stands until a mode ends may have arrived: one such visit shows nothing.
+        """
+        if self.options.moving_modes is not None:
+            return True
+        code = int(np.argmax(np.bincount(self.modes[rows])))
+        use = self._use(code)
+        if use.moving >= LEAST_VISITS and not use.standing:
+            return True
+        last = int(self._frame_rows[rows.stop - 1])
+        later = self._all_modes[last + 1 : last + 2]
+        return len(later) > 0 and int(later[0]) == code
+
+    def _why_mode_is_not_enough(self, rows: slice) -> str | None:
+        mode = shown(self.labels[int(np.argmax(np.bincount(self.modes[rows])))])
+        if mode is None:
+            return None
+        return f"it stood until mode {mode} ended, as a robot does that has arrived"
+
     def _use(self, code: int) -> ModeUse:
         mode = shown(self.labels[code])
         return ModeUse() if mode is None else self._uses.of(mode)
+
+    def _is_decided(self, rows: slice) -> bool:
+        """Whether something recorded shows that it was meant to stand, or that it did move."""
+
+        def mostly(flags: Flags) -> bool:
+            return np.count_nonzero(flags[rows]) > MOSTLY * (rows.stop - rows.start)
+
+        if mostly(self.turns | self.sways) or mostly(self.stops):
+            return True
+        if mostly(self.resting) and self.wheels_are_commands:
+            return True
+        return any(self._use(code).usually_stands for code in self.codes(rows))
 
     def _against(self, at: int, rows: slice) -> list[str]:
         """What speaks against that it should have moved in a standstill."""
@@ -470,15 +545,28 @@ def judge_standstills(
         parts = [np.searchsorted(here, asked).tolist() for here in rows]
         there = [track.part(*part) for track, part in zip(tracks, parts, strict=True)]
         return Findings([], None if places else _nearest(there, search), unseen)
-    events = list[Judged]()
+    events, open_s = list[Judged](), list[float]()
     for batch in _batches(long):
         if search.deadline.passed:
             since_s = batch[0].times[0]
             unseen.append(f"{NO_TIME}; standstills from {since_s:.3f} s on were not judged")
             break
-        events += Standings(frame, motion, options, batch, noise, uses).judged()
+        events += Standings(frame, motion, options, batch, noise, uses).judged(open_s)
     cut = ["time limit reached before it was known in which modes it moves"] if uses.is_cut else []
+    if open_s and not cut:
+        cut = [_nothing_says(motion, open_s, sum(each.kind == "standstill" for each in events))]
     return Findings(events, None, unseen, cut)
+
+
+def _nothing_says(motion: Motion, open_s: Sequence[float], count: int) -> str:
+    """Why it is not known of some standstills whether the robot should have moved."""
+    which = f"{len(open_s)} of {count} standstills" if count > 1 else "the standstill"
+    lacking = "no commanded speed, wheel command or mode is known"
+    if motion.commanded or motion.wheels or motion.wheel_commands or motion.mode:
+        lacking = "nothing recorded says whether it should have moved then"
+    elif motion.turn_command and motion.heading is None:
+        lacking = "it was commanded to turn, but no heading is known"
+    return f"{which} from {min(open_s):.3f} s on cannot be judged: {lacking}"
 
 
 def _batches(places: Sequence[Place]) -> Iterator[Sequence[Place]]:
@@ -559,8 +647,12 @@ def _standstills(search: Search) -> Iterator[Event]:
 
 def _stuck(search: Search) -> Iterator[Event]:
     """It should have moved and stayed where it was."""
-    search.not_searched("stuck", *standstills_in(search).undecided)
-    return _events(search, "stuck", "stuck")
+    found = standstills_in(search)
+    events = list(_events(search, "stuck", "stuck"))
+    search.not_searched("stuck", *found.undecided)
+    if found.undecided and not events:
+        raise NotSearchableError("; ".join(found.undecided))
+    return iter(events)
 
 
 def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:

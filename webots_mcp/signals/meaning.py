@@ -1,0 +1,308 @@
+"""What signals mean: the quantity, role, unit and side of each, and where that is known from.
+
+A meaning is declared by a person, known from the device that was read, or read from the name. The
+words of names are compared as whole words, in their singular and common short forms; no part of a
+name is matched as a bare text. What none of these tells has an unknown meaning, and is not judged.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal, get_args
+
+from webots_mcp.signals.naming import angle_unit, unit_in, words_of
+
+Quantity = Literal[
+    "x", "y", "height", "heading", "roll", "pitch", "speed", "turn rate", "wheel speed",
+    "motor speed", "joint position", "joint speed", "distance", "force", "torque", "current",
+    "voltage", "temperature", "pressure", "light", "acceleration", "angular velocity",
+    "magnetic field", "percentage", "time", "count", "flag", "mode", "text",
+]  # fmt: skip
+Role = Literal["measured", "commanded", "target", "limit"]
+Source = Literal["declared", "device", "named", "behaviour", "unknown"]
+
+QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
+ROLES: Final[tuple[Role, ...]] = get_args(Role)
+SOURCES: Final[tuple[Source, ...]] = get_args(Source)  # the strongest first
+FIRM: Final = frozenset[Source](("declared", "device", "named"))  # a failure may rest on these
+_REMEMBERED: Final = 4096  # names whose words are kept
+
+# -- the words of names ------------------------------------------------------------------------
+
+_SHORT_FORMS: Final = {
+    "pos": "position", "vel": "velocity", "spd": "speed", "cmd": "command", "tgt": "target",
+    "ref": "reference", "dist": "distance", "temp": "temperature", "acc": "acceleration",
+    "accel": "acceleration", "ang": "angle", "odom": "odometry", "odo": "odometry",
+    "enc": "encoder", "mot": "motor", "whl": "wheel", "lin": "linear", "pct": "percent",
+    "batt": "battery", "volt": "voltage", "alt": "altitude", "hdg": "heading", "mag": "compass",
+    "magnetometer": "compass", "commanded": "command", "omega": "angular", "num": "count",
+    "baro": "pressure", "barometer": "pressure", "illuminance": "light", "brightness": "light",
+    "sonar": "distance", "lidar": "distance", "ultrasonic": "distance", "range": "distance",
+}  # fmt: skip
+_SIDES: Final = {
+    "left": "left", "right": "right", "l": "left", "r": "right", "fl": "front left",
+    "fr": "front right", "rl": "rear left", "rr": "rear right", "bl": "rear left",
+    "br": "rear right",
+}  # fmt: skip
+_ENDS: Final = {"front": "front", "rear": "rear", "back": "rear"}
+_COMMAND: Final = frozenset(("command", "demand"))
+_TARGET: Final = frozenset(("target", "setpoint", "goal", "desired", "reference"))
+_LIMIT: Final = frozenset(("limit", "max", "min", "maximum", "minimum", "threshold"))
+_MEASURED: Final = frozenset(("measured", "actual", "feedback", "encoder", "sensor", "real"))
+_COUNTS: Final = frozenset((
+    "count", "counter", "length", "queue", "item", "tick", "step", "score", "packet", "encoder",
+    "index", "id", "lap", "goal", "collision", "episode", "gear", "level", "size", "iteration",
+))  # fmt: skip
+_JOINTS: Final = frozenset((
+    "joint", "arm", "elbow", "shoulder", "wrist", "knee", "hip", "ankle", "neck", "waist", "torso",
+    "gripper", "finger", "claw", "jaw", "hand", "leg", "pan", "tilt", "turret", "mast", "slider",
+    "servo", "steering",
+))  # fmt: skip
+HOLDING: Final = frozenset(("gripper", "finger", "claw", "jaw", "hand"))  # they close on things
+_FREE_MOTORS: Final = frozenset((  # motors that move no robot over the ground by wheels
+    "fan", "propeller", "prop", "rotor", "engine", "brush", "pump", "spindle", "conveyor", "belt",
+    "thruster", "vacuum", "drum", "blade", "turbine",
+))  # fmt: skip
+_TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
+_GYROS: Final = frozenset(("gyro", "imu", "gyroscope"))
+_WORD_QUANTITIES: Final[dict[str, Quantity]] = {
+    "distance": "distance", "force": "force", "torque": "torque", "voltage": "voltage",
+    "temperature": "temperature", "pressure": "pressure", "suction": "pressure", "light": "light",
+    "lux": "light", "acceleration": "acceleration", "gyro": "angular velocity",
+    "compass": "magnetic field", "percent": "percentage", "roll": "roll", "pitch": "pitch",
+}  # fmt: skip
+_UNIT_QUANTITIES: Final[dict[str, Quantity]] = {
+    "N": "force", "N·m": "torque", "A": "current", "V": "voltage", "%": "percentage",
+    "m/s²": "acceleration", "s": "time", "ms": "time", "rad/s²": "angular velocity",
+}  # fmt: skip
+_MORE_UNITS: Final[dict[str, Quantity]] = {  # as words at the end of a name
+    "pa": "pressure", "kpa": "pressure", "hpa": "pressure", "bar": "pressure", "lux": "light",
+    "lx": "light", "c": "temperature", "celsius": "temperature", "k": "temperature",
+    "kelvin": "temperature", "mv": "voltage", "ma": "current",
+}  # fmt: skip
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def words_in(name: str) -> tuple[str, ...]:
+    """Return the words of a dotted name in their long, singular form: `motorsCmd.0`, motor command.
+
+    Numbers of items are left out.
+    """
+    words = (word for part in name.split(".") for word in words_of(part) if word)
+    found: list[str] = []
+    for word in words:
+        word = word.rstrip("0123456789")
+        if not word:
+            continue
+        singular = word[:-1] if len(word) > 3 and word.endswith("s") and word[-2] != "s" else word
+        found.append(_SHORT_FORMS.get(singular, _SHORT_FORMS.get(word, singular)))
+    return tuple(found)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def side_in(name: str) -> str | None:
+    """Return the side that a name tells, such as `left` or `front right`; None without one."""
+    words = words_in(name)
+    side = next((_SIDES[word] for word in words if word in _SIDES), None)
+    end = next((_ENDS[word] for word in words if word in _ENDS), None)
+    if side is None or " " in side or end is None:
+        return side
+    return f"{end} {side}"
+
+
+# -- meanings ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What a signal means.
+
+    Attributes:
+        quantity: What is measured or set; None where that is unknown.
+        role: Whether it is measured, commanded, a target or a limit; None where that is open.
+        unit: Its unit.
+        target_of: The signal whose target this is.
+        same_as: The signal that measures the same thing.
+        side: Which part of the robot it is of.
+        low: The lowest value it can have; `high` the highest.
+        source: Where the meaning is known from.
+        why: The reason, for a person.
+    """
+
+    quantity: Quantity | None = None
+    role: Role | None = None
+    unit: str | None = None
+    target_of: str | None = None
+    same_as: str | None = None
+    side: str | None = None
+    low: float | None = None
+    high: float | None = None
+    source: Source = "unknown"
+    why: str = ""
+
+    @property
+    def is_firm(self) -> bool:
+        """Whether a failure may rest on it."""
+        return self.source in FIRM
+
+    @property
+    def sets(self) -> bool:
+        """Whether it says what is wanted, not what is."""
+        return self.role in ("commanded", "target")
+
+
+UNKNOWN: Final = Meaning(why="its name does not say what it is")
+
+
+def meaning_by_name(
+    name: str, kind: str, register_role: str | None = None, names: Iterable[str] = ()
+) -> Meaning:
+    """Return what a signal's name and kind tell.
+
+    Args:
+        name: The signal.
+        kind: `num`, `bool`, `text`, `angle` or `null`, as the register has it.
+        register_role: Its role in the register: `x`, `yaw`, `mode`, `wheel` and so on.
+        names: All names of the robot, of which partners are found.
+    """
+    base = (register_role or "").rstrip("0123456789")
+    if base == "mode":
+        return _named("mode", None, name, "its name is one of a mode")
+    if kind == "bool":
+        return _named("flag", _role_in(name), name, "it is true or false")
+    if kind == "text":
+        return _named("text", _role_in(name), name, "it is a text")
+    if kind == "null":
+        return UNKNOWN
+    for role, quantity in (("x", "x"), ("y", "y"), ("z", "height"), ("yaw", "heading")):
+        if base == role:
+            return _named(quantity, _role_in(name) or "measured", name, "its name is one of a pose")
+    quantity = _quantity_in(name, kind, base, frozenset(names))
+    if quantity is None:
+        return UNKNOWN
+    return _named(quantity, _role_of(name, quantity, base), name, f"its name says {quantity}")
+
+
+def meanings_by_name(
+    kinds: Mapping[str, str], register_roles: Mapping[str, str]
+) -> dict[str, Meaning]:
+    """Return the meaning of each of a robot's signals, as far as their names tell.
+
+    Args:
+        kinds: The kind of each signal.
+        register_roles: The roles of those that have one.
+    """
+    names = frozenset(kinds)
+    return {
+        name: meaning_by_name(name, kind, register_roles.get(name), names)
+        for name, kind in kinds.items()
+    }
+
+
+def _named(quantity: Quantity, role: Role | None, name: str, why: str) -> Meaning:
+    unit = unit_in(name)
+    return Meaning(quantity, role, unit, side=side_in(name), source="named", why=why)
+
+
+def _role_in(name: str) -> Role | None:
+    words = frozenset(words_in(name))
+    if words & _COMMAND:
+        return "commanded"
+    if words & _TARGET:
+        return "target"
+    if words & _LIMIT:
+        return "limit"
+    return "measured" if words & _MEASURED else None
+
+
+def _role_of(name: str, quantity: Quantity, base: str) -> Role | None:
+    if base.startswith("commanded"):
+        return "commanded"
+    found = _role_in(name)
+    if found is not None or quantity in ("speed", "turn rate", "wheel speed", "motor speed"):
+        return found  # of a speed without such a word it is open whether it was measured
+    return "measured"
+
+
+def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quantity | None:
+    words, unit, last = words_in(name), unit_in(name), words_of(name.rpartition(".")[2])[-1]
+    said = frozenset(words)
+    if _COUNTS & {words[-1] if words else "", *words[-2:-1]} and unit is None and kind == "num":
+        return "count"
+    if motion := _motion_in(name, base, said, unit, names):
+        return motion
+    if unit in _UNIT_QUANTITIES:
+        return _UNIT_QUANTITIES[unit]
+    if last in _MORE_UNITS and len(words) > 1:
+        return _MORE_UNITS[last]
+    if kind == "angle" or angle_unit(name) is not None or unit in ("rad", "deg"):
+        if said & _JOINTS:
+            return "joint position"
+        if "roll" in said:
+            return "roll"
+        return "pitch" if "pitch" in said else None
+    if unit in ("m", "cm", "mm", "km") and not said & _JOINTS:
+        return "distance"
+    if found := next((_WORD_QUANTITIES[each] for each in words if each in _WORD_QUANTITIES), None):
+        return found
+    if said & _JOINTS and said & {"position", "angle", *_TARGET, *_COMMAND}:
+        return "joint position"
+    return None
+
+
+def _motion_in(
+    name: str, base: str, said: frozenset[str], unit: str | None, names: frozenset[str]
+) -> Quantity | None:
+    """Which speed it is, of robot, wheel, motor or joint; None where it is no speed."""
+    is_rate = unit in ("rad/s", "deg/s", "rpm")
+    is_speed = bool(said & {"speed", "velocity"}) or unit in ("m/s", "cm/s", "mm/s", "km/h")
+    if not (is_rate or is_speed or base in _DRIVING or said & {"command", "motor", "wheel"}):
+        return None
+    if said & _FREE_MOTORS:
+        return "motor speed"
+    if said & _JOINTS:
+        return "joint speed" if is_rate or is_speed else None
+    if "wheel" in said and not said & _NO_SPEED:
+        return "wheel speed"
+    if said & _GYROS:
+        return "angular velocity"
+    if said & _TURNING and (is_rate or is_speed or said & _COMMAND):
+        last = name.rpartition(".")[2]
+        return "turn rate" if last not in ("x", "y", "0", "1") else None
+    if said & {"yaw", "heading"} and (is_rate or "rate" in said):
+        return "turn rate"
+    side = side_in(name)
+    if base in ("wheel", "commanded_wheel"):
+        # Motors without a side may be those of propellers or of anything else.
+        return "wheel speed" if side or base == "commanded_wheel" else "motor speed"
+    if side and is_speed and not said & _NO_SPEED and _has_other_side(name, side, names):
+        return "wheel speed"
+    if base in ("commanded_speed", "speed"):
+        return "speed"
+    if is_speed and said <= _OF_SPEEDS:
+        return "speed"
+    return None
+
+
+_DRIVING: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
+_NO_SPEED: Final = frozenset((
+    "position", "angle", "tick", "distance", "torque", "force", "current", "power", "temperature",
+    "radius", "base", "track", "width", "slip", "contact", "gain", "count", "voltage", "limit",
+    "encoder", "odometry",
+))  # fmt: skip
+_OF_SPEEDS: Final = frozenset((
+    "speed", "velocity", "robot", "forward", "linear", "command", "target", "measured", "actual",
+    "m", "mm", "cm", "s", "km", "h", "ps", "mps", "setpoint", "desired", "reference", "body",
+    "gps", "base", "odometry",
+))  # fmt: skip
+
+
+def _has_other_side(name: str, side: str, names: frozenset[str]) -> bool:
+    """Whether a signal of the other side has the same words otherwise."""
+    other = {"left": "right", "right": "left"}
+    own = tuple(other.get(word, word) for word in words_in(name))
+    return any(words_in(each) == own for each in names if each != name)

@@ -41,7 +41,9 @@ _SHORT_FORMS: Final = {
     "batt": "battery", "volt": "voltage", "alt": "altitude", "hdg": "heading", "mag": "compass",
     "magnetometer": "compass", "commanded": "command", "omega": "angular", "num": "count",
     "baro": "pressure", "barometer": "pressure", "illuminance": "light", "brightness": "light",
-    "sonar": "distance", "lidar": "distance", "ultrasonic": "distance", "range": "distance",
+    "proximity": "distance", "ps": "distance", "ds": "distance", "ir": "distance",
+    "clearance": "distance", "sonar": "distance", "lidar": "distance", "range": "distance",
+    "ultrasonic": "distance",
 }  # fmt: skip
 _SIDES: Final = {
     "left": "left", "right": "right", "l": "left", "r": "right", "fl": "front left",
@@ -150,10 +152,28 @@ class Meaning:
         return self.source in FIRM
 
     @property
+    def is_sensed(self) -> bool:
+        """Whether it is the reading of a sensor: a known quantity that nobody set or counted."""
+        return self.quantity not in _NO_SENSOR and self.role in (None, "measured")
+
+    @property
     def sets(self) -> bool:
         """Whether it says what is wanted, not what is."""
         return self.role in ("commanded", "target")
 
+
+# A quantity that may be nothing at any time: an actuator is off, a foot is in the air, it is dark.
+CAN_BE_OFF: Final = frozenset[Quantity | None]((
+    "speed", "turn rate", "wheel speed", "motor speed", "joint speed", "force", "torque", "current",
+    "pressure", "light", "acceleration", "angular velocity",
+))  # fmt: skip
+# A quantity that cannot step away and back between two rows: its mass or capacity forbids it.
+INERT: Final = frozenset[Quantity | None]((
+    "x", "y", "height", "heading", "roll", "pitch", "joint position", "voltage", "temperature",
+    "percentage",
+))  # fmt: skip
+ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint position"))
+_NO_SENSOR: Final = frozenset[Quantity | None]((None, "count", "flag", "mode", "text", "time"))
 
 UNKNOWN: Final = Meaning(why="its name does not say what it is")
 

@@ -13,6 +13,7 @@ from webots_mcp.judging.detection.events import Found
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import Motion, RunNoise, Search
 from webots_mcp.signals.conditions.compiler import Expectation
+from webots_mcp.signals.meaning import Meaning
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_source import NOT_READ
 from webots_mcp.store.runs import RunInfo
@@ -98,6 +99,11 @@ class RunUnderCheck:
     def motion(self) -> Motion:
         """The signals of its motion."""
         return self.search.motion
+
+    @property
+    def meanings(self) -> dict[str, Meaning]:
+        """What each of its signals means."""
+        return self.search.meanings
 
     @cached_property
     def noise(self) -> RunNoise:

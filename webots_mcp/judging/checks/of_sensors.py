@@ -12,19 +12,14 @@ from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
-from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed, words_of
+from webots_mcp.signals.meaning import CAN_BE_OFF, INERT
+from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
 _MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first steps alone
 _LEAST_S: Final = 1.0  # as of what is missing
-_SET: Final = frozenset(
-    ("target", "setpoint", "goal", "desired", "commanded", "command", "cmd", "reference", "ref")
-)
-_RANGES: Final = frozenset(
-    ("distance", "range", "lidar", "sonar", "ir", "ds", "ps", "front", "left", "right", "rear")
-)
 _AT_LIMIT: Final = 0.05  # of the rows
 _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
@@ -81,8 +76,11 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
     names = _names_in(run)
     if name not in names.sensors or says.startswith("at "):
         return None
-    if says:  # its target went on
+    if says.startswith("frozen"):  # its target went on
         return "fail"
+    meaning = run.meanings[name]
+    if meaning.quantity in CAN_BE_OFF and flat.details.get("value") == 0:
+        return None
     frame = run.frame
     first, stop = frame.places([flat.start_s, flat.end_s]).tolist()
     before = frame.rows(max(0, first - OTHER_ROWS), first).usable(name)[1]
@@ -124,15 +122,12 @@ class _NamesIn:
 
     @cached_property
     def sensors(self) -> dict[str, RegisteredSignal]:
-        """The numbers that somebody measured, as far as their names tell."""
-        motion = self._run.motion
-        told = {motion.commanded, motion.speed, motion.mode, *motion.wheels, *motion.wheel_commands}
-        numbers = {each.name: each for each in self._run.search.numbers if not each.is_index}
-        aims = {aim for name in numbers for aim in find_targets(name, numbers)}
+        """The numbers that a sensor gave, as far as it is known what they mean."""
         return {
-            name: each for name, each in numbers.items()
-            if each not in told and name not in aims and not _SET.intersection(_words(name))
-        }  # fmt: skip
+            each.name: each
+            for each in self._run.search.numbers
+            if not each.is_index and self._run.meanings[each.name].is_sensed
+        }
 
 
 def _names_in(run: RunUnderCheck) -> _NamesIn:
@@ -141,10 +136,6 @@ def _names_in(run: RunUnderCheck) -> _NamesIn:
         shared[_NamesIn] = _NamesIn(run)
     names: _NamesIn = shared[_NamesIn]
     return names
-
-
-def _words(name: str) -> set[str]:
-    return {word for part in name.split(".") for word in words_of(part)}
 
 
 _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
@@ -174,7 +165,7 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
             name in names.place
             or signal.turn
             or names.target(name)
-            or not _RANGES.isdisjoint(_words(name))
+            or run.meanings[name].quantity == "distance"
         ):
             continue
         zones = run.frame.zones(name)
@@ -184,6 +175,8 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
         if len(np.unique(values)) < _MANY_VALUES:
             continue
         for limit in (float(values.min()), float(values.max())):
+            if limit == 0 and run.meanings[name].quantity in CAN_BE_OFF:
+                continue
             at = values == limit
             rests = runs_of(at, clock)
             long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
@@ -194,7 +187,11 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
 def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     """Warns where a signal went away and back at once, fails where it went to one value 3 times."""
     sensors = _names_in(run).sensors
-    gone = [e for e in run.events(JUMP.name) if "back" in e.details and e.name in sensors]
+    gone = [
+        each
+        for each in run.events(JUMP.name)
+        if "back" in each.details and each.name in sensors and _is_dropout(run, each)
+    ]
     if not gone:
         near = run.found.verdicts.nearest.get(JUMP.name)
         return Finding("pass", "none dropped out" + (f" ({near})" if near else ""))
@@ -205,6 +202,18 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
     return Finding(outcome, evidence, gone[0].start_s, len(gone), run.more(JUMP.name))
+
+
+def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
+    """Whether no motion and no switch explains that a reading went away and came back at once."""
+    quantity = run.meanings[jump.name or ""].quantity
+    if quantity in INERT:
+        return True
+    if quantity == "distance":  # other things may pass a sensor, but not at its very ends
+        zones = run.frame.zones(jump.name or "")
+        ends = (0.0, float(np.nanmin(zones.min)), float(np.nanmax(zones.max)))
+        return float(jump.details["after"]) in ends
+    return False
 
 
 def by_array(events: Iterable[Event]) -> list[Event]:

@@ -35,6 +35,7 @@ from webots_mcp.judging.detection.kinds import (
     NotSearchableError,
 )
 from webots_mcp.judging.detection.search import MOST_NAMED, Search
+from webots_mcp.signals.meaning import ANGLES, Meaning
 from webots_mcp.signals.naming import in_snake_case, listed, metres_in
 from webots_mcp.store.reading.frame import Frame, Zones
 from webots_mcp.store.signals import RegisteredSignal
@@ -51,6 +52,11 @@ BACK_HALF: Final = 0.5  # of a step: who comes back by so much to where it usual
 MOTION_SHARE: Final = 0.5  # of a step: the smallest neighbouring one of the same motion
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
 WHOLE_TURNS: Final = (math.tau, 360.0)
+COUNTERS: Final = tuple(float(2**bits) for bits in (8, 10, 12, 14, 15, 16, 24, 32))
+NEARLY_A_TURN: Final = 0.9
+LEAST_UNITS: Final = 3.0  # of the last digit: fewer may be its rounding
+MOST_DIGITS: Final = 9
+SAME_END: Final = 0.9  # of the pulses of a signal: so many go to one end of its range
 SWING_PERIOD_S: Final = 5.0  # of a longer one no single step is as a jump
 BESIDE_SWINGS_S: Final = 20.0  # before and after jumps: so long six half swings of it last
 SWING_HEIGHTS: Final = 2.6  # amplitudes: from one turn to the other it is 2, and noise adds some
@@ -79,24 +85,92 @@ def jump_events(search: Search) -> Iterator[Event]:
         if each.kind != "angle" and not each.is_index and each not in position
     ]
     for signal in search.in_time("jump", signals):
-        jumps, largest, least = find_jumps(frame, signal.name, search.options.jump_min_score)
+        meaning = search.meanings[signal.name]
+        turns = _turns_of(meaning)
+        jumps, largest, least = find_jumps(frame, signal.name, search.options.jump_min_score, turns)
+        jumps = [each for each in jumps if not _is_wrap(each, meaning)]
+        jumps = _above_resolution(jumps, frame, signal.name)
         if not jumps and largest < least < math.inf:
             unit = f" {signal.unit}" if signal.unit else ""
             near = f"{signal.name}: steps up to {largest:.2g}{unit}, a jump is one over {least:.2g}"
             search.note_nearest("jump", largest / least, near + unit)
         rows = int(frame.zones(signal.name).value_count.sum())
         if len(jumps) > max(3, MOST_JUMPS_SHARE * rows):
+            dropouts = _to_one_end(jumps, frame, signal.name)
+            yield from (_event(search, signal.name, each) for each in dropouts)
+            if dropouts:
+                continue
             many = f"not in {signal.name}: large steps are normal for it ({len(jumps)} found)"
             search.not_searched("jump", many)
             continue
-        for each in jumps:
-            details = {"before": each.before, "after": each.after}
-            details |= {} if each.back is None else {"back": each.back}
-            yield search.event("jump", each.start_s, each.end_s, signal.name, **details)
+        if not jumps and largest and least == math.inf and not (meaning.sets or _steps(meaning)):
+            few = f"not in {signal.name}: it changed too seldom to tell what is usual"
+            search.not_searched("jump", few)
+        yield from (_event(search, signal.name, each) for each in jumps)
     if position:
         x, y = (each.name for each in position)
         for time_s, length_m in find_leaps(frame, x, y, search.options.jump_m):
             yield search.event("jump", time_s, time_s, "position", distance_m=length_m)
+
+
+def _event(search: Search, name: str, jump: Jump) -> Event:
+    details = {"before": jump.before, "after": jump.after}
+    details |= {} if jump.back is None else {"back": jump.back}
+    return search.event("jump", jump.start_s, jump.end_s, name, **details)
+
+
+def _steps(meaning: Meaning) -> bool:
+    """Whether it changes in steps by nature."""
+    return meaning.quantity in ("count", "flag", "mode")
+
+
+def _turns_of(meaning: Meaning) -> tuple[float, ...]:
+    """At which values it may begin again at 0: whole turns, and the ends of counters."""
+    return (*WHOLE_TURNS, *COUNTERS) if meaning.quantity == "count" else WHOLE_TURNS
+
+
+def _is_wrap(jump: Jump, meaning: Meaning) -> bool:
+    """Whether an angle crossed the end of its scale; what leaps by a whole turn is an angle."""
+    if meaning.quantity is not None and meaning.quantity not in ANGLES:
+        return False
+    largest = max(abs(jump.before), abs(jump.after), jump.size)
+    return any(largest <= turn and jump.size >= NEARLY_A_TURN * turn for turn in WHOLE_TURNS)
+
+
+def _above_resolution(jumps: Sequence[Jump], frame: Frame, name: str) -> Sequence[Jump]:
+    """Those of more than a few units of the last digit that the signal has."""
+    if not jumps:
+        return jumps
+    spans = _sampled(frame.zones(name), frame.zones(name).value_count, 1)
+    values = np.concatenate([np.zeros(0), *(frame.rows(*span).usable(name)[1] for span in spans)])
+    unit = resolution_of(values)
+    return [each for each in jumps if each.size > LEAST_UNITS * unit]
+
+
+def resolution_of(values: Array) -> float:
+    """The unit of the last decimal digit of some values; 0 of those that are not rounded."""
+    for digits in range(MOST_DIGITS + 1):
+        scaled = values * 10**digits
+        if np.all(
+            np.abs(scaled - np.round(scaled)) <= 1e-6 * np.maximum(1.0, np.abs(scaled) * 1e-6)
+        ):
+            return float(10**-digits)
+    return 0.0
+
+
+def _to_one_end(jumps: Sequence[Jump], frame: Frame, name: str) -> Sequence[Jump]:
+    """Those that all went to the same end of the signal's range and came back, however many."""
+    pulses = [each for each in jumps if each.back is not None]
+    if not pulses:
+        return []
+    zones = frame.zones(name)
+    ends = (float(np.nanmin(zones.min)), float(np.nanmax(zones.max)))
+    found: list[Jump] = []
+    for end in ends:
+        own = [each for each in pulses if each.after == end]
+        if len(own) >= SAME_END * len(pulses):
+            found = own
+    return found
 
 
 @dataclass(frozen=True)
@@ -122,7 +196,9 @@ class Jump:
         return abs(self.after - self.before)
 
 
-def find_jumps(frame: Frame, name: str, score: float) -> tuple[list[Jump], float, float]:
+def find_jumps(
+    frame: Frame, name: str, score: float, turns: tuple[float, ...] = WHOLE_TURNS
+) -> tuple[list[Jump], float, float]:
     """Steps whose modified z-score (see `find_spikes`) is above the score; the largest step of all;
     and what a step has to be larger than.
 
@@ -142,13 +218,14 @@ def find_jumps(frame: Frame, name: str, score: float) -> tuple[list[Jump], float
         frame: The rows.
         name: Of the signal.
         score: How much larger than usual a step has to be.
+        turns: Where its values may begin again at 0.
     """
     zones = frame.zones(name)
     changes, largest = _steps_of(zones)
     for most in (1, SAMPLED_CHUNKS):
         parts = [frame.rows(*span).usable(name) for span in _sampled(zones, changes, most)]
         interval_s = _interval_s([times for times, _ in parts])
-        staying = (_staying(*part, interval_s) for part in parts)
+        staying = (_staying(*part, interval_s, turns) for part in parts)
         sizes = np.concatenate([np.zeros(0), *staying])
         is_known = len(sizes) >= LEAST_STEPS
         middle = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2]) if is_known else 0.0
@@ -159,7 +236,11 @@ def find_jumps(frame: Frame, name: str, score: float) -> tuple[list[Jump], float
     found: dict[float, Jump] = {}
     for start, stop in wanted:
         part = frame.rows(start - MARGIN_ROWS, stop + MARGIN_ROWS).usable(name)
-        jumps = _wide(*part, limit, interval_s) if is_known else _excursions(*part, interval_s)
+        jumps = (
+            _wide(*part, limit, interval_s, turns)
+            if is_known
+            else _excursions(*part, interval_s, turns)
+        )
         found |= {jump.start_s: jump for jump in jumps}
     jumps = _without_swings(list(found.values()), frame, name)
     sizes = float(largest.max(initial=0.0)), limit if is_known else math.inf
@@ -196,11 +277,13 @@ def _sampled(zones: Zones, weights: Indexes, most: int) -> list[tuple[int, int]]
     return zones.spans(sampled)
 
 
-def _wide(times: Array, values: Array, limit: float, interval_s: float) -> Iterator[Jump]:
+def _wide(
+    times: Array, values: Array, limit: float, interval_s: float, turns: tuple[float, ...]
+) -> Iterator[Jump]:
     """The steps above a limit that are no part of a motion."""
     steps = np.pad(np.diff(values), 1)
     wide = np.flatnonzero(np.abs(steps[1:-1]) > limit)
-    far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide, interval_s)
+    far = _step(values[wide], values[wide + 1], turns) > limit * _intervals(times, wide, interval_s)
     here, sign = np.abs(steps[wide + 1]), np.sign(steps[wide + 1])
     beside = np.maximum(steps[wide] * sign, steps[wide + 2] * sign)
     for row in wide[far & (beside < MOTION_SHARE * here)].tolist():
@@ -208,18 +291,20 @@ def _wide(times: Array, values: Array, limit: float, interval_s: float) -> Itera
         yield Jump(time_s, time_s, float(values[row]), float(values[row + 1]))
 
 
-def _staying(times: Array, values: Array, interval_s: float) -> Array:
+def _staying(times: Array, values: Array, interval_s: float, turns: tuple[float, ...]) -> Array:
     """The sizes of the steps that are not zero and are no part of an excursion."""
     steps = np.abs(np.diff(values))
     stays = steps > 0
-    for left, back in zip(*_come_back(times, values, steps, interval_s), strict=True):
+    for left, back in zip(*_come_back(times, values, steps, interval_s, turns), strict=True):
         stays[left:back] = False
     return steps[stays]
 
 
-def _excursions(times: Array, values: Array, interval_s: float) -> Iterator[Jump]:
+def _excursions(
+    times: Array, values: Array, interval_s: float, turns: tuple[float, ...]
+) -> Iterator[Jump]:
     """The values that left one that had rested and came back soon."""
-    lefts, backs = _come_back(times, values, np.abs(np.diff(values)), interval_s)
+    lefts, backs = _come_back(times, values, np.abs(np.diff(values)), interval_s, turns)
     for row, back in zip(lefts.tolist(), backs.tolist(), strict=True):
         away = values[row + 1 : back]
         farthest = float(away[np.abs(away - values[row]).argmax()])
@@ -228,7 +313,7 @@ def _excursions(times: Array, values: Array, interval_s: float) -> Iterator[Jump
 
 
 def _come_back(
-    times: Array, values: Array, steps: Array, interval_s: float
+    times: Array, values: Array, steps: Array, interval_s: float, turns: tuple[float, ...]
 ) -> tuple[Indexes, Indexes]:
     """Rows after which a value that had rested left, and rows in which it was back soon after.
 
@@ -236,7 +321,7 @@ def _come_back(
     """
     # At the turn of a swing two rows may meet the same value; three are a rest.
     left = np.flatnonzero((steps[2:] > 0) & (steps[1:-1] == 0) & (steps[:-2] == 0)) + 2
-    left = left[_step(values[left], values[left + 1]) > 0]
+    left = left[_step(values[left], values[left + 1], turns) > 0]
     backs = np.zeros(len(left), np.intp)
     for later in range(LONGEST_EXCURSION + 1, 1, -1):
         after = np.minimum(left + later, len(values) - 1)
@@ -291,11 +376,11 @@ def _intervals(times: Array, rows: Indexes, interval_s: float) -> Array:
     return np.maximum(1.0, (times[rows + 1] - times[rows]) / interval_s)
 
 
-def _step(before: Array, after: Array) -> Array:
+def _step(before: Array, after: Array, turns: tuple[float, ...]) -> Array:
     """How far it is from one to the other; the short way round where they may be angles."""
     far = np.abs(after - before)
     largest = np.maximum(np.maximum(np.abs(before), np.abs(after)), far)
-    return np.min([far, *(np.where(largest <= turn, turn - far, far) for turn in WHOLE_TURNS)], 0)
+    return np.min([far, *(np.where(largest <= turn, turn - far, far) for turn in turns)], 0)
 
 
 def _with_return(jumps: Sequence[Jump], usual: float) -> Iterator[Jump]:

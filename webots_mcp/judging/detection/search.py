@@ -24,7 +24,7 @@ from webots_mcp.judging.detection.kinds import (
     NotAskedError,
     NotSearchableError,
 )
-from webots_mcp.signals.meaning import Quantity
+from webots_mcp.signals.meaning import Meaning, Quantity
 from webots_mcp.signals.naming import FARTHEST_M, listed, metres_in, unit_in
 from webots_mcp.signals.register import first_in, pair_in
 from webots_mcp.store.chunks import shown
@@ -476,6 +476,11 @@ class Search:
     def motion(self) -> Motion:
         """The signals that tell how the robot moves in this run."""
         return motion_in(self.whole, self.known, self.options)
+
+    @cached_property
+    def meanings(self) -> dict[str, Meaning]:
+        """What each signal of the robot means."""
+        return meanings_of(self.known)
 
     @cached_property
     def signals(self) -> list[RegisteredSignal]:

@@ -186,7 +186,7 @@ def _caller(question: Question, recording: Recording) -> Generator[Caller | None
     if not question.has_caller:
         yield None
         return
-    from webots_mcp.steering.routes import Companions, Launcher
+    from webots_mcp.steering.launcher import Companions, Launcher
     from webots_mcp.steering.trial_worker import TrialWorkers
 
     companions = Companions(TrialWorkers(recording), Launcher(recording))

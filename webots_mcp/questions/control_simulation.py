@@ -29,8 +29,11 @@ from webots_mcp.questions.show_pictures import show_end
 from webots_mcp.simulator.launch import Launch, SessionStart, require_world
 from webots_mcp.simulator.orders import Order
 from webots_mcp.simulator.starting import Mode, Start, free_port
-from webots_mcp.steering.dispatch import ACTION, Dispatcher, require_possible
-from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.launcher import project_of
+from webots_mcp.steering.routes import Attempt
+from webots_mcp.steering.run_command import ACTION, require_possible
+from webots_mcp.steering.world_request import WorldRequest
 from webots_mcp.store.recording import Recording
 
 Port = Annotated[

@@ -43,7 +43,8 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.questions.send_command import settable
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.parameter import require_known
-from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
+from webots_mcp.steering.run_command import ACTION, known_names, require_possible
+from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
 from webots_mcp.store.parameters import (

@@ -54,7 +54,10 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.signals.naming import nearest_first
 from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
-from webots_mcp.steering.dispatch import Dispatcher, Report, find_target, holds_since, shown_result
+from webots_mcp.steering.command_answer import shown_result
+from webots_mcp.steering.dispatch import Dispatcher, ProgressReport
+from webots_mcp.steering.run_command import holds_since
+from webots_mcp.steering.target import find_target
 from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, described
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.segment import Subject
@@ -363,7 +366,7 @@ When = Literal["now", "reset"]
 
 async def set_parameters(
     recording: Recording,
-    report: Report,
+    report: ProgressReport,
     values: Mapping[str, Value],
     *,
     when: When = "now",

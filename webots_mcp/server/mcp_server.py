@@ -61,7 +61,7 @@ from webots_mcp.questions.declaring import (
 )
 from webots_mcp.signals.naming import harmless_first, perhaps_meant
 from webots_mcp.simulator.console import ConsoleWatch
-from webots_mcp.steering.routes import Companions, Launcher
+from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
 from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, take_in_journals

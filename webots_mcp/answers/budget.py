@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
-from webots_mcp.answers.models import Answer, Table
+from webots_mcp.answers.models import Answer, AnswerTable
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, shown_time
@@ -48,7 +48,7 @@ MOST_RUNS: Final = 5  # of which one answer tells
 
 
 @dataclass(frozen=True)
-class Limits:
+class ShorteningLimits:
     """How much of one value is shown."""
 
     items: int
@@ -67,19 +67,19 @@ class Limits:
 
 # From generous to tight: the first under which a value fits its budget is taken. Names go last.
 GLANCE: Final = (
-    Limits(items=16, text=200, keys=64, depth=8),
-    Limits(items=8, text=80, keys=32, depth=5),
-    Limits(items=4, text=40, keys=20, depth=3),
-    Limits(items=2, text=20, keys=10, depth=2),
-    Limits(items=2, text=12, keys=6, depth=1),
+    ShorteningLimits(items=16, text=200, keys=64, depth=8),
+    ShorteningLimits(items=8, text=80, keys=32, depth=5),
+    ShorteningLimits(items=4, text=40, keys=20, depth=3),
+    ShorteningLimits(items=2, text=20, keys=10, depth=2),
+    ShorteningLimits(items=2, text=12, keys=6, depth=1),
 )
 
 
 WHOLE: Final = tuple(
     replace(limits, exact=True)
     for limits in (
-        Limits(items=2000, text=4000, keys=1000, depth=20),
-        Limits(items=16, text=200, keys=1000, depth=20),
+        ShorteningLimits(items=2000, text=4000, keys=1000, depth=20),
+        ShorteningLimits(items=16, text=200, keys=1000, depth=20),
         *GLANCE,
     )
 )
@@ -106,7 +106,9 @@ def wall_clock(wall_time_s: float) -> str:
 
 
 def shorten(
-    value: Any, budget_tokens: int = STATE_BUDGET_TOKENS, levels: Sequence[Limits] = GLANCE
+    value: Any,
+    budget_tokens: int = STATE_BUDGET_TOKENS,
+    levels: Sequence[ShorteningLimits] = GLANCE,
 ) -> Shortened:
     """Make a JSON value fit `budget_tokens` of compact JSON, as `tokens_in` counts them.
 
@@ -172,7 +174,7 @@ def _cut(text: str, longest: int) -> str:
 
 
 class _Shortener:
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: ShorteningLimits) -> None:
         self._limits = limits
         self.cut = False
 
@@ -249,7 +251,7 @@ def _counts(others: list[Any]) -> dict[str, int]:
     return {name: names.count(name) for name in dict.fromkeys(names)}
 
 
-_AT_LENGTH: Final = (Limits(items=2000, text=20_000, keys=1000, depth=20),)
+_AT_LENGTH: Final = (ShorteningLimits(items=2000, text=20_000, keys=1000, depth=20),)
 
 _A = TypeVar("_A", bound=Answer)
 _T = TypeVar("_T")
@@ -349,18 +351,18 @@ def fitting(items: Sequence[_T], budget_tokens: int | None = None) -> list[_T]:
     return kept
 
 
-def table(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None:
+def table(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable | None:
     """A table, or None without rows."""
-    return Table(columns=list(columns), rows=list(rows)) if rows else None
+    return AnswerTable(columns=list(columns), rows=list(rows)) if rows else None
 
 
-def without_empty(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None:
+def without_empty(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable | None:
     """A table without the columns that have no value in any row."""
     kept = [index for index in range(len(columns)) if any(row[index] is not None for row in rows)]
     return table([columns[index] for index in kept], [[row[i] for i in kept] for row in rows])
 
 
-def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None:
+def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable | None:
     """A table that says once what all its rows share; the first column names the row."""
     full = without_empty(columns, rows)
     if full is None or len(rows) < 2:
@@ -368,7 +370,7 @@ def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None
     values = [[row[index] for row in full.rows] for index in range(len(full.columns))]
     kept = [i for i, column in enumerate(values) if not i or len({*map(compact_json, column)}) > 1]
     shared = {name: values[i][0] for i, name in enumerate(full.columns) if i not in kept}
-    told = Table(
+    told = AnswerTable(
         columns=[full.columns[i] for i in kept], rows=[[row[i] for i in kept] for row in full.rows]
     )
     told.in_every_row = shared or None

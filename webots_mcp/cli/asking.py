@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from webots_mcp.cli.options import (
     Json,
     Parameter,
-    Range,
+    TimeRangeOptions,
     Where,
     make_chunks_first,
     refuse_options,
@@ -92,7 +92,7 @@ def command_of(question: Question) -> Callable[..., None]:
 
     def run(
         *positional: Any,
-        span: Range | None = None,
+        span: TimeRangeOptions | None = None,
         recorded: Where | None = None,
         json: bool = False,
         follow: bool = False,
@@ -113,7 +113,11 @@ def command_of(question: Question) -> Callable[..., None]:
     parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
     if in_range:
-        parameters.append(inspect.Parameter("span", keyword, default=Range(), annotation=Range))
+        parameters.append(
+            inspect.Parameter(
+                "span", keyword, default=TimeRangeOptions(), annotation=TimeRangeOptions
+            )
+        )
     if question.follows:
         parameters.append(inspect.Parameter("follow", keyword, default=False, annotation=_FOLLOW))
     parameters += [

@@ -245,7 +245,7 @@ class ToWebots(Waiting):
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Range:
+class TimeRangeOptions:
     """Which run of which robot, and which stretch of it: the options that commands share."""
 
     robot: Robot = None
@@ -345,7 +345,7 @@ def _name_of(name: str) -> str:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Limits:
+class RetentionOptions:
     """How much is kept of what, as it was typed; by the names of `Retention`."""
 
     state: Annotated[str | None, _option("state", "Keep so much of recorded states ({}).")] = None

@@ -244,10 +244,10 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
 
 def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
     """The Python that can run the observer, where the one that Webots takes cannot."""
-    from webots_mcp.setup.interpreter import look_into
+    from webots_mcp.setup.interpreter import probe_interpreter
     from webots_mcp.setup.project_edits import python_change
 
-    found = look_into(controller)
+    found = probe_interpreter(controller)
     if found.error is None:
         return []
     change = python_change(controller, sys.executable)
@@ -311,7 +311,7 @@ def _make_ready(
     """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER, PROJECT_FILE
     from webots_mcp.setup import client_entries
-    from webots_mcp.setup.skills import parts_of
+    from webots_mcp.setup.skills import managed_texts
     from webots_mcp.setup.wsl import windows_server
     from webots_mcp.simulator.project import controllers_of, project_of
 
@@ -334,7 +334,7 @@ def _make_ready(
     for each in clients:
         planned = partial(client_entries.plan_entry, each, name, line)
         files += [{"client": each.name} | _written(each.file, writing, planned)]
-    files += [_written(e.file, writing, e.plan) for e in parts_of(project)] if skills else []
+    files += [_written(e.file, writing, e.plan) for e in managed_texts(project)] if skills else []
     controllers = [_described(found, project) for found in controllers_of(project)]
     hindrance = None if http or of_windows else client_entries.server_hindrance()
     notes = [note for note in (border, hindrance, expected) if note]
@@ -410,7 +410,7 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     """A controller, the lines that it needs, and the Python that it is started with."""
     from dataclasses import asdict
 
-    from webots_mcp.setup.interpreter import look_into
+    from webots_mcp.setup.interpreter import probe_interpreter
     from webots_mcp.setup.project_edits import (
         IMPORT,
         AlreadyPatchedError,
@@ -441,7 +441,7 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     if is_plain_robot(controller.file) and not has_observer(project):
         lacks = f"its robot {NO_SUPERVISOR}. {NO_POSITION_OF_ITS_OWN}"
         described["lacks"] = f"{lacks}: {offer_observer(project)}"
-    python = asdict(look_into(controller.file))
+    python = asdict(probe_interpreter(controller.file))
     known = {name: value for name, value in python.items() if value is not None}
     return described | {"python": known}
 

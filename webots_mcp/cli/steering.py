@@ -375,7 +375,7 @@ def run_plan(recording: Recording, plan: WorldPlan, options: TrialOptions) -> in
             ending_by_event(set_run.stopping),
         ):
             set_id = _set_of(recording, plan, options)
-            run_trials(set_run, set_id, _Progress(recording, set_id, plan).tell)
+            run_trials(set_run, set_id, _TrialProgress(recording, set_id, plan).tell)
     return set_id
 
 
@@ -456,7 +456,7 @@ def _text_of(plan: WorldPlan, options: TrialOptions) -> str:
     return json.dumps({"stand_in": options.stand_in, **json.loads(plan.text)}, sort_keys=True)
 
 
-class _Progress:
+class _TrialProgress:
     """A line on stderr for each trial that is over, and for each set that takes the lead."""
 
     def __init__(self, recording: Recording, set_id: int, plan: WorldPlan) -> None:

@@ -31,7 +31,7 @@ from webots_mcp.answers.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.answers.models import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
+from webots_mcp.answers.models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
 from webots_mcp.judging.checks.finding import Finding
@@ -376,7 +376,7 @@ def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None]
     return [None if each is None else figures([each.low, each.high]) for each in spreads]
 
 
-def _groups(found: Comparison) -> Table | None:
+def _groups(found: Comparison) -> AnswerTable | None:
     robots = {run.robot for group in found.groups for run in group.runs}
     rows = [_group_row(group, told_robot=len(robots) > 1) for group in found.groups]
     return condensed(GROUP_COLUMNS, rows)

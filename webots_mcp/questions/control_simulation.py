@@ -26,7 +26,7 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.questions.show_pictures import show_end
-from webots_mcp.simulator.launch import Launch, SessionStart, require_world
+from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, require_world
 from webots_mcp.simulator.orders import Order
 from webots_mcp.simulator.starting import Mode, Start, free_port
 from webots_mcp.steering.dispatch import Dispatcher
@@ -193,7 +193,7 @@ def _request(
     return WorldRequest(recording, dispatcher, robot, timeout_wall_s, caller.companions.webots)
 
 
-async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStart | None:
+async def _wait(launched: WebotsLaunch, caller: Caller, until_s: float) -> SessionStart | None:
     """Until a controller records; None where the time was over first.
 
     Raises:
@@ -201,7 +201,7 @@ async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStar
     """
     begun_s = time.monotonic()
     while True:
-        is_over = launched.webots.is_over  # before the look: what came last is seen
+        is_over = launched.webots.is_over  # checked first, so that rows of its last moment are read
         first = await to_thread.run_sync(launched.first_record)
         if first is not None or time.monotonic() > until_s:
             return first
@@ -216,7 +216,7 @@ async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStar
 
 
 def _answer(
-    recording: Recording, launched: Launch, first: SessionStart | None, started_s: float
+    recording: Recording, launched: WebotsLaunch, first: SessionStart | None, started_s: float
 ) -> CommandAnswer:
     header: dict[str, Any] = {}
     if first is not None:
@@ -234,7 +234,7 @@ def _answer(
     )
 
 
-def _then(launched: Launch) -> str:
+def _then(launched: WebotsLaunch) -> str:
     """How a start in pause goes on."""
     if launched.start.mode != "pause":
         return ""
@@ -243,7 +243,7 @@ def _then(launched: Launch) -> str:
     return f". {by_us if launched.start.streams else alone}"
 
 
-def _described(launched: Launch) -> dict[str, Any]:
+def _described(launched: WebotsLaunch) -> dict[str, Any]:
     address = launched.webots.address
     return {
         "world": str(launched.world),

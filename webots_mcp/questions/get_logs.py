@@ -10,7 +10,7 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from webots_mcp.answers.budget import cut_text, fitting, is_for_a_person, wall_clock
-from webots_mcp.answers.models import LogsAnswer, Table
+from webots_mcp.answers.models import AnswerTable, LogsAnswer
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.declaring import (
@@ -130,12 +130,12 @@ def _row(line: LogLine) -> dict[str, object]:
     }
 
 
-def _table(lines: list[LogLine], *, time_of_day: bool) -> Table:
+def _table(lines: list[LogLine], *, time_of_day: bool) -> AnswerTable:
     columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
     if time_of_day:
         columns.insert(columns.index("sim_time_s") + 1, "time")
     rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]
-    return Table(columns=columns, rows=[[row[name] for name in columns] for row in rows])
+    return AnswerTable(columns=columns, rows=[[row[name] for name in columns] for row in rows])
 
 
 def _answer(

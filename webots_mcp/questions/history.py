@@ -24,10 +24,10 @@ from webots_mcp.answers.budget import (
     without_empty,
 )
 from webots_mcp.answers.models import (
+    AnswerPart,
     ChangeSeries,
     HistoryAnswer,
     NumberSeries,
-    Part,
     RowColumns,
     RunSeries,
     RunTrendTables,
@@ -223,7 +223,7 @@ def _likely_points(view: View, asked: TimeRange, names: Sequence[str], budget_to
     return max(1, room // (_CELL_TOKENS * max(numbers, 1)))
 
 
-def _told(part: Part) -> dict[str, Any]:
+def _told(part: AnswerPart) -> dict[str, Any]:
     return part.model_dump(mode="json", exclude_none=True)
 
 

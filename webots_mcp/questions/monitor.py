@@ -161,7 +161,7 @@ def _of_earlier(told: Sequence[RunTrends]) -> list[str]:
     return [f"the trends of run {earlier}: webots_get_trends(run_id)"] if earlier else []
 
 
-def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:
+def _in_window(event: Event, window: WatchedWindow, wall_start_s: float) -> bool:
     """Whether it began in the window, or had begun before and lasted into it."""
     starts = (each.start_s for each in window.rows.segments if each.run_id == event.run_id)
     lasted = event.start_s < min(starts, default=math.inf) <= event.end_s
@@ -194,7 +194,7 @@ def _why_nothing(view: View) -> str:
 
 
 @dataclass(frozen=True)
-class Window:
+class WatchedWindow:
     """The recording since a moment.
 
     Attributes:
@@ -207,7 +207,7 @@ class Window:
     around: TimeRange
 
 
-def window_from(view: View, wall_start_s: float) -> Window:
+def window_from(view: View, wall_start_s: float) -> WatchedWindow:
     """The window of a robot from that wall time (Unix) on."""
     found = find_range(view.connection, Scope(since_wall_time=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
@@ -216,7 +216,7 @@ def window_from(view: View, wall_start_s: float) -> Window:
         for segment in found.segments or [_standing(view, wall_start_s)]
     ]
     around[-1] = replace(around[-1], end_s=math.inf)
-    return Window(found, replace(found, segments=tuple(around)))
+    return WatchedWindow(found, replace(found, segments=tuple(around)))
 
 
 def _from_row_before(connection: sqlite3.Connection, segment: Segment) -> float:

@@ -22,7 +22,7 @@ from webots_mcp.answers.budget import (
     room_tokens,
     tokens_of,
 )
-from webots_mcp.answers.models import SqlAnswer, Table
+from webots_mcp.answers.models import AnswerTable, SqlAnswer
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.declaring import READS, ShownLimit, question
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
@@ -98,7 +98,7 @@ async def webots_query_sql(
     less = _LESS.format(deleted) if deleted and _OF_STATES.search(sql) else None
     return SqlAnswer(
         **header,
-        result=Table(columns=columns, rows=rows),
+        result=AnswerTable(columns=columns, rows=rows),
         truncated=_truncated(found, len(rows), longest),
         hint="; ".join(filter(None, (less, wide or _none(rows)))) or None,
     )

@@ -30,12 +30,12 @@ from webots_mcp.answers.budget import (
     tokens_of,
 )
 from webots_mcp.answers.models import (
+    AnswerTable,
     DiagnosisAnswer,
     FullStateAnswer,
     RobotsAnswer,
     SensorsAnswer,
     StateAnswer,
-    Table,
     WorldAnswer,
 )
 from webots_mcp.contract import CUSTOM_DATA
@@ -179,7 +179,7 @@ def webots_get_world_info(
             runs_recorded=count_runs(view.connection, view.robot.id),
             controller=_controller(view, session),
             devices=_devices(view.robot.devices),
-            other_robots=Table(columns=["robot", "kind", "pause_state"], rows=shown)
+            other_robots=AnswerTable(columns=["robot", "kind", "pause_state"], rows=shown)
             if shown
             else None,
             database=name_of(recording.database),
@@ -192,7 +192,7 @@ def webots_get_world_info(
         return answer.model_copy(update=seen | {"hint": "; ".join(filter(None, hints)) or None})
 
 
-def _robots(views: list[View], *, told: bool) -> Table:
+def _robots(views: list[View], *, told: bool) -> AnswerTable:
     """A row for each; what could not be recorded only where there is any, or for a person."""
     columns, rows = [*_ROBOT_COLUMNS], [_row(view) for view in views]
     recorders = [_recorder(view) for view in views]
@@ -202,7 +202,7 @@ def _robots(views: list[View], *, told: bool) -> Table:
             columns.append(name)
             for row, value in zip(rows, values, strict=True):
                 row.append(value)
-    return Table(columns=columns, rows=rows)
+    return AnswerTable(columns=columns, rows=rows)
 
 
 def _recorder(view: View) -> dict[str, Any]:
@@ -236,7 +236,7 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
     return {
         "title": world.told.get("title"),
         "observer": world.observer,
-        "in_world": Table(columns=used, rows=rows),
+        "in_world": AnswerTable(columns=used, rows=rows),
         "hint": more if len(rows) < len(bodies) or world.told.get("more") else None,
     }
 
@@ -574,7 +574,7 @@ def _longest_that_fits(sizes: Collection[int], budget: int) -> int:
     return max(sizes, default=0)
 
 
-def _events(view: View) -> Table:
+def _events(view: View) -> AnswerTable:
     """The newest events that fit, the oldest of them first."""
     events = newest_events(view.connection, view.require_run().id, _EVENTS)
     rows = [
@@ -582,7 +582,7 @@ def _events(view: View) -> Table:
         for event in reversed(events)
     ]
     shown = fitting(rows, _EVENTS_TOKENS)[::-1]
-    return Table(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
+    return AnswerTable(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
 
 
 def _health(view: View) -> dict[str, Any] | None:

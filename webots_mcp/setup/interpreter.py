@@ -179,7 +179,7 @@ def _of_registry() -> dict[str, str]:
     return found
 
 
-def look_into(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpreter:
+def probe_interpreter(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpreter:
     """Start the Python of a controller as Webots would, and import the bridge there."""
     by_rule = chosen(controller)
     settings = {"command": " ".join(by_rule.command), "chosen_by": by_rule.by}

@@ -81,7 +81,7 @@ class AttachingPlace(NamedTuple):
     statement: str
 
 
-class _Place(NamedTuple):
+class _InsertionPoint(NamedTuple):
     """The statement after which the robot is attached, what attaches it, and the import's."""
 
     after: ast.stmt
@@ -237,7 +237,7 @@ def _parsed(source: bytes) -> ast.Module:
         raise InvalidInputError(f"it is no Python that can be read: {error}") from error
 
 
-def _place(module: ast.Module) -> _Place:
+def _place(module: ast.Module) -> _InsertionPoint:
     """Where the robot is attached: after its constructor, or after it was assigned to a name."""
     nodes = list(ast.walk(module))
     _refuse_bridge(nodes)
@@ -273,7 +273,7 @@ def _place(module: ast.Module) -> _Place:
         raise InvalidInputError(
             f"the module controller is imported inside the block of line {imported.lineno}"
         )
-    return _Place(after, f"{_BRIDGE}.attach({attach})", imported)
+    return _InsertionPoint(after, f"{_BRIDGE}.attach({attach})", imported)
 
 
 def _refuse_bridge(nodes: list[ast.AST]) -> None:
@@ -435,7 +435,7 @@ def _insert(lines: list[bytes], after: int, line: bytes) -> None:
     lines.insert(after, line + ending)
 
 
-def _indented(lines: list[bytes], place: _Place, encoding: str) -> bytes:
+def _indented(lines: list[bytes], place: _InsertionPoint, encoding: str) -> bytes:
     """What attaches the robot, indented as the statement before it.
 
     Raises:

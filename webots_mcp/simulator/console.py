@@ -310,19 +310,19 @@ class ConsoleWatch(threading.Thread):
         self._warned_of = ""
 
     def run(self) -> None:
-        """Look until stopped; whatever goes wrong ends a look, never the thread."""
+        """Search until stopped; whatever goes wrong ends one search, never the thread."""
         pause_s = _FIRST_LOOK_S
         while not self._ending.wait(pause_s):
             pause_s = _LOOK_EVERY_S
             try:
-                self.look()
+                self.follow_new()
             except Exception as error:  # noqa: BLE001  (it is reported)
                 if str(error) != self._warned_of:
                     self._warned_of = str(error)
                     warn(f"no console of Webots is followed: {error}")
 
-    def look(self) -> None:
-        """Follow what is not followed yet.
+    def follow_new(self) -> None:
+        """Follow each Webots of the recording that is not followed yet.
 
         Raises:
             DatabaseError: The recording cannot be read.

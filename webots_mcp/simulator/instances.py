@@ -220,7 +220,7 @@ def instances() -> list[Instance]:
         if arguments is not None:
             found[process.pid] = arguments
             starters.add(process.info["ppid"])
-    return [_look(pid, found[pid]) for pid in sorted(found.keys() - starters)]
+    return [_inspect_process(pid, found[pid]) for pid in sorted(found.keys() - starters)]
 
 
 def instance_at(port: int) -> Instance | None:
@@ -239,7 +239,7 @@ def _arguments(command_line: Sequence[str]) -> list[str] | None:
     return None
 
 
-def _look(pid: int, arguments: list[str]) -> Instance:
+def _inspect_process(pid: int, arguments: list[str]) -> Instance:
     words = [word[2:].partition("=") for word in arguments if word.startswith("--")]
     options = {name: value for name, _, value in words}
     asked = options.get("port", "")

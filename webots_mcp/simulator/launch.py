@@ -88,7 +88,7 @@ class SessionStart(NamedTuple):
     world: str | None
 
 
-class Launch:
+class WebotsLaunch:
     """A Webots that we have started, and what is recorded in it.
 
     Args:

@@ -277,21 +277,21 @@ class Observer:
         if not self._pace.go_on(may_step=not self.bridge.steps_world):
             return False
         try:
-            self._look()
+            self._observe()
         except Exception as error:  # noqa: BLE001  (it still steers, and looks again later)
             self.bridge.failed(error)
         self.bridge.get_command()
         return True
 
-    def _look(self) -> None:
-        """Look around, and record where everything is if it is time to."""
+    def _observe(self) -> None:
+        """Follow what is in the world, and record where everything is if that is due."""
         sim_time_s = float(self._robot.getTime())
         if self.bridge.detect_reload():
             self.world.begin_run()
             self._due_s = -math.inf
         self._record_news()
         is_due = sim_time_s >= self._due_s
-        if is_due and (seen := self.world.look(sim_time_s)):
+        if is_due and (seen := self.world.read_poses(sim_time_s)):
             self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
             self.bridge.publish(seen)
         self.custom_data.look(
@@ -420,8 +420,8 @@ class ObservedBody:
         node: Any = self.scene.node
         return int(node.getId()) == self.scene.id
 
-    def look(self, sim_time_s: float) -> bool:
-        """See where it is now; False where its node is not there any more, or has no place."""
+    def update_pose(self, sim_time_s: float) -> bool:
+        """Read where it is now; return False if its node was removed or has no position."""
         place = self._seen(sim_time_s) if self.is_there else None
         if place is not None:
             self._go_on(place)
@@ -539,9 +539,9 @@ class ObservedWorld:
         """Whether a walk has found something that `describe` has not recorded yet."""
         return self._is_new and self._is_walked
 
-    def look(self, sim_time_s: float) -> Seen:
-        """Where everything is now, by the words of its signals: robots, and solids that moved."""
-        gone = [key for key, body in self.bodies.items() if not body.look(sim_time_s)]
+    def read_poses(self, sim_time_s: float) -> Seen:
+        """Return where everything is now, by signal: robots, and solids that have moved."""
+        gone = [key for key, body in self.bodies.items() if not body.update_pose(sim_time_s)]
         for key in gone:
             self._lose(key)
         seen: Seen = {}
@@ -570,7 +570,7 @@ class ObservedWorld:
         """What there is, without where it is."""
         self._is_new = False
         for body in self.bodies.values():
-            body.look(float(self._robot.getTime()))
+            body.update_pose(float(self._robot.getTime()))
         bodies = self.bodies.values()
         described: dict[str, object] = {
             "title": self._title(),

@@ -9,7 +9,7 @@ from pathlib import Path
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.simulator.launch import Launch
+from webots_mcp.simulator.launch import WebotsLaunch
 from webots_mcp.simulator.orders import WebotsLine
 from webots_mcp.simulator.starting import Start
 from webots_mcp.steering.trial_worker import TrialWorkers
@@ -26,17 +26,17 @@ class Launcher:
     """
 
     def __init__(self, recording: Recording) -> None:
-        self.launched: Launch | None = None
+        self.launched: WebotsLaunch | None = None
         self._recording = recording
         self._lock = threading.Lock()
 
     @property
-    def running(self) -> Launch | None:
+    def running(self) -> WebotsLaunch | None:
         """The Webots that is still running, or None."""
         launched = self.launched
         return launched if launched is not None and not launched.webots.is_over else None
 
-    def begin(self, start: Start) -> Launch:
+    def begin(self, start: Start) -> WebotsLaunch:
         """Start Webots.
 
         Raises:
@@ -52,7 +52,7 @@ class Launcher:
                     "action=quit ends it"
                 )
             permit(self._recording, LAUNCH, {"world": str(start.world)}, create=True)
-            self.launched = Launch(self._recording, start, self._environment(), _ignore)
+            self.launched = WebotsLaunch(self._recording, start, self._environment(), _ignore)
             return self.launched
 
     def stop(self) -> None:

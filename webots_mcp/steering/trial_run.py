@@ -42,7 +42,7 @@ from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.signals.conditions import Evaluator, parse_condition
 from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, any_port, end_left_over
-from webots_mcp.steering.trial_plan import Range, TrialPlan, WorldPlan
+from webots_mcp.steering.trial_plan import ParameterRange, TrialPlan, WorldPlan
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.logs import LogFilter, Window, newest_lines
 from webots_mcp.store.merging import merge, settled
@@ -80,7 +80,7 @@ _START_VALUES: Final = (
 )
 _DECLARED: Final = "SELECT name, low, high, choices FROM parameter WHERE robot_id = ?"
 
-Command = Callable[[str], CommandLine]
+CommandOfWorld = Callable[[str], CommandLine]
 Ending: TypeAlias = Literal["for_s", "until", "prune"]
 FOLDER: Final = "trials"
 _MOST_THREADS: Final = 1000  # each waits for one trial
@@ -149,7 +149,7 @@ class LocalSimulators:
         count: How many run at once.
     """
 
-    command: Command
+    command: CommandOfWorld
     count: int
 
     def run(self, attempt: TrialAttempt) -> Result:
@@ -192,7 +192,7 @@ class TrialSimulator(KeptProgram):
 # -- one trial --------------------------------------------------------------------------------
 
 
-def run_attempt(attempt: TrialAttempt, command: Command) -> Result:
+def run_attempt(attempt: TrialAttempt, command: CommandOfWorld) -> Result:
     """Run a trial in a simulator of this machine.
 
     Raises:
@@ -220,7 +220,7 @@ def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> Re
     if recording is None:
         return None
     with recording.reader() as connection:
-        end = watch.look(connection)
+        end = watch.find_end(connection)
         return _scored(connection, plan, values, watch, end) if end else None
 
 
@@ -232,10 +232,10 @@ def _watched(
     recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
     until_s = time.monotonic() + timeout_s
     while True:
-        over = simulator.is_over  # before the look: what came last is seen
+        over = simulator.is_over  # checked first, so that rows of its last moment are read
         try:
             with recording.reader() as connection:
-                end = watch.look(connection)
+                end = watch.find_end(connection)
         except NoDatabaseError:
             end = None
         except ConditionFailedError as error:
@@ -261,7 +261,7 @@ def _ended(recording: Recording, watch: TrialWatch) -> str | None:
         return None
     with recording.reader() as connection:
         reason = run_info(connection, watch.run_id).end_reason
-        if reason is None or watch.look(connection) is not None:
+        if reason is None or watch.find_end(connection) is not None:
             return None
     return f"its run ended ({reason})"
 
@@ -272,7 +272,9 @@ def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: s
         text = "the controller recorded nothing in its data folder: does it name another one?"
         return Result(None, None, f"{why}; {text}" if why else text)
     with recording.reader() as connection:
-        end = end or watch.look(connection)  # rows that waited next to the database are in it now
+        end = end or watch.find_end(
+            connection
+        )  # rows that waited next to the database are in it now
         if end is not None:
             return _scored(connection, attempt.plan, attempt.values, watch, end)
         why = _ending_line(connection, watch.run_id) or why
@@ -341,8 +343,8 @@ class TrialWatch:
         self.reached_s: float | None = None
         self._started_s = 0.0
 
-    def look(self, connection: sqlite3.Connection) -> End | None:
-        """Its end, as far as it is recorded; None before.
+    def find_end(self, connection: sqlite3.Connection) -> End | None:
+        """Return the end of the trial as far as it is recorded; None before.
 
         Raises:
             InvalidInputError: It is not clear which robot to use, or its controller does not
@@ -416,7 +418,7 @@ class TrialWatch:
 # -- a set of trials ---------------------------------------------------------------------------
 
 
-Report = Callable[[Trial, Result], object]
+TrialReport = Callable[[Trial, Result], object]
 
 
 @dataclass(frozen=True)
@@ -452,7 +454,7 @@ class SetRun:
         return self.recording.data_dir / FOLDER / trial.uuid
 
 
-def run_trials(set_run: SetRun, set_id: int, report: Report) -> None:
+def run_trials(set_run: SetRun, set_id: int, report: TrialReport) -> None:
     """Run the trials of a set that are not over.
 
     Args:
@@ -483,7 +485,7 @@ def run_trials(set_run: SetRun, set_id: int, report: Report) -> None:
             lay_down(connection, set_id, job.lease)
 
 
-def _run_left(set_run: SetRun, set_id: int, report: Report) -> None:
+def _run_left(set_run: SetRun, set_id: int, report: TrialReport) -> None:
     with set_run.recording.reader() as connection:
         trials = trials_of(connection, set_id)
     for trial in trials:
@@ -650,7 +652,7 @@ def _sampler(plan: TrialPlan, number: int) -> optuna.samplers.BaseSampler:
         return optuna.samplers.TPESampler(seed=seed, constant_liar=True)
 
 
-def _distribution(each: Range) -> optuna.distributions.BaseDistribution:
+def _distribution(each: ParameterRange) -> optuna.distributions.BaseDistribution:
     import optuna
 
     if each.choices is not None:

@@ -14,7 +14,7 @@ from anyio import to_thread
 from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator.instances import instance_at
-from webots_mcp.simulator.launch import Launch, SessionStart, newest_in, starts_since
+from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, newest_in, starts_since
 from webots_mcp.simulator.orders import ANSWER_S, WebotsAddress, address_of, load_world
 from webots_mcp.steering.launcher import Launcher
 from webots_mcp.steering.routes import CLAIMING_S, MIN_ROUTE_S, UNCLAIMED, Request, why_no_reply
@@ -82,7 +82,7 @@ class WorldRequest(Request):
             answer.evidence = await self._await_end(situation.address)
         return answer
 
-    async def _is_meant(self, ours: Launch) -> bool:
+    async def _is_meant(self, ours: WebotsLaunch) -> bool:
         """Return whether the Webots of this server is that of the robot, if a robot is named."""
         if self.robot is None:
             return True

@@ -102,7 +102,7 @@ class BuiltInAction(NamedTuple):
     runs_user_code: bool = False
 
 
-# The one list of them. What each does is the function of that name in `bridge.actions`.
+# The one list of them. What each does is the method of that name in `bridge/*_actions.py`.
 BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "pause": BuiltInAction(ends_steps=True),
     "resume": BuiltInAction(ends_steps=True),

@@ -270,14 +270,14 @@ def test_what_a_test_changes_is_put_back(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
         import os
-        from webots_mcp.bridge import actions
+        from webots_mcp.bridge import control
 
         def test_first(webots_bridge):
             assert os.environ["WEBOTS_MCP_STRICT"] == "1"
-            assert actions.POLL_INTERVAL_S == 0
+            assert control.POLL_INTERVAL_S == 0
 
         def test_second():
-            assert actions.POLL_INTERVAL_S == 0.005
+            assert control.POLL_INTERVAL_S == 0.005
             assert "WEBOTS_MCP_STRICT" not in os.environ
         """
     )

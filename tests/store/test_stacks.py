@@ -140,12 +140,12 @@ def test_a_controllers_own_handler_of_the_signal_stays_and_no_file_of_others_is_
         handled: list[int] = []
         signal.signal(SIGNAL, lambda number, _: handled.append(number))
         watchdog = bridge._session._watchdog  # pyright: ignore[reportPrivateUsage]
-        watchdog.look()
+        watchdog.check()
         assert "signal" not in json.loads(path.read_bytes())
 
         shutil.rmtree(tmp_path / "data")
         (tmp_path / "data").write_text("in its place")
-        watchdog.look()
+        watchdog.check()
         with (tmp_path / "other").open("w") as other:  # which gets the number of the closed file
             other.write("kept")
             other.flush()
@@ -162,7 +162,7 @@ def test_the_loops_thread_is_the_one_that_steps(tmp_path: Path) -> None:
     bridge = MCPBridge(robot, tmp_path)
     with ThreadPoolExecutor(1) as other:
         stepped_in = other.submit(lambda: (robot.step(16), threading.get_ident())[1]).result()
-        bridge._session._watchdog.look()  # pyright: ignore[reportPrivateUsage]
+        bridge._session._watchdog.check()  # pyright: ignore[reportPrivateUsage]
     (path,) = tmp_path.glob("*-stacks-*")
     assert json.loads(path.read_bytes())["thread"] == stepped_in != threading.get_ident()
     bridge.close()
@@ -175,7 +175,7 @@ def test_a_loop_that_stays_silent_is_logged_once(tmp_path: Path) -> None:
     bridge.publish({"x": 1})
     with ThreadPoolExecutor(1) as other:
         for _ in range(3):
-            other.submit(bridge._session._watchdog.look).result()  # pyright: ignore[reportPrivateUsage]
+            other.submit(bridge._session._watchdog.check).result()  # pyright: ignore[reportPrivateUsage]
     bridge.close()
     with closing(sqlite3.connect(tmp_path / "webots.db")) as connection:
         (count,) = connection.execute(

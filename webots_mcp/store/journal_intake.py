@@ -430,7 +430,7 @@ class _Reading:
                 looks.changes.forget()
                 if entry.run in begun_here:
                     ends["run"] = {"uuid": begins}
-            changed = looks.changes.look(state) if state is not None else ()
+            changed = looks.changes.compare(state) if state is not None else ()
             if entry.number not in written:  # taken in by another process, or refused
                 continue
             if isinstance(entry.values, dict):  # a run or an end, after which others are over
@@ -442,7 +442,7 @@ class _Reading:
             seen_s = min(wall_time_s, time.time())  # what is dated later than now was seen now
             runs[run] = sim_time_s, seen_s, rows + (entry.kind == "state")
             if state is not None:
-                looks.names.look(state, entry.values[2], partial(self._enter_names, robot_id))
+                looks.names.register(state, entry.values[2], partial(self._enter_names, robot_id))
             for name, before, after in changed:
                 data = json.dumps({"from": before, "to": after}, ensure_ascii=False)
                 self._event(entry, "change", name[:200], data)

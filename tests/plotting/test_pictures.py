@@ -33,12 +33,11 @@ from webots_mcp.plotting.colours import DASHES, LINES
 from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.signals import compose_signals, paint_signals, plot_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
-from webots_mcp.questions.declaring import RunIds
+from webots_mcp.questions.arguments import RunIds
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Ask = dict[str, Any]
-
 QUESTIONS: dict[str, Ask] = {
     "one signal": {"signals": ["sensors.front"]},
     "several scales": {"signals": ["pose", "heading", "target", "battery_v", "sensors"]},

@@ -26,12 +26,11 @@ from tests.webots.conftest import (
 )
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.simulator import console
-from webots_mcp.simulator.console import belongs
 from webots_mcp.simulator.instances import instances
+from webots_mcp.simulator.own_webots import belongs
 from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio
-
 FAILS = """
 print("about to fail")
 import nothing_of_that_name

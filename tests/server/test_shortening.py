@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from webots_mcp.answers.budget import GLANCE, WHOLE, ShorteningLimits, shorten, tokens_in, tokens_of
+from webots_mcp.answers.shortening import (
+    GLANCE,
+    WHOLE,
+    ShorteningLimits,
+    shorten,
+    tokens_in,
+    tokens_of,
+)
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

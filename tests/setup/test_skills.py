@@ -21,7 +21,7 @@ from mcp import Client, StdioServerParameters
 import webots_mcp
 from tests.waiting import wait_for
 from webots_mcp import __version__
-from webots_mcp.answers.budget import tokens_in
+from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.contract import bundled
 from webots_mcp.setup.client_entries import is_ours
 from webots_mcp.setup.file_change import apply

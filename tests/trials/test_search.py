@@ -14,7 +14,7 @@ import pytest
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.questions.run_trials import set_facts
 from webots_mcp.steering.trial_plan import ParameterRange, Search, TrialPlan
-from webots_mcp.steering.trial_run import next_parameters
+from webots_mcp.steering.trial_search import next_parameters
 from webots_mcp.store.parameters import Trial
 from webots_mcp.store.recording import Recording
 

@@ -11,11 +11,11 @@ from webots_mcp.answers.budget import (
     seconds,
     short_name,
     shown,
-    tokens_of,
     wall_clock,
     without_empty,
 )
 from webots_mcp.answers.models import AnswerTable, KindVerdicts
+from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.judging.detection.events import (
     Events,
     Found,

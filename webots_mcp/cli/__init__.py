@@ -18,15 +18,9 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.cli.terminal import (
-    Typed,
-    as_typed,
-    ended_by,
-    ending_by_signals,
-    speak_of,
-    spelling_out,
-    value_name,
-)
+from webots_mcp.cli.ending import ended_by, ending_by_signals
+from webots_mcp.cli.streams import spelling_out
+from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
 from webots_mcp.errors import InvalidInputError, NotAllowedError, WebotsMCPError
 from webots_mcp.signals.naming import is_destructive, spelled_out
 

@@ -28,21 +28,14 @@ from webots_mcp.cli.options import (
     value_of,
     whole_number,
 )
-from webots_mcp.cli.terminal import (
-    Typed,
-    as_typed,
-    line_of_progress,
-    print_answer,
-    running,
-    show_progress,
-    speak_of,
-    text_of,
-    value_name,
-    wait,
-)
+from webots_mcp.cli.streams import line_of_progress, show_progress, wait
+from webots_mcp.cli.terminal import print_answer, text_of
+from webots_mcp.cli.wording import Typed, as_typed, running, speak_of, value_name
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.questions.declaring import FOR_A_PERSON, SCOPE, Caller, Question, Reply, faults_of
+from webots_mcp.questions.arguments import FOR_A_PERSON, SCOPE
+from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.faults import faults_of
 from webots_mcp.store.recording import Recording
 
 # How options are called whose argument has another name in all questions.

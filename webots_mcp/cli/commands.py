@@ -41,7 +41,7 @@ _OF_THE_CORE: Final = {
     "runs": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
     "signals": CommandEntry(PAST, f"{_Q}.history", "webots_list_signals"),
     "sql": CommandEntry(PAST, f"{_Q}.query_sql", "webots_query_sql"),
-    "status": CommandEntry(NOW, f"{_Q}.robot_state", "webots_list_robots"),
+    "status": CommandEntry(NOW, f"{_Q}.list_robots", "webots_list_robots"),
     "trends": CommandEntry(PAST, f"{_Q}.history", "webots_get_trends"),
     "export": CommandEntry(DATA, "webots_mcp.cli.data", "export"),
     "import": CommandEntry(DATA, "webots_mcp.cli.data", "import_"),

@@ -28,16 +28,8 @@ from webots_mcp.cli.options import (
     refuse_options,
     whole_number,
 )
-from webots_mcp.cli.terminal import (
-    binary_stdout,
-    id_ranges,
-    print_json,
-    print_notes,
-    print_table,
-    printable,
-    shown_progress,
-    wait,
-)
+from webots_mcp.cli.streams import binary_stdout, shown_progress, wait
+from webots_mcp.cli.terminal import id_ranges, print_json, print_notes, print_table, printable
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.plugins import export_formats

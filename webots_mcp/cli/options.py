@@ -126,7 +126,6 @@ def _no_constant(name: str) -> float:
 # -- which recording, which part of it, and how it is opened --
 
 _Given = ParamSpec("_Given")
-
 Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
 Robot: TypeAlias = Annotated[
     str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
@@ -317,7 +316,7 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
 
 def make_chunks_first(recording: Recording) -> None:
     """Put into chunks what no server has, so that a question of any length is answered."""
-    from webots_mcp.cli.terminal import shown_progress
+    from webots_mcp.cli.streams import shown_progress
     from webots_mcp.store.chunk_making import make_missing_chunks
 
     with shown_progress("making chunks of what was recorded") as progress:

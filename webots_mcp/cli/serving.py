@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from cyclopts.validators import Number
 
+from webots_mcp.cli.ending import ending_in_time
 from webots_mcp.cli.options import (
     HERE,
     DataDir,
@@ -25,7 +26,7 @@ from webots_mcp.cli.options import (
     Where,
     whole_number,
 )
-from webots_mcp.cli.terminal import ending_in_time, print_json
+from webots_mcp.cli.terminal import print_json
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.extras.plugins import stand_in_simulator
@@ -278,7 +279,8 @@ def _connect_to(url: str | None, robot: str) -> str:
     Raises:
         CommandRefusedError: There is no such library.
     """
-    from webots_mcp.simulator.instances import DEFAULT_PORT, HOME_VARIABLE, installations
+    from webots_mcp.simulator.installations import HOME_VARIABLE, installations
+    from webots_mcp.simulator.instances import DEFAULT_PORT
 
     url = url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
     os.environ[_URL] = f"{url.rstrip('/')}/{robot}" if url.count("/") == 2 else url

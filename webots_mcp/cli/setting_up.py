@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from webots_mcp.cli.options import HERE, Json, Parameter, Where
-from webots_mcp.cli.terminal import as_typed, print_json, print_notes, printable, terminal_width
+from webots_mcp.cli.terminal import print_json, print_notes, printable, terminal_width
+from webots_mcp.cli.wording import as_typed
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 
 if TYPE_CHECKING:
@@ -225,7 +226,7 @@ def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: W
 
 def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool) -> None:
     """Put the observer into a copy of a world, or into the world itself."""
-    from webots_mcp.setup.project_edits import controller_change, world_change
+    from webots_mcp.setup.observer_edits import controller_change, world_change
     from webots_mcp.simulator.project import project_of
 
     change = world_change(world, in_place=in_place, extern=extern)
@@ -245,7 +246,7 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
 def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
     """The Python that can run the observer, where the one that Webots takes cannot."""
     from webots_mcp.setup.interpreter import probe_interpreter
-    from webots_mcp.setup.project_edits import python_change
+    from webots_mcp.setup.observer_edits import python_change
 
     found = probe_interpreter(controller)
     if found.error is None:
@@ -261,7 +262,7 @@ def _remove_observer(world: Path, writing: Writing) -> None:
     """Take the observer out of a world, or delete the copy that was made for it."""
     from webots_mcp.contract import CONTROLLER_FOLDER, WORLD_ENDING, WORLD_FOLDER
     from webots_mcp.database.location import find_project
-    from webots_mcp.setup.project_edits import undo, unused_controller
+    from webots_mcp.setup.observer_edits import undo, unused_controller
 
     change = undo(world)
     writing.require_yes(world)

@@ -1,4 +1,7 @@
-"""The axes of a picture: their range of values, and the ticks on them."""
+"""The axes of a picture: their range of values, and the ticks on them.
+
+Values are mapped to pixels by `AxesBox`.
+"""
 
 from __future__ import annotations
 

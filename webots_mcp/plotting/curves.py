@@ -1,4 +1,7 @@
-"""Numeric signals as curves, broken where nothing was recorded, and which of them share a panel."""
+"""Numeric signals as curves, broken at gaps in the recording, and which of them share a panel.
+
+Signals of one unit and a similar scale share an axis.
+"""
 
 from __future__ import annotations
 

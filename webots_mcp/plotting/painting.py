@@ -1,4 +1,7 @@
-"""Painting what surrounds the data of a picture: title, axes, grid, legend, scale and marks."""
+"""Painting what surrounds the data of a picture: title, axes, grid, legend, scale and marks.
+
+Samples in a legend are functions that draw at a position.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What a picture is about: the runs in its ranges, what was recorded in each, and its events."""
+"""The runs in a picture: what was recorded of each, and its events.
+
+Several runs in one picture each begin at time 0.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Where a robot went: the rows of a run as points in the plane, and where they stand out."""
+"""The path of a robot: the rows of a run as points in the plane.
+
+Gaps in the recording and leaps break the path into pieces.
+"""
 
 from __future__ import annotations
 

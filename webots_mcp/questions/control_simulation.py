@@ -9,22 +9,12 @@ import anyio
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.answers.budget import cut_text
 from webots_mcp.answers.models import CommandAnswer, RunAnswer
+from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.questions.declaring import (
-    CHANGES,
-    DESTROYS,
-    MAX_WAIT_S,
-    Caller,
-    RobotName,
-    TimeoutS,
-    Value,
-    WaitS,
-    merged,
-    question,
-)
+from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName, TimeoutS, Value, WaitS
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, merged, question
 from webots_mcp.questions.show_pictures import show_end
 from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, require_world
 from webots_mcp.simulator.orders import Order
@@ -41,7 +31,6 @@ Port = Annotated[
     Field(description="Of a Webots of another project."),
 ]
 Force = Annotated[bool, Field(description="Press Webots' keys where nothing else works.")]
-
 _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
 _USUAL_WAIT_S: Final[dict[Order, float]] = {"reload": _RELOAD_WAIT_S, "step": MAX_WAIT_S}

@@ -20,7 +20,6 @@ from webots_mcp.answers.budget import (
     short_name,
     shown,
     some,
-    tokens_of,
     without_empty,
 )
 from webots_mcp.answers.models import (
@@ -34,11 +33,11 @@ from webots_mcp.answers.models import (
     SignalsAnswer,
     TrendsAnswer,
 )
+from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.trends import trends
-from webots_mcp.questions.declaring import (
-    READS,
+from webots_mcp.questions.arguments import (
     AnyNames,
     Cursor,
     Limit,
@@ -47,9 +46,8 @@ from webots_mcp.questions.declaring import (
     RobotName,
     RunId,
     ShownLimit,
-    merged,
-    question,
 )
+from webots_mcp.questions.declaring import READS, merged, question
 from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View

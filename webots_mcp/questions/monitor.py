@@ -28,7 +28,8 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection.events import asked_kinds, search_events
 from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.trends import RunTrends, trends
-from webots_mcp.questions.declaring import MAX_WAIT_S, READS, Caller, RobotName, question
+from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName
+from webots_mcp.questions.declaring import READS, Caller, question
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.recording import Recording, View
 
@@ -40,7 +41,6 @@ _ROWS_TOKENS: Final = 1_300
 _EVENTS_SHARE: Final = 0.45  # of them
 _TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
-
 _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.extras.requirements import checkout, quoted
-from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.installations import installations
 
 PROBE_TIMEOUT_S: Final = 30.0
 _PREFERENCE: Final = "pythonCommand"

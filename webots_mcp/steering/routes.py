@@ -18,15 +18,14 @@ from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.contract import HEARTBEAT_LATE_S
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator.instances import instance_at
+from webots_mcp.simulator.key_presses import KEYS, press
 from webots_mcp.simulator.orders import (
     ANSWER_S,
-    KEYS,
     RESTARTING,
     Order,
     OrderReply,
     WebotsAddress,
     give_order,
-    press,
     why_not_obeyed,
 )
 from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, Dispatcher, is_withdrawn

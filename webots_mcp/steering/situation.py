@@ -16,9 +16,9 @@ from webots_mcp.errors import (
     NoDatabaseError,
     NothingRecordedError,
 )
-from webots_mcp.simulator.console import belongs
 from webots_mcp.simulator.instances import Instance, instance_at, instances
 from webots_mcp.simulator.orders import Order, WebotsAddress, address_of
+from webots_mcp.simulator.own_webots import belongs
 from webots_mcp.steering.target import find_target
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer

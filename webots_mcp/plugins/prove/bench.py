@@ -21,7 +21,7 @@ from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.questions.control_simulation import webots_simulation_control
 from webots_mcp.questions.declaring import Question
 from webots_mcp.questions.send_command import webots_send_command
-from webots_mcp.setup.project_edits import controller_change, python_change, with_observer
+from webots_mcp.setup.observer_edits import controller_change, python_change, with_observer
 from webots_mcp.simulator.launch import WebotsLaunch
 from webots_mcp.simulator.orders import WebotsAddress
 from webots_mcp.simulator.starting import LaunchedWebots, Mode, Start, free_port

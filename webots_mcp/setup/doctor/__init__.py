@@ -29,14 +29,15 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 Verdict = Literal["ok", "warning", "wrong", "not checked"]
-
 _WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not checked", "ok")
 PAGE: Final = "docs/troubleshooting.md"
 _RECOVER: Final = (
     "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
 )
 # From the controller's machine to the client; within a module the order is that of its functions.
-_IN_ORDER: Final = ("recording_checks", "controller_checks", "webots_checks")
+_IN_ORDER: Final = (
+    "machine_checks", "recording_checks", "controller_checks", "simulation_check", "webots_checks",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from webots_mcp.setup.doctor import Diagnosis, Examined, check, ok, unclear, war
 from webots_mcp.setup.interpreter import Interpreter, chosen, probe_interpreter
 from webots_mcp.setup.project_edits import AlreadyPatchedError, attaching_place, is_plain_robot
 from webots_mcp.signals.naming import find_position
-from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.installations import installations
 from webots_mcp.simulator.project import (
     NO_POSITION_OF_ITS_OWN,
     NO_SUPERVISOR,

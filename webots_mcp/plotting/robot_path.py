@@ -18,7 +18,7 @@ from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.plotting.plotted_runs import PlottedRun
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.segment import Deadline
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,11 @@ class RobotPath:
 
 
 def read_path(
-    connection: sqlite3.Connection, part: PlottedRun, x: Signal, y: Signal, deadline_s: float
+    connection: sqlite3.Connection,
+    part: PlottedRun,
+    x: RegisteredSignal,
+    y: RegisteredSignal,
+    deadline_s: float,
 ) -> RobotPath:
     """The places of one run: of every row, or of every so many if the rows are many."""
     (segment,) = part.range.segments

@@ -31,7 +31,7 @@ from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.run_command import holds_since
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.segment import Subject
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.requests import permit
 
 BREAKPOINT_COLUMNS: Final = (
@@ -49,7 +49,7 @@ _LONGEST_CONDITION: Final = 300
 
 @question("Set a breakpoint", CHANGES)
 async def webots_breakpoint(
-    recording: Recording,
+    recording: RecordingAccess,
     condition: Annotated[
         str,
         Field(
@@ -95,7 +95,9 @@ async def webots_breakpoint(
 
 
 @question("List the breakpoints", READS)
-def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> BreakpointsAnswer:
+def webots_list_breakpoints(
+    recording: RecordingAccess, robot: RobotName = None
+) -> BreakpointsAnswer:
     """The robot's breakpoints, how often each was hit, and when last."""
     with recording.view(robot) as view:
         listed = stored.list_breakpoints(view.connection, view.robot.id)
@@ -114,7 +116,7 @@ def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> Br
 
 @question("Remove a breakpoint", CHANGES)
 async def webots_remove_breakpoint(
-    recording: Recording,
+    recording: RecordingAccess,
     breakpoint_id: Annotated[Id, Field(description="From webots_breakpoint.")],
     caller: Caller,
     robot: RobotName = None,
@@ -131,7 +133,7 @@ async def webots_remove_breakpoint(
 
 
 def _store(
-    recording: Recording, robot: str | None, condition: Condition, *asked: Any
+    recording: RecordingAccess, robot: str | None, condition: Condition, *asked: Any
 ) -> tuple[str, int, list[str]]:
     """Name of the robot, id of the breakpoint, and notes on its signals."""
     with recording.view(robot) as view:
@@ -140,7 +142,7 @@ def _store(
         return name, stored.set_breakpoint(connection, robot_id, condition.text, *asked), notes
 
 
-def _notes(view: View, condition: Condition) -> list[str]:
+def _notes(view: RobotView, condition: Condition) -> list[str]:
     if view.run is None:
         return condition.describe_unknown(())
     subject = Subject(view.robot.id, view.robot.name, view.run.id)
@@ -152,7 +154,7 @@ def _notes(view: View, condition: Condition) -> list[str]:
     return notes
 
 
-def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
+def _remove(recording: RecordingAccess, robot: str | None, breakpoint_id: int) -> str:
     with recording.view(robot) as view:
         name, robot_id = view.robot.name, view.robot.id
     with recording.writer() as connection:
@@ -160,7 +162,9 @@ def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
     return name
 
 
-async def _arm(recording: Recording, caller: Caller, robot: str) -> tuple[dict[str, Any], str]:
+async def _arm(
+    recording: RecordingAccess, caller: Caller, robot: str
+) -> tuple[dict[str, Any], str]:
     """Let the controller read its breakpoints again; its reply, or why there is none."""
     dispatcher = Dispatcher(recording, caller.report)
     try:
@@ -173,7 +177,7 @@ async def _arm(recording: Recording, caller: Caller, robot: str) -> tuple[dict[s
     return answer.result, ""
 
 
-def _breakpoint_row(view: View, each: stored.StoredBreakpoint) -> list[Any]:
+def _breakpoint_row(view: RobotView, each: stored.StoredBreakpoint) -> list[Any]:
     """A breakpoint as a row under `BREAKPOINT_COLUMNS`."""
     hit = stored.newest_hit(view.connection, each.robot_id, each.id) if each.hit_count else None
     run_id, time_s = hit or (None, None)

@@ -17,14 +17,14 @@ from webots_mcp.answers.shortening import (
 )
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.setup.doctor import Checked, diagnose, subject_of, worst
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 _LONGEST_TEXT: Final = 320
 _BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
 
 
 @question("Diagnose the set-up", READS, core=True)
-def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
+def webots_diagnose(recording: RecordingAccess) -> DiagnosisAnswer:
     """When nothing comes, or time stands still: each link from Webots and controller to here.
 
     Data folder, database, who records, what waits, why the simulation stands, which Webots run,

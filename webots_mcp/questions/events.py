@@ -30,7 +30,7 @@ from webots_mcp.questions.arguments import (
 )
 from webots_mcp.questions.declaring import READS, merged, question
 from webots_mcp.store.reading.ranges import Scope, TimeRange
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 
 DEFAULT_LIMIT: Final = 50
 
@@ -69,7 +69,7 @@ TimelineKinds = Annotated[
     quotes=True,
 )
 def webots_find_events(
-    recording: Recording,
+    recording: RecordingAccess,
     scope: Scope,
     kinds: Kinds = None,
     where: Annotated[
@@ -127,7 +127,7 @@ def webots_find_events(
 
 
 def _found(
-    view: View,
+    view: RobotView,
     asked: TimeRange,
     options: EventOptions,
     group: bool,
@@ -163,7 +163,7 @@ def _found(
 
 @question("Get the timeline", READS, quotes=True)
 def webots_get_timeline(
-    recording: Recording,
+    recording: RecordingAccess,
     scope: Scope,
     kinds: TimelineKinds = None,
     log_level: LogLevel = "info",
@@ -186,7 +186,7 @@ def webots_get_timeline(
 
 
 def _timeline(
-    view: View,
+    view: RobotView,
     asked: TimeRange,
     options: EventOptions,
     limit: int | None,

@@ -31,12 +31,19 @@ from webots_mcp.database.liveness import dead_sessions
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
 from webots_mcp.questions.declaring import READS, question
-from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
+from webots_mcp.store.recording import (
+    GETTING_STARTED,
+    RecordingAccess,
+    RobotView,
+    name_of,
+    storage,
+    view_of,
+)
 from webots_mcp.store.retention import described, unheeded
 from webots_mcp.store.retention_plan import file_sizes
 from webots_mcp.store.robots import (
-    Robot,
-    Session,
+    RobotRecord,
+    SessionRecord,
     WorldSeen,
     companions,
     console_trouble,
@@ -47,7 +54,7 @@ from webots_mcp.store.robots import (
     world_seen,
 )
 from webots_mcp.store.run_rows import (
-    Run,
+    RunRecord,
     count_runs,
     pace_of,
     real_time_factor,
@@ -71,7 +78,7 @@ _ROBOT_COLUMNS: Final = (
 
 
 @question("List the robots", READS, command="status", core=True)
-def webots_list_robots(recording: Recording) -> RobotsAnswer:
+def webots_list_robots(recording: RecordingAccess) -> RobotsAnswer:
     """Every robot ever recorded: whether it is live, whether its time moves, its current run.
 
     `actions` counts its own commands; webots_list_commands describes them.
@@ -95,7 +102,7 @@ def webots_list_robots(recording: Recording) -> RobotsAnswer:
 
 
 def _hint_of_robots(
-    connection: sqlite3.Connection, robots: Sequence[Robot], shown: int
+    connection: sqlite3.Connection, robots: Sequence[RobotRecord], shown: int
 ) -> str | None:
     if len(robots) > shown:
         return f"{len(robots)} robots in all, the latest {shown} are shown"
@@ -105,7 +112,7 @@ def _hint_of_robots(
 
 @question("Get world information", READS)
 def webots_get_world_info(
-    recording: Recording, robot: RobotName = None, run_id: RunId = None
+    recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> WorldAnswer:
     """The world file, its time step, the run and its pace, the controller's code, other robots.
 
@@ -141,7 +148,7 @@ def webots_get_world_info(
         return answer.model_copy(update=seen | {"hint": "; ".join(filter(None, hints)) or None})
 
 
-def _robots(views: list[View], *, told: bool) -> AnswerTable:
+def _robots(views: list[RobotView], *, told: bool) -> AnswerTable:
     """A row for each; what could not be recorded only where there is any, or for a person."""
     columns, rows = [*_ROBOT_COLUMNS], [_row(view) for view in views]
     recorders = [_recorder(view) for view in views]
@@ -154,7 +161,7 @@ def _robots(views: list[View], *, told: bool) -> AnswerTable:
     return AnswerTable(columns=columns, rows=rows)
 
 
-def _recorder(view: View) -> dict[str, Any]:
+def _recorder(view: RobotView) -> dict[str, Any]:
     """What a robot's session has recorded of its run, and what it could not."""
     session = view.session
     error = session.last_error if session else None
@@ -202,7 +209,7 @@ def _in_world(body: dict[str, Any], columns: list[str]) -> list[Any]:
     ]
 
 
-def _retention(recording: Recording, connection: sqlite3.Connection) -> dict[str, Any]:
+def _retention(recording: RecordingAccess, connection: sqlite3.Connection) -> dict[str, Any]:
     """What is kept of the recording, how large it is, and which limits of ours do not hold."""
     notes = unheeded(connection, recording.limits)
     return {
@@ -218,13 +225,13 @@ def _liveliest(robots: list[Any]) -> list[Any]:
     return latest[::-1][:_SHOWN_ROBOTS]
 
 
-def _fitting(views: list[View]) -> list[View]:
+def _fitting(views: list[RobotView]) -> list[RobotView]:
     """The first that fit, in the order of their first appearance."""
     fitting_rows = fitting([[*_row(view), *_recorder(view).values()] for view in views])
     return sorted(views[: len(fitting_rows)], key=lambda view: view.robot.id)
 
 
-def _row(view: View) -> list[Any]:
+def _row(view: RobotView) -> list[Any]:
     header, session = view.header(), view.session
     runs = count_runs(view.connection, view.robot.id)
     newest = [header[name] for name in ("status", "run_id", "sim_time_s", "age_s")]
@@ -233,12 +240,12 @@ def _row(view: View) -> list[Any]:
     return [name, view.robot.kind, view.robot.live, *newest, runs, actions]
 
 
-def _pace(view: View, run: Run) -> float | None:
+def _pace(view: RobotView, run: RunRecord) -> float | None:
     factor = real_time_factor(view.connection, run.id)
     return None if factor is None else round_number(factor)
 
 
-def _run(view: View, run: Run) -> dict[str, Any]:
+def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
     """What the run is; `rows` is as of its last heartbeat."""
     end_reason = run.end_reason or dict(dead_sessions(view.connection)).get(run.session_id)
     ended = {"ended_by": end_reason} if end_reason is not None else {}
@@ -252,7 +259,7 @@ def _run(view: View, run: Run) -> dict[str, Any]:
     }
 
 
-def _controller(view: View, session: Session | None) -> dict[str, Any] | None:
+def _controller(view: RobotView, session: SessionRecord | None) -> dict[str, Any] | None:
     if session is None:
         return None
     if view.robot.kind == CUSTOM_DATA:  # its own process and code are not known
@@ -271,7 +278,7 @@ def _devices(devices: dict[str, str]) -> dict[str, str] | None:
     return shorten(devices, _DEVICES_TOKENS).value or None
 
 
-def _companions(view: View) -> list[list[str]]:
+def _companions(view: RobotView) -> list[list[str]]:
     if view.session is None:
         return []
     others = companions(view.connection, view.session, view.now_s)

@@ -37,7 +37,7 @@ from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
 from webots_mcp.steering.dispatch import Dispatcher, ProgressReport
 from webots_mcp.steering.target import find_target
 from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, described
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 
 SET_WAIT_S: Final = 10.0
 _ACTION: Final = "set_parameters"
@@ -50,7 +50,7 @@ When = Literal["now", "reset"]
 
 
 async def set_parameters(
-    recording: Recording,
+    recording: RecordingAccess,
     report: ProgressReport,
     values: Mapping[str, Value],
     *,
@@ -73,7 +73,7 @@ async def set_parameters(
     return await Dispatcher(recording, report).ask(robot, _ACTION, timeout_s, params)
 
 
-def settable(recording: Recording, robot: str | None) -> dict[str, Declared]:
+def settable(recording: RecordingAccess, robot: str | None) -> dict[str, Declared]:
     """The parameters that a live controller declares.
 
     Raises:
@@ -84,13 +84,13 @@ def settable(recording: Recording, robot: str | None) -> dict[str, Declared]:
         return declared_by(connection, session.id) if session else {}
 
 
-def _none(view: View) -> str:
+def _none(view: RobotView) -> str:
     return _NONE if view.session is None or view.session.has_bridge else NO_BRIDGE
 
 
 @question("Get the parameters", READS, quotes=True)
 def webots_get_parameters(
-    recording: Recording,
+    recording: RecordingAccess,
     names: Annotated[
         list[str] | None, Field(max_length=50, description="Of parameters; '*' is any text.")
     ] = None,
@@ -116,7 +116,7 @@ def webots_get_parameters(
 
 @question("Set parameters", SETS, core=True, of_controller="values")
 async def webots_set_parameters(
-    recording: Recording,
+    recording: RecordingAccess,
     values: Annotated[
         dict[str, Value],
         Field(min_length=1, max_length=MOST_PARAMETERS, description='{"kp": 3.0, "gait": "trot"}'),
@@ -136,7 +136,7 @@ async def webots_set_parameters(
     )
 
 
-def _shown_rows(view: View, names: list[str] | None) -> list[list[Any]]:
+def _shown_rows(view: RobotView, names: list[str] | None) -> list[list[Any]]:
     found = described(view.connection, view.run) if view.run else []
     meant = _meant(names, [each["name"] for each in found])
     return [

@@ -43,13 +43,13 @@ from webots_mcp.signals.naming import OBSERVED
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.observed_pose import pose_at
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, newest_kept
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.robots import (
     fetch_session,
     rows_waiting,
 )
 from webots_mcp.store.run_rows import (
-    State,
+    StateRecord,
     newest_events,
     pace_of,
     select,
@@ -81,7 +81,7 @@ PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up t
 
 @question("Get the robot's state", READS, core=True, quotes=True)
 def webots_get_robot_state(
-    recording: Recording, robot: RobotName = None, run_id: RunId = None
+    recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
     """The robot now, at a glance: its newest published state, rounded, long arrays summed up.
 
@@ -107,7 +107,7 @@ def webots_get_robot_state(
 
 @question("Get the sensors", READS, quotes=True)
 def webots_get_sensors(
-    recording: Recording, robot: RobotName = None, run_id: RunId = None
+    recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> SensorsAnswer:
     """The newest sensor values: members of the state named after a sensor device or like one."""
     with recording.view(robot, run_id) as view:
@@ -132,7 +132,7 @@ def webots_get_sensors(
 
 @question("Get the full state", READS, core=True, quotes=True)
 def webots_get_full_state(
-    recording: Recording,
+    recording: RecordingAccess,
     path: PagePath = "",
     offset: Offset = 0,
     limit: PageSize = None,
@@ -162,7 +162,7 @@ def webots_get_full_state(
         return FullStateAnswer(**_page(part, path, offset, limit or _PAGE, left_tokens), **beside)
 
 
-def _with_observed_pose(view: View, state: State) -> dict[str, Any]:
+def _with_observed_pose(view: RobotView, state: StateRecord) -> dict[str, Any]:
     """The state, with where an observer saw the robot if it has no position of its own."""
     value = state.value()
     if OBSERVED in value:
@@ -173,7 +173,7 @@ def _with_observed_pose(view: View, state: State) -> dict[str, Any]:
     return {**value, OBSERVED: pose} if pose else value
 
 
-def _nothing_yet(view: View) -> str:
+def _nothing_yet(view: RobotView) -> str:
     """A robot that published before a reset will publish again."""
     run_id = view.run.id if view.run else 0
     (purged_rows,) = view.connection.execute(_PURGED, (run_id,)).fetchone() or (0,)
@@ -270,7 +270,7 @@ def _longest_that_fits(sizes: Collection[int], budget: int) -> int:
     return max(sizes, default=0)
 
 
-def _events(view: View) -> AnswerTable:
+def _events(view: RobotView) -> AnswerTable:
     """The newest events that fit, the oldest of them first."""
     events = newest_events(view.connection, view.require_run().id, _EVENTS)
     rows = [
@@ -281,7 +281,7 @@ def _events(view: View) -> AnswerTable:
     return AnswerTable(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
 
 
-def _health(view: View) -> dict[str, Any] | None:
+def _health(view: RobotView) -> dict[str, Any] | None:
     """The health of the session that recorded the run."""
     session = view.session
     if view.run is not None and (session is None or session.id != view.run.session_id):
@@ -305,7 +305,7 @@ def _health(view: View) -> dict[str, Any] | None:
     }
 
 
-def _kept(view: View) -> str | None:
+def _kept(view: RobotView) -> str | None:
     """Which seconds of the run were kept last at full rate, and why."""
     newest = newest_kept(view.connection, view.run.id) if view.run else None
     if newest is None or view.run is None:
@@ -316,7 +316,7 @@ def _kept(view: View) -> str | None:
     return f"{span}: {cut_text(newest.reason, _ERROR_CHARACTERS)}"
 
 
-def _replaced_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:
+def _replaced_in(state: StateRecord, part: dict[str, Any]) -> dict[str, str] | None:
     """The replaced values among those members of the state."""
     replaced = {
         path: kind

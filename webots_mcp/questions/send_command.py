@@ -28,7 +28,7 @@ from webots_mcp.questions.arguments import Cursor, Id, RobotName, TimeoutS
 from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
 from webots_mcp.steering.command_answer import shown_result
 from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 
 COMMAND_COLUMNS: Final = (
     "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
@@ -57,7 +57,7 @@ NO_BRIDGE: Final = "this robot has no bridge: it takes no commands, and has no p
     of_controller="params",
 )
 async def webots_send_command(
-    recording: Recording,
+    recording: RecordingAccess,
     action: Annotated[
         str, Field(min_length=1, max_length=200, description="As in webots_list_commands.")
     ],
@@ -83,7 +83,7 @@ async def webots_send_command(
     quotes=True,
 )
 async def webots_wait_for_command(
-    recording: Recording,
+    recording: RecordingAccess,
     command_id: Annotated[Id, Field(description="From its answer.")],
     caller: Caller,
     timeout_wall_s: TimeoutS = _WAIT_S,
@@ -94,7 +94,7 @@ async def webots_wait_for_command(
 
 @question("List the commands", READS, command="commands", core=True, quotes=True)
 def webots_list_commands(
-    recording: Recording,
+    recording: RecordingAccess,
     limit: Annotated[int, Field(ge=1, le=200, description="Most shown.")] = 10,
     status: Annotated[CommandStatus | None, Field(description="Only those.")] = None,
     cursor: Cursor = None,
@@ -126,7 +126,7 @@ def _command_row(command: Command, now_s: float) -> list[Any]:
     ]
 
 
-def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
+def _answer(view: RobotView, commands: list[Command], limit: int) -> CommandsAnswer:
     rows = [_command_row(command, view.now_s) for command in commands]
     rows = fitting(rows, _COMMANDS_TOKENS)
     more = len(rows) < len(commands) or len(commands) == limit

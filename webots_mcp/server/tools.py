@@ -36,7 +36,7 @@ from webots_mcp.errors import WebotsMCPError
 from webots_mcp.questions.declaring import Caller, Question, Reply
 from webots_mcp.questions.faults import faults_of, shown_value
 from webots_mcp.signals.naming import harmless_first, perhaps_meant
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import Requester
 
 _WRAPPER: Final = "params"
@@ -62,7 +62,7 @@ _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself
 _log = logging.getLogger(__name__)
 
 
-def tool_of(question: Question, recording: Recording, *, output_schema: bool = False) -> Tool:
+def tool_of(question: Question, recording: RecordingAccess, *, output_schema: bool = False) -> Tool:
     """A question on a recording as a tool; its schemas, which take milliseconds, are made once."""
     tool = _tool(question, output_schema)
     return tool.model_copy(update={"fn": functools.partial(tool.fn, recording)})
@@ -89,7 +89,7 @@ def _answering(question: Question) -> Callable[..., Any]:
     """The question as the SDK calls it, after a recording; with an answer whatever happens."""
 
     @functools.wraps(question.function)
-    async def wrapper(recording: Recording, ctx: Context[Any], **arguments: Any) -> Any:
+    async def wrapper(recording: RecordingAccess, ctx: Context[Any], **arguments: Any) -> Any:
         companions = ctx.request_context.lifespan_context
         caller = Caller("mcp", ctx.report_progress, companions, _requester(ctx))
         try:

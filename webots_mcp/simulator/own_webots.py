@@ -17,13 +17,13 @@ from webots_mcp.errors import (
     NoDatabaseError,
 )
 from webots_mcp.simulator.instances import Instance, instances
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.robots import list_robots
 
 _WORLD: Final = "SELECT EXISTS (SELECT 1 FROM run WHERE world = ?)"
 
 
-def own_webots(recording: Recording) -> list[Instance]:
+def own_webots(recording: RecordingAccess) -> list[Instance]:
     """Those that run on this machine.
 
     Raises:
@@ -33,7 +33,7 @@ def own_webots(recording: Recording) -> list[Instance]:
     return [each for each in running if belongs(each, recording)] if running else []
 
 
-def belongs(instance: Instance, recording: Recording) -> bool:
+def belongs(instance: Instance, recording: RecordingAccess) -> bool:
     """Whether a Webots is of a recording.
 
     Raises:
@@ -51,7 +51,7 @@ def belongs(instance: Instance, recording: Recording) -> bool:
         return False
 
 
-def _is_in_project(instance: Instance, recording: Recording) -> bool:
+def _is_in_project(instance: Instance, recording: RecordingAccess) -> bool:
     project = find_project(full_path(recording.data_dir))
     if project is None or instance.world is None:
         return False

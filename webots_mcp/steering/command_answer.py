@@ -35,7 +35,7 @@ from webots_mcp.steering.run_command import (
 )
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import Subject
-from webots_mcp.store.recording import View
+from webots_mcp.store.recording import RobotView
 from webots_mcp.store.robots import PRESS_PLAY, find_block, handler_at_work
 from webots_mcp.store.run_rows import state_at
 
@@ -70,7 +70,7 @@ _SIZES: Final = RunAnswerSizes()
 _MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
 
 
-def command_answer(view: View, command: Command, waited_s: float) -> CommandAnswer:
+def command_answer(view: RobotView, command: Command, waited_s: float) -> CommandAnswer:
     """Return the answer about a command after so many wall seconds of waiting."""
     failed = command.status != "done" and command.error is not None
     facts: dict[str, Any] = {
@@ -96,7 +96,7 @@ def shown_result(command: Command, budget_tokens: int = RESULT_BUDGET_TOKENS) ->
     return shorten(command.decoded_result(), budget_tokens, WHOLE).value
 
 
-def correct_mode(view: View, command: Command, answer: CommandAnswer) -> None:
+def correct_mode(view: RobotView, command: Command, answer: CommandAnswer) -> None:
     """Correct the mode in the answer about a command that a later command has followed."""
     if command.action not in _MODES or command.status not in ("done", "failed"):
         return
@@ -127,7 +127,7 @@ def correct_mode(view: View, command: Command, answer: CommandAnswer) -> None:
 # -- what to do next --------------------------------------------------------------------------
 
 
-def _hint(view: View, command: Command) -> str | None:
+def _hint(view: RobotView, command: Command) -> str | None:
     """Say what to do next, where the outcome alone does not say it."""
     if command.status == "pending":
         return "no controller has claimed it yet"
@@ -149,7 +149,7 @@ def _hint(view: View, command: Command) -> str | None:
     return _hint_unclaimed(view)
 
 
-def _hint_after_loss(view: View) -> str:
+def _hint_after_loss(view: RobotView) -> str:
     """Say what to do after a lost command, which may have run: start, check, then send again."""
     check = "check the robot's state before you send it again"
     if view.robot.live:
@@ -157,7 +157,7 @@ def _hint_after_loss(view: View) -> str:
     return f"start its controller (reload the world in Webots; an extern one by hand), then {check}"
 
 
-def _hint_unclaimed(view: View) -> str:
+def _hint_unclaimed(view: RobotView) -> str:
     """Say what keeps the controller's loop from claiming commands."""
     session = view.session
     if block := find_block(view.connection, session, view.run, view.now_s):
@@ -179,7 +179,7 @@ def _hint_unclaimed(view: View) -> str:
 # -- facts about a run ------------------------------------------------------------------------
 
 
-def _run_facts(view: View, command: Command) -> dict[str, Any]:
+def _run_facts(view: RobotView, command: Command) -> dict[str, Any]:
     """Return why a `run` command stopped, its progress, its values and its events."""
     progress, result = find_progress(view.connection, command), result_of(command)
     stopped, why = _stop_reason(command, result)
@@ -211,7 +211,7 @@ def _stop_reason(command: Command, result: Mapping[str, Any]) -> tuple[str | Non
 
 
 def _what_happened(
-    view: View, command: Command, progress: RunProgress, run_id: int
+    view: RobotView, command: Command, progress: RunProgress, run_id: int
 ) -> dict[str, Any]:
     """Return the state at the end, trends and events in between, and the rows before the end."""
     end_s = progress.to_s + SAME_TIME_S
@@ -232,7 +232,7 @@ def _what_happened(
     return facts | _trends_and_events(view, command, asked)
 
 
-def _rows_before_end(view: View, command: Command, run_id: int, end_s: float) -> Any:
+def _rows_before_end(view: RobotView, command: Command, run_id: int, end_s: float) -> Any:
     """Return the last rows with the signals of the condition; None without a condition."""
     until = params_of(command).get("until")
     rows = newest_rows(view.connection, run_id, _SIZES.rows, end_s)
@@ -247,7 +247,7 @@ def _rows_before_end(view: View, command: Command, run_id: int, end_s: float) ->
     return table(("sim_time_s", *names), lines)
 
 
-def _trends_and_events(view: View, command: Command, asked: TimeRange) -> dict[str, Any]:
+def _trends_and_events(view: RobotView, command: Command, asked: TimeRange) -> dict[str, Any]:
     (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
     found = search_events(view.connection, asked)
     of_others = found.only([event for event in found.events if not _is_own(event, command)])

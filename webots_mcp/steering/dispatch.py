@@ -23,9 +23,9 @@ from webots_mcp.database.queue import Command, CommandQueue, fetch_command
 from webots_mcp.steering.command_answer import command_answer, correct_mode
 from webots_mcp.steering.run_command import ACTION, describe_progress
 from webots_mcp.steering.target import find_target, require_parameters
-from webots_mcp.store.recording import Recording, look
+from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import Block, find_block, robot_name
+from webots_mcp.store.robots import BlockedLoop, find_block, robot_name
 
 # Called with what is done, how much there is to do (None where unknown), and a text.
 ProgressReport = Callable[[float, float | None, str], Awaitable[None]]
@@ -65,7 +65,7 @@ class Dispatcher:
         report: Called once a second while a command is under way.
     """
 
-    def __init__(self, recording: Recording, report: ProgressReport) -> None:
+    def __init__(self, recording: RecordingAccess, report: ProgressReport) -> None:
         self._recording = recording
         self._report = report
 
@@ -113,7 +113,7 @@ class Dispatcher:
         def correct(command_id: int) -> None:
             with self._recording.reader() as connection:
                 command = fetch_command(connection, command_id)
-                view = look(connection, robot_name(connection, command.robot_id))
+                view = view_robot(connection, robot_name(connection, command.robot_id))
                 correct_mode(view, command, answer)
 
         if answer.command_id is not None:
@@ -234,11 +234,11 @@ class Dispatcher:
 
     def _answer(self, command: Command, waited_s: float) -> CommandAnswer:
         with self._recording.reader() as connection:
-            view = look(connection, robot_name(connection, command.robot_id))
+            view = view_robot(connection, robot_name(connection, command.robot_id))
             return command_answer(view, command, waited_s)
 
 
-def withdraw_if_blocked(recording: Recording, command: Command) -> bool:
+def withdraw_if_blocked(recording: RecordingAccess, command: Command) -> bool:
     """Cancel a pending command where its loop is known to be blocked; True if it will never run.
 
     A controller that claims it in the meantime runs it, and the outcome is that of the controller.
@@ -255,14 +255,14 @@ def is_withdrawn(answer: CommandAnswer) -> bool:
     return (answer.error or "").endswith(_WITHDRAWN)
 
 
-def is_held_up(recording: Recording, command: Command) -> bool:
+def is_held_up(recording: RecordingAccess, command: Command) -> bool:
     """Whether a `step` or `run` that is under way cannot go on, since its loop is blocked."""
     if command.status != "claimed" or command.action not in LOOPING:
         return False
     return _block_of(recording, command) is not None
 
 
-def _block_of(recording: Recording, command: Command) -> Block | None:
+def _block_of(recording: RecordingAccess, command: Command) -> BlockedLoop | None:
     with recording.reader() as connection:
         name = robot_name(connection, command.robot_id)
     with recording.view(name) as view:

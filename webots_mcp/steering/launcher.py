@@ -14,7 +14,7 @@ from webots_mcp.simulator.orders import WebotsLine
 from webots_mcp.simulator.starting import Start
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.policy import LAUNCH
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import permit
 
 
@@ -25,7 +25,7 @@ class Launcher:
         launched: The Webots that was started last.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         self.launched: WebotsLaunch | None = None
         self._recording = recording
         self._lock = threading.Lock()
@@ -82,7 +82,7 @@ class Companions:
         self.webots.stop()
 
 
-def project_of(recording: Recording) -> Path:
+def project_of(recording: RecordingAccess) -> Path:
     """Find the Webots project of a server: that of its data folder, else of its current folder.
 
     Raises:

@@ -36,7 +36,7 @@ from webots_mcp.steering.situation import (
     find_evidence,
     find_instance,
 )
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import permit
 
 CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # a loop that has just stopped is detected within it
@@ -62,7 +62,7 @@ class Request:
         started_s: When it began, on the monotonic clock.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     dispatcher: Dispatcher
     robot: str | None
     timeout_s: float

@@ -24,7 +24,7 @@ from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.steering.target import find_target
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.runs import pace
 
@@ -53,7 +53,12 @@ class RunProgress(NamedTuple):
 
 
 def require_possible(
-    recording: Recording, robot: str | None, until: str | None, for_s: float | None, *, reset: bool
+    recording: RecordingAccess,
+    robot: str | None,
+    until: str | None,
+    for_s: float | None,
+    *,
+    reset: bool,
 ) -> None:
     """Refuse a run that could not end as requested, before anything is sent.
 
@@ -80,7 +85,7 @@ def require_possible(
                 _require_open(view, condition)
 
 
-def known_names(view: View) -> set[str]:
+def known_names(view: RobotView) -> set[str]:
     """Return the signals that a robot published in its five newest runs; empty before any row."""
     newest = "SELECT id FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 5"
     runs = view.connection.execute(newest, (view.robot.id,)).fetchall()
@@ -167,7 +172,7 @@ def params_of(command: Command) -> Mapping[str, Any]:
     return json.loads(command.params)
 
 
-def _require_known(view: View, condition: Condition) -> None:
+def _require_known(view: RobotView, condition: Condition) -> None:
     """Refuse signals that were never published: most likely a name is misspelt."""
     known = known_names(view)  # empty before the first row, when nothing can be said
     if known and (unknown := condition.describe_unknown(known)):
@@ -178,7 +183,7 @@ def _require_known(view: View, condition: Condition) -> None:
         )
 
 
-def _require_open(view: View, condition: Condition) -> None:
+def _require_open(view: RobotView, condition: Condition) -> None:
     """Refuse a condition that holds at the newest row: the run would be over at once.
 
     A condition with `changed` may hold: a change lasts one step, so the next one is awaited.

@@ -20,8 +20,8 @@ from webots_mcp.simulator.instances import Instance, instance_at, instances
 from webots_mcp.simulator.orders import Order, WebotsAddress, address_of
 from webots_mcp.simulator.own_webots import belongs
 from webots_mcp.steering.target import find_target
-from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
+from webots_mcp.store.robots import SessionRecord, find_holder, list_robots, live_observer
 
 
 class RecordedUntil(NamedTuple):
@@ -63,7 +63,7 @@ class Situation:
         return Situation(None, False, why, address, until, is_address_sure=is_address_sure)
 
 
-def assess(recording: Recording, robot: str | None, action: str) -> Situation:
+def assess(recording: RecordingAccess, robot: str | None, action: str) -> Situation:
     """Find out which controllers could run an action that steers the simulation.
 
     Raises:
@@ -81,7 +81,7 @@ def assess(recording: Recording, robot: str | None, action: str) -> Situation:
                     "none of the recorded robots has a live controller"
                 )
             except CommandRefusedError as error:
-                view = look(connection, robot)
+                view = view_robot(connection, robot)
                 _require_not_held_elsewhere(view, error)
                 return _situation(view, can_command=False, why_silent=str(error))
             return _situation(view, can_command=True, why_silent=_why_silent(view))
@@ -89,7 +89,7 @@ def assess(recording: Recording, robot: str | None, action: str) -> Situation:
         return Situation.without_controller(str(error).rstrip("."))
 
 
-def find_evidence(order: Order, before: RecordedUntil, view: View) -> str | None:
+def find_evidence(order: Order, before: RecordedUntil, view: RobotView) -> str | None:
     """Return the evidence in the recording that an order was obeyed; None while there is none."""
     if order == "pause":
         unknown = view.status.is_moving or view.status.why == UNMOVED
@@ -103,7 +103,7 @@ def find_evidence(order: Order, before: RecordedUntil, view: View) -> str | None
     return f"run {view.run.id} began"
 
 
-def find_address(recording: Recording, situation: Situation) -> WebotsAddress:
+def find_address(recording: RecordingAccess, situation: Situation) -> WebotsAddress:
     """Find the address of the wanted Webots; if unknown, that of the only one of this project.
 
     Raises:
@@ -120,7 +120,7 @@ def find_address(recording: Recording, situation: Situation) -> WebotsAddress:
     return _require_one(same or ours, running).address
 
 
-def find_instance(recording: Recording, situation: Situation) -> Instance:
+def find_instance(recording: RecordingAccess, situation: Situation) -> Instance:
     """Find the wanted Webots among the programs of this machine.
 
     Raises:
@@ -133,7 +133,7 @@ def find_instance(recording: Recording, situation: Situation) -> Instance:
     raise CommandRefusedError(f"no Webots of this machine listens at {address}")
 
 
-def _require_not_held_elsewhere(view: View, error: CommandRefusedError) -> None:
+def _require_not_held_elsewhere(view: RobotView, error: CommandRefusedError) -> None:
     """Refuse a simulation that another robot's bridge has paused: only that bridge resumes it."""
     session = view.session
     if session is None or not session.is_alive(view.now_s):
@@ -146,7 +146,7 @@ def _require_not_held_elsewhere(view: View, error: CommandRefusedError) -> None:
         raise error
 
 
-def _situation(view: View, *, can_command: bool, why_silent: str | None) -> Situation:
+def _situation(view: RobotView, *, can_command: bool, why_silent: str | None) -> Situation:
     observer = live_observer(view.connection, view.session, view.now_s)
     return Situation(
         robot=view.robot.name,
@@ -159,7 +159,7 @@ def _situation(view: View, *, can_command: bool, why_silent: str | None) -> Situ
     )
 
 
-def _why_silent(view: View) -> str | None:
+def _why_silent(view: RobotView) -> str | None:
     """Say why a command would not be claimed soon; None where it would, or this is unknown."""
     session = view.session
     if session is None or not session.is_alive(view.now_s):
@@ -171,7 +171,7 @@ def _why_silent(view: View) -> str | None:
     return None
 
 
-def _never_polls(session: Session, now_s: float) -> bool:
+def _never_polls(session: SessionRecord, now_s: float) -> bool:
     """Return whether the loop has run for two heartbeats without calling `get_command()`."""
     since_s = session.last_poll_wall_time_s or session.started_wall_time_s
     return session.age_s(since_s, now_s) > 2 * HEARTBEAT_LATE_S

@@ -14,9 +14,9 @@ from typing import Any
 from webots_mcp.contract import BUILT_IN_ACTIONS, CUSTOM_DATA
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, UnknownActionError
 from webots_mcp.signals.naming import misfit_of_parameters, perhaps_meant
-from webots_mcp.store.recording import View, look
+from webots_mcp.store.recording import RobotView, view_robot
 from webots_mcp.store.robots import (
-    Session,
+    SessionRecord,
     companions,
     find_holder,
     list_robots,
@@ -27,7 +27,7 @@ from webots_mcp.store.robots import (
 )
 
 
-def find_target(connection: sqlite3.Connection, robot: str | None, action: str) -> View:
+def find_target(connection: sqlite3.Connection, robot: str | None, action: str) -> RobotView:
     """Find the robot that is to run an action.
 
     Without a name it is the only live robot; for an action that steers the simulation, the only
@@ -41,7 +41,7 @@ def find_target(connection: sqlite3.Connection, robot: str | None, action: str) 
     """
     if robot is None and _needs_supervisor(action):
         robot = _only_supervisor(connection)
-    view = look(connection, robot)
+    view = view_robot(connection, robot)
     _require_action(view, action)
     session = _require_live(view)
     if _needs_supervisor(action) and not session.supervisor:
@@ -50,7 +50,7 @@ def find_target(connection: sqlite3.Connection, robot: str | None, action: str) 
     return view
 
 
-def require_parameters(view: View, action: str, params: Mapping[str, Any]) -> None:
+def require_parameters(view: RobotView, action: str, params: Mapping[str, Any]) -> None:
     """Refuse parameters that do not fit a built-in action; the bridge would refuse them too.
 
     Raises:
@@ -77,7 +77,7 @@ def _only_supervisor(connection: sqlite3.Connection) -> str | None:
     return names[0] if len(names) == 1 else None
 
 
-def _require_action(view: View, action: str) -> None:
+def _require_action(view: RobotView, action: str) -> None:
     """Refuse an action that the controller does not know.
 
     Without registered actions nothing is refused: the loop may handle what get_command() returns.
@@ -94,7 +94,7 @@ def _require_action(view: View, action: str) -> None:
     )
 
 
-def _require_live(view: View) -> Session:
+def _require_live(view: RobotView) -> SessionRecord:
     """Return the robot's session; during a reload the old one: its successor runs the command."""
     session = view.session
     if session is not None and not session.has_bridge:
@@ -107,7 +107,7 @@ def _require_live(view: View) -> Session:
     )
 
 
-def _no_bridge_text(view: View, session: Session) -> str:
+def _no_bridge_text(view: RobotView, session: SessionRecord) -> str:
     observer = live_observer(view.connection, session, view.now_s)
     is_observed = view.robot.kind == CUSTOM_DATA
     how = "the observer records it from its customData" if is_observed else "it writes a journal"
@@ -122,7 +122,7 @@ def _no_bridge_text(view: View, session: Session) -> str:
     )
 
 
-def _no_supervisor_text(view: View, session: Session, action: str) -> str:
+def _no_supervisor_text(view: RobotView, session: SessionRecord, action: str) -> str:
     make_one = (
         "set the field 'supervisor' of its Robot node to TRUE and create it with Supervisor() "
         "instead of Robot()"
@@ -139,7 +139,7 @@ def _no_supervisor_text(view: View, session: Session, action: str) -> str:
     return f"{action} needs a Supervisor and robot {view.robot.name!r} is not one: {next_step}"
 
 
-def _require_not_paused_elsewhere(view: View, session: Session, action: str) -> None:
+def _require_not_paused_elsewhere(view: RobotView, session: SessionRecord, action: str) -> None:
     """Refuse while another robot's bridge has paused the simulation: this loop cannot run then."""
     holder = find_holder(view.connection, session, view.now_s)
     if holder is None or holder.id == session.id:

@@ -27,12 +27,12 @@ from webots_mcp.judging.run_score import score_run
 from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, any_port
 from webots_mcp.steering.trial_plan import TrialPlan, WorldPlan
 from webots_mcp.steering.trial_watch import End, TrialWatch
-from webots_mcp.store.logs import LogFilter, Window, newest_lines
+from webots_mcp.store.logs import LogFilter, LogWindow, newest_lines
 from webots_mcp.store.merging import settled
 from webots_mcp.store.parameters import (
-    Result,
+    TrialResult,
 )
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.runs import run_info
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Simulators(Protocol):
         """How many can run at once, now."""
         ...
 
-    def run(self, attempt: TrialAttempt) -> Result:
+    def run(self, attempt: TrialAttempt) -> TrialResult:
         """Run a trial; its recording is in its folder then, and the result has its run's id there.
 
         Raises:
@@ -106,7 +106,7 @@ class LocalSimulators:
     command: CommandOfWorld
     count: int
 
-    def run(self, attempt: TrialAttempt) -> Result:
+    def run(self, attempt: TrialAttempt) -> TrialResult:
         """As `Simulators.run`."""
         return run_attempt(attempt, self.command)
 
@@ -143,7 +143,7 @@ class TrialSimulator(KeptProgram):
         return next((line for line in reversed(text.splitlines()) if line.strip()), "")
 
 
-def run_attempt(attempt: TrialAttempt, command: CommandOfWorld) -> Result:
+def run_attempt(attempt: TrialAttempt, command: CommandOfWorld) -> TrialResult:
     """Run a trial in a simulator of this machine.
 
     Raises:
@@ -164,7 +164,7 @@ def run_attempt(attempt: TrialAttempt, command: CommandOfWorld) -> Result:
     return _concluded(attempt, watch, end, why)
 
 
-def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> Result | None:
+def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> TrialResult | None:
     """The result of a trial that had ended before its process was killed; None where it had not."""
     watch = TrialWatch(plan)
     recording = _settled(folder)
@@ -180,7 +180,7 @@ def _watched(
 ) -> tuple[End | None, str]:
     """Until the trial is over; the end that it reached, or why it reached none."""
     folder, timeout_s = attempt.folder, attempt.plan.timeout_s
-    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
     until_s = time.monotonic() + timeout_s
     while True:
         over = simulator.is_over  # checked first, so that rows of its last moment are read
@@ -206,7 +206,7 @@ def _watched(
             return None, ended
 
 
-def _ended(recording: Recording, watch: TrialWatch) -> str | None:
+def _ended(recording: RecordingAccess, watch: TrialWatch) -> str | None:
     """Why the run cannot continue: its controller's process has ended."""
     if watch.run_id is None:
         return None
@@ -217,11 +217,11 @@ def _ended(recording: Recording, watch: TrialWatch) -> str | None:
     return f"its run ended ({reason})"
 
 
-def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: str) -> Result:
+def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: str) -> TrialResult:
     recording = _settled(attempt.folder)
     if recording is None:
         text = "the controller recorded nothing in its data folder: does it name another one?"
-        return Result(None, None, f"{why}; {text}" if why else text)
+        return TrialResult(None, None, f"{why}; {text}" if why else text)
     with recording.reader() as connection:
         end = end or watch.find_end(
             connection
@@ -230,12 +230,12 @@ def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: s
             return _scored(connection, attempt.plan, attempt.values, watch, end)
         why = _ending_line(connection, watch.run_id) or why
     reached = "nothing" if watch.reached_s is None else f"{watch.reached_s:.3f} s"
-    return Result(watch.run_id, None, f"did not reach its end, only {reached}: {why}")
+    return TrialResult(watch.run_id, None, f"did not reach its end, only {reached}: {why}")
 
 
 def _ending_line(connection: sqlite3.Connection, run_id: int | None) -> str | None:
     """By which exception the controller ended, where it did."""
-    wanted = LogFilter(run_id, Window(-math.inf, math.inf), ENDED_BY, "error")
+    wanted = LogFilter(run_id, LogWindow(-math.inf, math.inf), ENDED_BY, "error")
     found = newest_lines(connection, wanted, 1) if run_id is not None else []
     return found[0].message if found else None
 
@@ -246,21 +246,21 @@ def _scored(
     values: dict[str, Any],
     watch: TrialWatch,
     end: End,
-) -> Result:
+) -> TrialResult:
     assert watch.run_id is not None  # it has an end
     ended: tuple[Any, Any] = (end.by, end.sim_time_s)
     try:
         watch.require_parameters(connection, values)
     except ValueError as error:
-        return Result(watch.run_id, None, str(error), *ended)
+        return TrialResult(watch.run_id, None, str(error), *ended)
     if end.by == "prune":
         why = f"{plan.prune!r} held at {end.sim_time_s:.3f} s"
-        return Result(watch.run_id, None, why, *ended, pruned=True)
+        return TrialResult(watch.run_id, None, why, *ended, pruned=True)
     scored = score_run(connection, watch.run_id, plan.score, end_s=end.sim_time_s)
-    return Result(watch.run_id, scored.value, scored.why, *ended)
+    return TrialResult(watch.run_id, scored.value, scored.why, *ended)
 
 
-def _settled(folder: Path) -> Recording | None:
+def _settled(folder: Path) -> RecordingAccess | None:
     """The recording of a trial whose processes have ended, with all rows that waited next to it."""
     try:
         return settled(folder / DATABASE_NAME)

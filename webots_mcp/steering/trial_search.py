@@ -18,7 +18,7 @@ from webots_mcp.errors import (
 from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.steering.trial_plan import ParameterRange, TrialPlan
 from webots_mcp.store.parameters import (
-    Trial,
+    TrialRecord,
 )
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def require_optuna() -> None:
         raise InvalidInputError(explain_extra("a search", "search")) from error
 
 
-def next_parameters(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any] | None:
+def next_parameters(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any] | None:
     """The parameters of the trial after these; None where there is none.
 
     Each set is tried `plan.repeats` times in a row.
@@ -53,7 +53,7 @@ def next_parameters(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any] 
     return trials[first].values if first < number else _suggested(plan, trials)
 
 
-def _suggested(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any]:
+def _suggested(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any]:
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)

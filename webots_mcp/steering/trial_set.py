@@ -28,8 +28,8 @@ from webots_mcp.steering.trial_plan import WorldPlan
 from webots_mcp.steering.trial_search import next_parameters
 from webots_mcp.store.merging import merge
 from webots_mcp.store.parameters import (
-    Result,
-    Trial,
+    TrialRecord,
+    TrialResult,
     add_trial,
     begin_trial,
     fetch_trial_set,
@@ -41,7 +41,7 @@ from webots_mcp.store.parameters import (
     trials_of,
 )
 from webots_mcp.store.policy import LAUNCH
-from webots_mcp.store.recording import Job, Recording
+from webots_mcp.store.recording import Job, RecordingAccess
 from webots_mcp.store.requests import permit
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ from webots_mcp.steering.trial_run import Simulators, StoppedError, TrialAttempt
 FOLDER: Final = "trials"
 _MOST_THREADS: Final = 1000  # each waits for one trial
 _PATIENCE_S: Final = 0.5  # between two checks whether the caller wants to stop
-TrialReport = Callable[[Trial, Result], object]
+TrialReport = Callable[[TrialRecord, TrialResult], object]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class SetRun:
         job: The set, as long as this process works on it.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     plan: WorldPlan
     simulators: Simulators
     stopping: threading.Event
@@ -82,7 +82,7 @@ class SetRun:
         with self.writer():
             pass
 
-    def folder(self, trial: Trial) -> Path:
+    def folder(self, trial: TrialRecord) -> Path:
         """The data folder of a trial."""
         return self.recording.data_dir / FOLDER / trial.uuid
 
@@ -125,7 +125,7 @@ def _run_left(set_run: SetRun, set_id: int, report: TrialReport) -> None:
         if trial.is_over:
             shutil.rmtree(set_run.folder(trial), ignore_errors=True)
     left = deque(trial for trial in trials if not trial.is_over)
-    running: dict[Future[Result], Trial] = {}
+    running: dict[Future[TrialResult], TrialRecord] = {}
     pool = ThreadPoolExecutor(_MOST_THREADS)
     try:
         while True:
@@ -156,7 +156,7 @@ def _require_wanted(set_run: SetRun, set_id: int) -> None:
         raise CommandRefusedError(f"trial set {set_id} stopped: {reason}")
 
 
-def _next_trial(set_run: SetRun, set_id: int, left: deque[Trial]) -> Trial | None:
+def _next_trial(set_run: SetRun, set_id: int, left: deque[TrialRecord]) -> TrialRecord | None:
     """One that waits, or a new one of a search; None where there is none."""
     if left:
         return left.popleft()
@@ -171,7 +171,7 @@ def _next_trial(set_run: SetRun, set_id: int, left: deque[Trial]) -> Trial | Non
         return add_trial(connection, set_id, values)
 
 
-def run_trial(set_run: SetRun, trial: Trial) -> Result:
+def run_trial(set_run: SetRun, trial: TrialRecord) -> TrialResult:
     """Run one trial, or only score and merge it where it has run to its end already.
 
     Raises:
@@ -196,14 +196,14 @@ def run_trial(set_run: SetRun, trial: Trial) -> Result:
     return result
 
 
-def _with_run(result: Result, merged: dict[str, int], folder: Path) -> Result:
+def _with_run(result: TrialResult, merged: dict[str, int], folder: Path) -> TrialResult:
     """With the id that its run has where it was merged."""
-    with Recording(folder / DATABASE_NAME, folder).reader() as connection:
+    with RecordingAccess(folder / DATABASE_NAME, folder).reader() as connection:
         row = connection.execute("SELECT uuid FROM run WHERE id = ?", (result.run_id,)).fetchone()
     return replace(result, run_id=merged[row[0]])
 
 
-def _run(set_run: SetRun, trial: Trial) -> Result:
+def _run(set_run: SetRun, trial: TrialRecord) -> TrialResult:
     folder = set_run.folder(trial)
     set_run.require_held()  # in that folder another process may record by now
     shutil.rmtree(folder, ignore_errors=True)

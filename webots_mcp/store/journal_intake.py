@@ -130,7 +130,7 @@ class _Faults(NamedTuple):
 _NO_FAULTS: Final = _Faults()
 
 
-class _Place(NamedTuple):
+class _JournalPosition(NamedTuple):
     """How far this process has read a part of a journal.
 
     Attributes:
@@ -178,11 +178,11 @@ class _Looks:
         self.lost_runs: dict[str, dict[str, Any]] = {}
         self.names = signal_register.SignalNames()
         self.changes = signal_register.StateChanges()
-        self.changes.look(json.loads(newest or "{}"))
+        self.changes.compare(json.loads(newest or "{}"))
 
 
 _lock = threading.Lock()
-_places: dict[Path, _Place] = {}
+_places: dict[Path, _JournalPosition] = {}
 _looks: dict[str, _Looks] = {}
 _kept: dict[Path, str] = {}  # of which nothing fits, and why
 
@@ -316,7 +316,7 @@ class _Reading:
         place = _places.get(self.path)
         if place is None or place.file != self.identity or place.number > number:
             offset = _skip(self.file, start, number)
-            place = _Place(self.identity, offset, number, offset > start, self.faults)
+            place = _JournalPosition(self.identity, offset, number, offset > start, self.faults)
             _looks[self.uuid] = _Looks(*newest)  # another process may have read on meanwhile
         looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(*newest))
         while lines := _read_lines(self.file, place.offset):
@@ -328,7 +328,7 @@ class _Reading:
                 begin = partial(self._begin, looks)
                 taken = waiting_file.take_in(self.connection, session_id, entries, finish, begin)
                 done = _until(lines, taken.number)[-1].end
-                place = _Place(self.identity, done, taken.number, True, self.faults)
+                place = _JournalPosition(self.identity, done, taken.number, True, self.faults)
             else:
                 faults = self.faults.and_those(each.fault for each in lines)
                 place = place._replace(offset=lines[-1].end, faults=faults)
@@ -347,7 +347,7 @@ class _Reading:
                 entry.values["dropped"] += dropped
         return entries
 
-    def _counted(self, session_id: int, place: _Place) -> _Place:
+    def _counted(self, session_id: int, place: _JournalPosition) -> _JournalPosition:
         """Count what was dropped and no entry followed; a part of which nothing fits is kept."""
         _kept.pop(self.path, None)
         if not place.faults.lines:

@@ -40,8 +40,8 @@ from webots_mcp.steering.trial_run import (
     webots,
 )
 from webots_mcp.store.merging import pack, unpack
-from webots_mcp.store.parameters import Result
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.parameters import TrialResult
+from webots_mcp.store.recording import RecordingAccess
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler
@@ -94,7 +94,7 @@ class Returned(NamedTuple):
         shipped: The UUID of the recording, where it was shipped.
     """
 
-    result: Result
+    result: TrialResult
     recording: bytes | None = None
     shipped: str | None = None
 
@@ -182,7 +182,7 @@ def _note_nothing(pid: int | None) -> None:
     """Whoever handed the trial out cannot end a process of this machine; its keeper does."""
 
 
-def packed(result: Result, folder: Path) -> Returned:
+def packed(result: TrialResult, folder: Path) -> Returned:
     """A result with its recording, unless that is too large."""
     bundle = folder.parent / _BUNDLE
     pack(folder, bundle)
@@ -200,7 +200,7 @@ def _shipped(folder: Path, url: str) -> str:
     """The UUID of the recording, which is in the pool then."""
     from webots_mcp.plugins.pool.shipping import Order, Report, Source, ship
 
-    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
     ship(Order(recording, partial(open_pool, url, ships=True), full=True, pictures=True), Report())
     with recording.reader() as connection:
         return Source(connection).uuid()
@@ -275,7 +275,7 @@ class ClusterSimulators:
             raise CommandRefusedError(_no_workers(self._address, "any more"))
         return max(1, min(self._count, self._most or self._count))
 
-    def run(self, attempt: TrialAttempt) -> Result:
+    def run(self, attempt: TrialAttempt) -> TrialResult:
         """As `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text
@@ -294,13 +294,13 @@ class ClusterSimulators:
             bundle.unlink()
         return returned.result
 
-    def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
+    def _fetched(self, result: TrialResult, recording_uuid: str, folder: Path) -> TrialResult:
         """The result, with its runs in a recording in the folder, as if it had been returned."""
         from webots_mcp.plugins.pool.fetching import fetch
         from webots_mcp.plugins.pool.pool_contents import Meant, pooled_runs
 
         assert self._needs.ship_to is not None
-        recording = Recording(folder / DATABASE_NAME, folder)
+        recording = RecordingAccess(folder / DATABASE_NAME, folder)
         recording.create()
         with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
             runs = [each for each in pooled_runs(pool) if each.recording_uuid == recording_uuid]
@@ -318,7 +318,7 @@ class ClusterSimulators:
                 f"{error.allowed_failures + 1} workers died while they ran it, the last one "
                 f"{error.last_worker.address}: see their logs"
             )
-            return Returned(Result(None, None, why))
+            return Returned(TrialResult(None, None, why))
         except CancelledError as error:
             raise CommandRefusedError(_LOST.format(self._address)) from error
         except WebotsMCPError:

@@ -20,24 +20,24 @@ from webots_mcp.extras.requirements import install_line
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import Motion, find_motion
 from webots_mcp.signals.naming import FARTHEST_M, metres_in
-from webots_mcp.store.chunk_table import Cells
+from webots_mcp.store.chunk_table import ColumnCells
 from webots_mcp.store.export import (
     CHUNK_ROWS,
     Column,
     ColumnKind,
+    ExportTable,
+    FlatRow,
     Progress,
     Recorded,
-    Row,
-    Source,
-    Table,
+    StateTable,
     as_text,
 )
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Segment
-from webots_mcp.store.run_rows import MAX_FILE_BYTES, Event, StoredImage, columns_of
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.run_rows import MAX_FILE_BYTES, EventRecord, StoredImage, columns_of
+from webots_mcp.store.signals import RegisteredSignal
 
 # What there is to count, in the order in which it is told.
 KINDS: Final = (
@@ -124,8 +124,8 @@ class Way:
             self._every *= 2
 
 
-Item: TypeAlias = "Recorded | LogLine | Event | PlacedCommand | StoredImage"
-_Row = TypeVar("_Row", LogLine, Event, StoredImage)
+Item: TypeAlias = "Recorded | LogLine | EventRecord | PlacedCommand | StoredImage"
+_Row = TypeVar("_Row", LogLine, EventRecord, StoredImage)
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Contents:
     connection: sqlite3.Connection
     data_dir: Path
     wanted: TimeRange
-    source: Source
+    source: StateTable
 
     @classmethod
     def of(
@@ -147,7 +147,7 @@ class Contents:
         progress: Progress | None,
     ) -> Contents:
         """What the range has now, of which the states will be read `passes` times."""
-        source = Source.of(connection, wanted.segments, passes, progress)
+        source = StateTable.of(connection, wanted.segments, passes, progress)
         return cls(connection, data_dir, wanted, source)
 
     @property
@@ -156,7 +156,7 @@ class Contents:
         return [segment.run_id for segment in self.wanted.segments]
 
     @cached_property
-    def signals(self) -> dict[str, Signal]:
+    def signals(self) -> dict[str, RegisteredSignal]:
         """All of the robot, by name."""
         return known_signals(self.connection, self.wanted)
 
@@ -180,9 +180,9 @@ class Contents:
         """What was logged in the runs themselves."""
         return self._pages("log", LogLine)
 
-    def events(self) -> Iterator[Event]:
+    def events(self) -> Iterator[EventRecord]:
         """What the bridge noticed."""
-        return self._pages("event", Event)
+        return self._pages("event", EventRecord)
 
     def images(self) -> Iterator[StoredImage]:
         """Rows of pictures, whether or not their files are still there."""
@@ -243,25 +243,27 @@ def _bounds(segment: Segment) -> dict[str, Any]:
     }
 
 
-def _number(value_of: Callable[[str], Any], signal: Signal, factor: float) -> float | None:
+def _number(
+    value_of: Callable[[str], Any], signal: RegisteredSignal, factor: float
+) -> float | None:
     value = value_of(signal.name)
     if isinstance(value, (int, float)) and abs(value) <= FARTHEST_M:
         return value * factor
     return None
 
 
-def _metres(value_of: Callable[[str], Any], signal: Signal) -> float | None:
+def _metres(value_of: Callable[[str], Any], signal: RegisteredSignal) -> float | None:
     return _number(value_of, signal, metres_in(signal.name))
 
 
-def _radians(value_of: Callable[[str], Any], heading: Signal) -> float:
+def _radians(value_of: Callable[[str], Any], heading: RegisteredSignal) -> float:
     return _number(value_of, heading, math.tau / (heading.turn or math.tau)) or 0.0
 
 
 # Rows as Parquet, through the extra `parquet` (pyarrow).
 
 
-def write_parquet(source: Table, sink: BinaryIO) -> None:
+def write_parquet(source: ExportTable, sink: BinaryIO) -> None:
     """One column per dotted name: int64, double (NaN where a value was not a number), bool, text.
 
     A long array of numbers is a list of doubles; a column of several kinds is text.
@@ -270,7 +272,7 @@ def write_parquet(source: Table, sink: BinaryIO) -> None:
         InvalidInputError: pyarrow is not installed.
     """
     arrow, parquet = _pyarrow()
-    by_column = source.by_column() if isinstance(source, Source) else None
+    by_column = source.by_column() if isinstance(source, StateTable) else None
     columns = [each for _, each in by_column.columns] if by_column else source.columns()
     types = {
         "null": arrow.null(), "bool": arrow.bool_(), "int": arrow.int64(),
@@ -301,7 +303,7 @@ def _pyarrow() -> tuple[Any, Any]:
         ) from error
 
 
-def _array(arrow: Any, cells: Cells, column: Column) -> Any:
+def _array(arrow: Any, cells: ColumnCells, column: Column) -> Any:
     """The cells of a column as Arrow has them."""
     if column.kind == "null":
         return arrow.nulls(len(cells.is_null))
@@ -312,7 +314,7 @@ def _array(arrow: Any, cells: Cells, column: Column) -> Any:
     return arrow.array(cells.values, mask=cells.is_null)
 
 
-def _values(group: list[Row], column: Column) -> list[Any]:
+def _values(group: list[FlatRow], column: Column) -> list[Any]:
     convert = _CONVERSIONS.get(column.kind)
     values = [row.values.get(column.name) for row in group]
     return values if convert is None else [v if v is None else convert(v) for v in values]

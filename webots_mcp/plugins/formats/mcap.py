@@ -29,8 +29,8 @@ from webots_mcp.store.chunks import parse
 from webots_mcp.store.export import Exported, Progress, Recorded, json_text, value_at
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.run_rows import Event, StoredImage
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.run_rows import EventRecord, StoredImage
+from webots_mcp.store.signals import RegisteredSignal
 
 WORLD_FRAME: Final = "world"
 _PROFILE: Final = ""  # of no middleware
@@ -183,7 +183,7 @@ class _Writing:
         self._encode(item, "log", "foxglove.Log", message)
 
     @write.register
-    def _(self, item: Event) -> None:
+    def _(self, item: EventRecord) -> None:
         self.counts["events"] += 1
         message = {"kind": item.kind, "name": item.name, "data": item.details()}
         self._encode(item, "events", "webots_mcp.Event", message)
@@ -411,7 +411,7 @@ def layout(contents: Contents) -> dict[str, Any]:
     }
 
 
-def main_signals(contents: Contents) -> list[Signal]:
+def main_signals(contents: Contents) -> list[RegisteredSignal]:
     """What tells most of a run: how the robot moves, else the first numbers that it published."""
     numbers = [signal for signal in contents.signals.values() if signal.kind in ("num", "angle")]
     moving = [signal for signal in contents.motion.evidence if signal in numbers]
@@ -430,7 +430,7 @@ def _add_signals(panels: dict[str, dict[str, Any]], contents: Contents, topics: 
             panels[name] = {"paths": paths, "isSynced": True}
 
 
-def _paths(contents: Contents, topics: Topics, signal: Signal) -> list[dict[str, Any]]:
+def _paths(contents: Contents, topics: Topics, signal: RegisteredSignal) -> list[dict[str, Any]]:
     if signal.reduction or not _PLAIN_PATH.fullmatch(signal.path):
         return []
     return [

@@ -32,11 +32,11 @@ from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.making import obstacles_of
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
+from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
-from webots_mcp.store.recording import Recording, View, view_of
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robots import RUNNING, list_robots, nothing_recorded, without_observers
 from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
 from webots_mcp.store.runs import RunInfo, list_runs
@@ -125,7 +125,7 @@ def choice_of(asked: Mapping[str, str]) -> Choice:
 # How the robot is ---------------------------------------------------------------------------------
 
 
-def look(recording: Recording, choice: Choice, *, steers: bool) -> dict[str, Any]:
+def look(recording: RecordingAccess, choice: Choice, *, steers: bool) -> dict[str, Any]:
     """The status of the robot and the run that are chosen, and what else there is to choose.
 
     Raises:
@@ -137,7 +137,7 @@ def look(recording: Recording, choice: Choice, *, steers: bool) -> dict[str, Any
         run, header = view.run, view.header()
         is_newest = run == current_run(connection, view.robot.id)
         image = newest_image(connection, run.id) if run else None
-        asked = LogFilter(run.id if run else None, Window(-math.inf, math.inf),
+        asked = LogFilter(run.id if run else None, LogWindow(-math.inf, math.inf),
                           robot_id=view.robot.id)  # fmt: skip
         runs = list_runs(connection, robot=view.robot.name, limit=MOST_RUNS).runs
         settable = steers and is_newest
@@ -156,7 +156,7 @@ def look(recording: Recording, choice: Choice, *, steers: bool) -> dict[str, Any
         }
 
 
-def _view(connection: sqlite3.Connection, choice: Choice) -> View:
+def _view(connection: sqlite3.Connection, choice: Choice) -> RobotView:
     now_s = time.time()
     robots = without_observers(list_robots(connection, now_s))
     if not robots:
@@ -207,7 +207,7 @@ def run_title(run: RunInfo) -> str:
 _judges: Final = ThreadPoolExecutor(1, "webots-mcp lights")  # no look waits for a check
 
 
-def _with_lights(recording: Recording, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
+def _with_lights(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
     """The runs to choose from; behind those that are over a light, which a check gives them."""
     choices: list[dict[str, Any]] = []
     lights = 0
@@ -224,7 +224,7 @@ def _with_lights(recording: Recording, runs: Sequence[RunInfo]) -> list[dict[str
     return choices
 
 
-def _judge(recording: Recording, key: tuple[str, int, float]) -> None:
+def _judge(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
     """Check a run; one that cannot be read now is judged at another look."""
     try:
         with recording.reader() as connection:
@@ -256,7 +256,7 @@ def _bound(value: float | None) -> str:
     return "any" if value is None else f"{value:g}"
 
 
-def picture(recording: Recording, choice: Choice) -> dict[str, Any]:
+def picture(recording: RecordingAccess, choice: Choice) -> dict[str, Any]:
     """The newest picture of a run as part of the page itself, and what it is."""
     with recording.reader() as connection:
         run = _view(connection, choice).run
@@ -283,7 +283,7 @@ def _as_jpeg(file: Path) -> bytes:
 # Figures ------------------------------------------------------------------------------------------
 
 
-def draw(recording: Recording, choice: Choice) -> dict[str, Any]:
+def draw(recording: RecordingAccess, choice: Choice) -> dict[str, Any]:
     """The figures of a run as markup, None where there is nothing to draw, and notes."""
     with recording.reader() as connection:
         view = _view(connection, choice)

@@ -37,7 +37,7 @@ from webots_mcp.simulator.orders import Order
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
 from webots_mcp.store.chunk_making import make_missing_chunks
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import OpenRequest, Requester
 
 HOST: Final = LOOPBACK[0]
@@ -88,7 +88,7 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, recording: Recording, port: int, *, read_only: bool) -> None:
+    def __init__(self, recording: RecordingAccess, port: int, *, read_only: bool) -> None:
         super().__init__((HOST, port), _Request)
         self.recording, self.read_only = recording, read_only
         self.steered = replace(recording, read_only=False)
@@ -173,7 +173,9 @@ class PageServer(ThreadingHTTPServer):
             _log.error("the page cannot show all", exc_info=error)
 
 
-def create_page_server(recording: Recording, port: int, *, read_only: bool = False) -> PageServer:
+def create_page_server(
+    recording: RecordingAccess, port: int, *, read_only: bool = False
+) -> PageServer:
     """A server of the page of a recording, which need not be there yet.
 
     Args:
@@ -394,7 +396,7 @@ class ChunkMaker(threading.Thread):
         rounds: How often it put all that there was into chunks.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         super().__init__(name="webots-mcp page", daemon=True)
         self._recording = recording
         self._ending = threading.Event()
@@ -431,7 +433,7 @@ class ChunkMaker(threading.Thread):
 # What the buttons and inputs of the page do: the way that the tools' own commands go.
 
 
-def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
+def steer(recording: RecordingAccess, robot: str, order: Order) -> dict[str, Any]:
     """Give an order to the simulation of a robot; answers in words what came of it."""
     params = {"steps": 1} if order == "step" else {}
     dispatcher = Dispatcher(recording, _silent)
@@ -441,7 +443,7 @@ def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
     return _told(order, attempt.steer, request)
 
 
-def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str, Any]:
+def tune(recording: RecordingAccess, robot: str, name: str, value: Value) -> dict[str, Any]:
     """Set one parameter of a robot's controller, and say what came of it."""
     setting = partial(
         set_parameters, recording, _silent, {name: value}, robot=robot, timeout_s=_WAIT_S

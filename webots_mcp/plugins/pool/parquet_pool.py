@@ -45,7 +45,7 @@ from webots_mcp.plugins.pool.parquet_files import (
 from webots_mcp.plugins.pool.pool_interface import LISTED, Batch, Row, Table, batches, table, tables
 from webots_mcp.plugins.pool.value_columns import NameAndKind, chunks_of, columns_of
 from webots_mcp.signals.naming import unit_in
-from webots_mcp.store.sql import Result
+from webots_mcp.store.sql import SqlResult
 
 # A part is over when its file is so large, or its rows in memory are, or when what comes at a time
 # is so little beside it that it would be written again for almost nothing.
@@ -276,7 +276,7 @@ class ParquetPool:
         """A picture that was shipped, by the path in its row."""
         return self._storage.read(f"{folder_of(recording_uuid)}/{picture_file(path)}")
 
-    def select(self, sql: str, max_rows: int) -> Result:
+    def select(self, sql: str, max_rows: int) -> SqlResult:
         """The first rows of one SELECT of DuckDB.
 
         Raises:

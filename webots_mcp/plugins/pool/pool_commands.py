@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from webots_mcp.plugins.pool.fetching import Fetched
     from webots_mcp.plugins.pool.pool_interface import Pool
     from webots_mcp.plugins.pool.shipping import Report
-    from webots_mcp.store.sql import Result
+    from webots_mcp.store.sql import SqlResult
 
 _MOST_NAMED: Final = 3
 _SHORT: Final = 8  # of a UUID: as much of it as tells one from the others
@@ -208,7 +208,7 @@ def _listed(pool: Pool, part: str, choice: Choice) -> _List:
     return _List("runs", runs, columns, rows)
 
 
-def _print_answer(answer: Result) -> None:
+def _print_answer(answer: SqlResult) -> None:
     rows = [["NULL" if cell is None else cell for cell in row] for row in answer.rows]
     print_table(answer.columns, rows)
     cut = f"{answer.shortened} long values are cut" if answer.shortened else None

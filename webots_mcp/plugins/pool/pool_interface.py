@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.store.sql import Result
+    from webots_mcp.store.sql import SqlResult
 
 SQLValue: TypeAlias = "int | float | str | bytes | None"
 Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
@@ -330,7 +330,7 @@ class Pool(Protocol):
         """A picture that was shipped, by the path in its row."""
         ...
 
-    def select(self, sql: str, max_rows: int) -> Result:
+    def select(self, sql: str, max_rows: int) -> SqlResult:
         """The first rows of one SELECT, which cannot write, before a deadline; see `query_sql`."""
         ...
 

@@ -47,7 +47,7 @@ from webots_mcp.plugins.pool.pool_interface import (
     tables,
 )
 from webots_mcp.store.models import STATISTICS
-from webots_mcp.store.sql import Result, require_max_rows
+from webots_mcp.store.sql import SqlResult, require_max_rows
 
 Connection: TypeAlias = "psycopg.Connection[tuple[Any, ...]]"
 
@@ -373,7 +373,7 @@ class PostgresPool:
         found = list(self._asked(query, (recording_uuid, path)))
         return bytes(found[0][0]) if found else None
 
-    def select(self, sql: str, max_rows: int) -> Result:
+    def select(self, sql: str, max_rows: int) -> SqlResult:
         """The first rows of one SELECT.
 
         Raises:

@@ -35,10 +35,10 @@ from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import in_one_snapshot
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.robots import world_seen
-from webots_mcp.store.run_rows import Run, fetch_run, inside, opened
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.run_rows import RunRecord, fetch_run, inside, opened
+from webots_mcp.store.signals import RegisteredSignal
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -150,12 +150,12 @@ def moment_key(chapter: Chapter, moment: Moment) -> str:
     return f"moment {chapter.info.run_id} {list(chapter.moments).index(moment)}"
 
 
-def _known(connection: sqlite3.Connection, chapter: Chapter) -> dict[str, Signal]:
+def _known(connection: sqlite3.Connection, chapter: Chapter) -> dict[str, RegisteredSignal]:
     return {} if chapter.range is None else known_signals(connection, chapter.range)
 
 
 def _chosen(
-    chapters: Sequence[Chapter], known: Sequence[dict[str, Signal]], names: Sequence[str]
+    chapters: Sequence[Chapter], known: Sequence[dict[str, RegisteredSignal]], names: Sequence[str]
 ) -> dict[int, list[str]]:
     """The signals to draw of each run; of two robots each may lack what the other has."""
     if not names:
@@ -168,7 +168,7 @@ def _chosen(
     }
 
 
-def _why_none(known: Sequence[dict[str, Signal]], names: Sequence[str]) -> str:
+def _why_none(known: Sequence[dict[str, RegisteredSignal]], names: Sequence[str]) -> str:
     """Why none can be laid over each other: texts, and what rests, are chosen by name alone."""
     if names:
         return "none that was asked for is in both"
@@ -276,7 +276,7 @@ def obstacles_of(
     return _of_file(run) or _seen(connection, run)
 
 
-def _of_file(run: Run) -> tuple[Obstacle, ...]:
+def _of_file(run: RunRecord) -> tuple[Obstacle, ...]:
     file = Path(run.world or "")
     try:
         status = file.stat()
@@ -322,7 +322,7 @@ def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
     return tuple((shape.x + cos * u - sin * v, shape.y + sin * u + cos * v) for u, v in halves)
 
 
-def _seen(connection: sqlite3.Connection, run: Run) -> tuple[Obstacle, ...]:
+def _seen(connection: sqlite3.Connection, run: RunRecord) -> tuple[Obstacle, ...]:
     world = world_seen(connection, run)
     solids = world.told.get("solids", ()) if world else ()
     places = world.places if world else {}
@@ -665,7 +665,7 @@ class ReportAnswer(NotedAnswer):
 
 @question("Write a report", DESTROYS)
 def webots_report(
-    recording: Recording,
+    recording: RecordingAccess,
     run_ids: RunIds = None,
     file: Annotated[str, Field(max_length=500, description="In the data folder.")] = "",
     overwrite: Annotated[bool, Field(description="A file that is there.")] = False,

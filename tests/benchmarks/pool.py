@@ -28,7 +28,7 @@ from tests.benchmarks.core import (
 )
 from tests.benchmarks.history import record
 from tests.benchmarks.ways import make_states
-from tests.pool.lab import short_runs
+from tests.plugins.pool.lab import short_runs
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import connect as connect_recording

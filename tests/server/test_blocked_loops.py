@@ -16,7 +16,7 @@ from anyio import to_thread
 from mcp import Client
 
 from tests.bridge.conftest import Recording
-from tests.processes.conftest import data_dir, filed, has_states, start  # fixtures
+from tests.bridge.processes.conftest import data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, text_of
 from tests.waiting import until
 from webots_mcp.contract import HANG_VARIABLE

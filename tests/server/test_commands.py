@@ -18,9 +18,9 @@ from typing import Any
 import anyio
 import pytest
 
+from tests.database.test_queue import claim
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask, fail
-from tests.store.test_queue import claim
 from tests.waiting import until
 from webots_mcp.database.connection import connect as connect_database
 from webots_mcp.database.queue import CommandQueue, fetch_command, list_commands

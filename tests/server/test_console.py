@@ -16,14 +16,14 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.conftest import Connect, ask, fail, text_of
-from tests.waiting import until
-from tests.webots.conftest import (
+from tests.simulator.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
     wait_for_line,
     write_project,
 )
+from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.simulator import console
 from webots_mcp.simulator.console import belongs

@@ -144,9 +144,8 @@ class Keeper:
     def take_camera_frames(self, *, at_once: bool) -> None:
         """Take a small frame of each camera whose frame is due; `at_once` of all cameras."""
         now_s = self._clock.sim_time_s
-        frames = self.frames.take_due(
-            now_s, at_once=at_once
-        )  # without the lock: Webots may be slow
+        # Without the lock, since Webots may be slow.
+        frames = self.frames.take_due(now_s, at_once=at_once)
         with self._lock:
             if self._clock.run is not self._run:
                 self._begin_run()

@@ -268,15 +268,25 @@ def import_(
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
     """What the import has brought, of the runs that are in both recordings now."""
-    from webots_mcp.store.merging import merge, settled
+    from webots_mcp.database.upgrade import in_current_schema
+    from webots_mcp.store.merging import settled
 
-    settled(source)  # first: no database is made for what is no recording
+    with in_current_schema(source) as current:
+        settled(current)  # first: no database is made for what is no recording
+        return _merge_into(recorded, source, current)
+
+
+def _merge_into(recorded: Where, source: Path, current: Path) -> dict[str, Any]:
+    """Merge a settled recording; `current` is the source, or its copy in the current schema."""
+    from webots_mcp.store.merging import merge
+
     with recorded.writer("import", {"source": source}, create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
-        runs = sorted(merge(connection, recording.data_dir, source).values())
+        runs = merge(connection, recording.data_dir, current, pictures=source.parent).values()
+        runs = sorted(runs)
         return {
             "new_run_ids": [run_id for run_id in runs if run_id > newest],
             "known_run_ids": [run_id for run_id in runs if run_id <= newest],

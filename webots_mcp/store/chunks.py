@@ -59,9 +59,12 @@ _LAST_AT: Final = (
     "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
     "AND end_sim_time_s = ?"
 )
+NEWEST_STATE_ID: Final = (  # that was ever given
+    "max((SELECT coalesce(max(id), 0) FROM state), (SELECT coalesce(max(CAST(reserved_state_id "
+    "AS INTEGER)), 0) FROM recording))"
+)
 IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
-    "typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= "
-    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'state')"
+    f"typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= {NEWEST_STATE_ID}"
 )
 _WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
@@ -80,10 +83,6 @@ _COPIED: Final = ("robot", "session", "run", *_SEEN)
 _OTHERS: Final = (
     "SELECT type, name FROM main.sqlite_master WHERE type = 'view' OR type = 'table' AND name "
     f"NOT IN {_COPIED} AND name NOT LIKE 'sqlite_%'"
-)
-_LAST_IDS: Final = (
-    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
-    "INSERT INTO main.sqlite_sequence SELECT * FROM recorded.sqlite_sequence WHERE name = 'state'",
 )
 _UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may have the number of a deleted one
 _MARK: Final = f"SELECT state_id FROM main.watermark WHERE name = 'chunk' AND {IS_MARK}"
@@ -647,8 +646,6 @@ def chunks_aside(database: Path, *, frozen: bool) -> Generator[sqlite3.Connectio
             for table in _COPIED:
                 connection.execute(f"DELETE FROM main.{table}")
                 connection.execute(f"INSERT INTO main.{table} SELECT * FROM recorded.{table}")
-        for statement in _LAST_IDS:  # up to which a watermark is believed
-            connection.execute(statement)
         try:
             yield connection
         finally:

@@ -178,7 +178,7 @@ class _Looks:
         self.lost_runs: dict[str, dict[str, Any]] = {}
         self.names = signal_register.SignalNames()
         self.changes = signal_register.StateChanges()
-        self.changes.look(json.loads(newest or "{}"))
+        self.changes.compare(json.loads(newest or "{}"))
 
 
 _lock = threading.Lock()

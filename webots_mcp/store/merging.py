@@ -151,11 +151,9 @@ _IDS: Final = (
     f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
     f"AND signal_id = {STATE_IDS})"
 )
-_LAST_HERE: Final = "SELECT coalesce(max(seq), 0) FROM main.sqlite_sequence WHERE name = 'state'"
-_RESERVE: Final = (
-    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
-    "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
-)
+_NEWEST_HERE: Final = "SELECT coalesce(max(id), 0) FROM main.state"
+_RESERVED_HERE: Final = "SELECT coalesce(max(reserved_state_id), 0) FROM main.recording"
+_RESERVE: Final = "UPDATE main.recording SET reserved_state_id = max(reserved_state_id, ?)"
 _SIGNALS: Final = (
     "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
     "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
@@ -384,6 +382,8 @@ def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id
     shift = None
     if is_purged:
         shift = take_in_chunks(connection, run_id, run, robot_id)
+    elif _number(connection, _RESERVED_HERE) > _number(connection, _NEWEST_HERE):
+        shift = _reserve_ids(connection, run_id)  # SQLite would give ids that other rows had
     _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)
 
 
@@ -667,7 +667,7 @@ def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
 
 
 def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
-    (last_here,) = connection.execute(_LAST_HERE).fetchone()
+    last_here = max(_number(connection, _NEWEST_HERE), _number(connection, _RESERVED_HERE))
     first, last = connection.execute(_IDS, {"run": there}).fetchone()
     if first is None:
         return 0
@@ -677,7 +677,9 @@ def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
             "gives: the recording is damaged"
         )
     shift = last_here + 1 - first
-    delete, insert = _RESERVE
-    connection.execute(delete)
-    connection.execute(insert, (last + shift,))
+    connection.execute(_RESERVE, (last + shift,))
     return shift
+
+
+def _number(connection: sqlite3.Connection, query: str) -> int:
+    return int(connection.execute(query).fetchone()[0])

@@ -67,9 +67,10 @@ _UNCHECKED: Final = -1
 # Of the progress: the last picture whose file was shipped, and the last state of a kept stretch.
 _PICTURE: Final = "picture"
 _STRETCH: Final = "kept_stretch/"
-_SEQUENCE: Final = (
-    "SELECT max((SELECT coalesce(max(id), 0) FROM {}), "
-    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = '{}'))"
+_SEQUENCE: Final = (  # the greatest id that a table ever gave
+    "SELECT max((SELECT coalesce(max(id), 0) FROM {0}), iif('{0}' = 'state', "
+    "(SELECT reserved_state_id FROM recording), "
+    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = '{0}')))"
 )
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {}"
 # Up to the first that somebody is still making: its id is not looked at again later.
@@ -456,7 +457,7 @@ class Shipper:
             before = self._progress.get(f"{each.name}.check", _UNCHECKED)
             now = source.fingerprint(each, known)
             is_other = before != now and _UNCHECKED not in (before, now)
-            if source.number(_SEQUENCE.format(each.name, each.name)) < known or is_other:
+            if source.number(_SEQUENCE.format(each.name)) < known or is_other:
                 raise PoolError(
                     f"the recording {self._uuid} is not the one that was shipped to {self.address} "
                     f"before: its table {each.name!r} is not the same up to row {known}. It is an "

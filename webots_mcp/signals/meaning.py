@@ -59,6 +59,10 @@ _COUNTS: Final = frozenset((
     "count", "counter", "length", "queue", "item", "tick", "step", "score", "packet", "encoder",
     "index", "id", "lap", "goal", "collision", "episode", "gear", "level", "size", "iteration",
 ))  # fmt: skip
+_NOT_OF_SUBJECT: Final = frozenset((
+    *_COMMAND, *_TARGET, *_MEASURED, "position", "angle", "speed", "velocity", "rate", "current",
+    "state", "value", "rad", "deg", "m", "s", "rpm", "mm",
+))  # fmt: skip
 _JOINTS: Final = frozenset((
     "joint", "arm", "elbow", "shoulder", "wrist", "knee", "hip", "ankle", "neck", "waist", "torso",
     "gripper", "finger", "claw", "jaw", "hand", "leg", "pan", "tilt", "turret", "mast", "slider",
@@ -221,6 +225,38 @@ def meanings_by_name(
         name: meaning_by_name(name, kind, register_roles.get(name), names)
         for name, kind in kinds.items()
     }
+
+
+def targets_in(meanings: Mapping[str, Meaning]) -> list[tuple[str, str]]:
+    """Return the pairs of a measured signal and its target.
+
+    Declared ones count first. Else both have the same quantity, or one of them none that is known,
+    and the same words but for those of a role and of the quantity itself: `elbow.pos` and
+    `elbow.target`, `wheels.left.velocity` and `wheels.left.target`.
+    """
+    found: dict[str, str] = {
+        each.target_of: name for name, each in meanings.items() if each.target_of in meanings
+    }
+    by_subject: dict[tuple[frozenset[str], tuple[str, ...]], list[str]] = {}
+    for name, meaning in meanings.items():
+        if meaning.sets or (meaning.quantity is None and _role_in(name) in ("commanded", "target")):
+            by_subject.setdefault(_subject_of(name), []).append(name)
+    for name, meaning in meanings.items():
+        if name in found or meaning.sets or meaning.role == "limit" or not _subject_of(name)[0]:
+            continue
+        for target in by_subject.get(_subject_of(name), ()):
+            quantities = {meaning.quantity, meanings[target].quantity} - {None}
+            if target != name and len(quantities) <= 1 and meanings[target].target_of is None:
+                found[name] = target
+                break
+    return list(found.items())
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _subject_of(name: str) -> tuple[frozenset[str], tuple[str, ...]]:
+    """The words of a name without those of its role and quantity, and its numbers of items."""
+    items = tuple(part for part in name.split(".") if part.isdigit())
+    return frozenset(words_in(name)) - _NOT_OF_SUBJECT, items
 
 
 def _named(quantity: Quantity, role: Role | None, name: str, why: str) -> Meaning:

@@ -24,7 +24,7 @@ from webots_mcp.judging.checks.finding import (
     times,
     total_s,
 )
-from webots_mcp.judging.detection import jump, sensors
+from webots_mcp.judging.detection import degradation, fall, jump, sensors, targets
 from webots_mcp.judging.detection.condition import (
     NONE_EXPECTED,
     Adherence,
@@ -260,16 +260,21 @@ def reaches_goal(run: RunUnderCheck) -> Finding:
 # -- all of them -----------------------------------------------------------------------------------
 
 _JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
+_OFF, _FALL = (targets.OFF_TARGET.name,), (fall.FALL.name,)
+_NOISE: Final = (degradation.DEGRADATION.name,)
 CHECKS: Final[list[Check]] = [
     Check("moves when commanded", of_motion.moves_when_commanded, _MOVES, ("stuck", "standstill")),
-    Check("follows its targets", of_motion.follows_targets, _AIMS, of_values=True),
+    Check("rests when commanded", of_motion.rests_when_commanded, _MOVES, of_values=True),
+    Check("follows its targets", of_motion.follows_targets, _AIMS, _OFF),
     Check("wheels grip", of_motion.wheels_grip, "a position; speeds of wheels", of_values=True),
     Check("estimates agree", of_motion.estimates_agree, _TWO, of_values=True),
+    Check("stays upright", of_motion.stays_upright, "roll and pitch", _FALL),
     Check("stays in place", of_motion.stays_in_place, "the position", _JUMP),
     Check("sensors speak", of_sensors.sensors_speak, "numbers", ("missing",), of_values=True),
     Check("sensors live", of_sensors.sensors_live, "numbers", _FLAT, of_values=True),
     Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
     Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", _JUMP),
+    Check("sensors keep their noise", of_sensors.sensors_keep_noise, "numbers", _NOISE),
     Check("keeps pace", keeps_pace, "rows", of_values=True),
     Check("misses no steps", misses_no_steps, "rows", ("gap",), of_values=True),
     Check("logs no errors", logs_no_errors, "", ("log",)),

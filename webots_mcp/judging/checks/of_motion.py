@@ -6,16 +6,20 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, cast
 
-from webots_mcp.analysis.arrays import Array, RowSpan, median, np, runs_of
+from webots_mcp.analysis.arrays import Array, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times, total_s
-from webots_mcp.judging.detection.condition import lasting
+from webots_mcp.judging.detection.fall import FALL
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
-from webots_mcp.judging.detection.search import in_metres, places_in
-from webots_mcp.judging.detection.standstill import ON_THE_SPOT
-from webots_mcp.signals.naming import METRES, counted, find_targets, in_snake_case, listed, unit_in
+from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
+from webots_mcp.judging.detection.standstill import COMMAND_NOISE, ON_THE_SPOT, TURNED_RAD
+from webots_mcp.judging.detection.targets import OFF_TARGET, pursuits_in
+from webots_mcp.signals.meaning import words_in
+from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, unit_in, words_of
 from webots_mcp.signals.register import PLACES
+from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.reading.segment import just_after
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 _OFF_THE_FLOOR_M: Final = 0.3
@@ -27,6 +31,8 @@ _OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is no
 _NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
 _NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
 _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
+_ALIKE: Final = 0.05  # of the faster side: wheels that differ by less drive straight on
+_TURNED_ALONE_RAD: Final = 0.3  # in 3 s, while both sides turn alike
 _SLIPS: Final = 0.5  # of the usual way per turn of the wheels
 _CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
 _NOISE_SHARE: Final = 0.1  # of the speed that it may take
@@ -40,6 +46,7 @@ _LEAST_WAY_M: Final = 1.0
 _SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
 _WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
 _FAILS: Final = (0.15, 0.3)
+_OTHER_LENGTH: Final = 1.15  # times as long: worth a word
 
 
 def moves_when_commanded(run: RunUnderCheck) -> Finding:
@@ -58,6 +65,49 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
     if undecided := run.found.verdicts.reasons.get("stuck"):
         return Finding("not judged", "; ".join(undecided))
     return Finding("pass", f"{counted(len(stood), 'standstill')}, none against a command")
+
+
+def rests_when_commanded(run: RunUnderCheck) -> Finding:
+    """Warns where it turned by 0.1 rad or went 5 cm while every command was 0."""
+    motion = run.motion
+    commands = [*filter(None, (motion.commanded, motion.turn_command)), *motion.wheel_commands]
+    if not commands:
+        raise NotSearchableError("no command is known")
+    frame = run.frame
+    idle = np.ones(len(frame), np.bool_)
+    for each in commands:
+        idle &= np.abs(frame.numbers(each.name)) <= COMMAND_NOISE * run.noise.of(each.name)
+    moved: list[tuple[float, str]] = []
+    for rest in runs_of(idle, frame.times).spans():
+        if rest.end_s - rest.start_s >= ROLLS_OUT_S + APART_S:
+            part = frame.between(rest.start_s + ROLLS_OUT_S, just_after(rest.end_s))
+            moved += ((rest.start_s, each) for each in _moved_in(run, part))
+    if not moved:
+        return Finding("pass", "it rested whenever every command was 0")
+    names = listed([each.name for each in commands], 3)
+    evidence = f"{moved[0][1]} although {names} {'was' if len(commands) == 1 else 'were'} 0"
+    shown = run.shows(*(each.name for each in commands[:2]))
+    return Finding("warn", evidence, moved[0][0], len(moved), shown)
+
+
+def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
+    """How it moved in some rows, beyond the noise of its heading and position."""
+    ends = max(1, min(len(part) // 4, 50))
+    if (heading := run.motion.heading) is not None:
+        turn = heading.turn or math.tau
+        course = part.numbers(heading.name)
+        course = unwrap(course[np.isfinite(course)], turn) * math.tau / turn
+        if len(course) > 2 * ends:
+            turned = median(course[-ends:]) - median(course[:ends])
+            noise = run.noise.of(heading.name) * math.tau / turn
+            if abs(turned) > max(TURNED_RAD, _NOISE * noise):
+                yield f"turned by {turned:.2g} rad in {part.bounds_s[1] - part.bounds_s[0]:.3g} s"
+    if run.motion.position is not None:
+        rows, x, y = places_in(part, run.motion.position)
+        if len(rows) > 2 * ends:
+            way_m = math.hypot(*(median(each[-ends:]) - median(each[:ends]) for each in (x, y)))
+            if way_m > max(run.search.options.stuck_m, _NOISE * run.noise.position_m):
+                yield f"moved {way_m:.2g} m in {part.bounds_s[1] - part.bounds_s[0]:.3g} s"
 
 
 def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
@@ -92,70 +142,36 @@ def follows_targets(run: RunUnderCheck) -> Finding:
     Places where a robot shall go are no targets, and grippers hold things. A target that is always
     0 has no range to judge by.
     """
-    pairs = list(_pairs(run))
-    if not pairs:
-        none = "no target, other than always 0, is published beside what it is the target of"
-        raise NotSearchableError(none)
-    found: list[tuple[RegisteredSignal, RowSpan, float]] = []
-    for measured, target in pairs:
-        found += _apart(run, measured, target)
+    found = run.events(OFF_TARGET.name)
     if not found:
-        said = f"{counted(len(pairs), 'target')} followed, as by {pairs[0][0].name}"
+        pursuits = pursuits_in(run.search)
+        if not pursuits:
+            raise NotSearchableError("no target is published next to what it is the target of")
+        said = f"{counted(len(pursuits), 'target')} followed, as by {pursuits[0].measured.name}"
         return Finding("pass", said)
-    found.sort(key=lambda each: each[1].start_s)
-    names = listed(list(dict.fromkeys(signal.name for signal, *_ in found)), 3)
-    longest, by = max((rest.duration_s, by) for _, rest, by in found)
-    evidence = f"{names}: up to {longest:.3g} s without coming nearer, {by:.3g} away"
-    since_s, shown = found[0][1].start_s, run.shows(found[0][0].name)
-    return Finding("fail", evidence, since_s, len(found), shown)
+    names = listed(list(dict.fromkeys(each.name or "" for each in found)), 3)
+    longest = max(found, key=lambda each: each.duration_s)
+    details = longest.details
+    evidence = (
+        f"{names}: {details['off_percent']:g} % off {details['target']} for "
+        f"{longest.duration_s:.3g} s without coming nearer"
+    )
+    return Finding("fail", evidence, found[0].start_s, len(found), run.more(OFF_TARGET.name))
 
 
-def _pairs(run: RunUnderCheck) -> Iterator[tuple[RegisteredSignal, RegisteredSignal]]:
-    """Measured values with their targets, but for where the robot shall go, and what holds."""
-    motion, known = run.motion, run.search.known
-    there = [
-        name for name, each in known.items()
-        if each.kind in ("num", "angle") and run.frame.zones(name).value_count.any()
-    ]  # fmt: skip
-    away = {each.name for each in (*(motion.position or ()), motion.heading, motion.height) if each}
-    for name in there:
-        words = in_snake_case(name).replace(".", "_").split("_")
-        if name in away or (known[name].role or "")[:3].startswith(("x", "y", "z")):
-            continue
-        target, _ = find_targets(name, there)
-        if target is None or not _HOLDING.isdisjoint(words):
-            continue
-        zones = run.frame.zones(target)
-        if (zones.min < 0).any() or (zones.max > 0).any():
-            yield known[name], known[target]
+# -- attitude --------------------------------------------------------------------------------------
 
 
-def _apart(
-    run: RunUnderCheck, measured: RegisteredSignal, target: RegisteredSignal
-) -> Iterator[tuple[RegisteredSignal, RowSpan, float]]:
-    frame = run.frame
-    values, aims = frame.numbers(measured.name), frame.numbers(target.name)
-    there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
-    if len(there) < 2:
-        return
-    rows, values, aims = frame.times[there], values[there], aims[there]
-    before = np.maximum(np.searchsorted(rows, rows - APART_S, "right") - 1, 0)
-    off, was_off = (_between(each, aims, measured.turn) for each in (values, values[before]))
-    noise = max(run.noise.of(measured.name), run.noise.of(target.name))
-    span = float(np.ptp(aims)) or float(np.abs(aims).max())
-    is_apart = off > max(_OF_RANGE * span, _NOISE * noise)
-    nearer_by = max(_NEARER * span, _NOISE / 2 * noise)
-    # For as long again: a target that was set anew may lie the other way.
-    still = lasting(rows, is_apart & (was_off - off < nearer_by), APART_S)
-    for each in runs_of(still, rows).spans():
-        began = max(0, int(np.searchsorted(rows, each.start_s - APART_S, "right")) - 1)
-        lasted = each._replace(start_s=float(rows[began]))
-        yield measured, lasted, float(off[each.start : each.stop].max())
-
-
-def _between(values: Array, aims: Array, turn: float | None) -> Array:
-    off = values - aims
-    return np.abs(np.remainder(off + turn / 2, turn) - turn / 2) if turn else np.abs(off)
+def stays_upright(run: RunUnderCheck) -> Finding:
+    """Fails where it fell: tilted by over 60 degrees, and lay for a second or more."""
+    falls = run.events(FALL.name)
+    if not falls:
+        return Finding("pass", run.found.verdicts.not_found.get(FALL.name) or "it never fell")
+    first = falls[0]
+    got_up = first.details.get("got_up")
+    after = f"and got up {first.duration_s:.3g} s later" if got_up else "and stayed down"
+    evidence = f"fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
+    return Finding("fail", evidence, first.start_s, len(falls), run.more(FALL.name))
 
 
 # -- wheels and motion -----------------------------------------------------------------------------
@@ -182,6 +198,8 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
         raise NotSearchableError("its speed and that of its wheels have no fixed ratio")
     slips = runs_of(ratios < _SLIPS * usual, starts_s)
     found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).spans())
+    if turned := _turns_though_straight(run, wheels):
+        return turned
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
     rolls = f"rolls {usual:.3g} m/s{unit}"
     if not found:
@@ -190,6 +208,48 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
     least = min(float(np.nanmin(ratios[each.start : each.stop])) for each in found)
     evidence = f"slipped {times(len(found))}, up to {longest_s:.3g} s; {rolls}, then {least:.3g}"
     return Finding("fail", evidence, found[0].start_s, len(found), run.shows(wheels[0].name))
+
+
+def _turns_though_straight(run: RunUnderCheck, wheels: list[RegisteredSignal]) -> Finding | None:
+    """A robot that turned for long while the wheels of both sides turned alike: one side slips.
+
+    A robot that steers turns so by nature, and where none of its wheels has a side nothing is said.
+    """
+    heading = run.motion.heading
+    sides = {
+        side: [w for w in wheels if (run.meanings[w.name].side or "").endswith(side)]
+        for side in ("left", "right")
+    }
+    steers = any("steering" in words_in(name) for name in run.search.known)
+    if heading is None or steers or not all(sides.values()):
+        return None
+    frame, turn = run.frame, heading.turn or math.tau
+    course = unwrap(frame.numbers(heading.name), turn) * math.tau / turn
+    left, right = (
+        np.mean([frame.numbers(each.name) for each in wheels], axis=0) for wheels in sides.values()
+    )
+    fastest = np.maximum(np.abs(left), np.abs(right))
+    alike = (np.abs(left - right) <= _ALIKE * fastest) & (fastest > 0) & np.isfinite(course)
+    noise = run.noise.of(heading.name) * math.tau / turn
+    for rest in runs_of(alike, frame.times).spans():
+        if rest.end_s - rest.start_s < APART_S:
+            continue
+        part = course[rest.start : rest.stop]
+        clock = frame.times[rest.start : rest.stop]
+        cells = np.searchsorted(clock, np.arange(clock[0], clock[-1], APART_S))
+        turned = np.diff(part[cells])
+        far = np.flatnonzero(np.abs(turned) > max(_TURNED_ALONE_RAD, _NOISE * noise))
+        if not len(far):
+            continue
+        side = "left" if turned[far[0]] > 0 else "right"
+        total = float(np.abs(turned[far]).sum())
+        evidence = (
+            f"the {side} side slipped: it turned by {total:.3g} rad while the wheels of both "
+            "sides turned alike"
+        )
+        since_s = float(clock[cells[far[0]]])
+        return Finding("fail", evidence, since_s, 1, run.shows(heading.name, wheels[0].name))
+    return None
 
 
 def _ratios(
@@ -280,19 +340,34 @@ def _drift(
         return None
     first = max(5, int(np.count_nonzero(way_m < _FITTED * way_m[-1])) * thin)
     a, b = a - a[:first].mean(), b - b[:first].mean()
-    turn = cast("complex", np.vdot(b[:first], a[:first]))
-    off: Array = np.abs(a - b * (turn / abs(turn) if turn else 1.0))
-    if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1):
+    off = min((_laid_over(a, each, first) for each in (b, b.conj())), key=lambda each: each.max())
+    if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1) and not _are_own(one, other):
         return None
     names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
     warns_m, fails_m = (max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS))
     worst_m = float(off.max())
-    evidence = f"{names}: {worst_m:.3g} m apart at most, of a way of {way_m[-1]:.3g} m"
+    evidence = f"{names}: {worst_m:.3g} m apart at most, of a path of {way_m[-1]:.3g} m"
+    ratio = float(np.abs(np.diff(b[::thin])).sum() / way_m[-1])
+    if not 1 / _OTHER_LENGTH < ratio < _OTHER_LENGTH:
+        evidence += f"; the second path is {ratio:.3g} times as long"
     if worst_m <= warns_m:
         return Finding("pass", evidence)
     since_s = float(run.frame.times[there][int(np.argmax(off > warns_m))])
     outcome = "fail" if worst_m > fails_m else "warn"
     return Finding(outcome, evidence, since_s, 1, run.shows(one[0].name, other[0].name))
+
+
+def _laid_over(a: Any, b: Any, first: int) -> Array:
+    """How far two paths are apart where the second is turned so that its beginning fits best."""
+    turn = cast("complex", np.vdot(b[:first], a[:first]))
+    return np.asarray(np.abs(a - b * (turn / abs(turn) if turn else 1.0)))
+
+
+def _are_own(*positions: tuple[RegisteredSignal, RegisteredSignal]) -> bool:
+    """Whether the names of all say that they are positions of the robot itself."""
+    return all(
+        not set(BRANCHES).isdisjoint(words_of(x.name.partition(".")[0])) for x, _ in positions
+    )
 
 
 def stays_in_place(run: RunUnderCheck) -> Finding:

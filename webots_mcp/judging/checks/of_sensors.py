@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from webots_mcp.analysis.arrays import np, runs_of
 from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times
+from webots_mcp.judging.detection.degradation import DEGRADATION
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT
 from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed
+from webots_mcp.store.chunks import parse
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
+_SAMPLED_ROWS: Final = 50
+_ROWS: Final = "SELECT data, replaced FROM state WHERE id IN ({marks})"
 _MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first steps alone
 _LEAST_S: Final = 1.0  # as of what is missing
 _AT_LIMIT: Final = 0.05  # of the rows
@@ -37,6 +42,8 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
         for name, each in run.search.known.items() if each.is_number
     }  # fmt: skip
     never = [name for name, share in shares.items() if share == 1]
+    if not (silent or never) and (found := _missing_items(run)):
+        return found
     if not (silent or never):
         least = max(_MANY, _LEAST_S / run.search.length_s)
         if many := [name for name, share in shares.items() if share >= least]:
@@ -52,6 +59,45 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
     since_s = silent[0].start_s if silent and not never else run.search.began_s
     outcome = "fail" if nan or never else "warn"
     return Finding(outcome, evidence, since_s, len(silent) + len(never), run.more("missing"))
+
+
+def _missing_items(run: RunUnderCheck) -> Finding | None:
+    """Of long arrays: items that are NaN in all of a sample of the run's rows."""
+    frame = run.frame
+    arrays = [each for each in run.search.known.values() if each.reduction == "count"]
+    if not arrays or not len(frame):
+        return None
+    rows = np.unique(np.linspace(0, len(frame) - 1, _SAMPLED_ROWS).astype(np.intp))
+    ids = [int(each) for each in frame.ids[rows]]
+    marks = ", ".join("?" * len(ids))
+    stored = run.search.connection.execute(_ROWS.format(marks=marks), ids).fetchall()
+    states = [(parse(data), json.loads(replaced or "{}")) for data, replaced in stored]
+    for array in arrays:
+        name = array.name.rpartition(".")[0]
+        items = [
+            [value is None for value in values]
+            for state, replaced in states
+            if _FAULTY in str(replaced.get(f"{name}.*", ""))
+            and isinstance(values := value_at(state, name), list)
+        ]
+        if not items or len(items) < len(states) or len({len(each) for each in items}) > 1:
+            continue
+        never = int(np.count_nonzero(np.all(items, axis=0)))
+        total = len(items[0])
+        if never >= _MANY * total:
+            evidence = f"{name}: {never} of {total} items are NaN in every row"
+            since_s = run.search.began_s
+            return Finding("warn", evidence, since_s, never, run.shows(f"{name}.count"))
+    return None
+
+
+def value_at(state: Any, name: str) -> Any:
+    """Return the value of a dotted name in a state; None where there is none."""
+    for key in name.split("."):
+        if not isinstance(state, dict) or key not in state:
+            return None
+        state = state[key]
+    return state
 
 
 def sensors_live(run: RunUnderCheck) -> Finding:
@@ -214,6 +260,20 @@ def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
         ends = (0.0, float(np.nanmin(zones.min)), float(np.nanmax(zones.max)))
         return float(jump.details["after"]) in ends
     return False
+
+
+def sensors_keep_noise(run: RunUnderCheck) -> Finding:
+    """Warns where the noise of a sensor became three times as large, or more, for good."""
+    found = run.events(DEGRADATION.name)
+    if not found:
+        return Finding("pass", "none became noisier for good")
+    worst = max(found, key=lambda each: each.details["noise_after"] / each.details["noise_before"])
+    before, after = (worst.details[name] for name in ("noise_before", "noise_after"))
+    evidence = f"noise of {worst.name} grew from {before:g} to {after:g} for good"
+    others = listed([e.name or "" for e in found if e is not worst], MOST_NAMED)
+    evidence += f"; also {others}" if others else ""
+    more = run.more(DEGRADATION.name)
+    return Finding("warn", evidence, worst.start_s, len(found), more)
 
 
 def by_array(events: Iterable[Event]) -> list[Event]:

@@ -15,7 +15,7 @@ from functools import partial, reduce
 from itertools import starmap
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, Runs, median, np, runs_of
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, RowSpan, Runs, median, np, runs_of
 from webots_mcp.database.pauses import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.errors import (
     ConditionFailedError,
@@ -88,8 +88,24 @@ def condition_events(search: Search) -> Iterator[Event]:
     rows = search.ledger.rows = search.ledger.rows + int(np.count_nonzero(read))
     search.ledger.note_nearest("condition", rows, f"true in none of {rows} rows")
     for run, values in zip(runs.spans(), values_at(condition, frame, position, runs), strict=True):
-        details = dict(list(values.items())[:_MOST_VALUES])
+        details = dict(list(values.items())[:_MOST_VALUES]) | _extremes_in(frame, values, run)
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)
+
+
+def _extremes_in(frame: Frame, values: dict[str, Value], run: RowSpan) -> dict[str, Any]:
+    """The mean, minimum and maximum of each number of a condition while it held."""
+    found: dict[str, Any] = {}
+    part = frame.rows(run.start, run.stop)
+    for name in values:
+        if len(found) >= _MOST_VALUES or name not in frame:
+            continue
+        numbers = part.usable(name)[1]
+        if len(numbers) > 1 and numbers.min() < numbers.max():
+            figures = {"mean": numbers.mean(), "min": numbers.min(), "max": numbers.max()}
+            found[f"{name} meanwhile"] = {
+                each: float(f"{figure:.6g}") for each, figure in figures.items()
+            }
+    return found
 
 
 def _read(search: Search, segment: Segment, condition: Condition) -> Frame:

@@ -13,8 +13,17 @@ from typing import Any, Final
 
 from webots_mcp.database.liveness import dead_sessions
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.detection import condition, jump, sensors, standstill, stored
-from webots_mcp.judging.detection import jump as oscillation
+from webots_mcp.judging.detection import (
+    condition,
+    degradation,
+    fall,
+    jump,
+    oscillation,
+    sensors,
+    standstill,
+    stored,
+    targets,
+)
 from webots_mcp.judging.detection.kinds import (
     Event,
     EventKind,
@@ -65,6 +74,9 @@ KINDS: Final[list[EventKind]] = [
     sensors.FLAT,
     jump.JUMP,
     oscillation.OSCILLATION,
+    targets.OFF_TARGET,
+    fall.FALL,
+    degradation.DEGRADATION,
     stored.COMMAND,
     stored.LOG,
     stored.NOTICED,

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -18,27 +17,20 @@ from webots_mcp.analysis.arrays import (
     np,
     usual_interval_s,
 )
-from webots_mcp.analysis.summary import unwrap
 from webots_mcp.analysis.swings import (
     LEAST_HALF_SWINGS,
-    SLOW_HALF_SWINGS,
-    EvenRows,
     Swing,
     find_swings,
-    swings_in,
 )
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
     EventKind,
-    EventOptions,
-    NotSearchableError,
 )
-from webots_mcp.judging.detection.search import MOST_NAMED, Search
+from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.meaning import ANGLES, Meaning
-from webots_mcp.signals.naming import in_snake_case, listed, metres_in
+from webots_mcp.signals.naming import metres_in
 from webots_mcp.store.reading.frame import Frame, Zones
-from webots_mcp.store.signals import RegisteredSignal
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
 MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
@@ -65,14 +57,6 @@ SWING_STEPS: Final = 3  # of one swing there are at least so many, none of them 
 MUCH_SMALLER: Final = 0.25  # between two turns of a swing the largest steps are at least half alike
 SWITCHED_SHARE: Final = 0.5  # of the half swings: so many have a jump where a swing is switched
 _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
-LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
-_ENDS_WITHIN: Final = 1.5  # periods
-# Sensors swing by nature while a robot drives.
-_SWINGING: Final = re.compile(
-    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
-    r"|position|odom|odometry|left|right|cmd|command\w*|error)([._]|$)",
-    re.IGNORECASE,
-)
 
 
 def jump_events(search: Search) -> Iterator[Event]:
@@ -488,98 +472,4 @@ JUMP: Final = EventKind(
     of_numbers=True,
     drawn=1,
     alike=Alike(_alike, sort=lambda event: event.end_s > event.start_s),  # who came back or stayed
-)
-
-
-# -- `oscillation`: a signal that a robot moves with went to and fro regularly ---------------------
-
-
-def oscillation_events(search: Search) -> Iterator[Event]:
-    """Of heading, wheels, speed, position and the like, and of what is asked for."""
-    signals = search.required_numbers()
-    if search.options.signals == EventOptions.signals:
-        signals = [each for each in signals if _SWINGING.search(in_snake_case(each.name))]
-    if left := [each.name for each in search.numbers if each not in signals]:
-        why = (
-            f"not in {len(left)} of {len(search.numbers)} signals, whose names do not suggest "
-            f"motion: name them in signals ({listed(left, MOST_NAMED)})"
-        )
-        if not signals:
-            raise NotSearchableError(why)
-        search.not_searched("oscillation", why)
-    _note_periods(search)
-    for name, swing in _found(search, signals):
-        details = {
-            "half_periods": swing.half_swings,
-            "period_s": swing.period_s,
-            "amplitude": swing.amplitude,
-        }
-        event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
-        goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
-        yield replace(event, ongoing=goes_on)
-
-
-def _note_periods(search: Search) -> None:
-    """Which periods are too long for the run to hold enough of them."""
-    half_periods = search.options.min_half_periods
-    fitting_s = 2 * search.length_s / half_periods
-    if fitting_s < _longest_period_s(search):
-        search.not_searched(
-            "oscillation",
-            f"run {search.segment.run_id} lasted only {search.length_s:.3g} s, too short for "
-            f"{half_periods} half periods where a period is over {fitting_s:.2g} s",
-        )
-
-
-def _longest_period_s(search: Search) -> float:
-    if (asked_s := search.options.oscillation_period_s) is not None:
-        return asked_s
-    times = search.frame.times
-    length_s = float(times[-1] - times[0]) if len(times) else 0.0
-    return max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
-
-
-def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tuple[str, Swing]]:
-    """The swings of each signal, in the chunks in which it changes."""
-    frame, least = search.frame, search.options.min_half_periods
-    asked = least, _longest_period_s(search)
-    shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
-    for signal in search.in_time("oscillation", signals):
-        for span in _changing(frame.zones(signal.name), least):
-            if span not in shared:
-                part = frame.rows(*span)
-                shared[span] = part, EvenRows.of(part.times)
-            part, rows = shared[span]
-            times, numbers = part.usable(signal.name)
-            rows = rows if len(times) == len(part) else EvenRows.of(times)
-            if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
-                numbers = unwrap(numbers, signal.turn)
-            for swing in swings_in(rows, numbers, *asked):
-                yield signal.name, swing
-
-
-def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:
-    """Rows of the chunks in which the value changes, and of those next to them."""
-    if int(zones.change_count.sum()) < least:
-        return []
-    changes = np.pad(zones.change_count > 0, 1)
-    return zones.spans(changes[:-2] | changes[1:-1] | changes[2:])
-
-
-def _ends_within_s(event: Event) -> float:
-    return _ENDS_WITHIN * event.details["period_s"]
-
-
-OSCILLATION: Final = EventKind(
-    "oscillation",
-    "of heading, wheels, ...",
-    oscillation_events,
-    lasts=True,
-    around_s=lambda options: (
-        options.min_half_periods * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
-    ),
-    ends_within_s=_ends_within_s,
-    of_numbers=True,
-    drawn=3,
-    alike=Alike(lambda events, unit: "oscillations"),
 )

@@ -478,6 +478,11 @@ class Search:
         return motion_in(self.whole, self.known, self.options)
 
     @cached_property
+    def noise(self) -> RunNoise:
+        """How noisy the run's signals are."""
+        return RunNoise(self.whole, self.motion)
+
+    @cached_property
     def meanings(self) -> dict[str, Meaning]:
         """What each signal of the robot means."""
         return meanings_of(self.known)

@@ -1,0 +1,136 @@
+"""Oscillations of two to eight rows a period, and how the amplitude of any oscillation goes on.
+
+Fast ones are the peaks of a periodogram that Fisher's test of the largest ordinate (R. A. Fisher,
+Tests of significance in harmonic analysis, 1929) does not take for noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+from webots_mcp.analysis.arrays import Array, noise_of, np, runs_of
+from webots_mcp.analysis.swings import EvenRows, Swing
+
+LONGEST_FAST_ROWS: Final = 8.0  # of a period; longer ones are found by their bends
+FALSE_ALARMS: Final = 1e-6  # of a window without an oscillation
+_WINDOW: Final = 64  # rows
+_HOP: Final = 32
+_DEGREE: Final = 3  # of the polynomial that takes slow motion out of a window
+_CERTAIN: Final = 4.0  # standard errors: an amplitude beyond is none of noise
+_SAME_PHASE_RAD: Final = 1.0  # from one period to the next
+_MOST_PERIODS: Final = 10_000
+
+
+def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> Iterator[Swing]:
+    """Yield the oscillations with a period of 2 to 8 rows, in order.
+
+    Args:
+        rows: Whose values they are.
+        values: Angles have to be unwrapped.
+        least_half_swings: Shorter ones are none.
+    """
+    values = values if rows.moving is None else values[rows.moving]
+    for times, part in rows.stretches(values):
+        if len(part) >= _WINDOW and part.min() < part.max():
+            yield from _in_stretch(times, part, least_half_swings)
+
+
+def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
+    starts = np.arange(0, len(values) - _WINDOW + 1, _HOP)
+    windows = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
+    base = np.polynomial.legendre.legvander(np.linspace(-1, 1, _WINDOW), _DEGREE)
+    slow, _, _, _ = np.linalg.lstsq(base, windows.T, rcond=None)
+    rest = windows - (base @ slow).T
+    power = np.abs(np.fft.rfft(rest, axis=1)) ** 2
+    power[:, -1] /= 2  # the last ordinate has one degree of freedom, the others two
+    first = math.ceil(_WINDOW / LONGEST_FAST_ROWS)
+    band = power[:, first:]
+    count = band.shape[1]
+    total = band.sum(axis=1)
+    peak = band.argmax(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.nan_to_num(band.max(axis=1) / total)
+    chance = count * (1 - share) ** (count - 1)
+    # What remains of a step or a bend is spread over the band; rounding is no oscillation.
+    swings = (chance < FALSE_ALARMS) & (total > 1e-12 * np.maximum(power.sum(axis=1), 1e-300))
+    amplitude = np.sqrt(2 * total * share) / (_WINDOW / math.sqrt(2))
+    for run in runs_of(swings, times[starts]).spans():
+        ordinate = first + int(np.bincount(peak[run.start : run.stop]).argmax())
+        begin, end = int(starts[run.start]), int(starts[run.stop - 1]) + _WINDOW - 1
+        interval_s = float(times[end] - times[begin]) / (end - begin)
+        period_s = _WINDOW / ordinate * interval_s
+        half_swings = int(2 * float(times[end] - times[begin]) / period_s)
+        if half_swings >= least:
+            size = float(np.median(amplitude[run.start : run.stop]))
+            explained = float(np.median(share[run.start : run.stop]))
+            yield Swing(
+                float(times[begin]), float(times[end]), half_swings, period_s, size, explained
+            )
+
+
+class Course(NamedTuple):
+    """An oscillation with all periods that belong to it.
+
+    Attributes:
+        start_amplitude: Of its first periods; `end_amplitude` of its last ones.
+    """
+
+    swing: Swing
+    start_amplitude: float
+    end_amplitude: float
+
+
+def course_of(swing: Swing, times: Array, values: Array) -> Course:
+    """Follow an oscillation to where its amplitude is lost in the noise, on both sides.
+
+    A growing oscillation stands out late, though its first periods have the same period and phase.
+
+    Args:
+        swing: As it was found.
+        times: Of the rows around it, without recording gaps.
+        values: Of the same rows.
+    """
+    period_s, noise = swing.period_s, noise_of(values)
+    amplitudes: list[float] = []
+    first_s, last_s = swing.start_s, swing.end_s
+    for step_s in (-period_s, period_s):
+        edge_s = swing.start_s if step_s < 0 else swing.end_s
+        inner = _sine_at(times, values, edge_s - max(step_s, 0.0), period_s)
+        phase = inner[1] if inner else None
+        size = inner[0] if inner else swing.amplitude
+        for _ in range(_MOST_PERIODS):
+            begin_s = edge_s + min(step_s, 0.0)
+            found = _sine_at(times, values, begin_s, period_s)
+            if found is None or phase is None:
+                break
+            amplitude, here, rows = found
+            error = noise * math.sqrt(2 / rows)
+            drift = abs(math.remainder(here - phase, 2 * math.pi))
+            if amplitude < _CERTAIN * error or amplitude <= 0 or drift > _SAME_PHASE_RAD:
+                break
+            edge_s, phase, size = edge_s + step_s, here, amplitude
+        amplitudes.append(size)
+        if step_s < 0:
+            first_s = max(edge_s, float(times[0]))
+        else:
+            last_s = min(edge_s, float(times[-1]))
+    half_swings = max(swing.half_swings, int(2 * (last_s - first_s) / period_s))
+    longer = replace(swing, start_s=first_s, end_s=last_s, half_swings=half_swings)
+    return Course(longer, *amplitudes)
+
+
+def _sine_at(
+    times: Array, values: Array, start_s: float, period_s: float
+) -> tuple[float, float, int] | None:
+    """The amplitude and phase of the sine in one period, and its rows; None where it has few."""
+    first, stop = np.searchsorted(times, (start_s - 1e-9, start_s + period_s + 1e-9)).tolist()
+    if stop - first < 5 or times[stop - 1] - times[first] < 0.7 * period_s:
+        return None
+    angle = 2 * math.pi * times[first:stop] / period_s
+    clock = (times[first:stop] - times[first]) / period_s
+    base = np.stack((np.cos(angle), np.sin(angle), np.ones(stop - first), clock), axis=1)
+    (cosine, sine, _, _), _, _, _ = np.linalg.lstsq(base, values[first:stop], rcond=None)
+    return math.hypot(cosine, sine), math.atan2(sine, cosine), stop - first

@@ -1,0 +1,105 @@
+"""`degradation`: the noise of a sensor grew for good.
+
+Noise is estimated in blocks of equal numbers of rows, from fourth differences, which leave out any
+smooth motion. A change counts where every block after it is noisier than every block before it:
+by chance that happens once in `comb(before + after, before)` orders, at most once in 12,870.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+from webots_mcp.analysis.arrays import Array, noise_of, np
+from webots_mcp.judging.detection.kinds import Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.search import Search, places_in
+from webots_mcp.signals.meaning import Quantity
+from webots_mcp.store.signals import RegisteredSignal
+
+_ROUNDING: Final = 1e-9  # of the largest value: less noise is that of floating-point numbers
+TIMES: Final = 3.0  # the noise after, of the noise before
+_BLOCKS: Final = 32
+_LEAST_ROWS: Final = 40  # of a block: its noise is known to about 15 % then
+_LEAST_SIDE: Final = 6  # blocks before, and after
+_MOST_CHANCE: Final = 1 / 12_870
+_SAME_MOTION: Final = 2.0  # times as fast: then the motion may explain the noise
+# Quantities whose noise does not depend on how the robot moves.
+_STEADY: Final[frozenset[Quantity | None]] = frozenset(
+    ("distance", "x", "y", "height", "heading", "temperature", "voltage", "pressure", "light")
+)
+
+
+def degradation_events(search: Search) -> Iterator[Event]:
+    """Of sensors whose noise does not depend on motion: distances, places, temperatures, ..."""
+    signals = [
+        search.known[name]
+        for name, meaning in search.meanings.items()
+        if meaning.is_sensed and meaning.quantity in _STEADY and search.known[name].is_number
+    ]
+    wanted = {each.name for each in search.signals}
+    signals = [each for each in signals if each.name in wanted and not each.is_index]
+    if not signals:
+        raise NotSearchableError("no sensor is known whose noise does not depend on motion")
+    for signal in search.in_time("degradation", signals):
+        found = _change_of(search, signal)
+        if found is None:
+            continue
+        start_s, before, after = found
+        end_s = float(search.frame.times[-1])
+        details = {"noise_before": float(f"{before:.3g}"), "noise_after": float(f"{after:.3g}")}
+        yield search.event("degradation", start_s, end_s, signal.name, **details)
+
+
+def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, float] | None:
+    """When the noise grew, and how large it was before and after; None where it did not."""
+    times, values = search.frame.usable(signal.name)
+    blocks = min(_BLOCKS, len(values) // _LEAST_ROWS)
+    if blocks < 2 * _LEAST_SIDE:
+        return None
+    edges = np.linspace(0, len(values), blocks + 1).astype(np.intp)
+    noises = np.array([noise_of(values[a:b]) for a, b in zip(edges, edges[1:], strict=False)])
+    if noises.min() <= _ROUNDING * float(np.abs(values).max()):
+        return None
+    best: tuple[float, int] | None = None
+    for at in range(_LEAST_SIDE, blocks - _LEAST_SIDE + 1):
+        if noises[:at].max() < noises[at:].min() and 1 / math.comb(blocks, at) <= _MOST_CHANCE:
+            ratio = float(np.median(noises[at:]) / np.median(noises[:at]))
+            best = max(best or (0.0, 0), (ratio, at))
+    if best is None or best[0] < TIMES or not _moves_alike(search, times, int(edges[best[1]])):
+        return None
+    middle = best[1]
+    return (
+        float(times[edges[middle]]),
+        float(np.median(noises[:middle])),
+        float(np.median(noises[middle:])),
+    )
+
+
+def _moves_alike(search: Search, times: Array, row: int) -> bool:
+    """Whether the robot moved about as fast before a row as after it, as far as that is known."""
+    if search.motion.position is None or not 0 < row < len(times):
+        return True
+    rows, x, y = places_in(search.frame, search.motion.position)
+    clock = search.frame.times[rows]
+    speeds: list[float] = []
+    for part in (clock < times[row], clock >= times[row]):
+        if np.count_nonzero(part) < 2:
+            return True
+        ends = np.flatnonzero(part)[[0, -1]]
+        lasts_s = float(clock[ends[1]] - clock[ends[0]]) or 1.0
+        thin = max(1, int(np.count_nonzero(part)) // 100)
+        way_m = np.hypot(np.diff(x[part][::thin]), np.diff(y[part][::thin])).sum()
+        speeds.append(float(way_m) / lasts_s)
+    slow, fast = sorted(speeds)
+    return fast <= max(_SAME_MOTION * slow, search.options.min_commanded_m_s)
+
+
+DEGRADATION: Final = EventKind(
+    "degradation",
+    "a sensor's noise grew for good",
+    degradation_events,
+    of_numbers=True,
+    lasts=True,
+    ends_within_s=lambda event: math.inf,
+)

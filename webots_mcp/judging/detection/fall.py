@@ -1,0 +1,109 @@
+"""`fall`: a robot that stood upright tipped over and stayed down.
+
+The tilt is the angle between the robot's up axis now and while it stood at first, from its roll and
+pitch, so that a sensor that is mounted upside down does not matter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+from webots_mcp.analysis.arrays import Array, np, runs_of
+from webots_mcp.judging.detection.kinds import Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.search import Search
+from webots_mcp.signals.meaning import Quantity
+from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.signals import RegisteredSignal
+
+UPRIGHT_RAD: Final = math.radians(30)  # below it a robot stands ...
+FALLEN_RAD: Final = math.radians(60)  # ... beyond this it has tipped over ...
+DOWN_RAD: Final = math.radians(45)  # ... and beyond this it lies
+SETTLED_S: Final = 1.0  # for so long each of them has to last
+NO_ATTITUDE: Final = "publish roll and pitch (of an InertialUnit), in rad or deg"
+
+
+def fall_events(search: Search) -> Iterator[Event]:
+    """From where the tilt leaves the upright range to where the robot stands again, if ever."""
+    signals = {quantity: _signal(search, quantity) for quantity in ("roll", "pitch")}
+    if not any(signals.values()):
+        raise NotSearchableError(NO_ATTITUDE)
+    times, tilt = tilt_of(search.frame, signals["roll"], signals["pitch"])
+    if len(times) < 2:
+        raise NotSearchableError("roll and pitch have no value in that range")
+    fell_s = -math.inf
+    for run in runs_of(tilt > DOWN_RAD, times).spans():
+        lies = tilt[run.start : run.stop]
+        lasts_s = run.end_s - run.start_s
+        if run.start_s < fell_s or lasts_s < SETTLED_S or lies.max() < FALLEN_RAD:
+            continue
+        before = np.flatnonzero(tilt[: run.start] > UPRIGHT_RAD)
+        left = run.start
+        while left > 0 and tilt[left - 1] > UPRIGHT_RAD:
+            left -= 1
+        stood = runs_of(tilt[:left] <= UPRIGHT_RAD, times[:left])
+        if not len(stood.only(stood.durations_s >= SETTLED_S)) or len(before) == run.start:
+            continue
+        again = runs_of(tilt[run.stop :] <= UPRIGHT_RAD, times[run.stop :])
+        up = again.only(again.durations_s >= SETTLED_S)
+        fell_s = float(up.starts_s[0]) if len(up) else float(times[-1])
+        yield search.event(
+            "fall",
+            float(times[left]),
+            fell_s,
+            None,
+            tilt_deg=round(math.degrees(float(np.median(lies))), 1),
+            got_up=bool(len(up)),
+        )
+    search.note_nearest(
+        "fall",
+        float(tilt.max()) / FALLEN_RAD,
+        f"largest tilt {math.degrees(float(tilt.max())):.0f}°",
+    )
+
+
+def tilt_of(
+    frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal | None
+) -> tuple[Array, Array]:
+    """Return the times of rows with an attitude, and the tilt in them, in rad.
+
+    Args:
+        frame: The rows.
+        roll: None where only the pitch is known; it counts as 0 then.
+        pitch: As `roll`.
+    """
+    angles = [
+        np.zeros(len(frame))
+        if each is None
+        else frame.numbers(each.name) * math.tau / (each.turn or math.tau)
+        for each in (roll, pitch)
+    ]
+    there = np.isfinite(angles[0]) & np.isfinite(angles[1])
+    across, along = (each[there] for each in angles)
+    times = frame.times[there]
+    if not len(times):
+        return times, across
+    up = np.stack((-np.sin(along), np.sin(across) * np.cos(along), np.cos(across) * np.cos(along)))
+    first = np.median(up[:, times <= times[0] + SETTLED_S], axis=1)
+    first /= np.linalg.norm(first) or 1.0
+    return times, np.arccos(np.clip(first @ up, -1.0, 1.0))
+
+
+def _signal(search: Search, quantity: Quantity) -> RegisteredSignal | None:
+    """The first signal of that quantity that has values and is measured."""
+    for name, meaning in search.meanings.items():
+        if meaning.quantity == quantity and meaning.is_sensed:
+            if search.whole.zones(name).value_count.any():
+                return search.known[name]
+    return None
+
+
+FALL: Final = EventKind(
+    "fall",
+    "tipped over",
+    fall_events,
+    lasts=True,
+    around_s=lambda options: 10 * SETTLED_S,
+    drawn=0,
+)

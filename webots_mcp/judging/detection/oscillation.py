@@ -1,0 +1,146 @@
+"""`oscillation`: a signal that a robot moves with went to and fro regularly."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+from webots_mcp.analysis.arrays import Array, gap_borders, np, usual_interval_s
+from webots_mcp.analysis.fast_swings import Course, course_of, find_fast_swings
+from webots_mcp.analysis.summary import unwrap
+from webots_mcp.analysis.swings import (
+    SLOW_HALF_SWINGS,
+    EvenRows,
+    Swing,
+    swings_in,
+)
+from webots_mcp.judging.detection.kinds import (
+    Alike,
+    Event,
+    EventKind,
+    EventOptions,
+    NotSearchableError,
+)
+from webots_mcp.judging.detection.search import MOST_NAMED, Search
+from webots_mcp.signals.naming import in_snake_case, listed
+from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.signals import RegisteredSignal
+
+LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
+GROWS: Final = 2.0  # times the amplitude at one end: then both are reported
+_ENDS_WITHIN: Final = 1.5  # periods
+# Sensors swing by nature while a robot drives.
+_SWINGING: Final = re.compile(
+    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
+    r"|position|odom|odometry|left|right|cmd|command\w*|error)([._]|$)",
+    re.IGNORECASE,
+)
+
+
+def oscillation_events(search: Search) -> Iterator[Event]:
+    """Of heading, wheels, speed, position and the like, and of what is asked for."""
+    signals = search.required_numbers()
+    if search.options.signals == EventOptions.signals:
+        signals = [each for each in signals if _SWINGING.search(in_snake_case(each.name))]
+    if left := [each.name for each in search.numbers if each not in signals]:
+        why = (
+            f"not in {len(left)} of {len(search.numbers)} signals, whose names do not suggest "
+            f"motion: name them in signals ({listed(left, MOST_NAMED)})"
+        )
+        if not signals:
+            raise NotSearchableError(why)
+        search.not_searched("oscillation", why)
+    _note_periods(search)
+    for name, (swing, at_start, at_end) in _found(search, signals):
+        details = {
+            "half_periods": swing.half_swings,
+            "period_s": swing.period_s,
+            "amplitude": swing.amplitude,
+        }
+        if max(at_start, at_end) > GROWS * min(at_start, at_end):
+            details |= {"amplitude_at_start": at_start, "amplitude_at_end": at_end}
+        event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
+        goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
+        yield replace(event, ongoing=goes_on)
+
+
+def _note_periods(search: Search) -> None:
+    """Which periods are too long for the run to hold enough of them."""
+    half_periods = search.options.min_half_periods
+    fitting_s = 2 * search.length_s / half_periods
+    if fitting_s < _longest_period_s(search):
+        search.not_searched(
+            "oscillation",
+            f"run {search.segment.run_id} lasted only {search.length_s:.3g} s, too short for "
+            f"{half_periods} half periods where a period is over {fitting_s:.2g} s",
+        )
+
+
+def _longest_period_s(search: Search) -> float:
+    if (asked_s := search.options.oscillation_period_s) is not None:
+        return asked_s
+    times = search.frame.times
+    length_s = float(times[-1] - times[0]) if len(times) else 0.0
+    return max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
+
+
+def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tuple[str, Course]]:
+    """The swings of each signal, in the chunks in which it changes."""
+    frame, least = search.frame, search.options.min_half_periods
+    asked = least, _longest_period_s(search)
+    shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
+    for signal in search.in_time("oscillation", signals):
+        for span in _changing(frame.zones(signal.name), least):
+            if span not in shared:
+                part = frame.rows(*span)
+                shared[span] = part, EvenRows.of(part.times)
+            part, rows = shared[span]
+            times, numbers = part.usable(signal.name)
+            rows = rows if len(times) == len(part) else EvenRows.of(times)
+            if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
+                numbers = unwrap(numbers, signal.turn)
+            for swing in swings_in(rows, numbers, *asked):
+                yield signal.name, _course(swing, times, numbers)
+            for swing in find_fast_swings(rows, numbers, least):
+                yield signal.name, Course(swing, swing.amplitude, swing.amplitude)
+
+
+def _course(swing: Swing, times: Array, values: Array) -> Course:
+    """The whole of an oscillation, in the rows around it without a gap."""
+    gaps = gap_borders(times, usual_interval_s(times) or 0.0)
+    edges = np.concatenate(([0], gaps, [len(times)]))
+    row = int(np.searchsorted(times, swing.start_s))
+    at = int(np.searchsorted(edges, row, "right")) - 1
+    part = slice(int(edges[at]), int(edges[at + 1]))
+    if swing.end_s > times[part][-1]:  # it goes on after a gap
+        return Course(swing, swing.amplitude, swing.amplitude)
+    return course_of(swing, times[part], values[part])
+
+
+def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:
+    """Rows of the chunks in which the value changes, and of those next to them."""
+    if int(zones.change_count.sum()) < least:
+        return []
+    changes = np.pad(zones.change_count > 0, 1)
+    return zones.spans(changes[:-2] | changes[1:-1] | changes[2:])
+
+
+def _ends_within_s(event: Event) -> float:
+    return _ENDS_WITHIN * event.details["period_s"]
+
+
+OSCILLATION: Final = EventKind(
+    "oscillation",
+    "of heading, wheels, ...",
+    oscillation_events,
+    lasts=True,
+    around_s=lambda options: (
+        options.min_half_periods * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
+    ),
+    ends_within_s=_ends_within_s,
+    of_numbers=True,
+    drawn=3,
+    alike=Alike(lambda events, unit: "oscillations"),
+)

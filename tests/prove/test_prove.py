@@ -17,7 +17,7 @@ import pytest
 
 from tests.webots.program import put_on_path
 from webots_mcp.contract import host_name
-from webots_mcp.plugins.prove.bench import Bench, tried
+from webots_mcp.plugins.prove.bench import Bench, run_check
 from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED, check_launch
 from webots_mcp.simulator.instances import HOME_VARIABLE
 
@@ -144,14 +144,14 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
         bench.row()
 
     try:
-        found = tried(check_launch, bench)
+        found = run_check(check_launch, bench)
         assert found["outcome"] == "as expected", found
         bench.patience_s = 1
-        found = tried(check_stuck, bench, limit_s=0.5)
+        found = run_check(check_stuck, bench, limit_s=0.5)
         assert (found["outcome"], found["seen"]) == ("otherwise", "it hung for 0.5 s")
         stuck = bench.user
         bench.patience_s = 60
-        assert tried(check_launch, bench)["outcome"] == "as expected"
+        assert run_check(check_launch, bench)["outcome"] == "as expected"
         free.set()
         stuck.join()
         assert late == ["Webots ended: True"]

@@ -20,9 +20,10 @@ from __future__ import annotations
 
 from webots_mcp.standin.controller_path import LIBRARY  # first: the others import `controller`
 from webots_mcp.standin.in_process import InProcessRobot, InProcessSimulation, InProcessSupervisor
-from webots_mcp.standin.simulation import Simulation
+from webots_mcp.standin.simulation import StandInSimulation as Simulation
 from webots_mcp.standin.simulator import Mode
-from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError
+from webots_mcp.standin.vrml import RequestAfterEndError as ControllerEndedError
+from webots_mcp.standin.vrml import StandInError, WorldError, WouldBlockError
 
 __all__ = [
     "LIBRARY",

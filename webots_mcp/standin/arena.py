@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from math import cos, hypot, isinf, sin
 from typing import Any, Final
 
-from webots_mcp.standin.geometry import Block, Color, Disc, Frame, Shape, frame_of
-from webots_mcp.standin.vrml import Node, children_of, descendants_of
+from webots_mcp.standin.geometry import Color, CoordinateFrame, Disc, Shape, UprightBox, frame_of
+from webots_mcp.standin.vrml import WorldNode, children_of, descendants_of
 from webots_mcp.standin.world import World, own_frame
 
 _GEOMETRIES: Final = ("Box", "Capsule", "Cylinder", "Sphere")
@@ -30,11 +30,11 @@ class SceneColors:
 
 
 @dataclass(frozen=True)
-class Part:
+class BodyPart:
     """One geometry of a body: its place in the body and half of its size along x, y and z."""
 
     kind: str
-    frame: Frame
+    frame: CoordinateFrame
     half_m: tuple[float, float, float]
     color: Color
     is_solid: bool
@@ -49,13 +49,13 @@ class Part:
         part_x, part_y, _ = self.frame.translation
         return hypot(part_x - x, part_y - y) + hx
 
-    def standing(self, body: Frame) -> Shape:
+    def standing(self, body: CoordinateFrame) -> Shape:
         """This part as a shape in the world, for a body that stands upright."""
         x, y, z = body.point(self.frame.translation)
         hx, hy, hz = self.half_m
         if self.kind == "Box":
             yaw = body.yaw_rad + self.frame.yaw_rad
-            return Block(x, y, cos(yaw), sin(yaw), hx, hy, z - hz, z + hz, self.color)
+            return UprightBox(x, y, cos(yaw), sin(yaw), hx, hy, z - hz, z + hz, self.color)
         return Disc(x, y, hx, z - hz, z + hz, self.color, self.kind == "Sphere")
 
 
@@ -68,7 +68,7 @@ class Footprint:
     radius_m: float
 
     @staticmethod
-    def around(parts: list[Part]) -> Footprint:
+    def around(parts: list[BodyPart]) -> Footprint:
         """A disc around all parts, in the middle of the rectangle that they fill."""
         at_and_half = [
             (part.frame.translation, _turned_half(part.frame, part.half_m)) for part in parts
@@ -89,7 +89,7 @@ class Footprint:
 class Body:
     """A Solid or Robot at the top of the scene tree, with all that is fixed to it."""
 
-    def __init__(self, node: Node, frame: Frame) -> None:
+    def __init__(self, node: WorldNode, frame: CoordinateFrame) -> None:
         self.node = node
         self.name: str = node.fields["name"]
         self.is_movable = node.type_name == "Solid" and node.fields["physics"] is not None
@@ -101,12 +101,12 @@ class Body:
         """By how much it was pushed back by what it ran into in the last step, metres."""
         self.stand(frame)
 
-    def stand(self, frame: Frame) -> None:
+    def stand(self, frame: CoordinateFrame) -> None:
         """Put the body where `frame` says, tilted as it may be."""
         self.x, self.y, self.z = frame.translation
         self.yaw_rad = frame.yaw_rad
         upright = frame_of((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -self.yaw_rad))
-        tilt = upright.then(Frame(frame.rotation))
+        tilt = upright.then(CoordinateFrame(frame.rotation))
         self.parts = [*_parts_of(self.node, tilt, _color_of(self.node))]
         self.is_obstacle = any(part.is_solid for part in self.parts)
         self.footprint = Footprint.around(self.parts)
@@ -119,7 +119,7 @@ class Body:
         self.velocity_mps, self.yaw_rate_radps, self.is_pushed = (0.0, 0.0), 0.0, False
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> CoordinateFrame:
         """Where the body stands, upright."""
         return frame_of((self.x, self.y, self.z), (0.0, 0.0, 1.0, self.yaw_rad))
 
@@ -168,7 +168,7 @@ class Arena:
     """
 
     def __init__(self, world: World) -> None:
-        self.bodies = [*_bodies_in(world.root, Frame())]
+        self.bodies = [*_bodies_in(world.root, CoordinateFrame())]
         self.world = world
         self.colors = _scene_colors(world)
         self.gravity_mps2: float = world.info.fields["gravity"]
@@ -183,7 +183,9 @@ class Arena:
     def follow(self) -> None:
         """Nodes were added or removed: bodies that are new stand there, those that are gone not."""
         known = {body.node: body for body in self.bodies}
-        self.bodies[:] = [known.get(b.node, b) for b in _bodies_in(self.world.root, Frame())]
+        self.bodies[:] = [
+            known.get(b.node, b) for b in _bodies_in(self.world.root, CoordinateFrame())
+        ]
         self._sort()
 
     def scene(self, without: Body) -> list[Shape]:
@@ -263,7 +265,7 @@ def _scene_colors(world: World) -> SceneColors:
     return SceneColors(**colors)
 
 
-def _bodies_in(node: Node, frame: Frame) -> Iterator[Body]:
+def _bodies_in(node: WorldNode, frame: CoordinateFrame) -> Iterator[Body]:
     for child in children_of(node):
         place = frame.then(own_frame(child))
         if child.type_name in ("Solid", "Robot"):
@@ -272,7 +274,7 @@ def _bodies_in(node: Node, frame: Frame) -> Iterator[Body]:
             yield from _bodies_in(child, place)
 
 
-def _parts_of(node: Node, frame: Frame, color: Color) -> Iterator[Part]:
+def _parts_of(node: WorldNode, frame: CoordinateFrame, color: Color) -> Iterator[BodyPart]:
     """The bounding object of a Solid, or else what can be seen of it, and of all Solids in it."""
     bounding = node.fields["boundingObject"]
     shown = [bounding] if bounding else node.fields["children"]
@@ -283,14 +285,16 @@ def _parts_of(node: Node, frame: Frame, color: Color) -> Iterator[Part]:
         yield from _solids(child, frame)
 
 
-def bounding_parts(node: Node, frame: Frame) -> list[Part]:
+def bounding_parts(node: WorldNode, frame: CoordinateFrame) -> list[BodyPart]:
     """The bounding object of a node that stands at `frame`."""
     bounding = node.fields["boundingObject"]
     geometries = _geometries(bounding, frame) if bounding else ()
     return [_part(geometry, place, _DEFAULT_COLOR, True) for geometry, place in geometries]
 
 
-def _geometries(node: Node, frame: Frame) -> Iterator[tuple[Node, Frame]]:
+def _geometries(
+    node: WorldNode, frame: CoordinateFrame
+) -> Iterator[tuple[WorldNode, CoordinateFrame]]:
     frame = frame.then(own_frame(node))
     if node.type_name in _GEOMETRIES:
         yield node, frame
@@ -299,7 +303,7 @@ def _geometries(node: Node, frame: Frame) -> Iterator[tuple[Node, Frame]]:
             yield from _geometries(child, frame)
 
 
-def _solids(node: Node, frame: Frame) -> Iterator[Part]:
+def _solids(node: WorldNode, frame: CoordinateFrame) -> Iterator[BodyPart]:
     frame = frame.then(own_frame(node))
     if node.type_name == "Solid":
         yield from _parts_of(node, frame, _color_of(node))
@@ -308,28 +312,30 @@ def _solids(node: Node, frame: Frame) -> Iterator[Part]:
             yield from _solids(child, frame)
 
 
-def _part(geometry: Node, frame: Frame, color: Color, is_solid: bool) -> Part:
+def _part(geometry: WorldNode, frame: CoordinateFrame, color: Color, is_solid: bool) -> BodyPart:
     fields = geometry.fields
     if geometry.type_name == "Box":
         hx, hy, hz = (size / 2.0 for size in fields["size"])
     elif geometry.type_name == "Sphere":
-        return Part("Sphere", frame, (fields["radius"],) * 3, color, is_solid)
+        return BodyPart("Sphere", frame, (fields["radius"],) * 3, color, is_solid)
     else:
         hx, hy, hz = fields["radius"], fields["radius"], fields["height"] / 2.0
         hz += fields["radius"] if geometry.type_name == "Capsule" else 0.0
     if frame.rotation[8] > 0.999:
-        return Part(geometry.type_name, frame, (hx, hy, hz), color, is_solid)
+        return BodyPart(geometry.type_name, frame, (hx, hy, hz), color, is_solid)
     lying = _turned_half(frame, (hx, hy, hz))  # a lying shape counts as the box around it
-    return Part("Box", Frame(translation=frame.translation), lying, color, is_solid)
+    return BodyPart("Box", CoordinateFrame(translation=frame.translation), lying, color, is_solid)
 
 
-def _turned_half(frame: Frame, half_m: tuple[float, float, float]) -> tuple[float, float, float]:
+def _turned_half(
+    frame: CoordinateFrame, half_m: tuple[float, float, float]
+) -> tuple[float, float, float]:
     r, (hx, hy, hz) = frame.rotation, half_m
     x, y, z = (abs(r[i]) * hx + abs(r[i + 1]) * hy + abs(r[i + 2]) * hz for i in (0, 3, 6))
     return x, y, z
 
 
-def _color_of(node: Node) -> Color:
+def _color_of(node: WorldNode) -> Color:
     for part in descendants_of(node):
         color = part.fields.get("baseColor") or part.fields.get("diffuseColor")
         if color:
@@ -349,7 +355,7 @@ def _color(numbers: Sequence[float]) -> Color:
 class Joint:
     """A hinge, its motor and how far it has turned; of a slider, metres in the place of radians."""
 
-    node: Node
+    node: WorldNode
     max_velocity_radps: float
     acceleration_radps2: float
     min_position_rad: float
@@ -362,7 +368,7 @@ class Joint:
     velocity_radps: float = 0.0
 
     @staticmethod
-    def of(node: Node) -> Joint:
+    def of(node: WorldNode) -> Joint:
         """The joint that a node describes; without a motor it stands still."""
         motors = [n for n in node.fields["device"] if n.type_name in _MOTORS]
         fields: dict[str, Any] = motors[0].fields if motors else {}
@@ -482,7 +488,7 @@ class Vehicle:
         self.touching = touching
 
 
-def joints_in(robot: Node) -> list[Joint]:
+def joints_in(robot: WorldNode) -> list[Joint]:
     """All joints of a robot, in the order of the scene tree."""
     return [Joint.of(node) for node in descendants_of(robot) if node.type_name in _JOINTS]
 
@@ -502,6 +508,6 @@ def _wheel_of(joint: Joint) -> Wheel | None:
     return Wheel(joint, radius_m if axis[1] > 0.0 else -radius_m, left_m)
 
 
-def _radius_m(shape: Node | None) -> float:
+def _radius_m(shape: WorldNode | None) -> float:
     nodes = (shape, *descendants_of(shape)) if shape else ()
     return next((node.fields["radius"] for node in nodes if "radius" in node.fields), 0.0)

@@ -13,13 +13,13 @@ from controller.session import Message
 from webots_mcp.standin.arena import Body
 from webots_mcp.standin.devices import FetchedSensor
 from webots_mcp.standin.pictures import Label
-from webots_mcp.standin.simulator import Mode, Robot, Simulator, TrackedKey
+from webots_mcp.standin.simulator import Mode, SimulatedRobot, Simulator, TrackedKey
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
     FieldDefinition,
-    Node,
     Parser,
     WorldError,
+    WorldNode,
     descendants_of,
 )
 from webots_mcp.standin.world import as_text, load_world
@@ -35,7 +35,7 @@ FieldSet = tuple[FieldReference, int | None, Any]
 """A field, the index of an entry or None, and the new value."""
 
 
-def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
+def description(simulator: Simulator, robot: SimulatedRobot) -> dict[str, Any]:
     """The data that a controller receives when it connects."""
     fields = robot.node.fields
     requests = SupervisorRequests(simulator, robot)
@@ -57,7 +57,7 @@ def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
     }
 
 
-def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | None:
+def answer(simulator: Simulator, robot: SimulatedRobot, message: Message) -> Message | None:
     """Answer a controller; None if the answer has to wait until simulated time has passed."""
     kind, *rest = message
     if kind == "step":
@@ -71,7 +71,7 @@ def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | No
     return ("answer", requests.carry_out(operation, arguments), int(simulator.mode))
 
 
-def step_over(simulator: Simulator, robot: Robot) -> Message:
+def step_over(simulator: Simulator, robot: SimulatedRobot) -> Message:
     """The answer to a step request: time, mode and the values measured since the last one."""
     values: list[tuple[Any, Any]] = [*robot.fresh.items()]
     robot.fresh.clear()
@@ -82,7 +82,7 @@ def step_over(simulator: Simulator, robot: Robot) -> Message:
 
 def _step(
     simulator: Simulator,
-    robot: Robot,
+    robot: SimulatedRobot,
     duration_ms: int,
     changes: list[Any],
     field_sets: list[FieldSet],
@@ -100,7 +100,7 @@ def _step(
     return None
 
 
-class _GoneError(Exception):
+class _NodeRemovedError(Exception):
     """Something was asked of a node that was removed."""
 
 
@@ -111,7 +111,7 @@ class SupervisorRequests:
     Webots' C functions without `wb_supervisor_`.
     """
 
-    def __init__(self, simulator: Simulator, robot: Robot) -> None:
+    def __init__(self, simulator: Simulator, robot: SimulatedRobot) -> None:
         self._simulator = simulator
         self._world = simulator.world
         self._robot = robot
@@ -121,7 +121,7 @@ class SupervisorRequests:
         method: Callable[..., Any] = getattr(self, f"on_{operation}")
         try:
             return method(*arguments)
-        except _GoneError:
+        except _NodeRemovedError:
             return None
 
     def sent(self, what: TrackedKey) -> Any:
@@ -130,10 +130,10 @@ class SupervisorRequests:
             return self.carry_out("field_get", [what, None])
         return self.carry_out("node_get_pose", [*what])
 
-    def _node(self, node_id: int) -> Node:
+    def _node(self, node_id: int) -> WorldNode:
         node = self._world.node(node_id)
         if node is None:
-            raise _GoneError(node_id)
+            raise _NodeRemovedError(node_id)
         return node
 
     # Nodes ---------------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ class SupervisorRequests:
         """The node around a node."""
         return self.shown(self._world.parent_of(self._node(node_id)))
 
-    def shown(self, node: Node | None) -> Any:
+    def shown(self, node: WorldNode | None) -> Any:
         """What a controller is sent of a node: see `NodeFacts` of its package."""
         if node is None:
             return None
@@ -181,7 +181,7 @@ class SupervisorRequests:
         value = self._node(node_id).fields[name]
         if index is not None:
             value = value[index] if -len(value) <= index < len(value) else None
-        return self.shown(value) if isinstance(value, Node) else value
+        return self.shown(value) if isinstance(value, WorldNode) else value
 
     def set_fields(self, field_sets: list[FieldSet]) -> None:
         """Write fields, and let what they describe follow."""
@@ -209,7 +209,7 @@ class SupervisorRequests:
         node_id, name = field
         node = self._node(node_id)
         value = node.fields[name] if index is None else node.fields[name][index]
-        if isinstance(value, Node):
+        if isinstance(value, WorldNode):
             self._remove(value)
         else:
             del node.fields[name][index]
@@ -248,7 +248,7 @@ class SupervisorRequests:
         count = len(cast("list[Any]", left)) if isinstance(left, list) else -1
         return self._world.id_of(parent), name, count
 
-    def _remove(self, node: Node) -> tuple[Node, str] | None:
+    def _remove(self, node: WorldNode) -> tuple[WorldNode, str] | None:
         if _holds_robot(node):
             self._simulator.log("ERROR: the stand-in removes no robots")
             return None
@@ -260,7 +260,7 @@ class SupervisorRequests:
             self._stand_anew(found[0])
         return found
 
-    def _stand_anew(self, around: Node) -> None:
+    def _stand_anew(self, around: WorldNode) -> None:
         self._simulator.arena.follow()
         if body := self._body_around(around):
             self._simulator.stand_anew(body)
@@ -269,7 +269,7 @@ class SupervisorRequests:
         """A node and all in it, as written in a world file."""
         return as_text(self._node(node_id), self._world.protos)
 
-    def _follow(self, node: Node, name: str, value: Any) -> None:
+    def _follow(self, node: WorldNode, name: str, value: Any) -> None:
         if node.type_name == "Robot" and name == "customData":
             self._simulator.robot_of(node).fresh[CUSTOM_DATA_TAG] = value
         elif node.proto_name and name not in _FOLLOWED_OF_PROTOS:
@@ -315,7 +315,7 @@ class SupervisorRequests:
             if robot.node is self._node(node_id):
                 robot.vehicle.stop()
 
-    def _body_around(self, node: Node | None) -> Body | None:
+    def _body_around(self, node: WorldNode | None) -> Body | None:
         bodies = {body.node: body for body in self._simulator.arena.bodies}
         while node is not None and node not in bodies:
             node = self._world.parent_of(node)
@@ -359,11 +359,11 @@ class SupervisorRequests:
             self._simulator.labels.pop(number, None)
 
 
-def _holds_robot(node: Node) -> bool:
+def _holds_robot(node: WorldNode) -> bool:
     return any(each.type_name == "Robot" for each in (node, *descendants_of(node)))
 
 
-def _described(node: Node, name: str, definitions: Mapping[str, FieldDefinition]) -> Any:
+def _described(node: WorldNode, name: str, definitions: Mapping[str, FieldDefinition]) -> Any:
     definition = definitions.get(name)
     if definition is None:
         return None
@@ -374,10 +374,10 @@ def _described(node: Node, name: str, definitions: Mapping[str, FieldDefinition]
 # -- what lets a world run -------------------------------------------------------------------------
 
 
-class Seat(ABC):
+class ControllerEndpoint(ABC):
     """Where the controller of a robot is reached, in this process or in another one."""
 
-    robot: Robot
+    robot: SimulatedRobot
     is_ending = False
     """Whether the next thing it asks for is answered by the end."""
     was_told = False
@@ -395,7 +395,7 @@ class Seat(ABC):
             self.reply(("quit",))
 
 
-class Driver(ABC):
+class BaseSimulation(ABC):
     """A world in motion and those who control its robots.
 
     The methods named after buttons are a person's hands on Webots' window: they return once the
@@ -417,7 +417,7 @@ class Driver(ABC):
         """How the simulation runs."""
         return self.simulator.mode
 
-    def robot(self, name: str) -> Robot:
+    def robot(self, name: str) -> SimulatedRobot:
         """What is really the case with a robot: its `position`, `yaw_rad`, `collisions`, ...
 
         Raises:
@@ -459,7 +459,7 @@ class Driver(ABC):
 
     @property
     @abstractmethod
-    def _seats(self) -> Sequence[Seat]: ...
+    def _seats(self) -> Sequence[ControllerEndpoint]: ...
 
     @abstractmethod
     def _obey(self, function: Callable[[], None]) -> None:
@@ -469,9 +469,9 @@ class Driver(ABC):
     def _step_once(self) -> None: ...
 
     @abstractmethod
-    def _end(self, seats: Sequence[Seat]) -> None: ...
+    def _end(self, seats: Sequence[ControllerEndpoint]) -> None: ...
 
-    def _start(self, seats: Sequence[Seat]) -> None:  # noqa: B027 - in one process there is none
+    def _start(self, seats: Sequence[ControllerEndpoint]) -> None:  # noqa: B027 - in one process there is none
         """Start controllers that have been ended."""
 
     def _enter_world(self) -> None:  # noqa: B027
@@ -501,7 +501,7 @@ class Driver(ABC):
         self.exit_status = status
         self._end(self._seats)
 
-    def _serve(self, seat: Seat, message: Message) -> None:
+    def _serve(self, seat: ControllerEndpoint, message: Message) -> None:
         """Answer a controller, unless the answer has to wait for a physics step.
 
         One that is to end may still have the picture or scan of its last sample: Webots sends those

@@ -15,9 +15,9 @@ from typing import IO, Final, Protocol
 
 from controller.session import Inbox, Message, pack
 
-from webots_mcp.standin.controller_answers import Seat
+from webots_mcp.standin.controller_answers import ControllerEndpoint
 from webots_mcp.standin.controller_path import LIBRARY
-from webots_mcp.standin.simulator import Robot, Simulator
+from webots_mcp.standin.simulator import SimulatedRobot, Simulator
 from webots_mcp.standin.vrml import StandInError
 
 _TERMINATION_S: Final = 1.0
@@ -101,7 +101,7 @@ class ControllerProcess:
         self._on_exit(self)
 
 
-class Connection:
+class ControllerConnection:
     """The socket of one controller."""
 
     def __init__(self, stream: socket.socket) -> None:
@@ -139,7 +139,7 @@ class PrintLine(Protocol):
 
 
 @dataclass
-class Launch:
+class ControllerLaunch:
     """How controllers are started, the same for all robots of a simulation."""
 
     python: str
@@ -158,10 +158,10 @@ class Launch:
     """The exit status of the first controller that ended with an error, but not by force."""
 
 
-class Controller(Seat):
+class Controller(ControllerEndpoint):
     """A robot's controller, through all its processes."""
 
-    def __init__(self, robot: Robot, launch: Launch) -> None:
+    def __init__(self, robot: SimulatedRobot, launch: ControllerLaunch) -> None:
         self.robot = robot
         self.launch = launch
         self.file: Path | None = None
@@ -169,7 +169,7 @@ class Controller(Seat):
         self.process: ControllerProcess | None = None
         self.starts = 0
         """How often a process was started for the robot."""
-        self.connection: Connection | None = None
+        self.connection: ControllerConnection | None = None
         self.has_left = False
         """Whether the present process has closed its connection."""
 
@@ -231,7 +231,7 @@ class Controller(Seat):
         is_extern = self.robot.node.fields["controller"] == _EXTERN
         return is_extern and self.name not in self.launch.overrides
 
-    def enter(self, robot: Robot, simulator: Simulator) -> None:
+    def enter(self, robot: SimulatedRobot, simulator: Simulator) -> None:
         """Control a robot of a world that was loaded.
 
         Only the world's own name of a controller has to be one: links that stand in the project are

@@ -13,9 +13,9 @@ from math import atan2, cos, hypot, inf, nan, pi, sin
 from typing import Any, Final
 
 from webots_mcp.standin import pictures
-from webots_mcp.standin.arena import Arena, Body, Joint, Part, Vehicle, bounding_parts
-from webots_mcp.standin.geometry import Frame, Shape, Vector, nearest_m, targets_from
-from webots_mcp.standin.vrml import Node, children_of
+from webots_mcp.standin.arena import Arena, Body, BodyPart, Joint, Vehicle, bounding_parts
+from webots_mcp.standin.geometry import CoordinateFrame, Shape, Vector, nearest_m, targets_from
+from webots_mcp.standin.vrml import WorldNode, children_of
 from webots_mcp.standin.world import World, own_frame
 
 _SUN_M: Final = 1000.0
@@ -24,12 +24,12 @@ _NOT_SENT: Final = ("children", "boundingObject", "physics")
 
 
 @dataclass(frozen=True)
-class Site:
+class Mounting:
     """What a device is built into."""
 
     vehicle: Vehicle
     arena: Arena
-    frame: Frame
+    frame: CoordinateFrame
     """Where the device stands in the robot."""
     joint: Joint | None
 
@@ -38,7 +38,7 @@ class Site:
         """The robot's body."""
         return self.vehicle.body
 
-    def pose(self) -> Frame:
+    def pose(self) -> CoordinateFrame:
         """The device in the world."""
         return self.body.frame.then(self.frame)
 
@@ -55,10 +55,10 @@ class Site:
         return r[0], r[3], r[6]
 
 
-class Device:
+class SimulatedDevice:
     """One device; subclasses measure or set something."""
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         self.tag = tag
         self.node = node
         self.site = site
@@ -104,10 +104,10 @@ class Device:
         raise AttributeError(f"{self.node.type_name} {self.name!r} measures nothing")
 
 
-def _sent(node: Node) -> dict[str, Any]:
+def _sent(node: WorldNode) -> dict[str, Any]:
     """The fields of a device and of what belongs to it, as a Zoom."""
     return {
-        name: _sent(value) if isinstance(value, Node) else value
+        name: _sent(value) if isinstance(value, WorldNode) else value
         for name, value in node.fields.items()
         if name not in _NOT_SENT
     }
@@ -125,7 +125,7 @@ def looked_up(table: Sequence[Sequence[float]], measured: float) -> float:
     return table[-1][1]
 
 
-def resolved(node: Node, measured: float) -> float:
+def resolved(node: WorldNode, measured: float) -> float:
     """A value as the sensor's `resolution` and `lookupTable` show it."""
     value, resolution = looked_up(node.fields["lookupTable"], measured), node.fields["resolution"]
     return round(value / resolution) * resolution if resolution > 0.0 else value
@@ -134,7 +134,7 @@ def resolved(node: Node, measured: float) -> float:
 # Joints ------------------------------------------------------------------------------------------
 
 
-class Motor(Device):
+class SimulatedMotor(SimulatedDevice):
     """Turns a joint."""
 
     def configure(self, setting: str, value: Any) -> None:
@@ -150,7 +150,7 @@ class Motor(Device):
             joint.acceleration_radps2 = value
 
 
-class PositionSensor(Device):
+class SimulatedPositionSensor(SimulatedDevice):
     """Says how far a joint has turned or slid, in radians or metres."""
 
     def measure(self, period_ms: float) -> float:
@@ -161,7 +161,7 @@ class PositionSensor(Device):
 # Where the robot is and how it moves -------------------------------------------------------------
 
 
-class Gps(Device):
+class SimulatedGps(SimulatedDevice):
     """Where the sensor is, and how fast it moved since its last sample."""
 
     _last: tuple[float, float, float] | None = None
@@ -180,15 +180,15 @@ class Gps(Device):
         return [[*here], [(a - b) / seconds for a, b in zip(here, before, strict=True)]]
 
 
-class InertialUnit(Device):
+class SimulatedInertialUnit(SimulatedDevice):
     """Roll, pitch and yaw in radians; the floor is flat, so only yaw ever changes."""
 
     def measure(self, period_ms: float) -> list[float]:
         """Roll, pitch and yaw, yaw between -pi and pi."""
-        return [0.0, 0.0, _turn(self.site.place()[3])]
+        return [0.0, 0.0, _wrapped(self.site.place()[3])]
 
 
-class MotionSensor(Device, ABC):
+class SimulatedVectorSensor(SimulatedDevice, ABC):
     """Three numbers along the sensor's own axes; a disabled axis shows NaN."""
 
     def measure(self, period_ms: float) -> list[float]:
@@ -204,7 +204,7 @@ class MotionSensor(Device, ABC):
         """What is felt now, along the axes of the world."""
 
 
-class Accelerometer(MotionSensor):
+class SimulatedAccelerometer(SimulatedVectorSensor):
     """The change of the sensor's velocity since its last sample, and what carries its weight."""
 
     _last_mps: tuple[float, float] | None = None
@@ -227,7 +227,7 @@ class Accelerometer(MotionSensor):
         return vx - turning * (y - body.y), vy + turning * (x - body.x)
 
 
-class Gyro(MotionSensor):
+class SimulatedGyro(SimulatedVectorSensor):
     """How fast the robot turns, radians a second."""
 
     def feel(self, period_s: float) -> Vector:
@@ -235,7 +235,7 @@ class Gyro(MotionSensor):
         return 0.0, 0.0, self.site.body.yaw_rate_radps
 
 
-class Compass(MotionSensor):
+class SimulatedCompass(SimulatedVectorSensor):
     """Where north is: the direction of the world's y axis."""
 
     def feel(self, period_s: float) -> Vector:
@@ -243,14 +243,14 @@ class Compass(MotionSensor):
         return 0.0, 1.0, 0.0
 
 
-class TouchSensor(Device):
+class SimulatedTouchSensor(SimulatedDevice):
     """Feels what the robot runs into on the side where the sensor's bounding object is.
 
     A robot touches things as a disc, so the sensor answers for the part of that disc which its
     bounding object covers, seen from the middle.
     """
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         super().__init__(tag, node, site)
         disc = site.body.footprint
         parts = bounding_parts(node, site.frame)
@@ -260,10 +260,10 @@ class TouchSensor(Device):
         """1 while it touches something, else 0."""
         yaw = self.site.body.yaw_rad
         angles = [atan2(-y, -x) - yaw for x, y in self.site.body.touched]
-        return float(any(abs(_turn(a - at)) <= half for a in angles for at, half in self._sides))
+        return float(any(abs(_wrapped(a - at)) <= half for a in angles for at, half in self._sides))
 
 
-def _sides(part: Part, ahead_m: float, left_m: float) -> Iterator[tuple[float, float]]:
+def _sides(part: BodyPart, ahead_m: float, left_m: float) -> Iterator[tuple[float, float]]:
     """The directions that a part covers: the middle one and half of the angle, in radians."""
     (x, y, _), (hx, hy, _) = part.frame.translation, part.half_m
     x, y = x - ahead_m, y - left_m
@@ -274,18 +274,18 @@ def _sides(part: Part, ahead_m: float, left_m: float) -> Iterator[tuple[float, f
     corners = [
         part.frame.point((sx * hx, sy * hy, 0.0)) for sx, sy in product((-1.0, 1.0), repeat=2)
     ]
-    angles = [_turn(atan2(cy - left_m, cx - ahead_m) - middle) for cx, cy, _ in corners]
+    angles = [_wrapped(atan2(cy - left_m, cx - ahead_m) - middle) for cx, cy, _ in corners]
     yield middle, max(abs(angle) for angle in angles)
 
 
-def _turn(angle_rad: float) -> float:
+def _wrapped(angle_rad: float) -> float:
     return angle_rad - 2.0 * pi * round(angle_rad / (2.0 * pi))
 
 
 # What the robot sees -----------------------------------------------------------------------------
 
 
-class DistanceSensor(Device):
+class SimulatedDistanceSensor(SimulatedDevice):
     """One ray along the sensor's x axis, translated by the lookup table; noise is left out."""
 
     def measure(self, period_ms: float) -> float:
@@ -296,19 +296,19 @@ class DistanceSensor(Device):
         return looked_up(table, nearest_m(targets, cos(yaw), sin(yaw)))
 
 
-class FetchedSensor(Device, ABC):
+class FetchedSensor(SimulatedDevice, ABC):
     """A sensor of pictures or scans: its value is their number, they stay here until asked for."""
 
     _samples = 0
 
     def measure(self, period_ms: float) -> int:
         """Note what there is to see; the number of the sample."""
-        self.look()
+        self.capture()
         self._samples += 1
         return self._samples
 
     @abstractmethod
-    def look(self) -> None:
+    def capture(self) -> None:
         """Note what there is to see now."""
 
     @abstractmethod
@@ -316,12 +316,12 @@ class FetchedSensor(Device, ABC):
         """The picture or scan of the last sample."""
 
 
-class Lidar(FetchedSensor):
+class SimulatedLidar(FetchedSensor):
     """A level fan of rays from left to right; inf where nothing is in range."""
 
     _seen: tuple[tuple[float, float, float, float], list[Shape]] | None = None
 
-    def look(self) -> None:
+    def capture(self) -> None:
         """Note where everything stands."""
         self._seen = (self.site.place(), self.site.arena.scene(without=self.site.body))
 
@@ -343,14 +343,14 @@ class Lidar(FetchedSensor):
         return [distance if low <= distance <= high else inf for distance in ranges]
 
 
-class Camera(FetchedSensor):
+class SimulatedCamera(FetchedSensor):
     """Renders its image when the picture is read."""
 
-    _seen: pictures.View | None = None
+    _seen: pictures.CameraView | None = None
 
-    def look(self) -> None:
+    def capture(self) -> None:
         """Note where everything stands."""
-        self._seen = pictures.View(
+        self._seen = pictures.CameraView(
             *self.site.place(),
             width=self.node.fields["width"],
             height=self.node.fields["height"],
@@ -363,7 +363,7 @@ class Camera(FetchedSensor):
         return b"" if self._seen is None else pictures.render(self._seen, self.site.arena.colors)
 
 
-class LightSensor(Device):
+class SimulatedLightSensor(SimulatedDevice):
     """Adds up the irradiance of all lights, as Webots does; nothing reflects light."""
 
     def measure(self, period_ms: float) -> float:
@@ -372,7 +372,7 @@ class LightSensor(Device):
         irradiance = sum(self._from(light, world) for light in self.site.arena.lights)
         return resolved(self.node, irradiance)
 
-    def _from(self, light: Node, world: World) -> float:
+    def _from(self, light: WorldNode, world: World) -> float:
         fields, seen_through = light.fields, self.node.fields["colorFilter"]
         if not fields["on"]:
             return 0.0
@@ -381,23 +381,25 @@ class LightSensor(Device):
         color = _dot(fields["color"], seen_through) / 3.0
         return color * _attenuation(light, distance_m) * (fields["ambientIntensity"] + direct)
 
-    def _way_to(self, light: Node, world: World) -> tuple[Vector, float]:
+    def _way_to(self, light: WorldNode, world: World) -> tuple[Vector, float]:
         """The direction of a light, a unit vector, and its distance in metres."""
         frame = world.frame_around(light)
         if light.type_name == "DirectionalLight":
             x, y, z = frame.turned(light.fields["direction"])
             return _unit((-x, -y, -z)), _SUN_M
-        return _way(self.site.pose().translation, frame.point(light.fields["location"]))
+        return _direction_and_distance_m(
+            self.site.pose().translation, frame.point(light.fields["location"])
+        )
 
 
-def _attenuation(light: Node, distance_m: float) -> float:
+def _attenuation(light: WorldNode, distance_m: float) -> float:
     if light.type_name == "DirectionalLight":
         return 1.0
     a, b, c = light.fields["attenuation"]
     return 1.0 / max(a + b * distance_m + c * distance_m**2, 1e-9)
 
 
-def _way(here: Vector, there: Vector) -> tuple[Vector, float]:
+def _direction_and_distance_m(here: Vector, there: Vector) -> tuple[Vector, float]:
     """From one place to another: a unit vector and metres."""
     way = (there[0] - here[0], there[1] - here[1], there[2] - here[2])
     return _unit(way), hypot(*way)
@@ -426,10 +428,10 @@ class Packet:
     """How far it reaches; negative: everywhere."""
 
 
-class Emitter(Device):
+class SimulatedEmitter(SimulatedDevice):
     """Sends packets; they arrive in the basic time step after which they were sent."""
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         super().__init__(tag, node, site)
         self._packets: list[Packet] = []
 
@@ -445,7 +447,7 @@ class Emitter(Device):
         super().make_due()
         self._packets.clear()
 
-    def transmit(self, receivers: Sequence[Receiver]) -> None:
+    def transmit(self, receivers: Sequence[SimulatedReceiver]) -> None:
         """Bring what is to be sent to all receivers of other robots that can hear it."""
         packets, self._packets = self._packets, []
         for receiver in receivers if packets else ():
@@ -453,10 +455,10 @@ class Emitter(Device):
                 receiver.hear(packets, self)
 
 
-class Receiver(Device):
+class SimulatedReceiver(SimulatedDevice):
     """Queues packets until its controller gets them with the next sample."""
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         super().__init__(tag, node, site)
         self._arrived: list[tuple[bytes, Vector, float]] = []
 
@@ -471,12 +473,12 @@ class Receiver(Device):
         super().make_due()
         self._arrived.clear()
 
-    def hear(self, packets: list[Packet], emitter: Emitter) -> None:
+    def hear(self, packets: list[Packet], emitter: SimulatedEmitter) -> None:
         """Take those packets of an emitter that it can hear."""
         if not self.period_ms or self.node.fields["type"] != emitter.node.fields["type"]:
             return
         here, there = self.site.pose(), emitter.site.pose()
-        way, distance_m = _way(here.translation, there.translation)
+        way, distance_m = _direction_and_distance_m(here.translation, there.translation)
         strength = 1.0 / distance_m**2 if distance_m else inf
         direction = here.direction(way)
         self._arrived.extend(
@@ -495,41 +497,41 @@ class Receiver(Device):
         self._arrived.clear()
 
 
-DEVICES: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
-    "RotationalMotor": Motor,
-    "LinearMotor": Motor,
-    "PositionSensor": PositionSensor,
-    "DistanceSensor": DistanceSensor,
-    "GPS": Gps,
-    "InertialUnit": InertialUnit,
-    "Lidar": Lidar,
-    "Camera": Camera,
-    "LED": Device,
-    "Accelerometer": Accelerometer,
-    "Compass": Compass,
-    "Gyro": Gyro,
-    "LightSensor": LightSensor,
-    "TouchSensor": TouchSensor,
-    "Emitter": Emitter,
-    "Receiver": Receiver,
+DEVICES: Final[dict[str, Callable[[int, WorldNode, Mounting], SimulatedDevice]]] = {
+    "RotationalMotor": SimulatedMotor,
+    "LinearMotor": SimulatedMotor,
+    "PositionSensor": SimulatedPositionSensor,
+    "DistanceSensor": SimulatedDistanceSensor,
+    "GPS": SimulatedGps,
+    "InertialUnit": SimulatedInertialUnit,
+    "Lidar": SimulatedLidar,
+    "Camera": SimulatedCamera,
+    "LED": SimulatedDevice,
+    "Accelerometer": SimulatedAccelerometer,
+    "Compass": SimulatedCompass,
+    "Gyro": SimulatedGyro,
+    "LightSensor": SimulatedLightSensor,
+    "TouchSensor": SimulatedTouchSensor,
+    "Emitter": SimulatedEmitter,
+    "Receiver": SimulatedReceiver,
 }
 """The devices that the stand-in has, by node type."""
 
 
-def devices_in(vehicle: Vehicle, arena: Arena) -> list[Device]:
+def devices_in(vehicle: Vehicle, arena: Arena) -> list[SimulatedDevice]:
     """All devices of a robot in the order of the scene tree; tags count from 1."""
-    found: list[tuple[Node, Site]] = []
-    _find(vehicle.body.node, Site(vehicle, arena, Frame(), None), found)
+    found: list[tuple[WorldNode, Mounting]] = []
+    _find(vehicle.body.node, Mounting(vehicle, arena, CoordinateFrame(), None), found)
     return [DEVICES[node.type_name](tag, node, site) for tag, (node, site) in enumerate(found, 1)]
 
 
-def _find(node: Node, site: Site, found: list[tuple[Node, Site]]) -> None:
+def _find(node: WorldNode, site: Mounting, found: list[tuple[WorldNode, Mounting]]) -> None:
     joints = {joint.node: joint for joint in site.vehicle.joints}
     for child in children_of(node):
         if child.type_name == "Robot":
             continue
         frame = site.frame.then(own_frame(child))
-        here = Site(site.vehicle, site.arena, frame, joints.get(child, site.joint))
+        here = Mounting(site.vehicle, site.arena, frame, joints.get(child, site.joint))
         if child.type_name in DEVICES:
             found.append((child, here))
         _find(child, here, found)

@@ -14,7 +14,7 @@ Vector = tuple[float, float, float]
 UNTURNED: Final[Matrix] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
-class Frame(NamedTuple):
+class CoordinateFrame(NamedTuple):
     """Where something is, seen from what it stands in."""
 
     rotation: Matrix = UNTURNED
@@ -35,12 +35,12 @@ class Frame(NamedTuple):
             r[6] * x + r[7] * y + r[8] * z + tz,
         )
 
-    def inverse(self) -> Frame:
+    def inverse(self) -> CoordinateFrame:
         """What this frame stands in, seen from this frame."""
         r = self.rotation
-        turned = Frame((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
+        turned = CoordinateFrame((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
         x, y, z = turned.point(self.translation)
-        return Frame(turned.rotation, (-x, -y, -z))
+        return CoordinateFrame(turned.rotation, (-x, -y, -z))
 
     def direction(self, outside: Sequence[float]) -> Vector:
         """A direction given outside, seen from this frame."""
@@ -48,14 +48,14 @@ class Frame(NamedTuple):
 
     def turned(self, local: Sequence[float]) -> Vector:
         """A direction given in this frame, seen from outside."""
-        return Frame(self.rotation).point(local)
+        return CoordinateFrame(self.rotation).point(local)
 
-    def then(self, inner: Frame) -> Frame:
+    def then(self, inner: CoordinateFrame) -> CoordinateFrame:
         """A frame given in this frame, seen from outside."""
         a, b = self.rotation, inner.rotation
         rows = ((a[i], a[i + 1], a[i + 2]) for i in (0, 3, 6))
         product = (p * b[k] + q * b[k + 3] + r * b[k + 6] for p, q, r in rows for k in (0, 1, 2))
-        return Frame(cast("Matrix", tuple(product)), self.point(inner.translation))
+        return CoordinateFrame(cast("Matrix", tuple(product)), self.point(inner.translation))
 
 
 def _rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
@@ -74,10 +74,10 @@ def _rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
     )
 
 
-def frame_of(translation: Sequence[float], axis_angle: Sequence[float]) -> Frame:
+def frame_of(translation: Sequence[float], axis_angle: Sequence[float]) -> CoordinateFrame:
     """The frame that a `translation` and a `rotation` field describe."""
     x, y, z = translation
-    return Frame(_rotation_matrix(axis_angle), (x, y, z))
+    return CoordinateFrame(_rotation_matrix(axis_angle), (x, y, z))
 
 
 # Shapes that stand upright on a plane, and how rays hit them and they push a disc away ------------
@@ -141,7 +141,7 @@ class Circle(NamedTuple):
         ) / self.radius_m
 
 
-class Here(NamedTuple):
+class EnclosingShape(NamedTuple):
     """A shape that the point is inside of."""
 
     shape: Shape
@@ -155,11 +155,11 @@ class Here(NamedTuple):
         return dx, dy
 
 
-Target: TypeAlias = "Edge | Circle | Here"
+Target: TypeAlias = "Edge | Circle | EnclosingShape"
 
 
 @dataclass(frozen=True)
-class Block:
+class UprightBox:
     """A box that stands upright."""
 
     x: float
@@ -186,7 +186,7 @@ class Block:
         if beyond_x > reach_m or beyond_y > reach_m:
             return []
         if beyond_x <= 0.0 and beyond_y <= 0.0:
-            return [] if height_m is None else [Here(self)]
+            return [] if height_m is None else [EnclosingShape(self)]
         c, s = self.cos_yaw, self.sin_yaw
         seen: list[Target] = []
         if beyond_x > 0.0:
@@ -239,7 +239,7 @@ class Disc:
         if radius <= 0.0 or gap > reach_m * (reach_m + 2.0 * radius):
             return []
         if gap <= 0.0:
-            return [] if height_m is None else [Here(self)]
+            return [] if height_m is None else [EnclosingShape(self)]
         return [Circle(cx, cy, radius, gap, self)]
 
     def _radius_at(self, height_m: float) -> float:
@@ -260,7 +260,7 @@ class Disc:
         return (dx / distance * depth, dy / distance * depth) if distance else (depth, 0.0)
 
 
-Shape: TypeAlias = "Block | Disc"
+Shape: TypeAlias = "UprightBox | Disc"
 
 
 def targets_from(

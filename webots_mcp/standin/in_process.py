@@ -12,10 +12,10 @@ from controller.robot import Robot, Supervisor
 from controller.session import Message
 
 from webots_mcp.contract import bundled
-from webots_mcp.standin.controller_answers import Driver, Seat, description
+from webots_mcp.standin.controller_answers import BaseSimulation, ControllerEndpoint, description
 from webots_mcp.standin.simulator import Mode
-from webots_mcp.standin.simulator import Robot as SimulatedRobot
-from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError
+from webots_mcp.standin.simulator import SimulatedRobot as SimulatedRobot
+from webots_mcp.standin.vrml import RequestAfterEndError, StandInError, WorldError, WouldBlockError
 
 DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"
 """A 4 m x 4 m arena with a few obstacles and one two-wheeled robot, "rover"."""
@@ -23,7 +23,7 @@ DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"
 _LONGEST_STEP_MS: Final = 1 << 31
 
 
-class InProcessSimulation(Driver):
+class InProcessSimulation(BaseSimulation):
     """A world that the robots of this process move themselves, step by step.
 
     There is no thread and no pacing: time passes while a robot is inside `step`. Several robots
@@ -63,7 +63,7 @@ class InProcessSimulation(Driver):
         self.simulator.mode = Mode.PAUSE
         self._advance()
 
-    def _end(self, seats: Sequence[Seat]) -> None:
+    def _end(self, seats: Sequence[ControllerEndpoint]) -> None:
         for seat in seats:
             seat.is_ending = True
             if seat.robot.remaining_ms is not None:
@@ -123,7 +123,7 @@ class InProcessSimulation(Driver):
                 link.robot.forget_controller()
 
 
-class _LocalLink(Seat):
+class _LocalLink(ControllerEndpoint):
     """Both ends of the connection of an in-process robot."""
 
     def __init__(self, simulation: InProcessSimulation, robot: SimulatedRobot) -> None:
@@ -149,7 +149,7 @@ class _LocalLink(Seat):
         return self.replies.popleft()
 
     def exit(self) -> NoReturn:
-        raise ControllerEndedError(
+        raise RequestAfterEndError(
             "step() has returned -1: a controller process would end here, without a word. "
             "Leave the loop when step() returns -1 and make no further request"
         )
@@ -163,7 +163,7 @@ class InProcessRobot(Robot):
 
     Subclass it like `Robot`; there may be as many as a test wants. What differs from a controller
     process: `step` in a paused simulation raises `WouldBlockError` where it would wait for ever,
-    and a request after `step` has returned -1 raises `ControllerEndedError` where the process
+    and a request after `step` has returned -1 raises `RequestAfterEndError` where the process
     would end.
     """
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.standin.arena import Arena, Body, SceneColors
-from webots_mcp.standin.geometry import Block, Color, Shape, Target, targets_from
+from webots_mcp.standin.geometry import Color, Shape, Target, UprightBox, targets_from
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -22,7 +22,7 @@ _LIGHT: Final = (0.8, 0.6)
 
 
 @dataclass(frozen=True)
-class Picture:
+class PictureRequest:
     """A picture that was asked for."""
 
     path: Path
@@ -41,7 +41,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class Chart:
+class MapScale:
     """From metres to pixels."""
 
     x_m: float
@@ -49,14 +49,14 @@ class Chart:
     pixels_per_m: float
 
     @staticmethod
-    def of(shapes: list[Shape]) -> Chart:
+    def of(shapes: list[Shape]) -> MapScale:
         """The chart that shows all shapes, x to the right and y upwards."""
         corners = [corner for shape in shapes for corner in _outline(shape)] or [(-1.0, -1.0)]
         xs, ys = [x for x, _ in corners], [y for _, y in corners]
         width, height = max(xs) - min(xs), max(ys) - min(ys)
         room = [size - 2 * _MARGIN_PX for size in SIZE_PX]
         scale = min(room[0] / max(width, 0.1), room[1] / max(height, 0.1))
-        return Chart((max(xs) + min(xs)) / 2.0, (max(ys) + min(ys)) / 2.0, scale)
+        return MapScale((max(xs) + min(xs)) / 2.0, (max(ys) + min(ys)) / 2.0, scale)
 
     def at(self, x_m: float, y_m: float) -> tuple[float, float]:
         """The pixel of a point."""
@@ -66,7 +66,9 @@ class Chart:
         )
 
 
-def save_picture(picture: Picture, arena: Arena, time_s: float, labels: Iterable[Label]) -> None:
+def save_picture(
+    picture: PictureRequest, arena: Arena, time_s: float, labels: Iterable[Label]
+) -> None:
     """Draw the arena and write the file; the format is the extension's.
 
     Raises:
@@ -81,7 +83,7 @@ def save_picture(picture: Picture, arena: Arena, time_s: float, labels: Iterable
         raise ValueError(f"unknown extension {picture.path.suffix!r}, use .png or .jpg")
     image = Image.new("RGB", SIZE_PX, _rgb(arena.colors.sky))
     pen = ImageDraw.Draw(image)
-    chart = Chart.of([shape for body in arena.bodies for shape in body.shapes])
+    chart = MapScale.of([shape for body in arena.bodies for shape in body.shapes])
     _draw_floor(pen, chart, arena)
     for body in arena.bodies:
         _draw_body(pen, chart, body)
@@ -91,7 +93,7 @@ def save_picture(picture: Picture, arena: Arena, time_s: float, labels: Iterable
     image.save(picture.path, kind, quality=picture.quality)
 
 
-def _draw_floor(pen: ImageDraw, chart: Chart, arena: Arena) -> None:
+def _draw_floor(pen: ImageDraw, chart: MapScale, arena: Arena) -> None:
     corners = [c for body in arena.bodies for shape in body.shapes for c in _outline(shape)]
     if not corners:
         return
@@ -100,7 +102,7 @@ def _draw_floor(pen: ImageDraw, chart: Chart, arena: Arena) -> None:
     pen.rectangle((left, top, right, bottom), fill=_rgb(arena.colors.floor))
 
 
-def _draw_body(pen: ImageDraw, chart: Chart, body: Body) -> None:
+def _draw_body(pen: ImageDraw, chart: MapScale, body: Body) -> None:
     for shape in body.shapes:
         _draw_shape(pen, chart, shape)
     radius = body.footprint.radius_m
@@ -111,8 +113,8 @@ def _draw_body(pen: ImageDraw, chart: Chart, body: Body) -> None:
         pen.text(chart.at(x + radius, y + radius), body.name, fill=(0, 0, 0), font_size=14)
 
 
-def _draw_shape(pen: ImageDraw, chart: Chart, shape: Shape) -> None:
-    if isinstance(shape, Block):
+def _draw_shape(pen: ImageDraw, chart: MapScale, shape: Shape) -> None:
+    if isinstance(shape, UprightBox):
         pen.polygon([chart.at(*corner) for corner in _outline(shape)], fill=_rgb(shape.color))
         return
     radius_px = shape.radius_m * chart.pixels_per_m
@@ -126,7 +128,7 @@ def _draw_label(pen: ImageDraw, label: Label) -> None:
 
 
 def _outline(shape: Shape) -> list[tuple[float, float]]:
-    if not isinstance(shape, Block):
+    if not isinstance(shape, UprightBox):
         r = shape.radius_m
         return [(shape.x + dx, shape.y + dy) for dx in (-r, r) for dy in (-r, r)]
     c, s, a, b = shape.cos_yaw, shape.sin_yaw, shape.half_x_m, shape.half_y_m
@@ -146,7 +148,7 @@ def _rgb(color: Color) -> tuple[int, int, int]:
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """What a camera saw at one moment."""
 
     x: float
@@ -159,7 +161,7 @@ class View:
     shapes: tuple[Shape, ...]
 
 
-def render(view: View, colors: SceneColors) -> bytes:
+def render(view: CameraView, colors: SceneColors) -> bytes:
     """The picture: blue, green, red, alpha for each pixel, rows from the top left."""
     targets = targets_from(view.shapes, view.x, view.y, None)
     focal_px = view.width / 2.0 / tan(view.field_of_view_rad / 2.0)
@@ -172,7 +174,7 @@ def render(view: View, colors: SceneColors) -> bytes:
 
 
 def _column(
-    view: View, column: int, focal_px: float, targets: list[Target], background: bytes
+    view: CameraView, column: int, focal_px: float, targets: list[Target], background: bytes
 ) -> bytes:
     aside = (view.width / 2.0 - column - 0.5) / focal_px
     length = hypot(1.0, aside)
@@ -190,7 +192,7 @@ def _column(
     return pixels
 
 
-def _row(view: View, height_m: float, scale_px: float) -> int:
+def _row(view: CameraView, height_m: float, scale_px: float) -> int:
     row = round(view.height / 2.0 - (height_m - view.z) * scale_px)
     return min(max(row, 0), view.height)
 

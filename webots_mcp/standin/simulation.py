@@ -22,8 +22,8 @@ from typing import Final, Protocol, TypeVar, cast
 
 from controller.session import ADDRESS_FILE, Message
 
-from webots_mcp.standin.controller_answers import Driver, Seat, description
-from webots_mcp.standin.controllers import Connection, Controller, Launch
+from webots_mcp.standin.controller_answers import BaseSimulation, ControllerEndpoint, description
+from webots_mcp.standin.controllers import Controller, ControllerConnection, ControllerLaunch
 from webots_mcp.standin.simulator import Mode
 from webots_mcp.standin.vrml import StandInError
 
@@ -52,7 +52,7 @@ class ConsoleRecorder(Protocol):
         """
 
 
-class Simulation(Driver):
+class StandInSimulation(BaseSimulation):
     """A world that runs in a background thread, its controllers as processes of their own.
 
     Use it in a `with` statement; leaving it ends all controllers.
@@ -96,7 +96,7 @@ class Simulation(Driver):
         self._folder = Path(tempfile.mkdtemp(prefix="webots-standin-"))
         self._clean_up = weakref.finalize(self, shutil.rmtree, self._folder, True)
         overrides = {name: Path(file) for name, file in (controllers or {}).items()}
-        self._launch = Launch(
+        self._launch = ControllerLaunch(
             python, environment or {}, overrides, self._print, self._exited, secrets.token_hex(16)
         )
         self.controllers: list[Controller] = []
@@ -105,7 +105,7 @@ class Simulation(Driver):
         for name in overrides:
             self.robot(name)  # refuses a name that the world does not have
         self._find_controllers()
-        self._admitted: dict[Connection, Controller] = {}
+        self._admitted: dict[ControllerConnection, Controller] = {}
         self._calls: deque[tuple[Callable[[], None], Future[None]]] = deque()
         self._steps_asked = 0
         self._due_s = 0.0
@@ -116,7 +116,7 @@ class Simulation(Driver):
 
     # Life ----------------------------------------------------------------------------------------
 
-    def start(self, shown_port: int | None = None) -> Simulation:
+    def start(self, shown_port: int | None = None) -> StandInSimulation:
         """Start the controllers and, unless it is to be paused, time.
 
         Args:
@@ -146,7 +146,7 @@ class Simulation(Driver):
             self._thread.join()
         self._clean_up()
 
-    def __enter__(self) -> Simulation:
+    def __enter__(self) -> StandInSimulation:
         return self.start()
 
     def __exit__(self, *_: object) -> None:
@@ -341,12 +341,12 @@ class Simulation(Driver):
         return self.controllers
 
     def _welcome(self, door: socket.socket) -> None:
-        connection = Connection(door.accept()[0])
+        connection = ControllerConnection(door.accept()[0])
         self._selector.register(
             connection.stream, selectors.EVENT_READ, partial(self._hear, connection)
         )
 
-    def _hear(self, connection: Connection, _: socket.socket) -> None:
+    def _hear(self, connection: ControllerConnection, _: socket.socket) -> None:
         messages = connection.receive()
         if messages is None:
             self._forget(connection)
@@ -359,7 +359,7 @@ class Simulation(Driver):
             else:
                 self._admit(connection, message)
 
-    def _admit(self, connection: Connection, message: Message) -> None:
+    def _admit(self, connection: ControllerConnection, message: Message) -> None:
         _, token, name = message
         controller = next((c for c in self.controllers if c.name == name), None)
         if not hmac.compare_digest(token, self._launch.token):
@@ -374,7 +374,7 @@ class Simulation(Driver):
             connection.send(("welcome", description(self.simulator, controller.robot)))
             self._notice()
 
-    def _forget(self, connection: Connection) -> None:
+    def _forget(self, connection: ControllerConnection) -> None:
         self._selector.unregister(connection.stream)
         connection.stream.close()
         if controller := self._admitted.pop(connection, None):
@@ -392,12 +392,12 @@ class Simulation(Driver):
         for controller, robot in zip(self.controllers, self.simulator.robots, strict=True):
             controller.enter(robot, self.simulator)
 
-    def _start(self, seats: Sequence[Seat]) -> None:
+    def _start(self, seats: Sequence[ControllerEndpoint]) -> None:
         for controller in self.controllers:
             if controller in seats:
                 controller.start()
 
-    def _end(self, seats: Sequence[Seat]) -> None:
+    def _end(self, seats: Sequence[ControllerEndpoint]) -> None:
         """As Webots does it: a second to ask, a second to exit, then by force."""
         controllers = [controller for controller in self.controllers if controller in seats]
         for controller in controllers:

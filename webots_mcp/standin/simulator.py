@@ -13,9 +13,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
-from webots_mcp.standin.devices import Device, Emitter, Receiver, devices_in
-from webots_mcp.standin.pictures import Label, Picture, save_picture
-from webots_mcp.standin.vrml import Node, WorldError
+from webots_mcp.standin.devices import (
+    SimulatedDevice,
+    SimulatedEmitter,
+    SimulatedReceiver,
+    devices_in,
+)
+from webots_mcp.standin.pictures import Label, PictureRequest, save_picture
+from webots_mcp.standin.vrml import WorldError, WorldNode
 from webots_mcp.standin.world import World
 
 TrackedKey: TypeAlias = "tuple[int, int | str | None]"
@@ -38,13 +43,15 @@ A world to be loaded, empty to read the same one again, or the exit status to qu
 """
 
 
-class Robot:
+class SimulatedRobot:
     """A robot of the world and the state of its controller's requests."""
 
     def __init__(self, body: Body, arena: Arena) -> None:
-        self.node: Node = body.node
+        self.node: WorldNode = body.node
         self.vehicle = Vehicle(body, joints_in(body.node))
-        self.devices: dict[int, Device] = {d.tag: d for d in devices_in(self.vehicle, arena)}
+        self.devices: dict[int, SimulatedDevice] = {
+            d.tag: d for d in devices_in(self.vehicle, arena)
+        }
         self.folder = Path.cwd()
         """Where the relative paths of its controller start."""
         self.remaining_ms: float | None = None
@@ -127,7 +134,7 @@ class Simulator:
         self.log = log
         self.arena = Arena(world)
         self.robots = [
-            Robot(b, self.arena) for b in self.arena.bodies if b.node.type_name == "Robot"
+            SimulatedRobot(b, self.arena) for b in self.arena.bodies if b.node.type_name == "Robot"
         ]
         names = [robot.name for robot in self.robots]
         if double := {name for name in names if names.count(name) > 1}:
@@ -137,17 +144,17 @@ class Simulator:
         if not self.robots and world.left_out:
             raise WorldError(self.no_robot())
         devices = [device for robot in self.robots for device in robot.devices.values()]
-        self._emitters = [device for device in devices if isinstance(device, Emitter)]
-        self._receivers = [device for device in devices if isinstance(device, Receiver)]
+        self._emitters = [device for device in devices if isinstance(device, SimulatedEmitter)]
+        self._receivers = [device for device in devices if isinstance(device, SimulatedReceiver)]
         self.time_ms = 0.0
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
         self.is_reset_wanted = False
         """Whether everything is put back at the end of the next physics step."""
         self.wanted_after_step: Wanted | None = None
-        self.added: list[Node] = []
+        self.added: list[WorldNode] = []
         """What controllers have added: the next reset removes it."""
-        self._pictures: list[Picture] = []
+        self._pictures: list[PictureRequest] = []
         self._start = {
             node: ([*node.fields["translation"]], [*node.fields["rotation"]])
             for node in world.nodes
@@ -159,7 +166,7 @@ class Simulator:
         """Simulated time in seconds."""
         return self.time_ms / 1000.0
 
-    def robot(self, name: str) -> Robot:
+    def robot(self, name: str) -> SimulatedRobot:
         """The robot with this name."""
         for robot in self.robots:
             if robot.name == name:
@@ -181,7 +188,7 @@ class Simulator:
         asked = "no robot" if name is None else f"no robot {name!r}"
         return f"{asked} in {self.world.path.name}; it has {known or 'none'}"
 
-    def left_out_robots(self, name: str | None = None) -> list[Node]:
+    def left_out_robots(self, name: str | None = None) -> list[WorldNode]:
         """What was left out of the world and may be this robot, or any: what has a controller."""
         at_top = [n for n in self.world.left_out if self.world.parent_of(n) is self.world.root]
         robots = [node for node in self.world.left_out if _has_controller(node)]
@@ -189,17 +196,17 @@ class Simulator:
             return robots or at_top
         return [node for node in robots if node.fields.get("name", name) == name]
 
-    def robot_of(self, node: Node) -> Robot:
+    def robot_of(self, node: WorldNode) -> SimulatedRobot:
         """The robot that a Robot node describes."""
         return next(robot for robot in self.robots if robot.node is node)
 
-    def ask_step(self, robot: Robot, duration_ms: int) -> bool:
+    def ask_step(self, robot: SimulatedRobot, duration_ms: int) -> bool:
         """Take a controller's request to simulate; True if that much has passed already."""
         basic = self.world.basic_time_step_ms
         robot.remaining_ms = ceil(duration_ms / basic) * basic - robot.ahead_ms
         return self._is_over(robot)
 
-    def _is_over(self, robot: Robot) -> bool:
+    def _is_over(self, robot: SimulatedRobot) -> bool:
         if robot.remaining_ms is None or robot.remaining_ms > 0.0:
             return False
         late_ms = -robot.remaining_ms
@@ -208,7 +215,7 @@ class Simulator:
         robot.delay_ms = 0 if robot.is_synchronous else int(late_ms)
         return True
 
-    def advance(self) -> list[Robot]:
+    def advance(self) -> list[SimulatedRobot]:
         """Make one physics step; returns the robots whose controllers have waited for it."""
         basic = self.world.basic_time_step_ms
         for robot in self.robots:
@@ -227,12 +234,12 @@ class Simulator:
             self.wanted, self.wanted_after_step = self.wanted_after_step, None
         return [robot for robot in self.robots if self._let_pass(robot, basic)]
 
-    def _measure(self, robot: Robot, passed_ms: float) -> None:
+    def _measure(self, robot: SimulatedRobot, passed_ms: float) -> None:
         for device in robot.devices.values():
             if device.is_due(passed_ms):
                 device.put_value(robot.fresh)
 
-    def _let_pass(self, robot: Robot, passed_ms: float) -> bool:
+    def _let_pass(self, robot: SimulatedRobot, passed_ms: float) -> bool:
         if robot.remaining_ms is None:
             robot.ahead_ms += passed_ms
             return False
@@ -268,7 +275,7 @@ class Simulator:
 
     def export(self, path: Path, quality: int) -> None:
         """Write a picture: at once when paused, else with the next rendering."""
-        self._pictures.append(Picture(path, quality))
+        self._pictures.append(PictureRequest(path, quality))
         if self.mode is Mode.PAUSE:
             self._render()
 
@@ -277,12 +284,12 @@ class Simulator:
         for picture in pictures:
             self._save(picture)
 
-    def _save(self, picture: Picture) -> None:
+    def _save(self, picture: PictureRequest) -> None:
         try:
             save_picture(picture, self.arena, self.time_s, [*self.labels.values()])
         except (OSError, ValueError, ImportError) as error:
             self.log(f"ERROR: cannot export the image {picture.path}: {error}")
 
 
-def _has_controller(node: Node) -> bool:
+def _has_controller(node: WorldNode) -> bool:
     return "controller" in node.fields or "controllerArgs" in node.fields

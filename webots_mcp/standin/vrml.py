@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple, TypeAlias, cast
 DATA: Final = Path(__file__).with_name("data")
 """The folder of the node types and of the PROTO nodes that are built in."""
 
-Value: TypeAlias = "bool | str | Node | list[float] | list[Value] | None"
+Value: TypeAlias = "bool | str | WorldNode | list[float] | list[Value] | None"
 """A field as written: numbers are always a list of floats, `[...]` is a list of anything."""
 NUMBERS_IN: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
 """How many numbers make one value of a type; all other types take one."""
@@ -65,7 +65,7 @@ class Token(NamedTuple):
 
 
 @dataclass(eq=False)
-class Node:
+class WorldNode:
     """A node of the scene tree; the parser fills in the fields that the file names, as `Value`s."""
 
     type_name: str
@@ -78,19 +78,19 @@ class Node:
     """Fields that a PROTO node has and its base node has not; the nodes in them stand in that."""
 
 
-def children_of(node: Node) -> Iterator[Node]:
+def children_of(node: WorldNode) -> Iterator[WorldNode]:
     """The nodes in the fields of a node, in the order of the file."""
     for name, value in node.fields.items():
         if name in node.parameters:
             continue
-        if isinstance(value, Node):
+        if isinstance(value, WorldNode):
             yield value
         elif isinstance(value, list):
             items = cast("list[Any]", value)
-            yield from (item for item in items if isinstance(item, Node))
+            yield from (item for item in items if isinstance(item, WorldNode))
 
 
-def descendants_of(node: Node) -> Iterator[Node]:
+def descendants_of(node: WorldNode) -> Iterator[WorldNode]:
     """Everything inside a node, from the top of the file to the bottom."""
     for child in children_of(node):
         yield child
@@ -126,7 +126,7 @@ class WouldBlockError(StandInError):
     """An in-process `step` that would never return, because the simulation is paused."""
 
 
-class ControllerEndedError(StandInError):
+class RequestAfterEndError(StandInError):
     """The API was used after `step` had returned -1.
 
     A controller process would end here without a word (C `exit`); in process that would end the
@@ -154,14 +154,14 @@ class Parser:
         self._given = given
         self._line = line
         self._next = 0
-        self._defined: dict[str, Node] = {}
+        self._defined: dict[str, WorldNode] = {}
         self.urls: dict[str, str] = {}
         """Where the file says that PROTOs come from, by their names."""
         self._last_line = self._tokens[-1].line if self._tokens else 1
 
-    def nodes(self) -> list[Node]:
+    def nodes(self) -> list[WorldNode]:
         """The nodes at the top of the file, in order."""
-        nodes: list[Node] = []
+        nodes: list[WorldNode] = []
         while self._next < len(self._tokens):
             if not self._takes_externproto():
                 line = self._tokens[self._next].line
@@ -244,7 +244,7 @@ class Parser:
             raise WorldError(f"expected {what}, found {token.text!r}", token.line)
         return token
 
-    def _node(self) -> Node:
+    def _node(self) -> WorldNode:
         token = self._name("a node")
         if token.text == "USE":
             return self._used()
@@ -255,16 +255,16 @@ class Parser:
         name = self._name("a DEF name").text
         return self._body(self._name("a node type"), name)
 
-    def _used(self) -> Node:
+    def _used(self) -> WorldNode:
         token = self._name("a DEF name")
         if token.text not in self._defined:
             raise WorldError(f"USE {token.text} comes before any DEF {token.text}", token.line)
         return self._defined[token.text]
 
-    def _body(self, type_token: Token, def_name: str) -> Node:
+    def _body(self, type_token: Token, def_name: str) -> WorldNode:
         is_inner = self._line is not None  # in a PROTO: not to be found from outside
         line = type_token.line if self._line is None else self._line
-        node = Node(type_token.text, "" if is_inner else def_name, line)
+        node = WorldNode(type_token.text, "" if is_inner else def_name, line)
         brace = self._take()
         if brace.text != "{":
             raise WorldError(
@@ -355,7 +355,7 @@ NODE_TYPES: Final = Parser((DATA / "nodes.txt").read_text(encoding="utf-8")).typ
 """Fields by node type."""
 
 
-def give_types(node: Node, definitions: Mapping[str, FieldDefinition]) -> None:
+def give_types(node: WorldNode, definitions: Mapping[str, FieldDefinition]) -> None:
     """Give a node all fields that its type has, with values of their types.
 
     Raises:
@@ -368,7 +368,7 @@ def give_types(node: Node, definitions: Mapping[str, FieldDefinition]) -> None:
         node.fields[name] = _typed(value, name, definition, node)
 
 
-def _typed(value: Value, name: str, definition: FieldDefinition, node: Node) -> Value:
+def _typed(value: Value, name: str, definition: FieldDefinition, node: WorldNode) -> Value:
     many, kind = definition.type_name[:2] == "MF", definition.type_name[2:]
     try:
         if not many:
@@ -386,7 +386,7 @@ def _typed(value: Value, name: str, definition: FieldDefinition, node: Node) -> 
 
 def _single(value: Value, kind: str) -> Any:
     if kind in ("Bool", "String", "Node"):
-        expected = {"Bool": bool, "String": str, "Node": (Node, type(None))}[kind]
+        expected = {"Bool": bool, "String": str, "Node": (WorldNode, type(None))}[kind]
         if not isinstance(value, expected):
             raise TypeError(kind)
         return value
@@ -418,7 +418,7 @@ def _numbers(value: Any) -> list[float]:
 
 
 def _shown(value: Value) -> str:
-    return f"a {value.type_name} node" if isinstance(value, Node) else repr(value)
+    return f"a {value.type_name} node" if isinstance(value, WorldNode) else repr(value)
 
 
 # -- what a PROTO stands for -----------------------------------------------------------------------
@@ -525,7 +525,7 @@ class Protos:
         files = (self._home / "projects").rglob("*.proto") if self._home else ()
         return {file.stem: file for file in files}
 
-    def build(self, node: Node) -> None:
+    def build(self, node: WorldNode) -> None:
         """Make a PROTO node what it stands for; its own fields and those of its base are there.
 
         Raises:
@@ -549,7 +549,7 @@ class Protos:
         node.fields = node.fields | base.fields
         node.proto_name, node.type_name = node.type_name, base.type_name
 
-    def shown_definitions(self, node: Node) -> Mapping[str, FieldDefinition]:
+    def shown_definitions(self, node: WorldNode) -> Mapping[str, FieldDefinition]:
         """The fields that a supervisor sees of a node: of a PROTO node its own."""
         proto = self.find(node.proto_name) if node.proto_name else None
         return proto.shown if proto else NODE_TYPES[node.type_name]
@@ -568,7 +568,7 @@ def _e_puck(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _loose_box(fields: Mapping[str, Any]) -> dict[str, Any]:
-    physics = Node("Physics", "", 0, {"density": [-1.0], "mass": [fields["mass"]]})
+    physics = WorldNode("Physics", "", 0, {"density": [-1.0], "mass": [fields["mass"]]})
     return {"physics": physics if fields["mass"] > 0.0 else None}
 
 
@@ -587,13 +587,13 @@ def _circle_arena(fields: Mapping[str, Any]) -> dict[str, Any]:
     count = max(fields["subdivision"], 8)
     middle_m = radius + thickness / 2.0
     length_m = 2.0 * (radius + thickness) * tan(pi / count)
-    walls: list[Node] = []
+    walls: list[WorldNode] = []
     for angle in (2.0 * pi * i / count for i in range(count)):
         place = [middle_m * cos(angle), middle_m * sin(angle), height / 2.0]
         wall: dict[str, Any] = {"translation": place, "rotation": [0.0, 0.0, 1.0, angle]}
         wall |= {"size": [thickness, length_m, height], "name": "wall"}
         wall["appearance"] = fields["wallAppearance"]
-        walls.append(Node("SolidBox", "", 0, wall))
+        walls.append(WorldNode("SolidBox", "", 0, wall))
     return {"floorSize": [2.0 * radius, 2.0 * radius], "walls": walls}
 
 

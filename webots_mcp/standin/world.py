@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.standin.geometry import Frame, frame_of
+from webots_mcp.standin.geometry import CoordinateFrame, frame_of
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
-    Node,
     Parser,
     Protos,
     WorldError,
+    WorldNode,
     children_of,
     descendants_of,
     give_types,
@@ -31,23 +31,23 @@ _UNSCALED: Final = [1.0, 1.0, 1.0]
 class World:
     """The scene tree of one world file.
 
-    After loading, every node has all fields that its type has, as Python values: `float`, `int`,
-    `bool`, `str`, a list of floats for vectors, rotations and colors, a `Node` or None, and lists
-    of those for MF fields.
+    After loading, every node has all fields of its type as Python values: `float`, `int`, `bool`,
+    `str`, a list of floats for vectors, rotations and colors, a `WorldNode` or None, and lists of
+    those for MF fields.
     """
 
-    def __init__(self, path: Path, top: list[Node], protos: Protos) -> None:
+    def __init__(self, path: Path, top: list[WorldNode], protos: Protos) -> None:
         self.path = path
         self.protos = protos
-        self.root = Node("Group", "", 1, {"children": [*top]})
-        self.nodes: list[Node] = []
+        self.root = WorldNode("Group", "", 1, {"children": [*top]})
+        self.nodes: list[WorldNode] = []
         """Every node once, in the order of the scene tree; what was added comes last."""
-        self.left_out: list[Node] = []
+        self.left_out: list[WorldNode] = []
         """What stands in the file and not in the world: nodes of types that are not known here."""
-        self._ids: dict[Node, int] = {}
-        self._by_id: dict[int, Node] = {}
+        self._ids: dict[WorldNode, int] = {}
+        self._by_id: dict[int, WorldNode] = {}
         self._next_id = 0
-        self._parents: dict[Node, Node] = {}
+        self._parents: dict[WorldNode, WorldNode] = {}
         self._register(self.root, None)
         info = next((node for node in top if node.type_name == "WorldInfo"), None)
         if info is None:
@@ -59,7 +59,7 @@ class World:
         if info.fields["coordinateSystem"] != "ENU":
             raise WorldError("the stand-in has no coordinateSystem but ENU", info.line)
 
-    def _register(self, node: Node, parent: Node | None) -> None:
+    def _register(self, node: WorldNode, parent: WorldNode | None) -> None:
         if node in self._ids:  # a USE: stands where its DEF stands
             return
         if node.type_name in NODE_TYPES:
@@ -75,15 +75,15 @@ class World:
         for child in children_of(node):
             self._register(child, node)
 
-    def _leave_out_unknown(self, node: Node) -> None:
+    def _leave_out_unknown(self, node: WorldNode) -> None:
         for child in [*children_of(node)]:
             if not self._is_known(child):
                 self._leave_out(child, node)
 
-    def _is_known(self, node: Node) -> bool:
+    def _is_known(self, node: WorldNode) -> bool:
         return node.type_name in NODE_TYPES or self.protos.find(node.type_name) is not None
 
-    def _leave_out(self, child: Node, parent: Node) -> None:
+    def _leave_out(self, child: WorldNode, parent: WorldNode) -> None:
         if child not in self.left_out:
             self.left_out.append(child)
             self._parents[child] = parent
@@ -101,7 +101,7 @@ class World:
         A line names the first node of its type in the file; what lies higher in the tree was left
         out before it.
         """
-        by_type: dict[str, list[Node]] = {}
+        by_type: dict[str, list[WorldNode]] = {}
         for node in sorted(self.left_out, key=lambda node: node.line):
             by_type.setdefault(node.type_name, []).append(node)
         lines = [
@@ -123,7 +123,7 @@ class World:
         why = self.protos.why_not.get(type_name)
         return f" ({why})" if why else ""
 
-    def left_out_in(self, robot: Node) -> dict[str, str]:
+    def left_out_in(self, robot: WorldNode) -> dict[str, str]:
         """Devices that the world gives a robot and the stand-in does not: names and node types."""
         names: dict[str, str] = {}
         for node in self.left_out:
@@ -134,7 +134,7 @@ class World:
                         names.setdefault(name, node.type_name)
         return names
 
-    def _around(self, node: Node) -> Iterator[Node]:
+    def _around(self, node: WorldNode) -> Iterator[WorldNode]:
         while (parent := self._parents.get(node)) is not None:
             yield parent
             node = parent
@@ -144,15 +144,15 @@ class World:
         """The title that WorldInfo gives, empty if none."""
         return str(self.info.fields["title"])
 
-    def id_of(self, node: Node) -> int:
+    def id_of(self, node: WorldNode) -> int:
         """The number that a controller knows the node by."""
         return self._ids[node]
 
-    def node(self, node_id: int) -> Node | None:
+    def node(self, node_id: int) -> WorldNode | None:
         """The node of that number; None where it was removed."""
         return self._by_id.get(node_id)
 
-    def add(self, node: Node, parent: Node, name: str, index: int | None) -> list[str]:
+    def add(self, node: WorldNode, parent: WorldNode, name: str, index: int | None) -> list[str]:
         """Put a node, as the parser gives it, into a field, or before one of its entries.
 
         Returns:
@@ -179,7 +179,7 @@ class World:
             parent.fields[name].insert(index, node)
         return [*dict.fromkeys(each.type_name for each in self.left_out[left_out:])]
 
-    def remove(self, node: Node) -> tuple[Node, str] | None:
+    def remove(self, node: WorldNode) -> tuple[WorldNode, str] | None:
         """Take a node out of the field that it stands in, which is returned."""
         parent = self._parents.get(node)
         if parent is None:
@@ -196,7 +196,7 @@ class World:
             return parent, name
         return None
 
-    def _forget_all_but_used(self, node: Node) -> None:
+    def _forget_all_but_used(self, node: WorldNode) -> None:
         """Forget a node and what is in it, but for what stands elsewhere too, by a USE."""
         there = {self.root: None, **dict.fromkeys(descendants_of(self.root))}
         gone = {each for each in (node, *descendants_of(node)) if each not in there}
@@ -206,37 +206,37 @@ class World:
                 if self._parents.get(child) in gone:
                     self._parents[child] = parent
 
-    def _forget(self, nodes: list[Node]) -> None:
+    def _forget(self, nodes: list[WorldNode]) -> None:
         gone = set(nodes)
         self.nodes = [node for node in self.nodes if node not in gone]
         for node in gone & self._ids.keys():
             del self._by_id[self._ids.pop(node)]
             self._parents.pop(node, None)
 
-    def parent_of(self, node: Node) -> Node | None:
+    def parent_of(self, node: WorldNode) -> WorldNode | None:
         """The node around this one; None for the root."""
         return self._parents.get(node)
 
-    def of_type(self, type_name: str) -> list[Node]:
+    def of_type(self, type_name: str) -> list[WorldNode]:
         """All nodes of one type, in the order of the scene tree."""
         return [node for node in self.nodes if node.type_name == type_name]
 
-    def find(self, def_path: str) -> Node | None:
+    def find(self, def_path: str) -> WorldNode | None:
         """The node with this DEF name; `A.B` is the B somewhere inside A."""
-        found: Node | None = self.root
+        found: WorldNode | None = self.root
         for name in def_path.split("."):
             found = next((n for n in descendants_of(found) if n.def_name == name), None)
             if found is None:
                 return None
         return found
 
-    def frame_of(self, node: Node) -> Frame | None:
+    def frame_of(self, node: WorldNode) -> CoordinateFrame | None:
         """Where a node stands in the world; None for nodes that have no place of their own."""
         return self.frame_around(node).then(own_frame(node)) if "rotation" in node.fields else None
 
-    def frame_around(self, node: Node) -> Frame:
+    def frame_around(self, node: WorldNode) -> CoordinateFrame:
         """Where that stands which a node stands in."""
-        frame = Frame()
+        frame = CoordinateFrame()
         for parent in self._around(node):
             frame = own_frame(parent).then(frame)
         return frame
@@ -264,22 +264,22 @@ def load_world(path: str | Path) -> World:
         raise WorldError(f"{path.name}: its PROTO nodes hold each other without an end") from None
 
 
-def own_frame(node: Node) -> Frame:
+def own_frame(node: WorldNode) -> CoordinateFrame:
     """Where a node stands in its parent; nodes without a place do not move what is inside."""
     if "rotation" not in node.fields:
-        return Frame()
+        return CoordinateFrame()
     return frame_of(node.fields["translation"], node.fields["rotation"])
 
 
 # Nodes as text, as they would stand in a world file -----------------------------------------------
 
 
-def as_text(node: Node, protos: Protos) -> str:
+def as_text(node: WorldNode, protos: Protos) -> str:
     """A node and all in it, without the fields that have their default values."""
     return _node(node, protos, set())
 
 
-def _node(node: Node, protos: Protos, written: set[Node]) -> str:
+def _node(node: WorldNode, protos: Protos, written: set[WorldNode]) -> str:
     if node.def_name and node in written:
         return f"USE {node.def_name}"
     written.add(node)
@@ -299,8 +299,8 @@ def _typed_default(default: Any, type_name: str) -> object:
     return cast("object", default)
 
 
-def _value(value: Any, kind: str, protos: Protos, written: set[Node]) -> str:
-    if isinstance(value, Node):
+def _value(value: Any, kind: str, protos: Protos, written: set[WorldNode]) -> str:
+    if isinstance(value, WorldNode):
         return _node(value, protos, written)
     if isinstance(value, str):
         quoted = value.replace("\\", "\\\\").replace('"', '\\"')

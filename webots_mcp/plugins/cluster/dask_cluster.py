@@ -52,7 +52,7 @@ _WITHOUT_WORKERS_S: Final = 60.0
 _SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}")
 _WITH_TLS: Final = ("tls://", "wss://")
-_TASK: Final = "webots_mcp.plugins.cluster.dask_cluster:run_here"
+_TASK: Final = "webots_mcp.plugins.cluster.dask_cluster:run_on_worker"
 _BUNDLE: Final = "recording.zip"
 _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
 _SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
@@ -62,7 +62,7 @@ _SHARED: Final = "all workers need the project under the same path, such as in a
 
 
 @dataclass(frozen=True)
-class Needs:
+class WorkerRequirements:
     """What a worker has to have.
 
     Attributes:
@@ -85,7 +85,7 @@ class Needs:
         return stand_in if self.is_stand_in else webots
 
 
-class Returned(NamedTuple):
+class TrialReturn(NamedTuple):
     """What a worker returns: what became of a trial, and what it recorded.
 
     Attributes:
@@ -99,7 +99,7 @@ class Returned(NamedTuple):
     shipped: str | None = None
 
 
-def what_lacks(needs: Needs) -> str | None:
+def missing_requirement(needs: WorkerRequirements) -> str | None:
     """What keeps this machine from running a trial; None where nothing does."""
     if needs.version != VERSION:
         return f"it has webots-mcp {VERSION}, not {needs.version}"
@@ -139,11 +139,11 @@ def digest_of(world: str) -> str:
     return digest.hexdigest()
 
 
-def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
+def run_on_worker(asked: dict[str, Any], plan_text: str) -> TrialReturn:
     """Run the only trial of a plan on this worker, in a scratch folder of its own.
 
     Args:
-        asked: The fields of its `Needs`.
+        asked: The fields of its `WorkerRequirements`.
         plan_text: The plan.
 
     Raises:
@@ -152,11 +152,11 @@ def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
     """
     from distributed import get_worker
 
-    needs = Needs(**asked)
+    needs = WorkerRequirements(**asked)
     worker: Any = get_worker()
-    unwanted = _Unwanted(worker)
+    unwanted = _Cancellation(worker)
     where = f"worker {worker.address} on {host_name()}"
-    if (lack := what_lacks(needs)) is not None:
+    if (lack := missing_requirement(needs)) is not None:
         raise CommandRefusedError(f"{where}: {lack}")
     plan = WorldPlan(**json.loads(plan_text))
     try:
@@ -166,10 +166,10 @@ def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
             attempt = TrialAttempt(plan, plan.parameters[0], folder, unwanted, _note_nothing)
             result = run_attempt(attempt, needs.command)
             if result.run_id is None:
-                return Returned(result)
+                return TrialReturn(result)
             if needs.ship_to is None:
                 return packed(result, folder)
-            return Returned(result, shipped=_shipped(folder, needs.ship_to))
+            return TrialReturn(result, shipped=_shipped(folder, needs.ship_to))
     except StoppedError:
         raise unwanted.as_dask_says() from None
     except InvalidInputError:
@@ -182,7 +182,7 @@ def _note_nothing(pid: int | None) -> None:
     """Whoever handed the trial out cannot end a process of this machine; its keeper does."""
 
 
-def packed(result: Result, folder: Path) -> Returned:
+def packed(result: Result, folder: Path) -> TrialReturn:
     """A result with its recording, unless that is too large."""
     bundle = folder.parent / _BUNDLE
     pack(folder, bundle)
@@ -192,21 +192,24 @@ def packed(result: Result, folder: Path) -> Returned:
             f"its recording has {size:,} bytes packed, and a worker returns at most "
             f"{MOST_BYTES:,}: --ship-to has it come through a pool instead"
         )
-        return Returned(replace(result, run_id=None, score=None, error=why, pruned=False))
-    return Returned(result, bundle.read_bytes())
+        return TrialReturn(replace(result, run_id=None, score=None, error=why, pruned=False))
+    return TrialReturn(result, bundle.read_bytes())
 
 
 def _shipped(folder: Path, url: str) -> str:
     """The UUID of the recording, which is in the pool then."""
-    from webots_mcp.plugins.pool.shipping import Order, Report, Source, ship
+    from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ShippingSource, ship
 
     recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
-    ship(Order(recording, partial(open_pool, url, ships=True), full=True, pictures=True), Report())
+    ship(
+        ShippingJob(recording, partial(open_pool, url, ships=True), full=True, pictures=True),
+        ShippingReport(),
+    )
     with recording.reader() as connection:
-        return Source(connection).uuid()
+        return ShippingSource(connection).uuid()
 
 
-class _Unwanted:
+class _Cancellation:
     """Whether nobody wants the current task any more: it was cancelled, or its worker closes.
 
     A client that is gone, killed or not, cancels what it asked for.
@@ -247,7 +250,9 @@ class ClusterSimulators:
         notes: What its owner should know.
     """
 
-    def __init__(self, client: Any, address: str, needs: Needs, most: int | None) -> None:
+    def __init__(
+        self, client: Any, address: str, needs: WorkerRequirements, most: int | None
+    ) -> None:
         self.notes = _other_pythons(client)
         self._client = client
         self._address = address
@@ -279,7 +284,7 @@ class ClusterSimulators:
         """As `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text
-        future: Future[Returned] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
+        future: Future[TrialReturn] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
         while not wait([future], _PATIENCE_S).done:
             if attempt.stopping.wait(0):
                 future.cancel()
@@ -297,18 +302,18 @@ class ClusterSimulators:
     def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
         """The result, with its runs in a recording in the folder, as if it had been returned."""
         from webots_mcp.plugins.pool.fetching import fetch
-        from webots_mcp.plugins.pool.pool_contents import Meant, pooled_runs
+        from webots_mcp.plugins.pool.pool_contents import ChosenRuns, pooled_runs
 
         assert self._needs.ship_to is not None
         recording = Recording(folder / DATABASE_NAME, folder)
         recording.create()
         with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
             runs = [each for each in pooled_runs(pool) if each.recording_uuid == recording_uuid]
-            ids = fetch(pool, connection, folder, Meant(runs, ())).runs
+            ids = fetch(pool, connection, folder, ChosenRuns(runs, ())).runs
         (own,) = (ids[each.uuid] for each in runs if each.run_id == result.run_id)
         return replace(result, run_id=own)
 
-    def _returned(self, future: Future[Returned]) -> Returned:
+    def _returned(self, future: Future[TrialReturn]) -> TrialReturn:
         from distributed import KilledWorker
 
         try:
@@ -318,7 +323,7 @@ class ClusterSimulators:
                 f"{error.allowed_failures + 1} workers died while they ran it, the last one "
                 f"{error.last_worker.address}: see their logs"
             )
-            return Returned(Result(None, None, why))
+            return TrialReturn(Result(None, None, why))
         except CancelledError as error:
             raise CommandRefusedError(_LOST.format(self._address)) from error
         except WebotsMCPError:
@@ -356,7 +361,7 @@ def cluster(
         _require_pool(ship_to)
         ship_to = ship_to if "://" in ship_to else str(Path(ship_to).absolute())
     with _connected(address) as client:
-        needs = Needs(VERSION, plan.world, digest_of(plan.world), is_stand_in, ship_to)
+        needs = WorkerRequirements(VERSION, plan.world, digest_of(plan.world), is_stand_in, ship_to)
         _require_fit(client, address, needs)
         yield ClusterSimulators(client, address, needs, most)
 
@@ -400,7 +405,7 @@ async def _kind_of_server(distributed: Any, address: str) -> str:
         return (await server.identity())["type"]
 
 
-def _require_fit(client: Any, address: str, needs: Needs) -> None:
+def _require_fit(client: Any, address: str, needs: WorkerRequirements) -> None:
     """See that there are workers with simulators, which have what they need.
 
     Raises:
@@ -411,7 +416,7 @@ def _require_fit(client: Any, address: str, needs: Needs) -> None:
         raise CommandRefusedError(_no_workers(address, "yet"))
     lacks = [*_other_versions(client, workers)]
     if not lacks:
-        found = client.run(what_lacks, needs, workers=workers)
+        found = client.run(missing_requirement, needs, workers=workers)
         lacks = [f"worker {each}: {lack}" for each, lack in found.items() if lack is not None]
     if lacks:
         more = f" (and {len(lacks) - 1} other workers)" if len(lacks) > 1 else ""

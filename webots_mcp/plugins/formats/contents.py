@@ -103,7 +103,7 @@ class Pose(NamedTuple):
     yaw_rad: float
 
 
-class Way:
+class SampledPath:
     """Poses of a run, as many as a viewer draws at once: every second one goes when it is full."""
 
     def __init__(self) -> None:

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, Final, cast
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import explain_extra
-from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
+from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, SampledPath
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.export import Exported, Progress, Recorded, json_text, value_at
 from webots_mcp.store.logs import LogLine
@@ -71,7 +71,7 @@ def write_mcap(contents: Contents, sink: BinaryIO) -> Counter[str]:
     """
     writer = _library().Writer(sink)
     writer.start(profile=_PROFILE, library="webots-mcp")
-    writing = _Writing(contents, writer)
+    writing = _McapWriter(contents, writer)
     writing.begin()
     for item in contents.items(pass_number=2):
         writing.write(item)
@@ -131,7 +131,7 @@ def _named(name: str) -> str:
     return _NOT_IN_TOPICS.sub("_", name)
 
 
-class _Writing:
+class _McapWriter:
     """A file that is being written."""
 
     def __init__(self, contents: Contents, writer: Any) -> None:
@@ -144,8 +144,8 @@ class _Writing:
 
     def begin(self) -> None:
         """What comes before the messages: the schemas of states, ways, and what runs these are."""
-        shapes = {run_id: Shape({"object"}) for run_id in self._contents.run_ids}
-        ways = {run_id: Way() for run_id in self._contents.run_ids}
+        shapes = {run_id: FieldShape({"object"}) for run_id in self._contents.run_ids}
+        ways = {run_id: SampledPath() for run_id in self._contents.run_ids}
         for recorded in self._contents.source.recorded():
             state = parse(recorded.data)
             shapes[recorded.run_id].see(_renamed(state))
@@ -232,7 +232,7 @@ class _Writing:
         topic = self._topics.topic(item.run_id, "pose")
         self._message(item, topic, "foxglove.FrameTransform", message)
 
-    def _write_way(self, run_id: int, way: Way) -> None:
+    def _write_way(self, run_id: int, way: SampledPath) -> None:
         first = way.first
         assert first is not None
         poses = [_pose(pose) for pose in way.poses]
@@ -315,12 +315,12 @@ def _object(**properties: Schema) -> Schema:
 
 
 @dataclass
-class Shape:
+class FieldShape:
     """What values of one field were seen to be: of which types, and what is inside of them."""
 
     types: set[str] = field(default_factory=set[str])
-    fields: dict[str, Shape] = field(default_factory=dict[str, "Shape"])
-    items: Shape | None = None
+    fields: dict[str, FieldShape] = field(default_factory=dict[str, "FieldShape"])
+    items: FieldShape | None = None
 
     def see(self, value: Any) -> None:
         """Take in a value; null says nothing."""
@@ -332,11 +332,11 @@ class Shape:
             for name, inner in cast("dict[str, Any]", value).items():
                 shape = self.fields.get(name)
                 if shape is None:
-                    shape = self.fields[name] = Shape()
+                    shape = self.fields[name] = FieldShape()
                 shape.see(inner)
         elif isinstance(value, list):
             self.types.add("array")
-            self.items = self.items or Shape()
+            self.items = self.items or FieldShape()
             self.items.see_each(cast("list[Any]", value))
 
     def see_each(self, values: list[Any]) -> None:

@@ -26,7 +26,14 @@ from webots_mcp.analysis.arrays import np
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import explain_extra
-from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way
+from webots_mcp.plugins.formats.contents import (
+    KINDS,
+    Contents,
+    Item,
+    PlacedCommand,
+    Pose,
+    SampledPath,
+)
 from webots_mcp.plugins.formats.mcap import main_signals
 from webots_mcp.store.export import (
     Exported,
@@ -81,8 +88,8 @@ def write_rrd(contents: Contents, file: Path) -> Counter[str]:
     with warnings.catch_warnings():
         warnings.simplefilter("error", rerun.error_utils.RerunWarning)
         stream = rerun.RecordingStream("webots_mcp", recording_id=_recording_id(contents))
-        with _Saved(file) as saved:
-            writing = _Writing(contents, rerun, stream, saved)
+        with _PipedFile(file) as saved:
+            writing = _RerunWriter(contents, rerun, stream, saved)
             stream.save(str(saved.path), default_blueprint=writing.blueprint())
             saved.begin()
             try:
@@ -94,7 +101,7 @@ def write_rrd(contents: Contents, file: Path) -> Counter[str]:
     return writing.counts
 
 
-class _Saved:
+class _PipedFile:
     """A pipe for Rerun to save to, of which a thread of ours writes the bytes to the file.
 
     Rerun's own thread stops at the first byte that a full disk refuses, and whoever flushes then
@@ -109,7 +116,7 @@ class _Saved:
         self._error: OSError | None = None
         self._thread = Thread(target=self._copy, name="rrd")
 
-    def __enter__(self) -> _Saved:
+    def __enter__(self) -> _PipedFile:
         if sys.platform != "win32":  # has no pipes among its files: Rerun writes the file itself
             self._folder = TemporaryDirectory()
             self.path = Path(self._folder.name, "pipe")
@@ -175,10 +182,10 @@ class _Times(NamedTuple):
     wall: Any
 
 
-class _Writing:
+class _RerunWriter:
     """A recording that is being written."""
 
-    def __init__(self, contents: Contents, rerun: Any, stream: Any, saved: _Saved) -> None:
+    def __init__(self, contents: Contents, rerun: Any, stream: Any, saved: _PipedFile) -> None:
         self.counts: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
         self._contents = contents
         self._rerun = rerun
@@ -220,7 +227,7 @@ class _Writing:
     def _write_states(self) -> None:
         recorded = self._contents.source.recorded()
         for run_id, rows in groupby(recorded, attrgetter("run_id")):
-            way = Way()
+            way = SampledPath()
             for group in _groups(rows):
                 self.counts["states"] += len(group)
                 self._write_group(run_id, group, [flat_row(each) for each in group], way)
@@ -230,7 +237,7 @@ class _Writing:
                 self._stream.log(f"{self._frame(run_id)}_way", line, static=True)
 
     def _write_group(
-        self, run_id: int, group: Sequence[Recorded], rows: Sequence[Row], way: Way
+        self, run_id: int, group: Sequence[Recorded], rows: Sequence[Row], way: SampledPath
     ) -> None:
         numbers, texts = dict[str, list[tuple[int, Any]]](), dict[str, list[tuple[int, str]]]()
         poses: list[tuple[int, Pose]] = []

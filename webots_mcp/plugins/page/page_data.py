@@ -66,7 +66,7 @@ _NO_OUTCOME: Final = "⚪"  # not judged yet, or not to be judged
 
 
 @dataclass(frozen=True)
-class Choice:
+class PageRequest:
     """What a page is asked to show.
 
     Attributes:
@@ -95,7 +95,7 @@ class Choice:
     height_px: int = 500
 
 
-def choice_of(asked: Mapping[str, str]) -> Choice:
+def page_request(asked: Mapping[str, str]) -> PageRequest:
     """What a request asks for, in its parameters.
 
     Raises:
@@ -105,7 +105,7 @@ def choice_of(asked: Mapping[str, str]) -> Choice:
         names, panels, view = (
             json.loads(asked.get(name) or "null") for name in ("signals", "panels", "view")
         )
-        return Choice(
+        return PageRequest(
             robot=asked.get("robot") or None,
             run_id=int(asked["run"]) if asked.get("run") else None,
             beside_id=int(asked["beside"]) if asked.get("beside") else None,
@@ -125,7 +125,7 @@ def choice_of(asked: Mapping[str, str]) -> Choice:
 # How the robot is ---------------------------------------------------------------------------------
 
 
-def look(recording: Recording, choice: Choice, *, steers: bool) -> dict[str, Any]:
+def robot_status(recording: Recording, choice: PageRequest, *, steers: bool) -> dict[str, Any]:
     """The status of the robot and the run that are chosen, and what else there is to choose.
 
     Raises:
@@ -156,7 +156,7 @@ def look(recording: Recording, choice: Choice, *, steers: bool) -> dict[str, Any
         }
 
 
-def _view(connection: sqlite3.Connection, choice: Choice) -> View:
+def _view(connection: sqlite3.Connection, choice: PageRequest) -> View:
     now_s = time.time()
     robots = without_observers(list_robots(connection, now_s))
     if not robots:
@@ -256,7 +256,7 @@ def _bound(value: float | None) -> str:
     return "any" if value is None else f"{value:g}"
 
 
-def picture(recording: Recording, choice: Choice) -> dict[str, Any]:
+def picture(recording: Recording, choice: PageRequest) -> dict[str, Any]:
     """The newest picture of a run as part of the page itself, and what it is."""
     with recording.reader() as connection:
         run = _view(connection, choice).run
@@ -283,7 +283,7 @@ def _as_jpeg(file: Path) -> bytes:
 # Figures ------------------------------------------------------------------------------------------
 
 
-def draw(recording: Recording, choice: Choice) -> dict[str, Any]:
+def draw(recording: Recording, choice: PageRequest) -> dict[str, Any]:
     """The figures of a run as markup, None where there is nothing to draw, and notes."""
     with recording.reader() as connection:
         view = _view(connection, choice)
@@ -338,7 +338,7 @@ def _composed(compose: Callable[[], tuple[Axes, tuple[str, ...]]]) -> tuple[Axes
 
 
 def _ranges(
-    connection: sqlite3.Connection, robot: str, run_id: int, choice: Choice
+    connection: sqlite3.Connection, robot: str, run_id: int, choice: PageRequest
 ) -> list[TimeRange]:
     scope = Scope(robot=robot, run_id=run_id)
     if choice.beside_id not in (None, run_id):

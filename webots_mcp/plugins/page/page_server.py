@@ -29,7 +29,7 @@ from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.contract import VERSION
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
-from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
+from webots_mcp.plugins.page.page_data import draw, page_request, picture, problem, robot_status
 from webots_mcp.questions.send_command import set_parameters
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.signals.parameter import Value
@@ -350,21 +350,21 @@ class _Request(BaseHTTPRequestHandler):
         """Say nothing: the terminal is for what a person must know."""
 
 
-def _look(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
-    found = look(server.recording, choice_of(asked), steers=not server.read_only)
+def _answer_status(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    found = robot_status(server.recording, page_request(asked), steers=not server.read_only)
     orders = () if server.read_only else ORDERS
     return found | {"orders": orders, "rounds": server.chunk_maker.rounds}
 
 
-def _draw(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
-    drawn = draw(server.recording, choice_of(asked))
+def _answer_figures(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    drawn = draw(server.recording, page_request(asked))
     if drawn.get("is_cut") and server.chunk_maker.says:
         drawn["notes"].insert(0, server.chunk_maker.says)
     return drawn
 
 
-def _picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
-    return picture(server.recording, choice_of(asked))
+def _answer_picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return picture(server.recording, page_request(asked))
 
 
 def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
@@ -380,7 +380,7 @@ def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> d
     return tune(server.steered, robot, name, body["value"])
 
 
-_QUESTIONS: Final = {"look": _look, "draw": _draw, "picture": _picture}
+_QUESTIONS: Final = {"look": _answer_status, "draw": _answer_figures, "picture": _answer_picture}
 
 
 # Making chunks while the page is served, where no server does: what is long is drawn whole.
@@ -404,10 +404,10 @@ class ChunkMaker(threading.Thread):
     def run(self) -> None:
         """Look until stopped."""
         while not self._ending.is_set():
-            self.look()
+            self.make_chunks()
             self._ending.wait(_PERIOD_S)
 
-    def look(self) -> None:
+    def make_chunks(self) -> None:
         """Put what there is into chunks."""
         worked = False
 
@@ -438,7 +438,7 @@ def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
     attempt = Attempt(recording, dispatcher, robot, _WAIT_S, order, params)
     asked = {"command": order, "robot": robot}
     request = OpenRequest(recording, _BY_PAGE, ["webots_simulation_control"], asked)
-    return _told(order, attempt.steer, request)
+    return _carry_out(order, attempt.steer, request)
 
 
 def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str, Any]:
@@ -448,10 +448,10 @@ def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str,
     )
     asked = {"values": {name: value}, "robot": robot}
     request = OpenRequest(recording, _BY_PAGE, ["webots_set_parameters"], asked)
-    return _told(f"{name} = {value!r}", setting, request)
+    return _carry_out(f"{name} = {value!r}", setting, request)
 
 
-def _told(what: str, ask: Any, request: OpenRequest) -> dict[str, Any]:
+def _carry_out(what: str, ask: Any, request: OpenRequest) -> dict[str, Any]:
     try:
         with request:
             answer: CommandAnswer = anyio.run(ask)

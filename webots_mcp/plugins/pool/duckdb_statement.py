@@ -22,7 +22,7 @@ import psutil
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.parquet_files import CHUNK, Storage, files_of, name_of, package
-from webots_mcp.plugins.pool.pool_interface import Table, tables
+from webots_mcp.plugins.pool.pool_interface import ShippedTable, tables
 from webots_mcp.store.sql import (
     FOLDER,
     MAX_BYTES,
@@ -162,7 +162,7 @@ def _shown(at: int, kind: str) -> str:
     return f"#{at} AS c{at}" if _AS_THEY_ARE.fullmatch(kind) else f"CAST(#{at} AS VARCHAR) AS c{at}"
 
 
-def _view(table: Table, paths: list[str]) -> str:
+def _view(table: ShippedTable, paths: list[str]) -> str:
     """A table over its files; without any, a table without rows."""
     columns = dict(zip(table.columns, (_TYPES[kind] for kind in table.types), strict=True))
     shown, cut = ", ".join(f'"{name}"' for name in columns), ""

@@ -23,7 +23,7 @@ from typing import Final
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.liveness import process_alive
-from webots_mcp.plugins.pool.pool_contents import Meant, PooledRun
+from webots_mcp.plugins.pool.pool_contents import ChosenRuns, PooledRun
 from webots_mcp.plugins.pool.pool_interface import Pool, is_whole, table
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.chunks import STATE_IDS
@@ -35,7 +35,7 @@ _MOST_RUNS: Final = 100  # that are written into one small recording,
 _MOST_ROWS: Final = 200_000  # unless one of them has more rows by itself
 _PAUSE_S: Final = 0.002  # between two short writes, for robots that record here
 _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value", "image")
-_HERE: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
+_LOCAL_RUNS: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
 # What retention moved there may have been shipped before that as well.
 _DROP_MOVED: Final = (
     "DELETE FROM kept_state WHERE call IS NULL AND EXISTS (SELECT 1 FROM state s "
@@ -74,7 +74,7 @@ _IN_CHUNKS: Final = "SELECT coalesce(sum(row_count), 0) FROM row_group WHERE run
 
 
 @dataclass
-class Fetched:
+class FetchResult:
     """What became of the runs that were meant, by their UUIDs.
 
     Attributes:
@@ -103,9 +103,9 @@ def fetch(
     pool: Pool,
     connection: sqlite3.Connection,
     data_dir: Path,
-    meant: Meant,
+    meant: ChosenRuns,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> Fetched:
+) -> FetchResult:
     """Bring the runs that are meant, with their sessions, commands and trials.
 
     Args:
@@ -119,7 +119,7 @@ def fetch(
         PoolError: The pool cannot be read.
     """
     _sweep(data_dir)
-    found, here = Fetched(), _here(connection)
+    found, here = FetchResult(), _local_run_ids(connection)
     found.known = [run.uuid for run in meant.runs if run.uuid in here]
     new = [run for run in meant.runs if run.uuid and run.uuid not in here]
     found.going_on = [run.uuid for run in new if run.end_reason is None]
@@ -134,13 +134,13 @@ def fetch(
         done += sum(run.row_count for run in part)
         progress(done, of)
     fetcher.take_trials(meant)
-    here = _here(connection)
+    here = _local_run_ids(connection)
     found.runs = {run.uuid: here[run.uuid] for run in meant.runs if run.uuid in here}
     return found
 
 
-def _here(connection: sqlite3.Connection) -> dict[str, int]:
-    return dict(connection.execute(_HERE).fetchall())
+def _local_run_ids(connection: sqlite3.Connection) -> dict[str, int]:
+    return dict(connection.execute(_LOCAL_RUNS).fetchall())
 
 
 def _parts(runs: Sequence[PooledRun]) -> Iterator[list[PooledRun]]:
@@ -160,7 +160,7 @@ class _Fetcher:
     """Small recordings of what a pool holds, merged one by one."""
 
     def __init__(
-        self, pool: Pool, connection: sqlite3.Connection, data_dir: Path, found: Fetched
+        self, pool: Pool, connection: sqlite3.Connection, data_dir: Path, found: FetchResult
     ) -> None:
         self._pool, self._connection, self._data_dir = pool, connection, data_dir
         self._found = found
@@ -193,9 +193,9 @@ class _Fetcher:
         for run_id in here.values():
             chunk_whole_run(self._connection, run_id, _PAUSE_S)
 
-    def take_trials(self, meant: Meant) -> None:
+    def take_trials(self, meant: ChosenRuns) -> None:
         """Take in the trials of runs that are here by now, and others of a set that is meant."""
-        here = _here(self._connection)
+        here = _local_run_ids(self._connection)
         wanted = defaultdict[str, tuple[set[int], set[int]]](lambda: (set(), set()))
         for run in meant.runs:
             if run.uuid in here:

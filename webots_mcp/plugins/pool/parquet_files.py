@@ -49,7 +49,7 @@ from webots_mcp.errors import (
     WebotsMCPError,
 )
 from webots_mcp.extras.requirements import explain_extra, install_line
-from webots_mcp.plugins.pool.pool_interface import Row, SQLValue, Table, redacted
+from webots_mcp.plugins.pool.pool_interface import PoolRow, ShippedTable, SQLValue, redacted
 
 FORMAT: Final = 2
 POOL: Final = "_pool"
@@ -306,22 +306,22 @@ def picture_file(path: str) -> str:
     return f"_pictures/{'/'.join(parts)}"
 
 
-def name_of(table: Table) -> str:
+def name_of(table: ShippedTable) -> str:
     """What a table is called in a pool of files."""
     return VALUES if table.name == CHUNK else table.name
 
 
-def is_cut(table: Table) -> bool:
+def is_cut(table: ShippedTable) -> bool:
     """Whether its rows never change and are in parts, of a day or of a run."""
     return table.name == CHUNK or table.time_column is not None
 
 
-def part_file(table: Table, folder: str, number: int) -> str:
+def part_file(table: ShippedTable, folder: str, number: int) -> str:
     """A part of a table whose rows never change."""
     return f"table={name_of(table)}/{folder}/part-{number:06}.parquet"
 
 
-def files_of(table: Table, recording_uuid: str = "*") -> str:
+def files_of(table: ShippedTable, recording_uuid: str = "*") -> str:
     """The pattern of all files of a table, of one recording or of all."""
     cut = "day=*/" if table.time_column else "run=*/" if table.name == CHUNK else ""
     return f"{folder_of(recording_uuid)}/table={name_of(table)}/{cut}part-*.parquet"
@@ -333,10 +333,10 @@ def run_of(path: str) -> int | None:
     return int(run_id) if name == "run" else None
 
 
-def by_folder(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+def by_folder(table: ShippedTable, rows: Iterable[PoolRow]) -> Mapping[str, list[PoolRow]]:
     """Rows that never change by their folders: those of a day, chunks of a run."""
     place = table.columns.index(table.time_column or "run_id")
-    found: dict[str, list[Row]] = defaultdict(list)
+    found: dict[str, list[PoolRow]] = defaultdict(list)
     for row in rows:
         name = f"day={day_of(row[place])}" if table.time_column else f"run={row[place]}"
         found[name].append(row)
@@ -351,9 +351,9 @@ def day_of(wall_time_s: SQLValue) -> str:
         return NO_DAY
 
 
-def by_block(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+def by_block(table: ShippedTable, rows: Iterable[PoolRow]) -> Mapping[str, list[PoolRow]]:
     """Rows of a table that changes, by the files in which they are."""
-    found: dict[str, list[Row]] = defaultdict(list)
+    found: dict[str, list[PoolRow]] = defaultdict(list)
     for row in rows:
         block = cast("int", row[0]) // _IDS_IN_BLOCK if table.key == ("id",) else 0
         found[f"table={table.name}/part-{block:09}.parquet"].append(row)
@@ -364,7 +364,7 @@ def by_block(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
 
 
 @dataclass(frozen=True)
-class Part:
+class OpenPart:
     """The part of a table that is open: of a table whose rows never change.
 
     Attributes:
@@ -385,7 +385,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Progress:
+class ShippedProgress:
     """What the pool holds of a recording.
 
     Attributes:
@@ -395,25 +395,25 @@ class Progress:
     """
 
     numbers: Mapping[str, int] = field(default_factory=dict[str, int])
-    parts: Mapping[str, Part] = field(default_factory=dict[str, Part])
+    parts: Mapping[str, OpenPart] = field(default_factory=dict[str, OpenPart])
     listed: Mapping[str, Mapping[str, list[Any]]] = field(
         default_factory=dict[str, Mapping[str, list[Any]]]
     )
 
-    def part(self, table: str) -> Part:
+    def part(self, table: str) -> OpenPart:
         """Of a table, the first where it has no rows yet."""
-        return self.parts.get(table, Part())
+        return self.parts.get(table, OpenPart())
 
-    def with_part(self, table: str, part: Part) -> Progress:
+    def with_part(self, table: str, part: OpenPart) -> ShippedProgress:
         """After rows of a table have come."""
         return replace(self, parts={**self.parts, table: part})
 
-    def with_listed(self, table: str, rows: Mapping[str, list[Any]]) -> Progress:
+    def with_listed(self, table: str, rows: Mapping[str, list[Any]]) -> ShippedProgress:
         """After rows of a table that is listed have changed."""
         return replace(self, listed={**self.listed, table: {**self.listed.get(table, {}), **rows}})
 
 
-def read_progress(storage: Storage, recording_uuid: str) -> Progress:
+def read_progress(storage: Storage, recording_uuid: str) -> ShippedProgress:
     """What the pool holds of a recording: nothing where it is new.
 
     Raises:
@@ -421,10 +421,10 @@ def read_progress(storage: Storage, recording_uuid: str) -> Progress:
     """
     path = f"{folder_of(recording_uuid)}/{PROGRESS}"
     content = storage.read(path)
-    return Progress() if content is None else decoded_progress(storage, path, content)
+    return ShippedProgress() if content is None else decoded_progress(storage, path, content)
 
 
-def decoded_progress(storage: Storage, path: str, content: bytes) -> Progress:
+def decoded_progress(storage: Storage, path: str, content: bytes) -> ShippedProgress:
     """The progress in a file.
 
     Raises:
@@ -432,14 +432,14 @@ def decoded_progress(storage: Storage, path: str, content: bytes) -> Progress:
     """
     try:
         found: dict[str, Any] = json.loads(content)
-        parts = {str(name): Part(**part) for name, part in found["parts"].items()}
+        parts = {str(name): OpenPart(**part) for name, part in found["parts"].items()}
         numbers = {str(name): int(number) for name, number in found["numbers"].items()}
-        return Progress(numbers, parts, found["listed"])
+        return ShippedProgress(numbers, parts, found["listed"])
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise PoolError(f"{path} in {storage.address} cannot be read: {error}") from error
 
 
-def place_progress(storage: Storage, recording_uuid: str, progress: Progress) -> None:
+def place_progress(storage: Storage, recording_uuid: str, progress: ShippedProgress) -> None:
     """Say what is there: rows count from now on."""
     content = json.dumps(asdict(progress)).encode()
     storage.place(f"{folder_of(recording_uuid)}/{PROGRESS}", content)
@@ -497,7 +497,7 @@ class _Holder:
         return not now_s < self.until_wall_time_s <= now_s + _LATEST_S
 
 
-class Lease:
+class ShippingLease:
     """The lease of a recording, held from `take` to `give_back`, as long as it is renewed."""
 
     def __init__(self, storage: Storage, recording_uuid: str) -> None:

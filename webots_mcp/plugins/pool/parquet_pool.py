@@ -23,9 +23,9 @@ from webots_mcp.plugins.pool.parquet_files import (
     CHUNK,
     PROGRESS,
     RUNS,
-    Lease,
-    Part,
-    Progress,
+    OpenPart,
+    ShippedProgress,
+    ShippingLease,
     Storage,
     by_block,
     by_folder,
@@ -42,7 +42,15 @@ from webots_mcp.plugins.pool.parquet_files import (
     run_of,
     uuid_in,
 )
-from webots_mcp.plugins.pool.pool_interface import LISTED, Batch, Row, Table, batches, table, tables
+from webots_mcp.plugins.pool.pool_interface import (
+    LISTED,
+    Batch,
+    PoolRow,
+    ShippedTable,
+    batches,
+    table,
+    tables,
+)
 from webots_mcp.plugins.pool.value_columns import NameAndKind, chunks_of, columns_of
 from webots_mcp.signals.naming import unit_in
 from webots_mcp.store.sql import Result
@@ -63,7 +71,7 @@ _ROWS_AT_ONCE: Final = 1000
 class ParquetShipment:
     """One recording's part of the pool."""
 
-    def __init__(self, storage: Storage, recording_uuid: str, lease: Lease) -> None:
+    def __init__(self, storage: Storage, recording_uuid: str, lease: ShippingLease) -> None:
         self._storage = storage
         self._uuid = recording_uuid
         self._lease = lease
@@ -102,7 +110,7 @@ class ParquetShipment:
             self._settle()
         self._is_settled = False
         before = self._progress
-        after = Progress({**before.numbers, **progress}, before.parts, before.listed)
+        after = ShippedProgress({**before.numbers, **progress}, before.parts, before.listed)
         for each, rows in _by_table(batches):
             if each.name == "run":
                 self._claim(each, rows)
@@ -117,7 +125,7 @@ class ParquetShipment:
         self._is_settled = True
         return self._damaged
 
-    def _append(self, table: Table, rows: Iterable[Row]) -> Part:
+    def _append(self, table: ShippedTable, rows: Iterable[PoolRow]) -> OpenPart:
         """Add rows to the open part of a table; what it is then."""
         part = self._progress.part(table.name)
         counts, is_over = dict(part.rows), False
@@ -134,9 +142,9 @@ class ParquetShipment:
             self._place(path, content)
             is_over |= _is_over(content, whole, counts.get(folder, 0))
             counts[folder] = whole.num_rows
-        return Part(part.number + 1) if is_over else Part(part.number, counts)
+        return OpenPart(part.number + 1) if is_over else OpenPart(part.number, counts)
 
-    def _signals(self, chunks: Iterable[Row]) -> Mapping[int, NameAndKind]:
+    def _signals(self, chunks: Iterable[PoolRow]) -> Mapping[int, NameAndKind]:
         """How the signals of chunks are called, which were shipped before them."""
         at = table(CHUNK).columns.index("signal_id")
         if not self._named.keys() >= {row[at] for row in chunks if int(str(row[at])) > 0}:
@@ -147,7 +155,9 @@ class ParquetShipment:
                     self._named[row["id"]] = (row["name"], row["kind"])
         return self._named
 
-    def _replace(self, table: Table, rows: Iterable[Row], after: Progress) -> Progress:
+    def _replace(
+        self, table: ShippedTable, rows: Iterable[PoolRow], after: ShippedProgress
+    ) -> ShippedProgress:
         """Put rows that change in the place of those of their keys."""
         for name, changed in by_block(table, rows).items():
             path = self._path(name)
@@ -181,7 +191,7 @@ class ParquetShipment:
                 elif held.num_rows > count:
                     self._place(path, encoded(each, held.slice(0, count)))
 
-    def _claim(self, table: Table, rows: Iterable[Row]) -> None:
+    def _claim(self, table: ShippedTable, rows: Iterable[PoolRow]) -> None:
         """Say that the runs are this recording's, before any row of them is there."""
         at = table.columns.index("uuid")
         for uuid in {str(row[at]) for row in rows if row[at]} - self._own_runs:
@@ -211,7 +221,7 @@ class ParquetPool:
         self._storage, self._ships = Storage(url), ships
         self._url = self._storage.root if self._storage.is_local else url
         self.address = self._storage.address
-        self._all: dict[str, Progress] | None = None
+        self._all: dict[str, ShippedProgress] | None = None
 
     def __enter__(self) -> ParquetPool:
         require_pool(self._storage, make=self._ships)
@@ -229,7 +239,7 @@ class ParquetPool:
         Raises:
             PoolBusyError: Another does.
         """
-        lease = Lease(self._storage, recording_uuid)
+        lease = ShippingLease(self._storage, recording_uuid)
         lease.take()
         try:
             yield ParquetShipment(self._storage, recording_uuid, lease)
@@ -254,7 +264,7 @@ class ParquetPool:
         return dict(read_progress(self._storage, recording_uuid).numbers)
 
     def rows(
-        self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
+        self, recording_uuid: str, table: ShippedTable, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
         """Rows whose columns have one of these values; a file is held, and a few rows of it."""
         part = read_progress(self._storage, recording_uuid).part(table.name)
@@ -290,7 +300,7 @@ class ParquetPool:
 
 
 @cache
-def schema_of(table: Table) -> Any:
+def schema_of(table: ShippedTable) -> Any:
     """The Arrow schema of a table: what its columns mean, and their units, is in the fields.
 
     A column without a value has its type in each file, so that engines can put files together.
@@ -312,7 +322,7 @@ def schema_of(table: Table) -> Any:
     return arrow.schema(fields, metadata=about)
 
 
-def as_arrow(table: Table, rows: Sequence[Row]) -> Any:
+def as_arrow(table: ShippedTable, rows: Sequence[PoolRow]) -> Any:
     """Fitted rows as an Arrow table."""
     arrow, schema = package("pyarrow"), schema_of(table)
     columns = [*zip(*rows, strict=True)] or [()] * len(table.columns)
@@ -320,7 +330,7 @@ def as_arrow(table: Table, rows: Sequence[Row]) -> Any:
     return arrow.table(arrays, schema=schema)
 
 
-def encoded(table: Table, arrow_table: Any) -> bytes:
+def encoded(table: ShippedTable, arrow_table: Any) -> bytes:
     """The rows as one file of Parquet.
 
     JSON differs from row to row, and so do measured values: a dictionary is no use for either.
@@ -347,12 +357,12 @@ def _whole(content: bytes, path: str) -> Any:
 
 
 def _rows(
-    table: Table,
+    table: ShippedTable,
     content: bytes,
     path: str,
     count: int | None,
     where: Mapping[str, Collection[int]],
-) -> Iterator[Row]:
+) -> Iterator[PoolRow]:
     """Of the first rows of a file, or of all, those whose columns have one of these values.
 
     Raises:
@@ -384,15 +394,15 @@ def _clear_damage(path: str) -> Generator[None]:
         raise PoolError(f"{path} is damaged ({error}): restore or remove it") from error
 
 
-def _replaced(table: Table, held: Any | None, rows: Iterable[Row]) -> list[Row]:
+def _replaced(table: ShippedTable, held: Any | None, rows: Iterable[PoolRow]) -> list[PoolRow]:
     """What a table that changes holds when these rows have come, in the order of its key.
 
-    A row replaces the one of its key, but a null of `Table.lasting` does not replace a value.
+    A row replaces the one of its key, but null never replaces a value in `ShippedTable.lasting`.
     """
     key = [table.columns.index(name) for name in table.key]
     lasting = [name in table.lasting for name in table.columns]
     before = [] if held is None else [held.column(name).to_pylist() for name in table.columns]
-    found: dict[Any, Row] = {}
+    found: dict[Any, PoolRow] = {}
     for row in chain(zip(*before, strict=True), rows):
         named = tuple(row[at] for at in key)
         old = found.get(named, row)
@@ -408,9 +418,9 @@ def _is_over(content: bytes, whole: Any, rows_before: int) -> bool:
     return len(content) > PART_BYTES or whole.nbytes > _PART_MEMORY_BYTES or is_seldom_more
 
 
-def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[Table, list[Row]]]:
+def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[ShippedTable, list[PoolRow]]]:
     """The rows of each table, in the order in which the tables come."""
-    found: dict[Table, list[Row]] = {}
+    found: dict[ShippedTable, list[PoolRow]] = {}
     for batch in batches:
         found.setdefault(batch.table, []).extend(batch.rows)
     # Chunks at last: their columns are called as the signals, which are there then.

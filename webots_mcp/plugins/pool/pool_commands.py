@@ -21,22 +21,22 @@ from webots_mcp.cli.terminal import (
 )
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plugins.pool.pool_contents import (
-    Choice,
+    RunFilter,
     chosen_runs,
     chosen_trial_sets,
-    meant,
+    resolve_filter,
     robots,
 )
 
 if TYPE_CHECKING:
-    from webots_mcp.plugins.pool.fetching import Fetched
+    from webots_mcp.plugins.pool.fetching import FetchResult
     from webots_mcp.plugins.pool.pool_interface import Pool
-    from webots_mcp.plugins.pool.shipping import Report
+    from webots_mcp.plugins.pool.shipping import ShippingReport
     from webots_mcp.store.sql import Result
 
 _MOST_NAMED: Final = 3
 _SHORT: Final = 8  # of a UUID: as much of it as tells one from the others
-_ALL: Final = Choice()
+_ALL: Final = RunFilter()
 
 
 def fetch(
@@ -49,7 +49,7 @@ def fetch(
             help="The pool: postgresql://HOST/DATABASE, a folder, s3://BUCKET/PREFIX, ...",
         ),
     ],
-    choice: Choice = _ALL,
+    choice: RunFilter = _ALL,
     recorded: Where = HERE,
     json: Json = False,
 ) -> int:
@@ -64,7 +64,7 @@ def fetch(
     from webots_mcp.plugins.pool.pool_contents import open_pool
 
     with open_pool(url) as pool:
-        wanted = meant(pool, choice)  # first: no database is made for nothing
+        wanted = resolve_filter(pool, choice)  # first: no database is made for nothing
         with (
             recorded.writer("fetch", create=True) as (here, connection),
             shown_progress("fetching") as progress,
@@ -77,7 +77,7 @@ def fetch(
     return 0 if found.runs else 1
 
 
-def _as_data(found: Fetched) -> dict[str, Any]:
+def _as_data(found: FetchResult) -> dict[str, Any]:
     """The ids of the runs that are here, and what was not taken, by its UUIDs."""
     return {
         "fetched_run_ids": found.come,
@@ -91,7 +91,7 @@ def _as_data(found: Fetched) -> dict[str, Any]:
     }
 
 
-def _print_fetched(found: Fetched, address: str) -> None:
+def _print_fetched(found: FetchResult, address: str) -> None:
     def ids(uuids: Iterable[str]) -> str | None:
         return id_ranges([found.runs[uuid] for uuid in uuids])
 
@@ -141,7 +141,7 @@ def pool(
         Count,
         Parameter("-n", metavar="N", help="The newest N, or N rows (20); of a SELECT up to 1000."),
     ] = 20,
-    choice: Choice = _ALL,
+    choice: RunFilter = _ALL,
     json: Json = False,
 ) -> None:
     """List what is in a pool, or ask it one SELECT; nothing is changed.
@@ -178,7 +178,7 @@ class _List(NamedTuple):
     rows: Sequence[list[Any]]
 
 
-def _listed(pool: Pool, part: str, choice: Choice) -> _List:
+def _listed(pool: Pool, part: str, choice: RunFilter) -> _List:
     if part == "robots":
         found = robots(chosen_runs(pool, choice))
         columns = ("robot", "recordings", "runs", "rows", "first", "last")
@@ -270,7 +270,7 @@ def ship(
     """
     from webots_mcp.plugins.pool.pool_contents import is_postgres, open_pool
     from webots_mcp.plugins.pool.pool_interface import redacted
-    from webots_mcp.plugins.pool.shipping import Order, Report
+    from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport
     from webots_mcp.plugins.pool.shipping import follow as follow_recording
     from webots_mcp.plugins.pool.shipping import ship as ship_once
 
@@ -283,8 +283,8 @@ def ship(
         raise InvalidInputError("--every is for --follow: without it, everything is shipped once")
     (url,) = urls
     connect = functools.partial(open_pool, url, ships=True)
-    order = Order(recorded.recording(), connect, full, pictures)
-    report, is_done = Report(), False
+    order = ShippingJob(recorded.recording(), connect, full, pictures)
+    report, is_done = ShippingReport(), False
     try:
         if follow:
             _say(f"shipping to {redacted(url)} until Ctrl-C")
@@ -303,7 +303,7 @@ def _say(text: str) -> None:
     print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
 
 
-def _show_report(address: str, report: Report, *, is_done: bool, as_json: bool) -> None:
+def _show_report(address: str, report: ShippingReport, *, is_done: bool, as_json: bool) -> None:
     notes = [*_notes(report), *report.notes]
     if as_json:
         return print_json({"pool": address, "complete": is_done, **vars(report), "notes": notes})
@@ -316,7 +316,7 @@ def _show_report(address: str, report: Report, *, is_done: bool, as_json: bool) 
     print_notes(notes)
 
 
-def _notes(report: Report) -> list[str]:
+def _notes(report: ShippingReport) -> list[str]:
     notes: list[str] = []
     if lost := [f"{table} {rows}" for table, rows in sorted(report.lost.items()) if rows]:
         notes.append(f"rows deleted before they could be shipped: {', '.join(lost)}")

@@ -180,7 +180,7 @@ def _option(name: str, metavar: str, text: str) -> Parameter:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Choice:
+class RunFilter:
     """Which runs are meant: those of which all that is given is true."""
 
     run_uuid: Annotated[
@@ -212,7 +212,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Meant:
+class ChosenRuns:
     """What a choice means in a pool.
 
     Attributes:
@@ -224,7 +224,7 @@ class Meant:
     trial_sets: Sequence[PooledTrialSet]
 
 
-def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
+def chosen_runs(pool: Pool, choice: RunFilter) -> list[PooledRun]:
     """The runs that are meant, by when they began.
 
     Raises:
@@ -263,22 +263,22 @@ def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
     return found
 
 
-def meant(pool: Pool, choice: Choice) -> Meant:
+def resolve_filter(pool: Pool, choice: RunFilter) -> ChosenRuns:
     """What is to be fetched.
 
     Raises:
         InvalidInputError: That is nothing, or nothing is given that says what.
     """
-    if choice == Choice():
+    if choice == RunFilter():
         raise InvalidInputError(
             "which runs? Give --run, --label, --trials, --robot, --since or --until; "
             f"'webots-mcp pool {pool.address} runs' lists them"
         )
     sets = chosen_trial_sets(pool, choice) if choice.trials is not None else []
-    return Meant(chosen_runs(pool, choice), sets)
+    return ChosenRuns(chosen_runs(pool, choice), sets)
 
 
-def chosen_trial_sets(pool: Pool, choice: Choice) -> list[PooledTrialSet]:
+def chosen_trial_sets(pool: Pool, choice: RunFilter) -> list[PooledTrialSet]:
     """The trial sets that are meant: all, or the one of that UUID, as each recording has it."""
     sets = pooled_trial_sets(pool)
     if choice.trials is None:
@@ -295,11 +295,11 @@ def _named(what: str, asked: str, uuids: Sequence[str]) -> str:
     Raises:
         InvalidInputError: None does, or several do.
     """
-    meant = asked.strip().lower()
-    found = sorted({uuid for uuid in uuids if uuid.lower().startswith(meant)})
+    resolve_filter = asked.strip().lower()
+    found = sorted({uuid for uuid in uuids if uuid.lower().startswith(resolve_filter)})
     if len(found) == 1:
         return found[0]
-    if found and meant:
+    if found and resolve_filter:
         raise InvalidInputError(
             f"{len(found)} of the {what}s have a UUID that begins with {asked!r} "
             f"({', '.join(found[:_MOST_OFFERED])}, ...): give more of it"

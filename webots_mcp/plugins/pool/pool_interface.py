@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from webots_mcp.store.sql import Result
 
 SQLValue: TypeAlias = "int | float | str | bytes | None"
-Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
-Row = tuple[SQLValue, ...]
+ValueType: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
+PoolRow = tuple[SQLValue, ...]
 
 BATCH_BYTES: Final = 4_000_000
 BATCH_ROWS: Final = 20_000
@@ -39,7 +39,7 @@ _LOCAL_COLUMNS: Final = {
     "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
 }
 _OF_TRIALS: Final = ("trial_set", "trial")
-_TYPES: Final[dict[str, Kind]] = {
+_TYPES: Final[dict[str, ValueType]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
 }  # fmt: skip
 # What is needed to list the runs and trial sets of a pool: of few tables few columns.
@@ -65,7 +65,7 @@ _SECRET: Final = re.compile(
 
 
 @dataclass(frozen=True)
-class Table:
+class ShippedTable:
     """A table that is shipped; its columns in the order in which a batch has their values.
 
     Attributes:
@@ -89,7 +89,7 @@ class Table:
     name: str
     key: tuple[str, ...]
     columns: tuple[str, ...]
-    types: tuple[Kind, ...]
+    types: tuple[ValueType, ...]
     json_columns: frozenset[str]
     json_values: frozenset[str]
     nullable: frozenset[str]
@@ -102,7 +102,7 @@ class Table:
 
 
 @cache
-def tables() -> tuple[Table, ...]:
+def tables() -> tuple[ShippedTable, ...]:
     """All that are shipped, each after those that it refers to. Importing the models costs."""
     from webots_mcp.store import models
 
@@ -110,7 +110,7 @@ def tables() -> tuple[Table, ...]:
     return tuple(_table(each) for each in ordered if each.name not in _LOCAL)
 
 
-def table(name: str) -> Table:
+def table(name: str) -> ShippedTable:
     """The table of that name.
 
     Raises:
@@ -119,7 +119,7 @@ def table(name: str) -> Table:
     return {each.name: each for each in tables()}[name]
 
 
-def _table(model: Any) -> Table:
+def _table(model: Any) -> ShippedTable:
     name: str = model.name
     local = _LOCAL_COLUMNS.get(name, ())
     shipped: list[Any] = [column for column in model.columns if column.name not in local]
@@ -130,7 +130,7 @@ def _table(model: Any) -> Table:
         named = "id" if name == owner else f"{owner}_id"
         return named if named in columns else None
 
-    return Table(
+    return ShippedTable(
         name=name,
         key=tuple(column.name for column in model.primary_key.columns),
         columns=columns,
@@ -157,13 +157,13 @@ def _table(model: Any) -> Table:
 class Batch:
     """Rows in the order of the table's columns: JSON is text, a flag 0 or 1."""
 
-    table: Table
-    rows: Sequence[Row]
+    table: ShippedTable
+    rows: Sequence[PoolRow]
 
 
-def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
+def batches(table: ShippedTable, rows: Iterable[PoolRow]) -> Iterator[Batch]:
     """Rows as batches of bounded size; a row that is larger by itself is a batch of its own."""
-    held: list[Row] = []
+    held: list[PoolRow] = []
     size = 0
     for row in rows:
         added = row_bytes(row)
@@ -176,7 +176,7 @@ def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
         yield Batch(table, held)
 
 
-def row_bytes(row: Row) -> int:
+def row_bytes(row: PoolRow) -> int:
     """About how many bytes of memory a row's values take."""
     sized = sum([len(value) for value in row if isinstance(value, (str, bytes))])
     return sized + _VALUE_BYTES * len(row)
@@ -204,7 +204,7 @@ def fitted(batch: Batch, replaced: Counter[str]) -> Batch:
     return Batch(batch.table, [*zip(*columns, strict=True)]) if others else batch
 
 
-def _nearest(value: SQLValue, kind: Kind, *, nullable: bool) -> SQLValue:
+def _nearest(value: SQLValue, kind: ValueType, *, nullable: bool) -> SQLValue:
     """The value of a type that comes nearest to one that SQLite holds."""
     least = None if nullable else kind()
     if value is None or isinstance(value, kind):
@@ -264,10 +264,10 @@ class Shipment(Protocol):
     def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> Mapping[str, int]:
         """Write fitted rows, and change these numbers of the progress: all of it or nothing.
 
-        Rows of appended tables come once. A row of the others replaces the one of its key, but
-        where a column of `Table.lasting` is null, the value stays; rows that are not in the batch
-        stay too, since retention at the edge deletes what a pool keeps. Batches may name a table
-        twice; what a row refers to comes before it.
+        Rows of appended tables come once. A row of another table replaces the row of its key, but
+        where a column of `ShippedTable.lasting` is null, the value stays. Rows that are missing
+        from the batch stay too, since retention at the edge deletes what a pool keeps. Batches may
+        name a table twice; what a row refers to comes before it.
 
         Returns:
             By column (`log.message`), how many values the pool cannot hold as they are: it has what
@@ -321,7 +321,7 @@ class Pool(Protocol):
         ...
 
     def rows(
-        self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
+        self, recording_uuid: str, table: ShippedTable, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
         """Rows whose columns have one of these values, in any order."""
         ...

@@ -39,9 +39,9 @@ from webots_mcp.plugins.pool.duckdb_statement import answered
 from webots_mcp.plugins.pool.pool_interface import (
     LISTED,
     Batch,
-    Row,
+    PoolRow,
+    ShippedTable,
     SQLValue,
-    Table,
     batches,
     redacted,
     tables,
@@ -243,7 +243,7 @@ def _table_statements() -> list[str]:
     return made
 
 
-def _pooled(metadata: sa.MetaData, made: sa.Table, shipped: Table) -> sa.Table:
+def _pooled(metadata: sa.MetaData, made: sa.Table, shipped: ShippedTable) -> sa.Table:
     columns = [_column(made.columns[name], shipped) for name in shipped.columns]
     owner = sa.Column(OWNER, postgresql.UUID(), nullable=False)
     constraint = sa.PrimaryKeyConstraint(OWNER, *shipped.key)
@@ -262,7 +262,7 @@ def _pooled(metadata: sa.MetaData, made: sa.Table, shipped: Table) -> sa.Table:
     return pooled
 
 
-def _column(column: sa.Column[Any], shipped: Table) -> sa.Column[Any]:
+def _column(column: sa.Column[Any], shipped: ShippedTable) -> sa.Column[Any]:
     kind: Any = column.type
     if column.name in shipped.json_columns:
         kind = postgresql.JSON()
@@ -355,7 +355,7 @@ class PostgresPool:
         return {str(name): int(value) for name, value in self._asked(query, (recording_uuid,))}
 
     def rows(
-        self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
+        self, recording_uuid: str, table: ShippedTable, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
         """Rows whose columns have one of these values, in any order."""
         conditions = "".join(f' AND "{column}" = ANY(%s)' for column in where)
@@ -365,7 +365,7 @@ class PostgresPool:
         )
         query = f"SELECT {columns} FROM {table.name} WHERE {OWNER} = %s{conditions}"
         asked = (recording_uuid, *(list(ids) for ids in where.values()))
-        yield from batches(table, cast("Iterator[Row]", self._asked(query, asked)))
+        yield from batches(table, cast("Iterator[PoolRow]", self._asked(query, asked)))
 
     def picture(self, recording_uuid: str, path: str) -> bytes | None:
         """The file of a picture."""
@@ -499,7 +499,7 @@ class PostgresShipment:
             return False
         return True
 
-    def _copy(self, into: str, table: Table, rows: Iterable[Row]) -> None:
+    def _copy(self, into: str, table: ShippedTable, rows: Iterable[PoolRow]) -> None:
         names = ", ".join([OWNER, *map(_quoted, table.columns)])
         with (
             self._connection.cursor() as cursor,
@@ -509,7 +509,7 @@ class PostgresShipment:
                 copy.write_row((self._uuid, *row))
 
 
-def _merging(table: Table, staged: str) -> str:
+def _merging(table: ShippedTable, staged: str) -> str:
     """The statement that brings rows of a temporary table into their table."""
     insert = f"INSERT INTO {table.name} AS held SELECT * FROM {staged}"
     changing = [each for each in table.columns if each not in table.key]
@@ -531,7 +531,7 @@ def _merging(table: Table, staged: str) -> str:
     )
 
 
-def _holdable(table: Table, row: Row, replaced: Counter[str]) -> Row:
+def _holdable(table: ShippedTable, row: PoolRow, replaced: Counter[str]) -> PoolRow:
     """A row with what comes nearest to texts that PostgreSQL cannot hold, which are counted."""
     values = list[SQLValue]()
     for name, value in zip(table.columns, row, strict=True):

@@ -38,9 +38,9 @@ from webots_mcp.plugins.pool.pool_interface import (
     CHUNKS,
     Batch,
     Pool,
-    Row,
+    PoolRow,
     Shipment,
-    Table,
+    ShippedTable,
     fitted,
     is_whole,
     row_bytes,
@@ -94,7 +94,7 @@ _UNSENT: Final = (
 
 
 @dataclass(frozen=True)
-class Order:
+class ShippingJob:
     """What is to be shipped.
 
     Attributes:
@@ -111,7 +111,7 @@ class Order:
 
 
 @dataclass
-class Report:
+class ShippingReport:
     """What was shipped so far, and what was not.
 
     Attributes:
@@ -138,7 +138,7 @@ class Report:
             self.notes.append(text)
 
 
-def ship(order: Order, report: Report) -> None:
+def ship(order: ShippingJob, report: ShippingReport) -> None:
     """Ship all that is there, and end.
 
     Raises:
@@ -151,7 +151,9 @@ def ship(order: Order, report: Report) -> None:
         connected.note_states_in_no_chunk()
 
 
-def follow(order: Order, report: Report, say: Callable[[str], None], pause_s: float) -> NoReturn:
+def follow(
+    order: ShippingJob, report: ShippingReport, say: Callable[[str], None], pause_s: float
+) -> NoReturn:
     """Ship what is there and what comes, until a KeyboardInterrupt.
 
     A pool that is away is tried again, each time after a longer wait; a recording that is not there
@@ -176,7 +178,7 @@ def follow(order: Order, report: Report, say: Callable[[str], None], pause_s: fl
                     say(f"the pool {connected.address} is there again")
                 away_s, was_there, last_said = 0.0, True, ""
                 _go_on(connected, pause_s)
-        except ReplacedError as error:
+        except RecordingReplacedError as error:
             say(f"{error}: that one is shipped from here on")
         except NoDatabaseError:
             there = f"nothing is recorded at {name_of(order.recording.database)} now"
@@ -206,7 +208,7 @@ def _go_on(connected: Shipper, pause_s: float) -> NoReturn:
 
 
 @contextmanager
-def _shipper(order: Order, report: Report) -> Generator[Shipper]:
+def _shipper(order: ShippingJob, report: ShippingReport) -> Generator[Shipper]:
     """Be connected to recording and pool, as the one who ships the recording.
 
     Raises:
@@ -214,7 +216,7 @@ def _shipper(order: Order, report: Report) -> Generator[Shipper]:
         DatabaseError: The recording cannot be read.
     """
     with order.recording.reader() as connection:
-        uuid = Source(connection).uuid()  # first: nothing is asked of the pool in vain
+        uuid = ShippingSource(connection).uuid()  # first: nothing is asked of the pool in vain
     with order.open_pool() as pool, ExitStack() as stack:
         shipment = _entered(stack, pool, uuid)
         yield Shipper(order, report, uuid, pool.address, shipment)
@@ -229,14 +231,14 @@ def _entered(stack: ExitStack, pool: Pool, uuid: str) -> Shipment:
     return stack.enter_context(pool.shipment(uuid))
 
 
-class ReplacedError(PoolError):
+class RecordingReplacedError(PoolError):
     """Another recording stands where the one was that is shipped."""
 
 
 # -- reading ----------------------------------------------------------------------------------
 
 
-class Source:
+class ShippingSource:
     """A recording as it is read to be shipped, and which of its runs are another's to ship.
 
     Args:
@@ -285,19 +287,19 @@ class Source:
         ours = {session for run_id, session in sessions.items() if run_id not in runs}
         self._foreign_sessions = set(sessions.values()) - ours
 
-    def fingerprint(self, table: Table, row_id: int) -> int:
+    def fingerprint(self, table: ShippedTable, row_id: int) -> int:
         """A number of that row's values; `_UNCHECKED` where retention has deleted it."""
         query = f"SELECT {', '.join(table.columns)} FROM {table.name} WHERE id = ?"
         rows = self.connection.execute(query, (row_id,)).fetchall()
         return _digest(rows) if rows else _UNCHECKED
 
-    def rows(self, table: Table, where: str, *values: object) -> list[Row]:
+    def rows(self, table: ShippedTable, where: str, *values: object) -> list[PoolRow]:
         """The rows of a small part of a table that are ours to ship."""
         return self.connection.execute(self._query(table, where), values).fetchall()
 
-    def piece(self, table: Table, where: str, *values: object) -> tuple[list[Row], bool]:
+    def piece(self, table: ShippedTable, where: str, *values: object) -> tuple[list[PoolRow], bool]:
         """Of such rows as many as a bounded size has, and whether they are all."""
-        rows: list[Row] = []
+        rows: list[PoolRow] = []
         size = 0
         with closing(self.connection.execute(self._query(table, where), values)) as cursor:
             for row in cursor:
@@ -307,7 +309,7 @@ class Source:
                     return rows, False
         return rows, True
 
-    def _query(self, table: Table, where: str) -> str:
+    def _query(self, table: ShippedTable, where: str) -> str:
         """Without what belongs to runs and sessions of another; what outlasts them names none."""
         columns, conditions = [*table.columns], [where]
         others = {table.run_column: self.foreign, table.session_column: self._foreign_sessions}
@@ -330,7 +332,7 @@ def _text(stored: bytes) -> str:
     return stored.decode("utf-8", "replace")
 
 
-def _digest(rows: Sequence[Row]) -> int:
+def _digest(rows: Sequence[PoolRow]) -> int:
     """A number that other rows have with a chance of one in 2**63."""
     text = repr([tuple(row) for row in rows]).encode("utf-8", "surrogatepass")
     return int.from_bytes(blake2b(text, digest_size=8).digest(), "big") >> 1
@@ -347,7 +349,12 @@ class Shipper:
     """
 
     def __init__(
-        self, order: Order, report: Report, uuid: str, address: str, shipment: Shipment
+        self,
+        order: ShippingJob,
+        report: ShippingReport,
+        uuid: str,
+        address: str,
+        shipment: Shipment,
     ) -> None:
         self.address = address
         self._order, self._report, self._uuid, self._shipment = order, report, uuid, shipment
@@ -369,7 +376,7 @@ class Shipper:
             Whether the pool holds all that was there when the round began.
         """
         with self._order.recording.reader() as connection:
-            source = Source(connection)
+            source = ShippingSource(connection)
             self._require_the_same(source)
             is_frozen = isinstance(connection, FrozenConnection)
             if thorough:
@@ -393,7 +400,7 @@ class Shipper:
     def note_states_in_no_chunk(self) -> None:
         """Say how many states are neither shipped nor in chunks."""
         with self._order.recording.reader() as connection:
-            source = Source(connection)
+            source = ShippingSource(connection)
             self._knows_owners(source)
             behind, shipped = 0, self._progress.get("state", 0)  # at full rate
             for run_id in source.runs().keys() - source.foreign:
@@ -420,7 +427,7 @@ class Shipper:
         except DatabaseError as error:
             self._report.note(f"runs whose process was killed stay open in the pool: {error}")
 
-    def _make_chunks(self, source: Source) -> None:
+    def _make_chunks(self, source: ShippingSource) -> None:
         """Put states into chunks, at the edge; all of those of runs that are over."""
         database = self._order.recording.database
         if not isinstance(database, Path):
@@ -435,20 +442,20 @@ class Shipper:
         except (DatabaseError, sqlite3.Error) as error:
             self._report.note(f"not all states are in chunks, which alone are shipped: {error}")
 
-    def _appended(self) -> list[Table]:
+    def _appended(self) -> list[ShippedTable]:
         """States last: others should not wait for the largest table."""
         wanted = [each for each in tables() if each.is_appended and each.name not in CHUNKS]
         others = [each for each in wanted if each.name != "state"]
         return [*others, table("state")] if self._order.full else others
 
-    def _require_the_same(self, source: Source) -> None:
+    def _require_the_same(self, source: ShippingSource) -> None:
         """That the recording is the one of before, and not an older copy of it.
 
         Raises:
             PoolError: It is not.
         """
         if (uuid := source.uuid()) != self._uuid:
-            raise ReplacedError(f"the recording {uuid} stands now where {self._uuid} was")
+            raise RecordingReplacedError(f"the recording {uuid} stands now where {self._uuid} was")
         if self._is_checked:
             return
         for each in (table("run"), table("row_group"), *self._appended()):
@@ -466,7 +473,7 @@ class Shipper:
                 )
         self._is_checked = True
 
-    def _ship_changing(self, source: Source, *, thorough: bool) -> set[int]:
+    def _ship_changing(self, source: ShippingSource, *, thorough: bool) -> set[int]:
         """Ship what differs in tables that change; the runs that were over then."""
         while True:
             with _one_moment(source.connection):
@@ -482,19 +489,19 @@ class Shipper:
             self._ask_for_owners(source)
             self._send()
 
-    def _knows_owners(self, source: Source) -> bool:
+    def _knows_owners(self, source: ShippingSource) -> bool:
         """Whether the pool was asked whose the runs are; those of others are left out then."""
         runs = {run_id: uuid for run_id, uuid in source.runs().items() if uuid}
         source.leave_out({run_id for run_id, uuid in runs.items() if self._owners.get(uuid)})
         return self._owners.keys() >= set(runs.values())
 
-    def _ask_for_owners(self, source: Source) -> None:
+    def _ask_for_owners(self, source: ShippingSource) -> None:
         new = {uuid for uuid in source.runs().values() if uuid} - self._owners.keys()
         found = self._shipment.foreign_runs(new) if new else {}
         self._owners |= {uuid: found.get(uuid) for uuid in new}
         self._report.foreign |= found
 
-    def _compare(self, source: Source, each: Table, *, thorough: bool) -> bool:
+    def _compare(self, source: ShippingSource, each: ShippedTable, *, thorough: bool) -> bool:
         """Take the rows whose digest differs from the pool's; False where they are too many.
 
         Rows are compared so many at a time, by their ids; all of a table that has none.
@@ -516,7 +523,7 @@ class Shipper:
                 self._add(Batch(each, rows), {name: value, each.name: last})
         return True
 
-    def _ship_groups(self, source: Source) -> bool:
+    def _ship_groups(self, source: ShippingSource) -> bool:
         """Ship the next row groups, each with its chunks at once; whether these were all."""
         groups, chunks = table("row_group"), table("chunk")
         bounds = (self._progress.get(groups.name, 0), self._last_ids[groups.name])
@@ -528,7 +535,7 @@ class Shipper:
             self._put(group, self._reached(source, groups, group_id))
         return len(ids) < GROUPS_AT_ONCE
 
-    def _ship_appended(self, source: Source, each: Table) -> bool:
+    def _ship_appended(self, source: ShippingSource, each: ShippedTable) -> bool:
         """Ship the next rows; returns whether these were all."""
         after, upto = self._progress.get(each.name, 0), self._last_ids[each.name]
         for _ in range(MOST_BATCHES):
@@ -544,7 +551,9 @@ class Shipper:
             after = last
         return after >= upto
 
-    def _next(self, source: Source, each: Table, after: int, upto: int) -> tuple[list[Row], int]:
+    def _next(
+        self, source: ShippingSource, each: ShippedTable, after: int, upto: int
+    ) -> tuple[list[PoolRow], int]:
         """The next rows, and the last id that was looked at."""
         where, values = "id > ? AND id <= ?", (after, upto)
         if each.name == "state":
@@ -557,7 +566,7 @@ class Shipper:
         names = [name for name in self._progress if name.startswith(_STRETCH)]
         return json.dumps({name.removeprefix(_STRETCH): self._progress[name] for name in names})
 
-    def _ship_kept(self, source: Source, *, thorough: bool) -> None:
+    def _ship_kept(self, source: ShippingSource, *, thorough: bool) -> None:
         """Ship the states of kept stretches, where not all states are shipped."""
         where = "run_id = ? AND sim_time_s BETWEEN ? AND ? AND id > ? AND id <= ?"
         states, upto = table("state"), self._last_ids["state"]
@@ -572,11 +581,11 @@ class Shipper:
                 if rows:
                     self._put(Batch(states, rows), {name: int(str(rows[-1][0]))})
 
-    def _reached(self, source: Source, each: Table, last: int) -> dict[str, int]:
+    def _reached(self, source: ShippingSource, each: ShippedTable, last: int) -> dict[str, int]:
         """The progress up to a row, with a number by which it is known again."""
         return {each.name: last, f"{each.name}.check": source.fingerprint(each, last)}
 
-    def _ship_pictures(self, source: Source) -> None:
+    def _ship_pictures(self, source: ShippingSource) -> None:
         """Ship the files of the pictures whose rows are shipped."""
         images = table("image")
         upto, path_at = self._progress.get(images.name, 0), images.columns.index("path")

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeAlias
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.plugins.pool.parquet_files import package
-from webots_mcp.plugins.pool.pool_interface import Row, table
+from webots_mcp.plugins.pool.pool_interface import PoolRow, table
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import (
     FIRST_LABEL,
@@ -45,7 +45,7 @@ NameAndKind: TypeAlias = "tuple[str, str]"
 
 
 def columns_of(
-    chunks: Iterable[Row],
+    chunks: Iterable[PoolRow],
     signals: Mapping[int, NameAndKind],
     altered: Counter[str],
     held: Any | None = None,
@@ -149,7 +149,7 @@ def _array(values: Decoded, name: str, kind: Any, others: dict[int, dict[str, An
     return arrow.array(fitting, kind).take(arrow.array(codes))
 
 
-def chunks_of(held: Any, run_id: int | None) -> Iterator[Row]:
+def chunks_of(held: Any, run_id: int | None) -> Iterator[PoolRow]:
     """The rows of the table `chunk` that columns were made of, without ids of their own."""
     names = table("chunk").columns
     groups = held.column("group_id").to_numpy()

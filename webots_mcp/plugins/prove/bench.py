@@ -66,7 +66,7 @@ def require(holds: object, seen: str) -> None:
         raise OtherwiseError(seen)
 
 
-class Moment(NamedTuple):
+class RobotRow(NamedTuple):
     """The newest row of a robot, with the run and the process that it is of."""
 
     session_id: int
@@ -92,7 +92,7 @@ class Bench:
         before: The newest row of the rover when the check began.
     """
 
-    before: Moment
+    before: RobotRow
     user: threading.Thread
 
     def __init__(self, folder: Path, patience_s: float) -> None:
@@ -159,12 +159,12 @@ class Bench:
 
     # -- what it records --
 
-    def newest(self, robot: str = ROVER) -> Moment | None:
+    def newest(self, robot: str = ROVER) -> RobotRow | None:
         """The newest row of a robot since Webots was started; None where it has none."""
         found = self.rows(_NEWEST, robot, self._last_row)
-        return Moment._make((*found[0][:-1], json.loads(found[0][-1]))) if found else None
+        return RobotRow._make((*found[0][:-1], json.loads(found[0][-1]))) if found else None
 
-    def row(self, robot: str = ROVER) -> Moment:
+    def row(self, robot: str = ROVER) -> RobotRow:
         """The newest row of a robot, as soon as it has one since Webots was started."""
         return self.until(lambda: self.newest(robot), f"{robot} records nothing")
 
@@ -259,7 +259,7 @@ def _write_project(folder: Path) -> Path:
     return world
 
 
-def tried(
+def run_check(
     check: Callable[[Bench], object], bench: Bench, limit_s: float = _LIMIT_S
 ) -> dict[str, Any]:
     """What came of a check: where it hangs, Webots is ended and its thread left alone.

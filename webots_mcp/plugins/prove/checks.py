@@ -26,7 +26,7 @@ from PIL import Image
 from webots_mcp.answers.models import ShownPicture
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, Moment, require
+from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, RobotRow, require
 from webots_mcp.questions import control_simulation, edit_scene, send_command, show_pictures
 from webots_mcp.simulator import orders
 from webots_mcp.simulator.instances import PORTS_TRIED, find_webots
@@ -140,7 +140,7 @@ def running_pause(bench: Bench) -> None:
     bench.goes_on("resume was done")
 
 
-def _paused(bench: Bench) -> Moment:
+def _paused(bench: Bench) -> RobotRow:
     bench.control("pause")
     bench.stands("pause was done")
     return bench.row()
@@ -153,7 +153,7 @@ def running_steps(bench: Bench) -> None:
     _require_rounds(bench, before, 3)
 
 
-def _require_rounds(bench: Bench, before: Moment, rounds: int) -> None:
+def _require_rounds(bench: Bench, before: RobotRow, rounds: int) -> None:
     bench.stands(f"{rounds} rounds were to be made")
     now = bench.row()
     made, went_s = now.state["rounds"] - before.state["rounds"], now.sim_time_s - before.sim_time_s
@@ -255,7 +255,7 @@ def running_reset(bench: Bench) -> None:
     require(abs(place[0] + 0.3) < 0.05, f"the crate, which began at x = -0.3 m, is at {place}")
 
 
-def _after_reset(bench: Bench) -> Moment:
+def _after_reset(bench: Bench) -> RobotRow:
     before = bench.row()
     bench.control("reset")
     bench.until(lambda: bench.row().run_id > before.run_id, "no new run began")
@@ -354,7 +354,7 @@ def running_reload(bench: Bench) -> None:
     _require_ended(bench, "reload")
 
 
-def _began_after(bench: Bench, before: Moment) -> Moment:
+def _began_after(bench: Bench, before: RobotRow) -> RobotRow:
     id_before = before.session_id
     bench.until(lambda: bench.row().session_id > id_before, "no controller began anew", _LOAD_S)
     return bench.row()

@@ -49,7 +49,7 @@ def prove(
     anything is otherwise.
     """
     from webots_mcp.contract import VERSION
-    from webots_mcp.plugins.prove.bench import Bench, tried
+    from webots_mcp.plugins.prove.bench import Bench, run_check
     from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
     from webots_mcp.simulator.instances import find_webots
     from webots_mcp.simulator.starting import Start
@@ -68,7 +68,7 @@ def prove(
         try:
             for name in only or [*CHECKS, *NOT_TRIED]:
                 answer: dict[str, Any] = {"outcome": "not tried", "seen": NOT_TRIED.get(name)}
-                answer = tried(CHECKS[name], bench) if name in CHECKS else answer
+                answer = run_check(CHECKS[name], bench) if name in CHECKS else answer
                 parts = [f"{name}: {answer['outcome']}"]
                 parts += [f"{key}: {answer[key]}" for key in _SAID if answer.get(key)]
                 found.append({"check": name, **answer})

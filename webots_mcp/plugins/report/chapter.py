@@ -17,19 +17,19 @@ from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.plugins.report.words import (
     Grid,
-    Row,
+    GridRow,
     clock,
     counted,
     cut,
+    describe_event,
+    format_named_values,
+    format_signal_values,
+    format_value,
     length,
-    listed,
     number,
-    paced,
+    pace_text,
     share,
-    spelled,
     time_at,
-    told,
-    valued,
 )
 from webots_mcp.signals.naming import find_mode
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines
@@ -57,7 +57,7 @@ _SHARES: Final = {
 }  # fmt: skip
 
 
-class Held(NamedTuple):
+class ModeShare(NamedTuple):
     """For how long a mode had a value."""
 
     value: str
@@ -66,7 +66,7 @@ class Held(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Moment:
+class EventContext:
     """An event with the seconds around it.
 
     Attributes:
@@ -113,8 +113,8 @@ class Chapter:
     findings: Sequence[str] = ()
     unsearched: Sequence[str] = ()
     mode: str = ""
-    held: Sequence[Held] = ()
-    moments: Sequence[Moment] = ()
+    held: Sequence[ModeShare] = ()
+    moments: Sequence[EventContext] = ()
     checks: Grid | None = None
     parameters: Grid | None = None
     events: Grid | None = None
@@ -140,7 +140,7 @@ class Chapter:
         return {name: grid for name, grid in named.items() if grid is not None}
 
 
-class _Room:
+class _TextBudget:
     """Bytes for the texts of a run, shared out in order."""
 
     def __init__(self, room_bytes: float) -> None:
@@ -171,7 +171,7 @@ def chapter_of(
     """
     run, info = fetch_run(connection, run_id), run_info(connection, run_id)
     session = fetch_session(connection, run.session_id)
-    room = _Room(room_bytes)
+    room = _TextBudget(room_bytes)
     facts = _facts(info, session, run.basic_time_step_ms)
     title = f"Run {run_id} of {info.robot}" + (f": {info.label}" if info.label else "")
     try:
@@ -230,7 +230,7 @@ def _first_words(info: RunInfo) -> str:
     world = f" in {_file(info.world)}" if info.world else ""
     ended = f"It ended: {info.end_reason}." if info.end_reason else "It goes on."
     pace = info.real_time_factor
-    how_fast = f", {paced(pace)}" if pace is not None else ""
+    how_fast = f", {pace_text(pace)}" if pace is not None else ""
     return (
         f"{info.robot} ran for {length(info.duration_s)} of simulation time{world}, from "
         f"{clock(info.started_wall_time_s)} on{how_fast}. {ended}"
@@ -256,13 +256,13 @@ def _facts(info: RunInfo, session: Session | None, step_ms: float | None) -> dic
         + (f", of which {length(info.held_s)} paused by a command" if info.held_s else ""),
         "rows": f"{info.row_count:,}"
         + (f" ({info.purged_rows:,} of them purged since)" if info.purged_rows else ""),
-        "needs attention": listed(info.notable) or None,
+        "needs attention": format_named_values(info.notable) or None,
     }
     if session is not None:
         facts |= {
             "host": session.host,
             "supervisor": "yes" if session.supervisor else "no",
-            "versions": valued(session.versions) or None,
+            "versions": format_signal_values(session.versions) or None,
             "end of the controller": session.end_reason,
             "newest error of the recorder": session.last_error,
             "rows dropped": session.rows_dropped or None,
@@ -275,18 +275,18 @@ def _checks(
 ) -> Grid:
     """Each check, the worst first."""
     checked = check_run(connection, run_id, found=found, deadline_s=deadline_s / 2)
-    rows: list[Row] = []
+    rows: list[GridRow] = []
     for each in checked.worst_first:
         since = "" if each.since_s is None else time_at(each.since_s)
         cells = [each.name, each.outcome, each.evidence, since, str(each.often or "")]
-        rows.append(Row(cells, {"fail": "error", "warn": "warning"}.get(each.outcome, "")))
+        rows.append(GridRow(cells, {"fail": "error", "warn": "warning"}.get(each.outcome, "")))
     return Grid(("check", "outcome", "evidence", "since [s]", "times"), rows)
 
 
 def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:
     columns = ("name", "value", "unit", "default", "set_by", "since_s", "doc")
     rows = [
-        Row([_text(each[column]) for column in columns])
+        GridRow([_text(each[column]) for column in columns])
         for each in described(connection, fetch_run(connection, run_id))
     ]
     return Grid(("parameter", "value", "unit", "default", "set by", "since [s]", "what"), rows)
@@ -322,8 +322,8 @@ def _events(connection: sqlite3.Connection, found: Found) -> Grid:
     matter = [each for each in found.events if each.kind != "command" or _mark(each)]
     answer = found.only(matter).told(connection, MOST_EVENTS)
     rows = [
-        Row(
-            [time_at(each.start_s), _lasted(each), each.kind, told(each), _around(each)],
+        GridRow(
+            [time_at(each.start_s), _lasted(each), each.kind, describe_event(each), _around(each)],
             _mark(each),
         )
         for each in answer.events
@@ -342,19 +342,22 @@ def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
     return list(found.only(chosen).told(connection, MOST_MOMENTS).events)
 
 
-def _moment(event: Event, stored: Found) -> Moment:
+def _moment(event: Event, stored: Found) -> EventContext:
     many = f", the first of {event.count}" if event.count > 1 else ""
     lasted = f", for {length(event.duration_s)}" if event.duration_s and not many else ""
     title = f"{event.kind} at {time_at(event.start_s)} s{lasted}{many}"
     columns = ("at [s]", "kind", "what")
-    moment = Moment(event, title, told(event), _around(event), Grid(columns, ()))
+    moment = EventContext(event, title, describe_event(event), _around(event), Grid(columns, ()))
     around = [
         each for each in stored.events
         if moment.start_s <= each.start_s <= moment.end_s and each.kind != "image"
     ]  # fmt: skip
     nearest = sorted(around, key=lambda each: abs(each.start_s - event.start_s))[:_LINES_AROUND]
     shown = [each for each in around if any(each is near for near in nearest)]
-    rows = [Row([time_at(each.start_s), each.kind, told(each)], _mark(each)) for each in shown]
+    rows = [
+        GridRow([time_at(each.start_s), each.kind, describe_event(each)], _mark(each))
+        for each in shown
+    ]
     return replace(moment, lines=Grid(columns, rows, left_out=len(around) - len(shown)))
 
 
@@ -366,7 +369,9 @@ def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
         notes = ["Of the log only warnings and errors stand here."]
     answer = stored.told(connection, MOST_ENTRIES)
     rows = [
-        Row([time_at(each.start_s), _lasted(each), each.kind, told(each)], _mark(each))
+        GridRow(
+            [time_at(each.start_s), _lasted(each), each.kind, describe_event(each)], _mark(each)
+        )
         for each in answer.events
     ]
     left_out = sum(each.count for each in answer.left_out.values())
@@ -377,12 +382,12 @@ def _commands(connection: sqlite3.Connection, stored: Found) -> Grid:
     commands = stored.only([each for each in stored.events if each.kind == "command"])
     answer = commands.told(connection, MOST_EVENTS)
     rows = [
-        Row([
+        GridRow([
             time_at(each.start_s), str(each.details.get("id", "")), each.name or "",
-            valued(each.details.get("params") or {}), each.details["status"],
+            format_signal_values(each.details.get("params") or {}), each.details["status"],
             number(each.details.get("took_wall_s")),
             cut(str(each.details.get("error") or each.details.get("rule")
-                    or spelled(each.details.get("result", "")))),
+                    or format_value(each.details.get("result", "")))),
         ], _mark(each))
         for each in answer.events
     ]  # fmt: skip
@@ -403,17 +408,18 @@ def _log(connection: sqlite3.Connection, run_id: int) -> Grid:
     )
 
 
-def _line(line: LogLine) -> Row:
+def _line(line: LogLine) -> GridRow:
     cells = [time_at(line.sim_time_s), line.level, line.source, cut(line.message, 2_000)]
-    return Row(cells, _MARKS.get(line.level, ""))
+    return GridRow(cells, _MARKS.get(line.level, ""))
 
 
 def _trends(run: RunTrends) -> Grid:
     """Numbers, what changed most first; then texts and flags."""
     rows = [
-        Row([trend.name, trend.unit or "", trend.says, *_figures(trend)]) for trend in run.numbers
+        GridRow([trend.name, trend.unit or "", trend.says, *_figures(trend)])
+        for trend in run.numbers
     ]
-    rows += [Row([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
+    rows += [GridRow([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
     notes = [f"Without a value: {', '.join(run.without_value[:50])}."] if run.without_value else []
     columns = ("signal", "unit", "what it did", "mean", "deviation", "least", "greatest")
     return Grid(columns, rows, notes, left_out=run.total - len(run.numbers))
@@ -428,14 +434,14 @@ def _figures(trend: Trend) -> list[str]:
 
 def _course(state: StateTrend) -> str:
     if state.changes == 0:
-        return f"always {spelled(state.last)}"
+        return f"always {format_value(state.last)}"
     since = "" if state.since_s is None else f" since {time_at(state.since_s)} s"
     times = ", ".join(
         f"{cut(value, 40)} {length(held_s)}"
         for value, held_s in list(state.time_by_value_s.items())[:_MOST_VALUES]
     )
     changed = counted(state.changes, "change")
-    return f"{changed}, {spelled(state.last)}{since}; {times}"
+    return f"{changed}, {format_value(state.last)}{since}; {times}"
 
 
 def _mode(run: RunTrends) -> StateTrend | None:
@@ -443,10 +449,10 @@ def _mode(run: RunTrends) -> StateTrend | None:
     return next((state for state in run.states if state.name == name), None)
 
 
-def _held(mode: StateTrend) -> list[Held]:
+def _held(mode: StateTrend) -> list[ModeShare]:
     whole_s = sum(mode.time_by_value_s.values())
     return [
-        Held(
+        ModeShare(
             cut(value, 60),
             f"{length(held_s)}, {share(held_s, whole_s)}",
             100 * held_s / whole_s if whole_s else 0.0,
@@ -475,7 +481,7 @@ def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], 
 def _around(event: Event) -> str:
     """Values when it began; nothing where those rows are gone."""
     known = any(value is not None for value in event.around.values())
-    return valued(event.around) if known else ""
+    return format_signal_values(event.around) if known else ""
 
 
 def _mark(event: Event) -> str:
@@ -490,7 +496,7 @@ def _lasted(event: Event) -> str:
 
 
 def _text(value: object) -> str:
-    return "" if value is None else spelled(value)
+    return "" if value is None else format_value(value)
 
 
 def _file(path: str) -> str:

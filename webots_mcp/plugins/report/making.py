@@ -26,8 +26,15 @@ from webots_mcp.plotting.canvas import Room
 from webots_mcp.plotting.on_a_page import Figure, figure_part, signals_figure, way_figure
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, compose_trajectory
-from webots_mcp.plugins.report.chapter import Chapter, Moment, chapter_of
-from webots_mcp.plugins.report.words import Beside, beside, clock, counted, size, time_at
+from webots_mcp.plugins.report.chapter import Chapter, EventContext, chapter_of
+from webots_mcp.plugins.report.words import (
+    RunComparison,
+    clock,
+    compare_two_runs,
+    counted,
+    size,
+    time_at,
+)
 from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.invalid_rows import left_out_so_far
@@ -144,7 +151,7 @@ def _curves_missing(chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[st
     ]
 
 
-def moment_key(chapter: Chapter, moment: Moment) -> str:
+def moment_key(chapter: Chapter, moment: EventContext) -> str:
     """Under which the figure of a moment stands."""
     return f"moment {chapter.info.run_id} {list(chapter.moments).index(moment)}"
 
@@ -177,7 +184,7 @@ def _why_none(known: Sequence[dict[str, Signal]], names: Sequence[str]) -> str:
     return "they share no numeric signals"
 
 
-class _Drawn:
+class _FigureSet:
     """The figures of a report by their keys, and why others could not be drawn."""
 
     def __init__(self, connection: sqlite3.Connection, chapters: Sequence[Chapter]) -> None:
@@ -212,7 +219,7 @@ class _Drawn:
         plot, notes = compose_trajectory(self._connection, ranges, found=self._found)
         return way_figure(plot, notes, obstacles_of(self._connection, ranges))
 
-    def around(self, chapter: Chapter, moment: Moment) -> None:
+    def around(self, chapter: Chapter, moment: EventContext) -> None:
         """The signals that an event is about, or the usual ones, in the seconds around it."""
         about = [moment.event.name] if moment.event.name else []
         for names in filter(None, (about, list(moment.event.around))):
@@ -221,7 +228,7 @@ class _Drawn:
                 self.drawn[moment_key(chapter, moment)] = self._seconds(chapter, moment, names)
                 return
 
-    def _seconds(self, chapter: Chapter, moment: Moment, names: Sequence[str]) -> Figure:
+    def _seconds(self, chapter: Chapter, moment: EventContext, names: Sequence[str]) -> Figure:
         scope = Scope(run_id=chapter.info.run_id, start_s=moment.start_s, end_s=moment.end_s)
         around = find_range(self._connection, scope)
         composed = compose_signals(
@@ -237,8 +244,8 @@ def _drawn_of(
     both: Sequence[str],
     *,
     with_moments: bool,
-) -> _Drawn:
-    drawn = _Drawn(connection, chapters)
+) -> _FigureSet:
+    drawn = _FigureSet(connection, chapters)
     ranges = [each.range for each in chapters if each.range is not None]
     if len(ranges) > 1:
         drawn.overlaid(ranges, both)
@@ -339,7 +346,7 @@ def _seen(connection: sqlite3.Connection, run: Run) -> tuple[Obstacle, ...]:
 # The pictures of a run: as many as have room, downscaled, inside the page.
 
 
-class Picture(NamedTuple):
+class EmbeddedPicture(NamedTuple):
     """A picture in the page: its data URI, and what it shows."""
 
     uri: str
@@ -351,19 +358,19 @@ class Picture(NamedTuple):
         return len(self.uri) + _AROUND_BYTES
 
 
-class Pictures(NamedTuple):
+class EmbeddedPictures(NamedTuple):
     """Those that are shown, of how many, and how many of their files could not be used."""
 
-    shown: Sequence[Picture]
+    shown: Sequence[EmbeddedPicture]
     total: int
     unusable: int
 
 
-def pictures_of(found: Sequence[Event], data_dir: Path, room_bytes: float) -> Pictures:
+def pictures_of(found: Sequence[Event], data_dir: Path, room_bytes: float) -> EmbeddedPictures:
     """Pictures that are spread evenly over the run, the first and the newest among them."""
     tried = [_picture(event, data_dir) for event in spread(found, MOST_PICTURES)]
     made = [picture for picture in tried if picture is not None]
-    return Pictures(_within(made, room_bytes), len(found), len(tried) - len(made))
+    return EmbeddedPictures(_within(made, room_bytes), len(found), len(tried) - len(made))
 
 
 def spread(items: Sequence[Event], most: int) -> list[Event]:
@@ -373,7 +380,7 @@ def spread(items: Sequence[Event], most: int) -> list[Event]:
     return [items[round(i * (len(items) - 1) / (most - 1))] for i in range(most)]
 
 
-def _within(pictures: Sequence[Picture], room_bytes: float) -> list[Picture]:
+def _within(pictures: Sequence[EmbeddedPicture], room_bytes: float) -> list[EmbeddedPicture]:
     """All of them, else every second, every third and so on, until they have room."""
     for step in range(1, len(pictures) + 1):
         kept = list(pictures[::step])
@@ -382,7 +389,7 @@ def _within(pictures: Sequence[Picture], room_bytes: float) -> list[Picture]:
     return []
 
 
-def _picture(event: Event, data_dir: Path) -> Picture | None:
+def _picture(event: Event, data_dir: Path) -> EmbeddedPicture | None:
     """None where the file is gone, or holds no picture."""
     try:
         media_type, data = _content(inside(data_dir, str(event.details["path"])))
@@ -390,7 +397,7 @@ def _picture(event: Event, data_dir: Path) -> Picture | None:
         return None
     kind = "" if event.details["kind"] == "camera" else f", {event.details['kind']}"
     caption = f"{time_at(event.start_s)} s, {event.name or 'main view'}{kind}"
-    return Picture(f"data:{media_type};base64,{b64encode(data).decode()}", caption)
+    return EmbeddedPicture(f"data:{media_type};base64,{b64encode(data).decode()}", caption)
 
 
 def _content(file: Path) -> tuple[str, bytes]:
@@ -407,7 +414,7 @@ def _content(file: Path) -> tuple[str, bytes]:
     return "image/jpeg", buffer.getvalue()
 
 
-Progress = Callable[[int, int], None]
+ReportProgress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -435,7 +442,7 @@ def make_report(
     *,
     names: Sequence[str] = (),
     max_mb: float = MAX_MB,
-    progress: Progress | None = None,
+    progress: ReportProgress | None = None,
 ) -> Report:
     """Put a report of one run together, or of two beside each other.
 
@@ -462,13 +469,13 @@ def make_report(
     for run_id in run_ids:
         chapters.append(chapter_of(connection, run_id, texts_bytes / count, DEADLINE_S / count))
         done.step()
-    compared = beside(connection, run_ids, texts_bytes) if len(run_ids) > 1 else None
+    compared = compare_two_runs(connection, run_ids, texts_bytes) if len(run_ids) > 1 else None
     done.step()
     figures_bytes = _SHARE_OF_FIGURES * (room_bytes - texts_bytes)
     differing = compared.differing if compared is not None else ()
     figures = figures_of(connection, chapters, names, differing, figures_bytes)
     done.step()
-    page = Page(_title(chapters), time.time(), max_mb, chapters, compared, figures)
+    page = ReportContent(_title(chapters), time.time(), max_mb, chapters, compared, figures)
     rest_bytes = max_mb * 1e6 - len(render(page))
     share_bytes = rest_bytes / len(chapters)
     for chapter in chapters:
@@ -484,7 +491,7 @@ def make_report(
 class _Steps:
     """Tells how far the work has come."""
 
-    def __init__(self, progress: Progress | None, of: int) -> None:
+    def __init__(self, progress: ReportProgress | None, of: int) -> None:
         self._progress, self._of, self._done = progress, of, 0
 
     def step(self) -> None:
@@ -510,7 +517,7 @@ def _title(chapters: Sequence[Chapter]) -> str:
     return " and ".join(chapter.title for chapter in chapters)
 
 
-def _left_out(page: Page) -> list[str]:
+def _left_out(page: ReportContent) -> list[str]:
     """What a reader would miss, and why it is not there."""
     said: list[str] = []
     for chapter in page.chapters:
@@ -526,7 +533,7 @@ def _left_out(page: Page) -> list[str]:
     return [*said, *page.figures.left_out, *left_out_so_far()]
 
 
-def _holds(page: Page) -> dict[str, int]:
+def _holds(page: ReportContent) -> dict[str, int]:
     """How many rows, figures and pictures there are."""
     counts: dict[str, int] = {"figures": len(page.figures.marks)}
     for chapter in page.chapters:
@@ -537,13 +544,13 @@ def _holds(page: Page) -> dict[str, int]:
 
 
 @dataclass(frozen=True)
-class Page:
+class ReportContent:
     """All that a report shows.
 
     Attributes:
         made_wall_time_s: When it was made.
         max_mb: What it may take.
-        beside: The comparison of two runs; None of one.
+        comparison: The comparison of two runs; None of one.
         pictures: By run.
         left_out: What is not in it.
         size_bytes: What it takes, about; None while that is not known.
@@ -553,9 +560,9 @@ class Page:
     made_wall_time_s: float
     max_mb: float
     chapters: Sequence[Chapter]
-    beside: Beside | None
+    comparison: RunComparison | None
     figures: Figures
-    pictures: dict[int, Pictures] = field(default_factory=dict[int, Pictures])
+    pictures: dict[int, EmbeddedPictures] = field(default_factory=dict[int, EmbeddedPictures])
     left_out: Sequence[str] = ()
     size_bytes: int | None = None
 
@@ -565,7 +572,7 @@ def _spelled_out(value: object) -> object:
     return spelled_out(value) if type(value) is str else value
 
 
-def render(page: Page) -> bytes:
+def render(page: ReportContent) -> bytes:
     """The file. Every text of the recording is escaped: it is shown, and never run."""
     from markupsafe import Markup
 

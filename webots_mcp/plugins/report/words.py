@@ -52,7 +52,7 @@ def number(value: float | None, span: float = 0.0) -> str:
     return f"{0.0 if is_nothing else value:.4g}"
 
 
-def paced(factor: float) -> str:
+def pace_text(factor: float) -> str:
     """How fast simulation time went by."""
     text = f"{factor:.2g}"
     return "at the pace of real time" if text == "1" else f"at {text} times real time"
@@ -94,7 +94,7 @@ def counted(count: int, what: str) -> str:
     return f"{count:,} {what}" + ("" if count == 1 else "s")
 
 
-def spelled(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A value of any kind in one line."""
     if value is None:
         return "null"
@@ -115,98 +115,102 @@ def _rounded(value: Any) -> Any:
     return value
 
 
-def listed(values: Mapping[str, Any]) -> str:
+def format_named_values(values: Mapping[str, Any]) -> str:
     """Named values in one line; a unit at the end of a name stands behind its value."""
     return "; ".join(_named(name, value) for name, value in values.items())
 
 
-def valued(values: Mapping[str, Any]) -> str:
+def format_signal_values(values: Mapping[str, Any]) -> str:
     """Values of signals or parameters in one line, under the names that they have."""
-    return ", ".join(f"{name} {spelled(value)}" for name, value in values.items())
+    return ", ".join(f"{name} {format_value(value)}" for name, value in values.items())
 
 
 def _named(name: str, value: Any) -> str:
     found = _UNIT.fullmatch(name)
     if isinstance(value, str) and " " in value:
-        return f"{name.replace('_', ' ')}: {spelled(value)}"
+        return f"{name.replace('_', ' ')}: {format_value(value)}"
     if found is None or not isinstance(value, (int, float)):
-        return f"{name.replace('_', ' ')} {spelled(value)}"
-    return f"{found[1].replace('_', ' ')} {spelled(value)} {found[2]}"
+        return f"{name.replace('_', ' ')} {format_value(value)}"
+    return f"{found[1].replace('_', ' ')} {format_value(value)} {found[2]}"
 
 
-def told(event: Event) -> str:
+def describe_event(event: Event) -> str:
     """What happened, without when."""
     if event.count > 1:
-        return _of_many(event)
-    return cut(_WORDS.get(event.kind, _of_others)(event))
+        return _describe_many(event)
+    return cut(_WORDS.get(event.kind, _describe_others)(event))
 
 
-def _of_many(event: Event) -> str:
+def _describe_many(event: Event) -> str:
     details = {name: each for name, each in event.details.items() if name not in _UNTOLD}
     says = details.pop("says", f"{event.count} times {event.kind}")
     of = f"{event.name}: " if event.name else ""
-    return cut("; ".join(filter(None, (f"{of}{says}", listed(details)))))
+    return cut("; ".join(filter(None, (f"{of}{says}", format_named_values(details)))))
 
 
-def _of_change(event: Event) -> str:
+def _describe_change(event: Event) -> str:
     before, after = event.details["before"], event.details["after"]
-    return f"{event.name}: {spelled(before)} → {spelled(after)}"
+    return f"{event.name}: {format_value(before)} → {format_value(after)}"
 
 
-def _of_log(event: Event) -> str:
+def _describe_log(event: Event) -> str:
     return f"{event.name} ({event.details['source']}): {event.details['message']}"
 
 
-def _of_command(event: Event) -> str:
+def _describe_command(event: Event) -> str:
     details = dict(event.details)
-    params = valued(details.get("params") or {})
+    params = format_signal_values(details.get("params") or {})
     outcome = details["status"]
     if "took_wall_s" in details:
         outcome += f" after {length(details['took_wall_s'])} of wall time"
-    outcome += f", answer {spelled(details['result'])}" if details.get("result") else ""
+    outcome += f", answer {format_value(details['result'])}" if details.get("result") else ""
     outcome += f", {details['error']}" if details.get("error") else ""
     return f"{event.name}({params}): {outcome}"
 
 
-def _of_run(event: Event) -> str:
+def _describe_run(event: Event) -> str:
     return f"the run {event.details['what']} ({event.details['reason'] or 'unknown cause'})"
 
 
-def _of_noticed(event: Event) -> str:
+def _describe_noticed(event: Event) -> str:
     name = f" {event.name}" if event.name else ""
     data = event.details.get("data")
-    said = listed(cast("dict[str, Any]", data)) if isinstance(data, dict) else spelled(data)
+    said = (
+        format_named_values(cast("dict[str, Any]", data))
+        if isinstance(data, dict)
+        else format_value(data)
+    )
     return f"{event.details['what']}{name}" + (f": {said}" if data else "")
 
 
-def _of_image(event: Event) -> str:
+def _describe_image(event: Event) -> str:
     return f"picture of {event.name or 'the main view'}"
 
 
-def _of_gap(event: Event) -> str:
+def _describe_gap(event: Event) -> str:
     usual_s = event.details.get("usual_interval_s")
     return "no rows" + (f", else one each {number(usual_s)} s" if usual_s else "")
 
 
-def _of_others(event: Event) -> str:
+def _describe_others(event: Event) -> str:
     details = {name: each for name, each in event.details.items() if name not in _UNTOLD}
     said = [str(details.pop("says"))] if "says" in details else []
-    said += [listed(details)] if details else []
+    said += [format_named_values(details)] if details else []
     return ": ".join(filter(None, (event.name, "; ".join(said))))
 
 
 _WORDS: Final[Mapping[str, Callable[[Event], str]]] = {
-    "change": _of_change,
-    "log": _of_log,
-    "command": _of_command,
-    "run": _of_run,
-    "bridge_event": _of_noticed,
-    "image": _of_image,
-    "gap": _of_gap,
+    "change": _describe_change,
+    "log": _describe_log,
+    "command": _describe_command,
+    "run": _describe_run,
+    "bridge_event": _describe_noticed,
+    "image": _describe_image,
+    "gap": _describe_gap,
 }
 
 
-class Row(NamedTuple):
+class GridRow(NamedTuple):
     """Texts, and a mark that shows in the page: `warning`, `error` or nothing."""
 
     cells: Sequence[str]
@@ -231,7 +235,7 @@ class Grid:
     """
 
     columns: Sequence[str]
-    rows: Sequence[Row]
+    rows: Sequence[GridRow]
     notes: Sequence[str] = field(default=())
     left_out: int = 0
     or_more: bool = False
@@ -251,7 +255,7 @@ class Grid:
     def within(self, room_bytes: float, *, newest: bool = False) -> Grid:
         """As many of the first rows, or of the newest, as have room; empty columns are dropped."""
         rows = list(reversed(self.rows)) if newest else list(self.rows)
-        kept: list[Row] = []
+        kept: list[GridRow] = []
         for row in rows:
             room_bytes -= row.size_bytes
             if room_bytes < 0:
@@ -268,7 +272,7 @@ class Grid:
 
     def _without_empty_columns(self) -> Grid:
         kept = [i for i in range(len(self.columns)) if any(row.cells[i] for row in self.rows)]
-        rows = [Row([row.cells[i] for i in kept], row.mark) for row in self.rows]
+        rows = [GridRow([row.cells[i] for i in kept], row.mark) for row in self.rows]
         return replace(self, columns=[self.columns[i] for i in kept], rows=rows)
 
 
@@ -284,7 +288,7 @@ def _is_number(text: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Beside:
+class RunComparison:
     """Two runs beside each other.
 
     Attributes:
@@ -302,7 +306,9 @@ class Beside:
     why_not: str = ""
 
 
-def beside(connection: sqlite3.Connection, run_ids: Sequence[int], room_bytes: float) -> Beside:
+def compare_two_runs(
+    connection: sqlite3.Connection, run_ids: Sequence[int], room_bytes: float
+) -> RunComparison:
     """Compare two runs, in texts of about a tenth of so many bytes at most.
 
     Raises:
@@ -311,14 +317,14 @@ def beside(connection: sqlite3.Connection, run_ids: Sequence[int], room_bytes: f
     try:
         found = compare_runs(connection, run_ids, limit=MOST_DIFFERENCES)
     except NothingRecordedError as error:
-        return Beside(why_not=str(error))
+        return RunComparison(why_not=str(error))
     names = [group.name for group in found.groups]
     differences = _differences(found, names).within(_SHARE_OF_TEXTS * room_bytes)
     notes = [f"not known: {figures}: {why}" for figures, why in found.unknown.items()]
     notes += [
         f"only in {' and '.join(groups)}: {naming.listed(only)}" for groups, only in _only_in(found)
     ]
-    return Beside(
+    return RunComparison(
         _says(found),
         [each.name for each in found.differences if each.effect[1]],
         _parameters(found, names),
@@ -371,18 +377,19 @@ def _unlike_parameters(found: Comparison) -> list[tuple[str, Sequence[object], S
 
 
 def _values(values: Sequence[object]) -> str:
-    return "; ".join(map(spelled, values)) or "without it"
+    return "; ".join(map(format_value, values)) or "without it"
 
 
 def _parameters(found: Comparison, names: Sequence[str]) -> Grid | None:
     rows = [
-        Row([name, _values(one), _values(other)]) for name, one, other in _unlike_parameters(found)
+        GridRow([name, _values(one), _values(other)])
+        for name, one, other in _unlike_parameters(found)
     ]
     return Grid(("parameter", *names), rows) if rows else None
 
 
 def _measures(found: Comparison, names: Sequence[str]) -> Grid | None:
-    rows = [Row([each.name, *map(_median, each.spread)]) for each in found.measures]
+    rows = [GridRow([each.name, *map(_median, each.spread)]) for each in found.measures]
     return Grid(("figure", *names), rows) if rows else None
 
 
@@ -391,7 +398,7 @@ def _differences(found: Comparison, names: Sequence[str]) -> Grid:
     columns = ("signal", "unit", f"mean, {first}", f"mean, {second}", "effect",
                f"deviation, {first}", f"deviation, {second}")  # fmt: skip
     rows = [
-        Row([
+        GridRow([
             each.name, each.unit or "", *map(_median, each.mean), number(each.effect[1]),
             *map(_median, each.deviation),
         ])

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final
 from . import session as library
 from .devices import CLASS_OF, Device
 from .scene import Node, node_of
-from .session import Link, NodeFacts, Session, SocketLink
+from .session import ControllerSession, NodeFacts, SimulatorLink, SocketLink
 from .surface import Completed, integer, lacking, number, say, text
 
 _NULL_NODE: Final = (0, "", "", "", -1)
@@ -75,7 +75,7 @@ class Robot(Completed):
     created: ClassVar[Robot | None] = None
     """The first robot that was made."""
 
-    _session: Session
+    _session: ControllerSession
     devices: dict[str, Device]
     """All devices by name."""
     keyboard: Keyboard
@@ -85,13 +85,13 @@ class Robot(Completed):
         if link is None:
             return
         Robot.created = self
-        self._session = library.current = Session(link)
+        self._session = library.current = ControllerSession(link)
         described = self._session.robot["devices"]
         self._by_tag = {d["tag"]: CLASS_OF[d["node_type"]](d["tag"]) for d in described}
         self.keyboard = Keyboard()
         self.devices = {device.name: device for device in self._by_tag.values()}
 
-    def _connect(self) -> Link | None:
+    def _connect(self) -> SimulatorLink | None:
         if Robot.created is not None:
             say("Error: Only one instance of the Robot class should be created.")
             self._session = Robot.created._session

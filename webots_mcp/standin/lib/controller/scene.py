@@ -9,7 +9,7 @@ from functools import partial
 from math import nan
 from typing import Any, Final, cast
 
-from .session import NodeFacts, Session
+from .session import ControllerSession, NodeFacts
 from .surface import Completed, integer, lacking, number, numbers, say, text, type_number
 
 _LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
@@ -34,7 +34,7 @@ class Field(Completed):
 
     type: int | None
     """The number of the type, as `Field.SF_VEC3F`."""
-    _session: Session
+    _session: ControllerSession
     _key: tuple[int, str]
     _type_name: str
     _is_inner: bool
@@ -45,7 +45,7 @@ class Field(Completed):
     @classmethod
     def _of(
         cls,
-        session: Session,
+        session: ControllerSession,
         node_id: int,
         name: str,
         found: Sequence[Any],
@@ -308,7 +308,7 @@ class Node(Completed):
     `getId()`.
     """
 
-    _session: Session
+    _session: ControllerSession
     _id: int
     _found: tuple[str, str, str]
     _parent_id: int
@@ -324,7 +324,7 @@ class Node(Completed):
         raise lacking("Node(...); ask the supervisor for nodes")
 
     @classmethod
-    def _of(cls, session: Session, found: NodeFacts) -> Node:
+    def _of(cls, session: ControllerSession, found: NodeFacts) -> Node:
         node = cls.__new__(cls)
         node._session, node._id = session, found[0]
         node._found = (found[1], found[2], found[3])

@@ -70,7 +70,7 @@ def connect(port: int) -> socket.socket:
     return connection
 
 
-class Link(Protocol):
+class SimulatorLink(Protocol):
     """A connection to a simulator, through a socket or within one process."""
 
     description: dict[str, Any]
@@ -201,14 +201,14 @@ class ReceivedPackets(deque[Any]):
                 self.append(packet)
 
 
-class Session:
+class ControllerSession:
     """What the library knows between two requests.
 
     As in the real library one recursive lock guards it, held during the whole of `step`: other
     threads that want a sensor value or a request wait until the step is over.
     """
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: SimulatorLink) -> None:
         self.link = link
         self.robot: dict[str, Any] = link.description
         self.time_s: float = self.robot["time"]
@@ -503,5 +503,5 @@ class Session:
             self.link.exit()
 
 
-current: Session | None = None
+current: ControllerSession | None = None
 """The session of the process's one robot; devices made by name belong to it."""

@@ -41,7 +41,9 @@ from webots_mcp.plugins.pool.pool_contents import (
     resolve_filter,
 )
 from webots_mcp.plugins.pool.pool_interface import Batch, batches, table
-from webots_mcp.plugins.pool.postgres_pool import Connection, PostgresShipment, connect, prepare
+from webots_mcp.plugins.pool.postgres_connection import Connection, connect
+from webots_mcp.plugins.pool.postgres_pool import PostgresShipment
+from webots_mcp.plugins.pool.postgres_schema import prepare
 from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.recording import Recording
 

@@ -29,13 +29,8 @@ from webots_mcp.errors import (
 )
 from webots_mcp.plugins.pool.pool_contents import open_pool, pooled_runs
 from webots_mcp.plugins.pool.pool_interface import BATCH_BYTES, is_whole, table
-from webots_mcp.plugins.pool.shipping import (
-    LAST_GROUP,
-    ShippingJob,
-    ShippingReport,
-    ShippingSource,
-    follow,
-)
+from webots_mcp.plugins.pool.shipping import LAST_GROUP, ShippingJob, ShippingReport, follow
+from webots_mcp.plugins.pool.shipping_source import ShippingSource
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording

@@ -38,7 +38,7 @@ from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.pool_interface import Batch, PoolRow, ShippedTable, table, tables
-from webots_mcp.plugins.pool.postgres_pool import prepare, views
+from webots_mcp.plugins.pool.postgres_schema import prepare, views
 from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.slow

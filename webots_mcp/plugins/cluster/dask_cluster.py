@@ -1,8 +1,8 @@
-"""Trials on a Dask cluster: a worker runs a simulator, and returns its score and its recording.
+"""Trials on a Dask cluster: a worker runs a simulator, and returns a score and a recording.
 
-Workers have to have Dask's resource `simulator`: a task of ours takes one of it, so that no machine
-runs more simulators than its owner says. Dask runs a trial again whose worker died, and says when
-that happened too often. Needs the extra `cluster`.
+Workers need Dask's resource `simulator`, of which each trial takes one, so that no machine runs
+more simulators than its owner allows. Dask repeats a trial whose worker died, and gives up after
+some repetitions. Needs the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ from webots_mcp.store.parameters import Result
 from webots_mcp.store.recording import Recording
 
 RESOURCE: Final = "simulator"
-MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler
+MOST_BYTES: Final = 100_000_000
+"""Size of a packed recording that a worker returns, because it passes through the scheduler."""
 _CONNECT_S: Final = 10.0
-_PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
+_PATIENCE_S: Final = 0.5  # Between two checks for a request to stop.
 _COUNT_EVERY_S: Final = 2.0
 _WITHOUT_WORKERS_S: Final = 60.0
 _SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
@@ -58,19 +59,19 @@ _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once
 _SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
 
 
-# -- on a worker ------------------------------------------------------------------------------
+# -- functions that workers run ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class WorkerRequirements:
-    """What a worker has to have.
+    """What a worker needs.
 
     Attributes:
-        version: Of webots-mcp.
-        world: The path of the world file.
-        digest: Of that file and the sources of the project's controllers.
-        is_stand_in: Whether the stand-in runs it, and not Webots.
-        ship_to: The URL of a pool that takes the recordings; None where they are returned.
+        version: Version of webots-mcp.
+        world: Path of the world file.
+        digest: Hash of that file and the sources of the project's controllers.
+        is_stand_in: Whether the stand-in runs the world, not Webots.
+        ship_to: URL of a pool for the recordings; None to return them.
     """
 
     version: str
@@ -81,17 +82,17 @@ class WorkerRequirements:
 
     @property
     def command(self) -> Command:
-        """Of the simulator."""
+        """Return the command of the simulator."""
         return stand_in if self.is_stand_in else webots
 
 
 class TrialReturn(NamedTuple):
-    """What a worker returns: what became of a trial, and what it recorded.
+    """What a worker returns: the result of a trial and its recording.
 
     Attributes:
-        result: With the id of its run in that recording.
-        recording: Packed; None where there is none, or it was shipped.
-        shipped: The UUID of the recording, where it was shipped.
+        result: The result, with the run's id in that recording.
+        recording: The packed recording; None if there is none, or it was shipped.
+        shipped: UUID of the recording, if it was shipped.
     """
 
     result: Result
@@ -100,7 +101,7 @@ class TrialReturn(NamedTuple):
 
 
 def missing_requirement(needs: WorkerRequirements) -> str | None:
-    """What keeps this machine from running a trial; None where nothing does."""
+    """Return why this machine cannot run a trial; None if it can."""
     if needs.version != VERSION:
         return f"it has webots-mcp {VERSION}, not {needs.version}"
     if not Path(needs.world).is_file():
@@ -117,7 +118,7 @@ def missing_requirement(needs: WorkerRequirements) -> str | None:
 
 
 def _require_pool(url: str) -> None:
-    """See that it can be the address of a pool, without connecting.
+    """Check that a URL can name a pool, without connecting.
 
     Raises:
         InvalidInputError: It cannot, or the packages for it are missing.
@@ -129,7 +130,7 @@ def _require_pool(url: str) -> None:
 
 
 def digest_of(world: str) -> str:
-    """Of a world and of the sources of its project's controllers."""
+    """Return the hash of a world and of the sources of its project's controllers."""
     controllers = Path(world).parent.parent / "controllers"
     sources = (each for each in controllers.rglob("*.*") if each.suffix in _SOURCES)
     digest = hashlib.sha256()
@@ -140,11 +141,11 @@ def digest_of(world: str) -> str:
 
 
 def run_on_worker(asked: dict[str, Any], plan_text: str) -> TrialReturn:
-    """Run the only trial of a plan on this worker, in a scratch folder of its own.
+    """Run the only trial of a plan on this worker, in a temporary folder.
 
     Args:
-        asked: The fields of its `WorkerRequirements`.
-        plan_text: The plan.
+        asked: Fields of its `WorkerRequirements`.
+        plan_text: The plan as JSON.
 
     Raises:
         CommandRefusedError: This machine cannot run it.
@@ -173,17 +174,17 @@ def run_on_worker(asked: dict[str, Any], plan_text: str) -> TrialReturn:
     except StoppedError:
         raise unwanted.as_dask_says() from None
     except InvalidInputError:
-        raise  # no other worker could run it either
+        raise  # No other worker could run it either.
     except (OSError, WebotsMCPError) as error:
         raise CommandRefusedError(f"{where}: {error}") from error
 
 
 def _note_nothing(pid: int | None) -> None:
-    """Whoever handed the trial out cannot end a process of this machine; its keeper does."""
+    """Store no process id: the caller cannot end a process of this machine."""
 
 
 def packed(result: Result, folder: Path) -> TrialReturn:
-    """A result with its recording, unless that is too large."""
+    """Return a result with its recording, or with an error if that is too large."""
     bundle = folder.parent / _BUNDLE
     pack(folder, bundle)
     size = bundle.stat().st_size
@@ -197,8 +198,9 @@ def packed(result: Result, folder: Path) -> TrialReturn:
 
 
 def _shipped(folder: Path, url: str) -> str:
-    """The UUID of the recording, which is in the pool then."""
-    from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ShippingSource, ship
+    """Ship the recording to the pool, and return its UUID."""
+    from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
+    from webots_mcp.plugins.pool.shipping_source import ShippingSource
 
     recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
     ship(
@@ -210,9 +212,9 @@ def _shipped(folder: Path, url: str) -> str:
 
 
 class _Cancellation:
-    """Whether nobody wants the current task any more: it was cancelled, or its worker closes.
+    """Tells whether the current task was cancelled, or its worker is closing.
 
-    A client that is gone, killed or not, cancels what it asked for.
+    The tasks of a client that has ended, even by being killed, are cancelled.
     """
 
     def __init__(self, worker: Any) -> None:
@@ -220,7 +222,7 @@ class _Cancellation:
         self._key = worker.get_current_task()
 
     def wait(self, timeout: float | None = None, /) -> bool:
-        """Wait for so long; returns whether nobody wants it."""
+        """Wait for a timeout; return whether the task was cancelled."""
         time.sleep(timeout or 0.0)
         task = self._worker.state.tasks.get(self._key)
         return task is None or task.state == "cancelled" or self._closes
@@ -230,24 +232,24 @@ class _Cancellation:
         return self._worker.status.name in ("closing", "closed", "failed")
 
     def as_dask_says(self) -> Exception:
-        """What tells Dask that the task is not done; one whose worker closes runs elsewhere."""
+        """Return the exception that tells Dask to run the task elsewhere, or to end it."""
         from distributed import Reschedule
 
         return Reschedule() if self._closes else StoppedError()
 
 
-# -- where the set is -------------------------------------------------------------------------
+# -- functions of the process that runs the trial set -----------------------------------------
 
 
 class ClusterSimulators:
     """The simulators of a cluster's workers.
 
     Attributes:
-        client: Dask's.
-        address: Of the scheduler.
-        needs: What each worker has to have.
-        most: How many trials run at once at most; None for as many as there are workers.
-        notes: What its owner should know.
+        client: The client of Dask.
+        address: Address of the scheduler.
+        needs: What each worker needs.
+        most: Maximum of trials at once; None for as many as there are simulators.
+        notes: Notes for the user.
     """
 
     def __init__(
@@ -265,10 +267,10 @@ class ClusterSimulators:
 
     @property
     def count(self) -> int:
-        """How many can run at once, now; one where workers may come back.
+        """Return how many trials can run at once now; 1 while missing workers may come back.
 
         Raises:
-            CommandRefusedError: The scheduler is gone, or its workers for a minute.
+            CommandRefusedError: The scheduler was lost, or has had no workers for a minute.
         """
         now_s = time.monotonic()
         if now_s >= self._look_again_s:
@@ -281,7 +283,7 @@ class ClusterSimulators:
         return max(1, min(self._count, self._most or self._count))
 
     def run(self, attempt: TrialAttempt) -> Result:
-        """As `Simulators.run`."""
+        """Run a trial; see `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text
         future: Future[TrialReturn] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
@@ -300,7 +302,7 @@ class ClusterSimulators:
         return returned.result
 
     def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
-        """The result, with its runs in a recording in the folder, as if it had been returned."""
+        """Fetch a shipped recording into the folder; return the result with the run's id there."""
         from webots_mcp.plugins.pool.fetching import fetch
         from webots_mcp.plugins.pool.pool_contents import ChosenRuns, pooled_runs
 
@@ -343,19 +345,19 @@ def cluster(
     most: int | None = None,
     ship_to: str | None = None,
 ) -> Generator[ClusterSimulators]:
-    """The simulators of a cluster, as long as the block goes on.
+    """Connect to the simulators of a cluster for the duration of the block.
 
     Args:
-        address: Of the scheduler.
-        plan: Of the trials.
-        is_stand_in: Whether the stand-in runs them, and not Webots.
-        most: How many trials run at once at most; None for as many as there are workers.
-        ship_to: The URL of a pool through which the recordings come; None for the scheduler.
+        address: Address of the scheduler.
+        plan: The plan of the trials.
+        is_stand_in: Whether the stand-in runs them, not Webots.
+        most: Maximum of trials at once; None for as many as there are simulators.
+        ship_to: URL of a pool that passes the recordings on; None for the scheduler.
 
     Raises:
-        CommandRefusedError: Nobody answers there, no worker has a simulator, or one lacks
-            something.
-        InvalidInputError: It is no address, or Dask is not installed.
+        CommandRefusedError: The scheduler does not answer, no worker has a simulator, or a worker
+            lacks something.
+        InvalidInputError: The address is invalid, or Dask is not installed.
     """
     if ship_to is not None:
         _require_pool(ship_to)
@@ -372,7 +374,7 @@ def _connected(address: str) -> Generator[Any]:
         distributed: Any = import_module("distributed")
     except ImportError as error:
         raise InvalidInputError(explain_extra("a cluster of Dask", "cluster")) from error
-    # That a scheduler was lost is told by who misses it, in a sentence and not by a traceback.
+    # A lost scheduler is reported in a sentence where it is noticed, not by Dask's traceback.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if not _ADDRESS.fullmatch(address):
         raise InvalidInputError(
@@ -399,14 +401,14 @@ def _connected(address: str) -> Generator[Any]:
 
 
 async def _kind_of_server(distributed: Any, address: str) -> str:
-    """`Scheduler` or `Worker`. A `Client` waits without end for the answer of what is neither."""
+    """Return `Scheduler` or `Worker`. A `Client` would wait for ever for any other server."""
     security = distributed.Security().get_connection_args("client")
     async with distributed.rpc(address, timeout=_CONNECT_S, connection_args=security) as server:
         return (await server.identity())["type"]
 
 
 def _require_fit(client: Any, address: str, needs: WorkerRequirements) -> None:
-    """See that there are workers with simulators, which have what they need.
+    """Check that there are workers with simulators, and that they meet all requirements.
 
     Raises:
         CommandRefusedError: There is none, or one lacks something.
@@ -424,18 +426,18 @@ def _require_fit(client: Any, address: str, needs: WorkerRequirements) -> None:
 
 
 def _other_versions(client: Any, workers: list[str]) -> Iterator[str]:
-    """Workers of which Dask tells that they cannot even be asked: ours is not what is there."""
-    told = client.get_versions(packages=["webots_mcp"])["workers"]
+    """Yield workers with another version of webots-mcp, which cannot be asked for the rest."""
+    versions = client.get_versions(packages=["webots_mcp"])["workers"]
     for each in workers:
-        version = told[each]["packages"].get("webots_mcp")
+        version = versions[each]["packages"].get("webots_mcp")
         if version != VERSION:
             has = f"webots-mcp {version}" if version else "no webots-mcp"
-            python = told[each]["host"]["python"]
+            python = versions[each]["host"]["python"]
             yield f"worker {each} (Python {python}) has {has}: here is {VERSION}"
 
 
 def _other_pythons(client: Any) -> list[str]:
-    """Notes on workers whose Python is of another minor version: scores may hang on it."""
+    """Return notes on workers with another minor version of Python, which may change scores."""
     here, workers = python_version(), client.get_versions()["workers"]
     minor = here.split(".")[:2]
     pythons = {each: str(told["host"]["python"]) for each, told in workers.items()}
@@ -447,7 +449,7 @@ def _other_pythons(client: Any) -> list[str]:
 
 
 def _simulators_of(client: Any, address: str) -> dict[str, int]:
-    """How many simulators each worker runs at once, by its address."""
+    """Return how many simulators each worker can run at once, by its address."""
     try:
         workers = client.scheduler_info(n_workers=-1)["workers"]
     except Exception as error:
@@ -467,15 +469,15 @@ def _no_workers(address: str, when: str) -> str:
 
 
 def _call(*arguments: Any) -> Callable[[str], Any]:
-    """What calls a function of that name with these arguments.
+    """Return a function that calls a function by its name with these arguments.
 
-    The scheduler unpacks what it passes on, and need not have this package: only a worker looks
-    the name up.
+    The scheduler unpickles what it passes on, and may lack this package. Only a worker resolves
+    the name.
     """
-    toolz: Any = import_module("toolz")  # a part of Dask
+    toolz: Any = import_module("toolz")  # A dependency of Dask.
     return toolz.compose(methodcaller("__call__", *arguments), resolve_name)
 
 
 def _alone(plan: WorldPlan, values: dict[str, Any]) -> WorldPlan:
-    """A plan of one trial: a worker need not know of the others."""
+    """Return a plan of one trial, as a worker needs no others."""
     return replace(plan, parameters=[values], repeats=1, ranges={}, search=None, sets=0, seed=0)

@@ -1,4 +1,4 @@
-"""Commands about a pool: what is in it, a recording shipped to it, runs of it brought back."""
+"""The commands of pools: `pool` lists or queries, `ship` writes and `fetch` reads back."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.sql import Result
 
 _MOST_NAMED: Final = 3
-_SHORT: Final = 8  # of a UUID: as much of it as tells one from the others
+_SHORT: Final = 8  # Characters of a UUID that tell it from others.
 _ALL: Final = RunFilter()
 
 
@@ -64,7 +64,7 @@ def fetch(
     from webots_mcp.plugins.pool.pool_contents import open_pool
 
     with open_pool(url) as pool:
-        wanted = resolve_filter(pool, choice)  # first: no database is made for nothing
+        wanted = resolve_filter(pool, choice)  # First, so that no database is made in vain.
         with (
             recorded.writer("fetch", create=True) as (here, connection),
             shown_progress("fetching") as progress,
@@ -78,7 +78,7 @@ def fetch(
 
 
 def _as_data(found: FetchResult) -> dict[str, Any]:
-    """The ids of the runs that are here, and what was not taken, by its UUIDs."""
+    """Return the ids of fetched runs, and the UUIDs of runs that were not fetched."""
     return {
         "fetched_run_ids": found.come,
         "known_run_ids": [found.runs[uuid] for uuid in found.known],
@@ -170,7 +170,7 @@ def pool(
 
 
 class _List(NamedTuple):
-    """What a pool holds of a kind, as it is called in JSON; and as rows of a table."""
+    """A list of what a pool holds: its name in JSON, its items, and its table."""
 
     key: str
     found: Sequence[object]
@@ -288,14 +288,16 @@ def ship(
     try:
         if follow:
             _say(f"shipping to {redacted(url)} until Ctrl-C")
-            default_s = 2.0 if is_postgres(url) else 60.0  # of small files there are soon many
+            default_s = (
+                2.0 if is_postgres(url) else 60.0
+            )  # Shorter pauses would make many small files.
             follow_recording(order, report, _say, pause_s or default_s)
         else:
             ship_once(order, report)
             is_done = True
     finally:
-        is_told = json and isinstance(sys.exc_info()[1], WebotsMCPError)  # as the only object
-        if not is_told:
+        is_reported = json and isinstance(sys.exc_info()[1], WebotsMCPError)  # As the only object.
+        if not is_reported:
             _show_report(redacted(url), report, is_done=is_done, as_json=json)
 
 

@@ -1,10 +1,10 @@
-"""What is known of Webots from its sources alone, each as a check of a Webots that runs.
+"""Checks of a running Webots, one for each fact that is known from its sources only.
 
-docs/webots.md names for each of its statements the check that would confirm it. The docstring of a
-check says what the sources say, and what works still where that is not so. A check returns what it
-measured, or fails with what it saw. `running_NAME` is called with Webots in real time, of which the
-newest row of the rover is `bench.before`; `streaming_NAME` the same with --stream, and `check_NAME`
-starts what it needs.
+docs/webots.md names the check of each of its statements. The docstring of a check is printed: what
+the sources say, and after "otherwise" what still works if that is wrong. A check returns what it
+measured, or fails with what it observed. `running_NAME` is called with Webots in real time, after
+the rover has recorded `bench.before`; `streaming_NAME` the same with --stream. `check_NAME` starts
+Webots itself.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ NOT_TRIED: Final = {
 }
 _STEP_S: Final = 0.016
 _SAME: Final = 1e-6
-_LOAD_S: Final = 40.0  # until a world is there again
+_LOAD_S: Final = 40.0  # Until a world is loaded again.
 _STALL_S: Final = 6.0
 _STATUS: Final = 7
 _MASS: Final = "BALL.physics.mass"

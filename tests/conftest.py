@@ -15,7 +15,17 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.recordings.bridge import record
+from tests.recordings.fixtures import (
+    database,
+    empty,
+    looked_at,
+    recorded,
+    rover,
+    rover_recordings,
+)
 from webots_mcp.database.connection import connect
+
+__all__ = ["database", "empty", "looked_at", "recorded", "rover", "rover_recordings"]
 
 # The same examples each time, so that a red run was made red by the change that it tests;
 # `pytest --hypothesis-profile=explore` looks for new ones. No machine is too slow for them.

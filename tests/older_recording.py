@@ -1,16 +1,18 @@
-"""A recording of another schema than this one."""
+"""A recording of the previous schema."""
 
 from contextlib import closing
 from pathlib import Path
 
-from webots_mcp.contract import SCHEMA_VERSION
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.contract import PREVIOUS_SCHEMA_VERSION, new_uuid
+from webots_mcp.database.connection import connect, statements_of
+from webots_mcp.database.upgrade import PREVIOUS_SCHEMA_FILE
 
-OLDER_SCHEMA = SCHEMA_VERSION - 1
+OLDER_SCHEMA = PREVIOUS_SCHEMA_VERSION
 
 
 def make_older(file: Path) -> None:
-    """Make a recording that says of itself that it is one of the schema before."""
+    """Make an empty recording as the version before made it."""
     with closing(connect(file, "writer", create=True)) as connection:
-        create_schema(connection)
-        connection.execute(f"PRAGMA user_version = {OLDER_SCHEMA}")
+        for statement in statements_of(PREVIOUS_SCHEMA_FILE):
+            connection.execute(statement)
+        connection.execute("INSERT INTO recording VALUES (?, 0)", (new_uuid(),))

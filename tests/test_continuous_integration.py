@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests.lowest import lowest
-from tests.webots.conftest import CONTROLLER, webots, write_project
+from tests.simulator.conftest import CONTROLLER, webots, write_project
 
 yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
 __all__ = ["webots"]
@@ -83,9 +83,9 @@ def test_the_header_is_compiled_as_the_workflow_does(case: dict[str, str], tmp_p
     words = shlex.split(case["compile"])
     if shutil.which(words[0]) is None:
         pytest.skip(f"there is no {words[0]}")
-    names = {"tests/journal/driver.c", "webots_mcp/webots_mcp.h"}
+    names = {"tests/store/journal/driver.c", "webots_mcp/webots_mcp.h"}
     assert all((CHECKOUT / name).is_file() for name in names)
-    source = CHECKOUT / "tests/journal/driver.c"
+    source = CHECKOUT / "tests/store/journal/driver.c"
     program = tmp_path / "driver"
     subprocess.run([*words, f"-I{CHECKOUT / 'webots_mcp'}", source, "-o", program], check=True)
     environment = os.environ | {"WEBOTS_MCP_DATA_DIR": str(tmp_path / "recorded")}

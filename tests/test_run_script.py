@@ -96,4 +96,4 @@ def test_the_tests_run_side_by_side_unless_pytest_is_told_what_to_do(
         return subprocess.run(line, env=environment, capture_output=True, text=True).stdout
 
     assert asked().split()[:3] == ["-m", "pytest", "-n"]
-    assert asked("--pdb", "tests/test_naming.py") == "-m pytest --pdb tests/test_naming.py\n"
+    assert asked("--pdb", "tests/signals") == "-m pytest --pdb tests/signals\n"

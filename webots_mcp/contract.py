@@ -14,7 +14,8 @@ from typing import Final, Literal, NamedTuple, get_args
 
 VERSION: Final = "0.1.0"
 APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
-SCHEMA_VERSION: Final = 10  # PRAGMA user_version of a database that this version reads and writes
+PREVIOUS_SCHEMA_VERSION: Final = 10  # of recordings that `webots-mcp import` brings over
+SCHEMA_VERSION: Final = 11  # PRAGMA user_version of a database that this version reads and writes
 
 DATABASE_NAME: Final = "webots.db"
 WORLD_ENDING: Final = ".wbt"
@@ -102,7 +103,7 @@ class BuiltInAction(NamedTuple):
     runs_user_code: bool = False
 
 
-# The one list of them. What each does is the function of that name in `bridge.actions`.
+# The one list of them. What each does is the method of that name in `bridge/*_actions.py`.
 BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "pause": BuiltInAction(ends_steps=True),
     "resume": BuiltInAction(ends_steps=True),

@@ -39,8 +39,8 @@ parentheses that holds the true one nineteen times of twenty.
 
 The recordings are drawn, since only so is it known what happened in them. The robots, their
 noise and their faults are the authors' idea of real ones; the rules were made with other draws
-of the same kinds. No recording of a real robot was labelled yet. `python -m tests.detection
---wrong` and `python -m tests.checks` show the single cases."""
+of the same kinds. No recording of a real robot was labelled yet. `python -m tests.judging.detection
+--wrong` and `python -m tests.judging.checks` show the single cases."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,9 +15,9 @@ import numpy as np
 
 from tests.accuracy.page import share, table
 from tests.benchmarks.core import Bench
-from tests.detection.asking import UNHURRIED_S
-from tests.detection.labelled import Array, LabelledRun
-from tests.detection.writing import Writer
+from tests.judging.detection.asking import UNHURRIED_S
+from tests.judging.detection.labelled import Array, LabelledRun
+from tests.judging.detection.writing import Writer
 from tests.memory import memory_connection
 from webots_mcp.analysis.summary import MOST_CHANCE, Outcome, rank
 from webots_mcp.judging.comparison import Comparison, compare_runs

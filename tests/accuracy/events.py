@@ -12,14 +12,14 @@ from typing import Final
 
 from tests.accuracy.page import percent, share, table
 from tests.benchmarks.core import Bench, duration
-from tests.checks import judging as checks_judging
-from tests.detection.drawing import KINDS as RECORDINGS
-from tests.detection.driving import NOISE_LEVELS_M
-from tests.detection.judging import Tally, median, nine_in_ten
-from tests.detection.labelled import SETTING, Measure, Setting
-from tests.detection.measuring import Report, measure
-from tests.detection.sensing import READING_NOISES_M
-from tests.detection.swinging import NOISE_SHARE_LEVELS
+from tests.judging.checks import judging as checks_judging
+from tests.judging.detection.drawing import KINDS as RECORDINGS
+from tests.judging.detection.driving import NOISE_LEVELS_M
+from tests.judging.detection.judging import Tally, median, nine_in_ten
+from tests.judging.detection.labelled import SETTING, Measure, Setting
+from tests.judging.detection.measuring import Report, measure
+from tests.judging.detection.sensing import READING_NOISES_M
+from tests.judging.detection.swinging import NOISE_SHARE_LEVELS
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.judging.detection.events import KINDS
 from webots_mcp.judging.detection.kinds import EventOptions

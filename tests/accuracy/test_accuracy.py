@@ -11,7 +11,7 @@ import pytest
 from tests.accuracy.__main__ import PARTS, SHOWN, figures, page_of
 from tests.accuracy.page import FIGURES, PAGE, README, Part, sections, share
 from tests.benchmarks.core import Bench
-from tests.checks.labelled import FAULTS, WRITTEN
+from tests.judging.checks.labelled import FAULTS, WRITTEN
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.judging.detection.events import kind_names
 

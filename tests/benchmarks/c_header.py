@@ -15,7 +15,7 @@ from tests.benchmarks.core import Bench, Line, NotMeasurableError, Target, bench
 from webots_mcp import MCPBridge
 from webots_mcp.contract import C_HEADER
 from webots_mcp.standin import InProcessRobot
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 _PROGRAM = """
 #include <math.h>
@@ -57,7 +57,7 @@ def measure_c(bench: Bench) -> Iterable[Line]:
     c, python = median(ours), median(theirs)
     beside, target = f"publish() in Python {duration(python)}", Target(20.0)
     yield Line("publish, 40 values", duration(c), beside, c * 1e6, "us", target)
-    started_s, recording = time.process_time(), Recording(folder / "webots.db", folder)
+    started_s, recording = time.process_time(), RecordingAccess(folder / "webots.db", folder)
     with recording.reader() as connection:  # as many as a question takes in
         spent_s = time.process_time() - started_s
         intake_s = spent_s / connection.execute("SELECT count(*) FROM state").fetchone()[0]

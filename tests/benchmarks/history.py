@@ -23,10 +23,10 @@ from webots_mcp.judging.trends import trends
 from webots_mcp.plotting import plot
 from webots_mcp.questions.monitor import look_back
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.logs import LogFilter, Window, count_lines, newest_lines
+from webots_mcp.store.logs import LogFilter, LogWindow, count_lines, newest_lines
 from webots_mcp.store.reading.catalogue import list_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.series import query_history
 
 _ROWS: Final = 1_000_000
@@ -106,7 +106,7 @@ def _questions(
 ) -> Iterator[tuple[str, Callable[[], object], float]]:
     """What is asked, how, and what is aimed at for a million rows, in seconds."""
     whole, minute, ten = (find_range(db, Scope(last_s=last_s)) for last_s in (None, 60, 600))
-    recording, lines = Recording(file, file.parent), Window(-math.inf, math.inf)
+    recording, lines = RecordingAccess(file, file.parent), LogWindow(-math.inf, math.inf)
     asked, never = LogFilter(1, lines, text="SLIP"), "battery_v < 1 and pose.0 > 1000"
     rare = EventOptions(kinds=("condition",), where=never)
     yield "last minute of 10 signals", lambda: query_history(db, minute, _TEN), 0.025

@@ -167,7 +167,7 @@ def measure_watching(bench: Bench) -> Iterable[Line]:
 
         blocks = {name: partial(block, robot) for name, robot in robots.items()}
         taken = {name: Samples(found) for name, found in alternate(blocks, bench.count(12)).items()}
-        look = bridge._session._watchdog.look  # pyright: ignore[reportPrivateUsage]
+        look = bridge._session._watchdog.check  # pyright: ignore[reportPrivateUsage]
         looks = bench.count(500, least=10)
         look_s = processor_s(lambda: [look() for _ in range(looks)]) / looks
     plain = taken["plain"].p50

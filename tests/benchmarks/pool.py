@@ -28,7 +28,7 @@ from tests.benchmarks.core import (
 )
 from tests.benchmarks.history import record
 from tests.benchmarks.ways import make_states
-from tests.pool.lab import short_runs
+from tests.plugins.pool.lab import short_runs
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import connect as connect_recording
@@ -45,7 +45,7 @@ from webots_mcp.plugins.pool.postgres_connection import Connection, connect
 from webots_mcp.plugins.pool.postgres_pool import PostgresShipment
 from webots_mcp.plugins.pool.postgres_schema import prepare
 from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 _RESOLUTION_S: Final = 0.01  # of a process's times
 _VALUES: Final = ("state", "row_group", "chunk", "value")
@@ -75,7 +75,9 @@ def measure_pool(bench: Bench) -> Iterable[Line]:
 def measure_listing(bench: Bench) -> Iterable[Line]:
     recordings = bench.count(1000, 20)
     with short_runs(bench.folder / "robot") as recorded:
-        recording = Recording(recorded.folder / DATABASE_NAME, recorded.folder, read_only=True)
+        recording = RecordingAccess(
+            recorded.folder / DATABASE_NAME, recorded.folder, read_only=True
+        )
         url = str(bench.place("listed"))
         ship(ShippingJob(recording, partial(open_pool, url, ships=True)), ShippingReport())
     (shipped,) = Path(url).glob("recording=*")
@@ -118,7 +120,7 @@ def measure_room(bench: Bench) -> Iterable[Line]:
             what = f"{name}, {'states and chunks' if full else 'chunks'}"
             bench.say(what)
             url = make()
-            recording = Recording(database, database.parent, read_only=True)
+            recording = RecordingAccess(database, database.parent, read_only=True)
             order = ShippingJob(recording, partial(open_pool, url, ships=True), full=full)
             shipped_s = processor_s(lambda order=order: ship(order, ShippingReport()))
             here = bench.place(what)

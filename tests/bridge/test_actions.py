@@ -12,7 +12,6 @@ from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import actions
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import DEFAULT_WORLD
@@ -295,11 +294,11 @@ def test_what_is_no_name_of_a_world_is_refused_in_words(
     assert error == f"world must be the full path of a world file, not {world!r:.200}"
 
 
-def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:
-    known = actions._known  # pyright: ignore[reportPrivateUsage]
+def test_each_action_that_the_server_offers_is_one_that_bridges_run(bridge: MCPBridge) -> None:
+    known = bridge._session.control._actions  # pyright: ignore[reportPrivateUsage]
     assert {name: action.__name__ for name, action in known.items()} == {
         name: name for name in BUILT_IN_ACTIONS
-    }  # pyright: ignore[reportPrivateUsage]
+    }
 
 
 @pytest.mark.parametrize(

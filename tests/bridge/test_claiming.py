@@ -13,7 +13,7 @@ import pytest
 
 from tests.bridge.conftest import Recording, eager, heartbeat_now
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import actions
+from webots_mcp.bridge import control
 from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
@@ -71,7 +71,7 @@ def test_an_interrupt_between_claim_and_start_leaves_no_command_claimed(
     sent = recording.send("dance")
 
     def interrupt(frame: FrameType, event: str, _: object) -> Any:
-        if frame.f_code.co_filename != actions.__file__:
+        if frame.f_code.co_filename != control.__file__:
             return None
         if event == "line" and frame.f_lineno >= line and frame.f_locals.get("command"):
             sys.settrace(None)
@@ -93,7 +93,7 @@ def test_an_interrupt_between_claim_and_start_leaves_no_command_claimed(
 
 
 def _line_after(code: str) -> int:
-    lines = Path(actions.__file__).read_text("utf-8").splitlines()
+    lines = Path(control.__file__).read_text("utf-8").splitlines()
     return next(number for number, line in enumerate(lines, 1) if code in line) + 1
 
 

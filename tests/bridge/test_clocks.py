@@ -14,7 +14,7 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.database.connection import connect
 from webots_mcp.database.liveness import process_identity, reap
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.recording import look
+from webots_mcp.store.recording import view_robot
 
 HOUR_S = 3600.0
 
@@ -48,7 +48,7 @@ def test_a_session_lives_and_runs_whatever_the_clock_is_set_to(
     judge_all(recording)
     assert recording.rows("SELECT end_reason FROM session") == [None]
     connection = connect(recording.database, "reader")
-    view = look(connection, "rover")
+    view = view_robot(connection, "rover")
     assert view.robot.live
     assert view.status.text == "running"
     connection.close()

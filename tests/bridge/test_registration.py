@@ -15,7 +15,7 @@ from tests.bridge.conftest import Recording
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.recording import look
+from webots_mcp.store.recording import view_robot
 
 DAY_S = 86_400.0
 
@@ -151,8 +151,8 @@ def test_long_names_that_begin_alike_differ_and_are_found_by_all_of_them(
     assert len(set(recorded)) == 2
     assert all(len(name) == 200 and name.startswith("r" * 150) for name in recorded)
     with closing(connect(database, "reader")) as connection:
-        assert [look(connection, name).robot.name for name in names] == recorded
-        assert [look(connection, name).robot.name for name in recorded] == recorded
+        assert [view_robot(connection, name).robot.name for name in names] == recorded
+        assert [view_robot(connection, name).robot.name for name in recorded] == recorded
     for bridge in bridges:
         bridge.close()
     assert sorted(recording.rows("SELECT name FROM robot")) == sorted(recorded)

@@ -85,7 +85,7 @@ def test_names_beyond_the_limit_cost_no_search_for_their_places() -> None:
     before = sys.getprofile()
     sys.setprofile(count)
     try:
-        names.look(state, text, lambda _: True)
+        names.register(state, text, lambda _: True)
     finally:
         sys.setprofile(before)
     assert MAX_SIGNALS < calls < len(state)
@@ -102,7 +102,7 @@ def test_names_stand_where_the_last_value_of_that_name_does() -> None:
         entered.update(some)
         return True
 
-    SignalNames().look(state, json.dumps(state), enter)
+    SignalNames().register(state, json.dumps(state), enter)
     assert {name: each[:2] for name, each in entered.items()} == places(state)
 
 

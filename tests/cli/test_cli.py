@@ -241,10 +241,10 @@ def test_the_tail_of_one_robot_leaves_out_the_others(
 
 def test_a_follower_sees_each_line_once(rover: RecordedRobot) -> None:
     follower = Follower(rover.connection)
-    assert [line.kind for line in follower.look()] == ["state"]
-    assert follower.look() == []
+    assert [line.kind for line in follower.read_new()] == ["state"]
+    assert follower.read_new() == []
     command = CommandQueue(rover.connection).enqueue(rover.id, "go")
-    assert [line.text for line in follower.look()] == [f"#{command.id} go {{}}"]
+    assert [line.text for line in follower.read_new()] == [f"#{command.id} go {{}}"]
     CommandQueue(rover.connection).cancel(command.id, "no")
-    assert [line.text for line in follower.look()] == [f"#{command.id} go cancelled no"]
-    assert follower.look() == []
+    assert [line.text for line in follower.read_new()] == [f"#{command.id} go cancelled no"]
+    assert follower.read_new() == []

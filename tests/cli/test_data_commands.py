@@ -19,7 +19,7 @@ import pytest
 
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.retention import Limit, parse_limit, size_text
 
 Say = Callable[..., str]
@@ -99,7 +99,7 @@ def test_export_writes_the_trials_of_a_set(
     with closing(connect(database, "writer")) as connection:
         set_id = create_trial_set(connection, "{}", [{"kp": 1.0}, {"kp": 2.0}])
         for trial in trials_of(connection, set_id):
-            finish_trial(connection, trial, Result(None, trial.values["kp"] * 2, None))
+            finish_trial(connection, trial, TrialResult(None, trial.values["kp"] * 2, None))
     file = tmp_path / "trials.csv"
     assert say("export", "--trials", str(set_id), "-o", str(file)) == f"{file}: 2 rows\n"
     rows = list(csv.DictReader(io.StringIO(file.read_text())))
@@ -168,7 +168,7 @@ def test_import_takes_in_another_recording_with_its_trials_once(
     with closing(connect(database, "writer")) as connection:
         connection.execute("UPDATE session SET ended_wall_time_s = 1.0")
         set_id = create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}])
-        finish_trial(connection, trials_of(connection, set_id)[0], Result(2, 4.5, None))
+        finish_trial(connection, trials_of(connection, set_id)[0], TrialResult(2, 4.5, None))
     new = tmp_path / "new" / "webots.db"
     for told in ("new here: run 1 to 2", "nothing is new: run 1 to 2 was here already"):
         assert main(["import", str(database), "--data-dir", str(new.parent)]) == 0

@@ -15,8 +15,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.simulator.conftest import CONTROLLER, free_port, started, webots, write_project
 from tests.waiting import wait_for
-from tests.webots.conftest import CONTROLLER, free_port, started, webots, write_project
 
 __all__ = ["webots"]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.conftest import Recording
+from tests.bridge.processes.conftest import Start, data_dir, filed, has_states, start
 from tests.cli.conftest import Cli
-from tests.processes.conftest import Start, data_dir, filed, has_states, start
 
 __all__ = ["data_dir", "filed", "start"]  # fixtures
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.checks.judging import HEALTHY
-from tests.checks.labelled import FAULTS, WRITTEN, healthy, record
 from tests.golden.drawing import KINDS
+from tests.judging.checks.judging import HEALTHY
+from tests.judging.checks.labelled import FAULTS, WRITTEN, healthy, record
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, bundled
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.standin import Simulation

@@ -21,7 +21,7 @@ from mcp.client.streamable_http import streamable_http_client
 from mcp.server import MCPServer
 
 from tests.golden.drawing import Kind
-from tests.report.conftest import Shown
+from tests.plugins.report.conftest import Shown
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError

@@ -25,7 +25,7 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
 
@@ -134,7 +134,7 @@ def draw_trials(folder: Path) -> None:
         for trial, (speed, gait, score) in zip(trials, _TRIED, strict=True):
             run_id = _try(recorder, session_id, robot_id, speed, gait, score)
             failed = None if score is not None else "ValueError: it fell over"
-            finish_trial(connection, trial, Result(run_id, score, failed, "for_s", 10.0))
+            finish_trial(connection, trial, TrialResult(run_id, score, failed, "for_s", 10.0))
         connection.execute("UPDATE session SET ended_wall_time_s = 2e9, end_reason = 'finished'")
         _sum_up(connection)
 

@@ -16,7 +16,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting import plot
 from webots_mcp.plotting.canvas import Sheet
 from webots_mcp.plotting.trials import compose_trials, plot_trials
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 
 SVG = Sheet(image_format="svg")
 Tried = Callable[..., sqlite3.Connection]
@@ -31,7 +31,9 @@ def tried() -> Iterator[Tried]:
             values = [parameters for parameters, _ in trials]
             set_id = create_trial_set(connection, '{"score": "max(x)"}', values)
             for trial, (_, score) in zip(trials_of(connection, set_id), trials, strict=True):
-                finish_trial(connection, trial, Result(None, score, None if score else "it fell"))
+                finish_trial(
+                    connection, trial, TrialResult(None, score, None if score else "it fell")
+                )
             return connection
 
         yield write

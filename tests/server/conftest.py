@@ -14,9 +14,9 @@ from mcp import Client
 from mcp.types import CallToolResult, ImageContent, TextContent
 
 from tests.recordings.rows import Recorded
+from tests.simulator.conftest import start_webots as start_webots
+from tests.simulator.conftest import webots as webots
 from tests.waiting import until
-from tests.webots.conftest import start_webots as start_webots
-from tests.webots.conftest import webots as webots
 from webots_mcp import MCPBridge
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import InProcessSupervisor

@@ -19,7 +19,7 @@ from tests.server.conftest import Connect, Driver, ask, fail, text_of
 from webots_mcp import MemoryDatabase
 from webots_mcp.questions import all_questions
 from webots_mcp.server.mcp_server import tool_of
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = pytest.mark.anyio
 
@@ -288,7 +288,7 @@ def test_a_suggested_call_has_all_that_its_tool_requires_and_nothing_else(
     name: str, unknown: dict[str, Any], own: dict[str, Any]
 ) -> None:
     (question,) = (each for each in all_questions() if each.name == name)
-    recording = Recording(MemoryDatabase(), Path("unused"))
+    recording = RecordingAccess(MemoryDatabase(), Path("unused"))
     tool = tool_of(question, recording)
     arguments = own | {key: value for key, value in unknown.items() if key not in own}
     allowed = tool.parameters["properties"]

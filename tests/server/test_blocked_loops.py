@@ -16,7 +16,7 @@ from anyio import to_thread
 from mcp import Client
 
 from tests.bridge.conftest import Recording
-from tests.processes.conftest import data_dir, filed, has_states, start  # fixtures
+from tests.bridge.processes.conftest import data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, text_of
 from tests.waiting import until
 from webots_mcp.contract import HANG_VARIABLE
@@ -25,8 +25,8 @@ from webots_mcp.database.queue import CommandQueue, fetch_command
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.steering.dispatch import withdraw_if_blocked
-from webots_mcp.store.recording import Recording as Store
-from webots_mcp.store.robots import WAITING_IN_STEP, Block, find_block
+from webots_mcp.store.recording import RecordingAccess as Store
+from webots_mcp.store.robots import WAITING_IN_STEP, BlockedLoop, find_block
 
 __all__ = ["data_dir", "filed", "start"]
 pytestmark = pytest.mark.anyio
@@ -140,7 +140,7 @@ async def test_a_step_that_takes_no_longer_than_others_is_not_taken_for_a_pause(
 ) -> None:
     simulation, store = await paused_in_webots(start, filed, data_dir)
 
-    def block() -> Block | None:
+    def block() -> BlockedLoop | None:
         with store.view() as view:
             return find_block(view.connection, view.session, view.run, view.now_s)
 

@@ -18,14 +18,14 @@ from typing import Any
 import anyio
 import pytest
 
+from tests.database.test_queue import claim
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask, fail
-from tests.store.test_queue import claim
 from tests.waiting import until
 from webots_mcp.database.connection import connect as connect_database
 from webots_mcp.database.queue import CommandQueue, fetch_command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
 
 pytestmark = pytest.mark.anyio
@@ -368,7 +368,7 @@ async def test_who_is_interrupted_while_a_command_is_being_sent_leaves_none_behi
 ) -> None:
     robot, sending = recorded.robot(), threading.Event()
 
-    class Told(Recording):
+    class Told(RecordingAccess):
         @contextmanager
         def writer(self) -> Generator[sqlite3.Connection]:
             sending.set()
@@ -377,7 +377,7 @@ async def test_who_is_interrupted_while_a_command_is_being_sent_leaves_none_behi
 
     async def report(done: float, total: float | None, text: str) -> None: ...
 
-    with OpenRequest(Recording(file, file.parent), BY_COMMAND_LINE, ["pause"], {}):
+    with OpenRequest(RecordingAccess(file, file.parent), BY_COMMAND_LINE, ["pause"], {}):
         recorded.connection.execute("BEGIN IMMEDIATE")  # the sending thread waits for the lock
         dispatcher = Dispatcher(Told(file, file.parent), report)
         asking = asyncio.ensure_future(dispatcher.ask("rover", "pause", 10))

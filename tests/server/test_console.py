@@ -16,19 +16,19 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.conftest import Connect, ask, fail, text_of
-from tests.waiting import until
-from tests.webots.conftest import (
+from tests.simulator.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
     wait_for_line,
     write_project,
 )
+from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.simulator import console
 from webots_mcp.simulator.console import belongs
 from webots_mcp.simulator.instances import instances
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = pytest.mark.anyio
 
@@ -85,7 +85,7 @@ async def test_why_a_controller_never_recorded_is_told_before_there_is_a_run(
 ) -> None:
     world = write_project(tmp_path / "project", FAILS)
     data = tmp_path / "project" / "mcp_data"
-    Recording(data / "webots.db", data).create()
+    RecordingAccess(data / "webots.db", data).create()
     async with Client(create_server(data / "webots.db", data)) as client:
         process = start_webots("--stdout", "--stderr", f"--port={free_port()}", world)
         wait_for_line(process, "about to fail")
@@ -108,8 +108,8 @@ async def test_a_webots_whose_controllers_record_elsewhere_is_not_followed(
     wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
     (elsewhere,) = instances()
     for folder, is_its in ((data, False), (tmp_path / "trial", True)):
-        Recording(folder / "webots.db", folder).create()
-        assert belongs(elsewhere, Recording(folder / "webots.db", folder)) == is_its
+        RecordingAccess(folder / "webots.db", folder).create()
+        assert belongs(elsewhere, RecordingAccess(folder / "webots.db", folder)) == is_its
 
 
 async def test_a_server_that_only_reads_follows_nothing_and_says_so(

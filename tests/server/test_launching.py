@@ -15,14 +15,14 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, ask_until, fail
-from tests.waiting import until
-from tests.webots.conftest import (
+from tests.simulator.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
     wait_for_line,
     write_project,
 )
+from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.setup.file_change import apply

@@ -12,14 +12,14 @@ from anyio import to_thread
 from mcp import Client
 
 from tests.server.conftest import ask
-from tests.waiting import until
-from tests.webots.conftest import (
+from tests.simulator.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
     wait_for_line,
     write_project,
 )
+from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.file_change import apply
 from webots_mcp.setup.project_edits import controller_change, with_observer

@@ -11,7 +11,7 @@ import pytest
 from mcp import Client
 
 from tests.bridge.conftest import Recording
-from tests.processes.conftest import data_dir, filed, has_states, start  # fixtures
+from tests.bridge.processes.conftest import data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, fail
 from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server

@@ -14,14 +14,14 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, Driver, ask, ask_until, fail
-from tests.webots.conftest import (
+from tests.simulator.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
     wait_for_line,
     write_project,
 )
-from tests.webots.server import WebotsServer
+from tests.simulator.webots_server import WebotsServer
 from webots_mcp.contract import host_name
 from webots_mcp.server.mcp_server import create_server
 

@@ -26,7 +26,7 @@ from tests.waiting import until
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.steering.dispatch import Dispatcher, require_possible
 from webots_mcp.steering.routes import CLAIMING_S
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
 
 pytestmark = pytest.mark.anyio
@@ -135,7 +135,7 @@ async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
     async def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    recording = Recording(file, file.parent)
+    recording = RecordingAccess(file, file.parent)
     async with connect() as client:
         with pytest.raises(KeyboardInterrupt):
             async with OpenRequest(recording, BY_COMMAND_LINE, ["webots_run"], {}):
@@ -228,7 +228,7 @@ def test_a_change_in_the_newest_row_is_not_the_one_that_is_waited_for(recorded: 
     for n, mode in enumerate(("cruise", "turn")):
         robot.state(1.0 + n, {"mode": mode})
     assert isinstance(recorded.database, Path)
-    recording = Recording(recorded.database, recorded.database.parent)
+    recording = RecordingAccess(recorded.database, recorded.database.parent)
     require_possible(recording, None, "changed(mode)", None, reset=False)
     with pytest.raises(CommandRefusedError, match=r"since 2\.000 s"):
         require_possible(recording, None, "mode == 'turn'", None, reset=False)

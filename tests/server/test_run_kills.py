@@ -16,7 +16,7 @@ from mcp import Client, MCPError, StdioServerParameters
 from mcp.types import CallToolResult
 
 from tests.bridge.conftest import Recording
-from tests.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
+from tests.bridge.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, text_of
 from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server

@@ -12,9 +12,9 @@ import anyio
 import pytest
 
 from tests.bridge.conftest import Recording
-from tests.observer.conftest import OBSERVER
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
+from tests.simulator.observer.conftest import OBSERVER
 from tests.waiting import until
 from webots_mcp import MCPBridge
 from webots_mcp.simulator.observer import observe

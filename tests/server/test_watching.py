@@ -13,7 +13,7 @@ from tests.server.conftest import Connect, ask
 from tests.server.story import rows_of
 from webots_mcp.answers.movement import movement
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = pytest.mark.anyio
 
@@ -104,7 +104,7 @@ def test_a_movement_says_from_when_on_rows_were_not_read(
     recorded.connection.execute("BEGIN")
     drive(rover, *([0.01 * step, 0] for step in range(3000)))
     recorded.connection.execute("COMMIT")
-    with Recording(recorded.database, tmp_path).view(None, None) as view:
+    with RecordingAccess(recorded.database, tmp_path).view(None, None) as view:
         whole = find_range(view.connection, Scope())
         answer = movement(view, whole, 0)
     assert answer is not None

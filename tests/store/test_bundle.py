@@ -20,7 +20,7 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import DatabaseError, InvalidInputError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import is_bundle, merge, settled, unpacked, write_bundle
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 
 OF_RUN = ("state", "kept_stretch", "kept_state", "log", "event", "image", "parameter_value")
 # What a row is called, and where it stands, in each recording; and whether it is in chunks.
@@ -98,7 +98,7 @@ def there(tmp_path: Path) -> Folder:
         connection.execute("UPDATE parameter_value SET command_id = run_id")
         set_id = create_trial_set(connection, "{}", [{"kp": 1.0}, {"kp": 2.0}, {"kp": 3.0}])
         for trial, run_id in zip(trials_of(connection, set_id), (1, 2), strict=False):
-            finish_trial(connection, trial, Result(run_id, 1.5 * run_id, None))
+            finish_trial(connection, trial, TrialResult(run_id, 1.5 * run_id, None))
     return folder
 
 

@@ -18,7 +18,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.parameters import (
-    Result,
+    TrialResult,
     create_trial_set,
     fetch_trial_set,
     find_trial_set,
@@ -183,10 +183,10 @@ def trials_in_both(target: sqlite3.Connection, source: Path, folder: Path) -> li
     with closing(connect(source, "writer")) as connection:
         asked = [{"kp": 1.0}, {"kp": 2.0}, {"kp": 3.0}]
         set_id = create_trial_set(connection, '{"score": "duration"}', asked)
-        finish_trial(connection, trials_of(connection, set_id)[0], Result(1, 1.5, None))
+        finish_trial(connection, trials_of(connection, set_id)[0], TrialResult(1, 1.5, None))
     merge(target, folder, source)
     with closing(connect(source, "writer")) as connection:
-        finish_trial(connection, trials_of(connection, set_id)[1], Result(2, 4.5, None))
+        finish_trial(connection, trials_of(connection, set_id)[1], TrialResult(2, 4.5, None))
     found = find_trial_set(target)
     assert found is not None
     return [each.id for each in trials_of(target, found)]
@@ -216,7 +216,7 @@ def test_what_was_tried_here_or_is_about_to_be_stays_what_it_is_here(
     second = trials_of(target, 1)[1]
     assert second.status == "waiting"
 
-    finish_trial(target, second, Result(None, 7.0, None))
+    finish_trial(target, second, TrialResult(None, 7.0, None))
     lay_down(target, 1, lease)
     merge(target, tmp_path / "here", source)
     assert trials_of(target, 1)[1].score == 7.0
@@ -229,7 +229,7 @@ def test_trial_sets_come_with_their_runs_once_and_without_who_worked_on_them(
         set_id = create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}, {"kp": 2.0}])
         take_up(connection, set_id)
         first, _ = trials_of(connection, set_id)
-        finish_trial(connection, first, Result(2, 4.5, None))
+        finish_trial(connection, first, TrialResult(2, 4.5, None))
         (uuid,) = connection.execute("SELECT uuid FROM run WHERE id = 2").fetchone()
     for _ in range(2):
         runs = merge(target, tmp_path / "here", source)

@@ -14,14 +14,14 @@ import pytest
 
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import NoDatabaseError
-from webots_mcp.store.recording import OpenReaders, Recording
+from webots_mcp.store.recording import OpenReaders, RecordingAccess
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Iterator[Recording]:
+def recording(tmp_path: Path) -> Iterator[RecordingAccess]:
     make(tmp_path / "webots.db", "first")
     readers = OpenReaders()
-    yield Recording(tmp_path / "webots.db", tmp_path, readers=readers)
+    yield RecordingAccess(tmp_path / "webots.db", tmp_path, readers=readers)
     readers.close()
 
 
@@ -35,13 +35,13 @@ def uuid_of(connection: sqlite3.Connection) -> str:
     return connection.execute("SELECT uuid FROM recording").fetchone()[0]
 
 
-def ask(recording: Recording) -> str:
+def ask(recording: RecordingAccess) -> str:
     with recording.reader() as connection:
         return uuid_of(connection)
 
 
 def test_a_file_that_is_deleted_while_it_is_asked_is_missing_then_and_no_connection_is_left(
-    recording: Recording, tmp_path: Path
+    recording: RecordingAccess, tmp_path: Path
 ) -> None:
     with recording.reader() as connection:
         (tmp_path / "webots.db").unlink()
@@ -56,7 +56,7 @@ def test_a_file_that_is_deleted_while_it_is_asked_is_missing_then_and_no_connect
 
 
 def test_a_file_that_is_replaced_while_it_is_asked_is_the_one_that_the_next_question_reads(
-    recording: Recording, tmp_path: Path
+    recording: RecordingAccess, tmp_path: Path
 ) -> None:
     make(tmp_path / "other.db", "second")
     with recording.reader() as connection:
@@ -67,7 +67,7 @@ def test_a_file_that_is_replaced_while_it_is_asked_is_the_one_that_the_next_ques
     assert ask(recording) == "second"
 
 
-def test_a_file_that_was_damaged_is_opened_anew(recording: Recording, tmp_path: Path) -> None:
+def test_a_file_that_was_damaged_is_opened_anew(recording: RecordingAccess, tmp_path: Path) -> None:
     assert ask(recording) == "first"
     (tmp_path / "webots.db").write_bytes(b"")
     with pytest.raises(NoDatabaseError, match="empty"):
@@ -75,7 +75,7 @@ def test_a_file_that_was_damaged_is_opened_anew(recording: Recording, tmp_path: 
 
 
 def test_what_is_in_use_when_the_server_ends_is_closed_when_it_is_given_back(
-    recording: Recording,
+    recording: RecordingAccess,
 ) -> None:
     assert recording.readers is not None
     with recording.reader() as connection:
@@ -84,7 +84,9 @@ def test_what_is_in_use_when_the_server_ends_is_closed_when_it_is_given_back(
         connection.execute("SELECT 1")
 
 
-def test_many_at_once_are_answered_each_by_a_connection_of_its_own(recording: Recording) -> None:
+def test_many_at_once_are_answered_each_by_a_connection_of_its_own(
+    recording: RecordingAccess,
+) -> None:
     answers = list[str]()
     threads = [
         threading.Thread(target=lambda: answers.extend(ask(recording) for _ in range(20)))

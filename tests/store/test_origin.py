@@ -17,7 +17,7 @@ from webots_mcp.database.connection import Role, connect, keep_deadline, shipped
 from webots_mcp.errors import DatabaseError, ForeignDatabaseError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.sql import describe_schema
 
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT {} FROM n"
@@ -187,7 +187,7 @@ def test_a_statement_that_never_ends_is_ended(file: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(connection, "LONGEST_READ_S", 0.05)
     with (
         pytest.raises(DatabaseError, match="one statement took longer than"),
-        Recording(file, file.parent).reader() as reader,
+        RecordingAccess(file, file.parent).reader() as reader,
     ):
         keep_deadline(reader)  # as after a deadline of a question's own
         reader.execute(ENDLESS.format("i") + " WHERE i < 0").fetchall()

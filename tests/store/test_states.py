@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from tests.recordings.rows import Recorded
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError, InvalidRangeError
-from webots_mcp.store.logs import LogFilter, Window, count_lines, newest_lines, window_of
+from webots_mcp.store.logs import LogFilter, LogWindow, count_lines, newest_lines, window_of
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.run_rows import State, newest_state, real_time_factor, select
+from webots_mcp.store.run_rows import StateRecord, newest_state, real_time_factor, select
 
 
-def recorded_state(published: dict[str, Any]) -> State:
+def recorded_state(published: dict[str, Any]) -> StateRecord:
     encoded = encode(published)
-    return State(1, 1, 0.0, 0.0, encoded.text, encoded.replaced_text)
+    return StateRecord(1, 1, 0.0, 0.0, encoded.text, encoded.replaced_text)
 
 
 def test_the_newest_state_of_a_run_is_found(recorded: Recorded) -> None:
@@ -93,7 +93,7 @@ def test_log_lines_are_filtered_by_text_level_and_time(recorded: Recorded) -> No
         [("info", "Start"), ("warning", "wall 100% near"), ("error", "Wall hit"), ("debug", "x")]
     ):
         robot.log(float(i), text, level)
-    run = LogFilter(robot.run_id, Window(0, 10))
+    run = LogFilter(robot.run_id, LogWindow(0, 10))
 
     def found(**changes: Any) -> list[str]:
         asked = LogFilter(**(vars(run) | changes))
@@ -104,7 +104,7 @@ def test_log_lines_are_filtered_by_text_level_and_time(recorded: Recorded) -> No
     assert found(text="WALL") == ["wall 100% near", "Wall hit"]
     assert found(text="%") == ["wall 100% near"]
     assert found(lowest_level="warning") == ["wall 100% near", "Wall hit"]
-    assert found(window=Window(1.0, 2.0)) == ["wall 100% near"]
+    assert found(window=LogWindow(1.0, 2.0)) == ["wall 100% near"]
 
 
 def test_a_window_is_half_open_and_last_s_counts_back_from_the_newest_row() -> None:

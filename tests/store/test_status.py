@@ -19,7 +19,7 @@ from webots_mcp.database.connection import connect
 from webots_mcp.database.queue import CommandQueue
 from webots_mcp.database.waiting_file import waiting_paths
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.recording import look
+from webots_mcp.store.recording import view_robot
 from webots_mcp.store.robots import Status, judge, newest_session
 from webots_mcp.store.run_rows import current_run
 
@@ -230,7 +230,7 @@ def test_an_answer_tells_one_moment_whatever_is_recorded_while_it_is_put_togethe
 ) -> None:
     robot = recorded.robot()
     robot.state(1.0, {"x": 1})
-    view = look(recorded.connection, "rover")
+    view = view_robot(recorded.connection, "rover")
     robot.state(2.0, {"x": 2})
     robot.event(2.0, "pause", None, {"command_id": 1})
     header = view.header()

@@ -19,7 +19,7 @@ from webots_mcp.signals.naming import USUAL_POSITIONS, find_position, flatten, m
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.segment import Subject
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
     ({"pose": [1, 2, 0.5], "mode": "cruise"}, (1, 2, 0.5, "cruise")),
@@ -186,7 +186,7 @@ def seen_by_tools(connection: sqlite3.Connection, robot_id: int, state: Any) -> 
     motion = find_motion(catalogue(connection, subject), EventOptions())
     values = flatten(state)
 
-    def number(signal: Signal | None, factor: float = 1.0) -> Any:
+    def number(signal: RegisteredSignal | None, factor: float = 1.0) -> Any:
         value = values[signal.name] if signal else None
         return value if value is None or isinstance(value, str) else value * factor
 

@@ -74,7 +74,7 @@ def noise_of(values: Array) -> float:
     return median(sizes) / _GAIN if len(sizes) >= LEAST_ROWS - _ORDER else 0.0
 
 
-class Run(NamedTuple):
+class RowSpan(NamedTuple):
     """One of them: rows [start, stop) of a frame, the times of its first and last row.
 
     Attributes:
@@ -112,10 +112,10 @@ class Runs:
         rows, times = (self.starts[wanted], self.stops[wanted]), (self.starts_s, self.ends_s)
         return Runs(*rows, times[0][wanted], times[1][wanted])
 
-    def each(self) -> Iterator[Run]:
+    def spans(self) -> Iterator[RowSpan]:
         """One by one."""
         columns = (self.starts, self.stops, self.starts_s, self.ends_s)
-        return map(Run, *(column.tolist() for column in columns))
+        return map(RowSpan, *(column.tolist() for column in columns))
 
     def __len__(self) -> int:
         return len(self.starts)

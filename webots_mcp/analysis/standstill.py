@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, np
-from webots_mcp.analysis.track import Track
+from webots_mcp.analysis.track import SmoothedTrack
 
 WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide
 SETTLED_SHARE: Final = 0.2  # of the radius: within it of the place is where a standstill begins
@@ -56,7 +56,10 @@ class Standstill(NamedTuple):
 
 
 def find_standstills(
-    track: Track, radius_m: float, least_s: float, is_over: Callable[[], bool] = lambda: False
+    track: SmoothedTrack,
+    radius_m: float,
+    least_s: float,
+    is_over: Callable[[], bool] = lambda: False,
 ) -> list[Standstill]:
     """Stretches of at least `least_s` in which the position stayed within a radius.
 
@@ -108,7 +111,7 @@ class _Grid(NamedTuple):
     rows: int
 
 
-def _grid_of(track: Track, least_s: float) -> _Grid:
+def _grid_of(track: SmoothedTrack, least_s: float) -> _Grid:
     interval_s = median(np.diff(track.times))
     step_s = max(least_s / _SAMPLES, interval_s)
     first, last = track.times[[0, -1]] / step_s
@@ -146,7 +149,7 @@ def _stays(grid: _Grid, radius_m: float) -> Iterator[tuple[int, int]]:
 
 
 def _resting(
-    track: Track,
+    track: SmoothedTrack,
     rows: Rows,
     grid: _Grid,
     stays: Indexes,
@@ -198,7 +201,7 @@ def _settled(grid: _Grid, window: Indexes, limit_m: float) -> Indexes:
 
 
 def _joined(
-    track: Track,
+    track: SmoothedTrack,
     rows: Rows,
     starts: Indexes,
     ends: Indexes,
@@ -220,7 +223,9 @@ def _joined(
     return found
 
 
-def _begins_of_rest(track: Track, firsts: Indexes, lasts: Indexes, coarse_rows: int) -> Indexes:
+def _begins_of_rest(
+    track: SmoothedTrack, firsts: Indexes, lasts: Indexes, coarse_rows: int
+) -> Indexes:
     """The rows from which on it stands: of a ramp that ends in rest, the best fitting end.
 
     A slow robot is near its place long before it rests: its ramp is looked for in ever more rows,
@@ -283,7 +288,9 @@ class _Ramps(NamedTuple):
     explained_m2: Array
 
 
-def _ends_of_ramps(track: Track, start: Indexes, stop: Indexes, rest_until: Indexes) -> _Ramps:
+def _ends_of_ramps(
+    track: SmoothedTrack, start: Indexes, stop: Indexes, rest_until: Indexes
+) -> _Ramps:
     """Of ramps that end in rest, each in another row [start, stop), the best, with that rest."""
     at = start[:, None] + np.arange(int((stop - start).max()))
     inside = at < stop[:, None]
@@ -315,7 +322,7 @@ def _along_ramps(times: Array, values: Array) -> Array:
     return times * sums - moments
 
 
-def _is_same_ramp(track: Track, end: Indexes, rows: Indexes, wider: _Ramps) -> Flags:
+def _is_same_ramp(track: SmoothedTrack, end: Indexes, rows: Indexes, wider: _Ramps) -> Flags:
     """Whether a ramp in more rows ends where it does if all of them are of one motion.
 
     The end of n rows at a speed is known to twice the noise over the speed and the root of n: the
@@ -335,7 +342,7 @@ def _is_same_ramp(track: Track, end: Indexes, rows: Indexes, wider: _Ramps) -> F
 class Rows:
     """The positions of a track as recorded, and means of any of its stretches at once."""
 
-    def __init__(self, track: Track) -> None:
+    def __init__(self, track: SmoothedTrack) -> None:
         self.noise_m = track.noise_m
         self.count = len(track.times)
         columns = (track.times, track.raw_x, track.raw_y)

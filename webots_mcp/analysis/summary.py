@@ -173,7 +173,7 @@ def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Line:
+class FittedLine:
     """The straight line of least squares; `r2` is the share of the variance it explains."""
 
     slope_per_s: float
@@ -189,7 +189,7 @@ class Spike:
 
 
 @dataclass(frozen=True)
-class Step:
+class LevelStep:
     """The one change from row to row that makes most of the range; the values around it."""
 
     sim_time_s: float
@@ -197,7 +197,7 @@ class Step:
     after: float
 
 
-def fit_line(times: Array, values: Array, mean: float) -> Line | None:
+def fit_line(times: Array, values: Array, mean: float) -> FittedLine | None:
     """Least squares: slope = S_tv / S_tt, r2 = S_tv**2 / (S_tt * S_vv), sums about the means.
 
     N. R. Draper, H. Smith, Applied Regression Analysis (3rd ed. 1998), sections 1.2 and 1.3. None
@@ -207,7 +207,7 @@ def fit_line(times: Array, values: Array, mean: float) -> Line | None:
     stt, stv, svv = inner(dt, dt), inner(dt, dv), inner(dv, dv)
     if stt == 0:
         return None
-    return Line(stv / stt, min(1.0, stv / stt * (stv / svv)) if svv > 0 else 0.0)
+    return FittedLine(stv / stt, min(1.0, stv / stt * (stv / svv)) if svv > 0 else 0.0)
 
 
 def find_spikes(times: Array, values: Array, turn: float | None = None) -> list[Spike]:
@@ -266,12 +266,12 @@ def flat_since(
     return since_s if span == 0 or rested_s >= 0.1 * lasted_s > 0 else None
 
 
-def find_step(times: Array, values: Array) -> Step | None:
+def find_step(times: Array, values: Array) -> LevelStep | None:
     """The step that parts the values in two, with nothing between for half of their range."""
     row = _step_row(values)
     if not row:
         return None
-    return Step(float(times[row]), float(values[row - 1]), float(values[row]))
+    return LevelStep(float(times[row]), float(values[row - 1]), float(values[row]))
 
 
 def _last_step(rest: Array) -> int:
@@ -610,7 +610,7 @@ class Outcome(NamedTuple):
     pruned: bool = False
 
 
-class Score(NamedTuple):
+class ScoreSpread(NamedTuple):
     """Of the trials of a set: by the mean they are ranked and compared."""
 
     mean: float
@@ -629,7 +629,7 @@ class Ranked(NamedTuple):
     """
 
     parameters: dict[str, Any]
-    score: Score | None
+    score: ScoreSpread | None
     scores: list[float]
     failures: list[str]
     pruned: int = 0
@@ -688,7 +688,7 @@ def _ranked(group: Sequence[Outcome]) -> Ranked:
     scores = [each.score for each in group if each.score is not None]
     failures = [e.failure or "no score" for e in group if e.score is None and not e.pruned]
     pruned = sum(each.pruned for each in group)
-    score = Score(statistics.fmean(scores), min(scores), max(scores)) if scores else None
+    score = ScoreSpread(statistics.fmean(scores), min(scores), max(scores)) if scores else None
     return Ranked(group[0].parameters, score, scores, failures, pruned)
 
 

@@ -36,7 +36,7 @@ _MOST: Final = 2.0
 
 
 @dataclass(frozen=True)
-class Track:
+class SmoothedTrack:
     """Positions in one stretch without recording gaps, in metres.
 
     Attributes:
@@ -56,12 +56,12 @@ class Track:
     smoothed_rows: int
 
     @property
-    def reversed(self) -> Track:
+    def reversed(self) -> SmoothedTrack:
         """The same way, gone backwards in time."""
         places = {name: getattr(self, name)[::-1] for name in _PLACES}
         return replace(self, times=-self.times[::-1], **places)
 
-    def part(self, start: int, stop: int) -> Track:
+    def part(self, start: int, stop: int) -> SmoothedTrack:
         """Some of its rows."""
         columns = {name: getattr(self, name)[start:stop] for name in ("times", *_PLACES)}
         return replace(self, **columns)
@@ -69,7 +69,7 @@ class Track:
 
 def track_of(
     times: Array, x: Array, y: Array, noise_m: float | None = None, of_rows: int | None = None
-) -> Track:
+) -> SmoothedTrack:
     """Estimate the noise of a position and smooth it by no more than that asks for.
 
     Args:
@@ -83,7 +83,7 @@ def track_of(
     noise_m = position_noise_m(x, y) if noise_m is None else noise_m
     rows = _smoothing_rows(times, noise_m, of_rows or len(times))
     (smooth_x, gain), (smooth_y, _) = smooth(x, rows), smooth(y, rows)
-    return Track(times, smooth_x, smooth_y, x, y, noise_m, noise_m * gain, rows)
+    return SmoothedTrack(times, smooth_x, smooth_y, x, y, noise_m, noise_m * gain, rows)
 
 
 def position_noise_m(x: Array, y: Array) -> float:
@@ -93,7 +93,7 @@ def position_noise_m(x: Array, y: Array) -> float:
 
 def tracks_of(
     times: Array, x: Array, y: Array, noise_m: float | None = None, of_rows: int | None = None
-) -> list[Track]:
+) -> list[SmoothedTrack]:
     """One track per stretch without a gap.
 
     A gap is an interval of more than three median ones: what happened in it is unknown. The
@@ -143,7 +143,7 @@ class PathLength:
     noise_m: float
 
 
-def path_length(track: Track) -> PathLength:
+def path_length(track: SmoothedTrack) -> PathLength:
     """Metres travelled: the sum of legs that are longer than noise makes them.
 
     From row to row a noise of 1 cm would add up to metres while the robot stands still. A leg ends
@@ -166,7 +166,7 @@ def path_length(track: Track) -> PathLength:
     return PathLength(length_m + least_m, max(shortest_m, most_m - least_m), track.noise_m)
 
 
-def _leg_lengths(track: Track, corners: Indexes) -> Array:
+def _leg_lengths(track: SmoothedTrack, corners: Indexes) -> Array:
     """How long the ways from corner to corner are.
 
     Across its direction what is left of the noise makes a leg longer (along it the next one makes
@@ -185,7 +185,7 @@ def _leg_lengths(track: Track, corners: Indexes) -> Array:
     return legs_m / np.sinc(arcs / (2 * np.pi))
 
 
-def _corners(track: Track) -> Indexes:
+def _corners(track: SmoothedTrack) -> Indexes:
     """The rows in which one leg ends and the next begins."""
     variance = variance_along(len(track.times), track.smoothed_rows)
     shortest_m2 = (_leg_noise(len(variance), track.smoothed_rows) * track.left_m) ** 2 / 2
@@ -203,7 +203,7 @@ def _corners(track: Track) -> Indexes:
     return np.array(corners, np.intp)
 
 
-def travelled(tracks: list[Track]) -> PathLength:
+def travelled(tracks: list[SmoothedTrack]) -> PathLength:
     """Metres travelled along stretches one after the other, with the straight ways between them.
 
     How far it went in a recording gap is not known; it is at least the straight way.

@@ -17,7 +17,7 @@ from webots_mcp.answers.models import Answer, Table
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, shown_time
-from webots_mcp.store.recording import Recording, View, look, storage
+from webots_mcp.store.recording import RecordingAccess, RobotView, storage, view_robot
 
 # -- values, made short enough to be read whole by rules that are stated in the answer --
 
@@ -255,7 +255,7 @@ _A = TypeVar("_A", bound=Answer)
 _T = TypeVar("_T")
 
 
-def answer_about(view: View, model: type[_A], find: Callable[[], dict[str, Any]]) -> _A:
+def answer_about(view: RobotView, model: type[_A], find: Callable[[], dict[str, Any]]) -> _A:
     """The header with what was found; where nothing was recorded, with the reason as the hint."""
     answer: dict[str, Any] = view.header() | view.position_by()
     try:
@@ -265,7 +265,7 @@ def answer_about(view: View, model: type[_A], find: Callable[[], dict[str, Any]]
     return model(**answer)
 
 
-def header_of(recording: Recording, robot: str | None) -> dict[str, Any]:
+def header_of(recording: RecordingAccess, robot: str | None) -> dict[str, Any]:
     """The header of a robot, now."""
     with recording.view(robot) as view:
         return view.header()
@@ -274,7 +274,7 @@ def header_of(recording: Recording, robot: str | None) -> dict[str, Any]:
 def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
     """The header of the only robot that can be meant; empty where several can, or none."""
     try:
-        return look(connection, None).header()
+        return view_robot(connection, None).header()
     except (AmbiguousRobotError, NothingRecordedError):
         return {**storage(connection)}
 
@@ -393,7 +393,7 @@ def some(names: Sequence[str], most: int = 10) -> str:
 # -- the range of time that was asked about --
 
 
-def range_in(view: View, scope: Scope) -> TimeRange:
+def range_in(view: RobotView, scope: Scope) -> TimeRange:
     """What a scope means for the robot of a view, in its newest few runs.
 
     Raises:

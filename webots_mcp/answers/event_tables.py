@@ -21,7 +21,7 @@ from webots_mcp.judging.detection.events import (
     Found,
 )
 from webots_mcp.judging.detection.kinds import Event, Verdicts
-from webots_mcp.store.recording import View
+from webots_mcp.store.recording import RobotView
 
 EVENT_COLUMNS: Final = (
     "kind", "count", "run_id", "start_s", "time", "duration_s", "ongoing", "name", "details",
@@ -30,7 +30,7 @@ _GROUP_BUDGET_TOKENS: Final = 200
 
 
 def fitting_events(
-    found: Found, limit: int, budget_tokens: int, view: View, *, time_of_day: bool = False
+    found: Found, limit: int, budget_tokens: int, view: RobotView, *, time_of_day: bool = False
 ) -> tuple[Events, Table | None]:
     """At most `limit` of what was found, and as much of it as fits the budget."""
     while True:
@@ -65,7 +65,9 @@ def not_shown_of(told: Events) -> dict[str, str] | None:
     } or None
 
 
-def events_table(events: Sequence[Event], view: View, *, time_of_day: bool = False) -> Table | None:
+def events_table(
+    events: Sequence[Event], view: RobotView, *, time_of_day: bool = False
+) -> Table | None:
     """Events as rows under `EVENT_COLUMNS`, and the values around them.
 
     With the time of day, where it is asked for, at which each began.

@@ -16,13 +16,13 @@ from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.recording import View
+from webots_mcp.store.recording import RobotView
 
 _NAMING: Final = ("position", "unit")  # said once where it is the same of all runs
 
 
 def movement(
-    view: View, found: TimeRange, deadline_s: float = QUESTION_DEADLINE_S
+    view: RobotView, found: TimeRange, deadline_s: float = QUESTION_DEADLINE_S
 ) -> dict[str, Any] | None:
     """Distance along the path and displacement, in metres; None without a position.
 

@@ -9,8 +9,12 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast, get_args
 
 from webots_mcp.bridge.encoding import plain
 from webots_mcp.bridge.error_report import cut, describe, storable
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
-from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.bridge.simulation import Clock, Run, Simulation
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS, MAX_RUN_S, Pace, RunEnd, Then
 from webots_mcp.database.pauses import ARMED, OF_CONTROLLER, SET, VIOLATION, Cause
 from webots_mcp.errors import (
@@ -21,7 +25,6 @@ from webots_mcp.errors import (
 )
 
 if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
     from webots_mcp.signals.conditions import Condition, Evaluator
     from webots_mcp.signals.conditions.compiler import Expectation, Violated
     from webots_mcp.signals.naming import Value
@@ -104,20 +107,28 @@ class Breakpoint:
 class Breakpoints:
     """This robot's armed breakpoints: the stored ones, and those of the controller's code."""
 
-    def __init__(self, session: Session) -> None:
-        self._simulation = session.simulation
-        self._clock = session.clock
-        self._recorder = session.recorder
-        self._journal = session.journal
-        self._pause = session.pause
-        self._keeper = session.keeper
+    def __init__(
+        self,
+        simulation: Simulation,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        pause: Pause,
+        keeper: Keeper,
+    ) -> None:
+        self._simulation = simulation
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._pause = pause
+        self._keeper = keeper
         self.run: Run | None = None  # in which the stored ones were read; None: to be read again
         self.reaches = False  # the state that was looked at meets what is expected within a time
-        self._begun = session.clock.run
+        self._begun = clock.run
         self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
         self.armed: list[Breakpoint] = []
-        session.recorder.new_database_entries.append(self._read_later)
+        recorder.new_database_entries.append(self._read_later)
 
     # -- setting -------------------------------------------------------------------------------
 
@@ -258,7 +269,7 @@ class Breakpoints:
             self.load()
         return bool(self.armed)
 
-    def look(self, state: Any) -> list[Breakpoint]:
+    def evaluate(self, state: Any) -> list[Breakpoint]:
         """The breakpoints whose condition begins to hold and whose action is due; usually none."""
         clock, hit, self.reaches = self._clock, list[Breakpoint](), False
         if self.run is not clock.run:
@@ -273,7 +284,7 @@ class Breakpoints:
             except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)
                 self._disarm(each, f"condition {each.condition.text!r}: {describe(error)}")
             if each.unseen:
-                self._look_for_signals(each, state)
+                self._report_unpublished(each, state)
         return hit
 
     def _count(self, each: Breakpoint, hit: list[Breakpoint]) -> None:
@@ -326,7 +337,7 @@ class Breakpoints:
         self._off[number] = text
         self._recorder.record("breakpoint failed", None, (text, number))
 
-    def _look_for_signals(self, each: Breakpoint, state: Any) -> None:
+    def _report_unpublished(self, each: Breakpoint, state: Any) -> None:
         """Warn once of signals that are never published: a name may be misspelt."""
         now_s = self._clock.sim_time_s
         if each.asked_since_s is None:
@@ -535,7 +546,7 @@ class Watch:
 
     # -- from the loop -------------------------------------------------------------------------
 
-    def look(self, state: Any) -> bool:
+    def evaluate(self, state: Any) -> bool:
         """Evaluate a published state; True if it is the one that reaches the goal."""
         watched = self._watched
         if watched is None or watched.reached is not None or not self._begun(watched):

@@ -8,20 +8,18 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Generator, Mapping
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut, storable
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.database.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.signals.naming import harmless_first
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
-
 
 Progress = Generator[None, None, object]
 """A running built-in action: it yields until its outcome is known, and returns the result."""
@@ -71,6 +69,10 @@ class ClaimedCommand:
         return {**self.params, "id": self.id, "action": self.action, "params": self.params}
 
 
+Action = Callable[[ClaimedCommand], Progress]
+"""A built-in action: it begins a command, or raises where the command is refused."""
+
+
 class ClaimedCommands:
     """Claims commands for this session and writes their outcome."""
 
@@ -99,7 +101,7 @@ class ClaimedCommands:
         command = self._read(rows[0], registration.session_id, sim_time_s) if rows else None
         if command is None:
             self._claiming = False
-            self._look_for_successor(registration)
+            self._check_successor(registration)
         return command
 
     def begin(self, command: ClaimedCommand) -> None:
@@ -116,7 +118,7 @@ class ClaimedCommands:
             self.fail(ClaimedCommand(command_id, "", {}, session_id), _INTERRUPTED, sim_time_s)
         self._claiming = False
 
-    def _look_for_successor(self, registration: Registration) -> None:
+    def _check_successor(self, registration: Registration) -> None:
         ids = {"robot": registration.robot_id, "session": registration.session_id}
         for (pid,) in self._recorder.fetch(SUCCESSOR_PID, ids) or ():
             self._recorder.errors.warn(
@@ -209,10 +211,10 @@ class Handlers:
         loop_polls: The loop itself calls `get_command()`, and may handle the command it returns.
     """
 
-    def __init__(self, session: Session) -> None:
-        self._recorder = session.recorder
-        self._journal = session.journal
-        self._pause = session.pause
+    def __init__(self, recorder: Recorder, journal: Journal, pause: Pause) -> None:
+        self._recorder = recorder
+        self._journal = journal
+        self._pause = pause
         self._handlers: dict[str, Handler] = {}
         self._refused: set[str] = set()
         self.running = False

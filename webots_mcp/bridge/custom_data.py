@@ -19,16 +19,15 @@ import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import islice
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final, NamedTuple, Protocol, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import ErrorReport, cut
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.registration import same_simulation
+from webots_mcp.bridge.registration import Identity, same_simulation
 from webots_mcp.bridge.scene import SceneNode, find_field
-from webots_mcp.bridge.session import Session
-from webots_mcp.bridge.simulation import Clock, LoopMeter
+from webots_mcp.bridge.simulation import Clock, LoopMeter, Simulation
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
 from webots_mcp.database.liveness import is_living
 from webots_mcp.signals.register import SignalNames, StateChanges
@@ -96,14 +95,25 @@ def _with_json_numbers(text: str) -> str:
     return _C_NUMBERS.sub(spelled, text)
 
 
+class ObserverParts(NamedTuple):
+    """The parts of the observer's own bridge that recording other robots needs."""
+
+    identity: Identity
+    simulation: Simulation
+    clock: Clock
+    recorder: Recorder
+    journal: Journal
+    errors: ErrorReport
+
+
 class CustomDataReader:
     """Reads what the robots of a world write, and records it for those that no other records.
 
     Args:
-        observer: The session of the observer's own bridge.
+        observer: What is known of the observer itself, and its recorder.
     """
 
-    def __init__(self, observer: Session) -> None:
+    def __init__(self, observer: ObserverParts) -> None:
         self._observer = observer
         self._robots: dict[int, _Robot] = {}  # by the id of the body
         self._taken: set[str] = set()  # names of robots that other processes record
@@ -169,7 +179,7 @@ class _Robot:
         body: What the observer follows.
     """
 
-    def __init__(self, body: SeenRobot, observer: Session) -> None:
+    def __init__(self, body: SeenRobot, observer: ObserverParts) -> None:
         self.body = body
         self._observer = observer
         self._field: Any = None  # where it has none, or is gone
@@ -250,7 +260,7 @@ class _Robot:
 class _Recording:
     """The session of a robot, written by its observer."""
 
-    def __init__(self, body: SeenRobot, observer: Session) -> None:
+    def __init__(self, body: SeenRobot, observer: ObserverParts) -> None:
         identity = observer.identity._replace(
             robot_name=recorded_name(body.name or "robot"),
             kind=CUSTOM_DATA,
@@ -325,9 +335,9 @@ class _Recording:
             state.setdefault(MISSED, self._sequence.missed)
         encoded = encode(state)
         self._journal.state(encoded)
-        for name, before, after in self._changes.look(state):
+        for name, before, after in self._changes.compare(state):
             self._journal.event("change", {"from": before, "to": after}, name)
-        self._names.look(state, encoded.text, self.recorder.enter_signals)
+        self._names.register(state, encoded.text, self.recorder.enter_signals)
 
     def _report_missed(self) -> None:
         counted = self._sequence

@@ -13,11 +13,11 @@ from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
 from operator import methodcaller
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
-
+from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.simulation import Simulation
 
 SECTORS: Final = 8
 MOST_OBJECTS: Final = 8  # of a camera or a radar that are published, the nearest first
@@ -275,10 +275,10 @@ class DeviceReader:
         why: The reason for an interval above 1; empty while the interval is 1.
     """
 
-    def __init__(self, session: Session) -> None:
-        self._simulation = session.simulation
-        self._journal = session.journal
-        self._errors = session.errors
+    def __init__(self, simulation: Simulation, journal: Journal, errors: ErrorReport) -> None:
+        self._simulation = simulation
+        self._journal = journal
+        self._errors = errors
         self._durations_us: deque[float] = deque(maxlen=_READINGS)
         self._reported_interval = 1
         self.ring_interval = 1
@@ -325,17 +325,15 @@ def _why(interval: int, usual_us: float) -> str:
 # used here.
 
 
-def restart_motors(session: Session) -> None:
+def restart_motors(robot: Any, journal: Journal, failed: Failed) -> None:
     """After a reset: restart the motors in velocity control, at their last velocity."""
-    devices: dict[str, Any] = getattr(session.simulation.robot, "devices", None) or {}
+    devices: dict[str, Any] = getattr(robot, "devices", None) or {}
     motors = [each for each in devices.items() if type(each[1]).__name__ == "Motor"]
-    restarted = [
-        text for name, motor in motors if (text := _restart(name, motor, session.errors.failed))
-    ]
+    restarted = [text for name, motor in motors if (text := _restart(name, motor, failed))]
     if restarted:
         what = "the reset stopped these motors; the bridge called setPosition(inf) again"
         listed = ", ".join(restarted)
-        session.journal.log("info", "bridge", f"{what}, with their last velocity: {listed}")
+        journal.log("info", "bridge", f"{what}, with their last velocity: {listed}")
 
 
 def _restart(name: str, motor: Any, failed: Failed) -> str | None:

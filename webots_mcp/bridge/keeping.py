@@ -15,18 +15,16 @@ import threading
 import time
 from collections import deque
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.encoding import copy_or_encode, encode, encode_copy
 from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pictures import image_of
-from webots_mcp.bridge.simulation import Run
+from webots_mcp.bridge.pictures import Album, HeldFrame, image_of
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import KEEP_AFTER_S, new_uuid
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
-
 
 MOST_KEPT_S: Final = 600.0  # of one run; a condition that flickers would keep all of it
 _MOST_REASONS: Final = 10  # of one stretch that are stored
@@ -87,27 +85,35 @@ class Keeper:
         enabled: Whether anything is held at all.
     """
 
-    def __init__(self, session: Session, last_s: float) -> None:
-        self._clock = session.clock
-        self._recorder = session.recorder
-        self._journal = session.journal
-        self._album = session.album
-        self._throttle = session.throttle
+    def __init__(
+        self,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        album: Album,
+        throttle: Throttle,
+        last_s: float,
+    ) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._album = album
+        self._throttle = throttle
         self._last_s = last_s
         self._ring = Ring(last_s)
-        self._run = session.clock.run
-        self._ring.begin(session.clock.sim_time_s)
+        self._run = clock.run
+        self._ring.begin(clock.sim_time_s)
         self._kept_s = 0.0
         self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
         self._stretch: Stretch | None = None
         self._going_on = False
         self._asked: deque[tuple[Run, str]] = deque(maxlen=_MOST_REASONS)
         self._unwritten: deque[tuple[Run, RingRow]] = deque()
-        self._unwritten_frames: deque[tuple[Stretch, Frame]] = deque()
+        self._unwritten_frames: deque[tuple[Stretch, HeldFrame]] = deque()
         self._lock = threading.RLock()  # of all that is held: any thread may publish
-        self.frames = CameraFrames(session.journal, last_s)
+        self.frames = CameraFrames(journal, last_s)
         self.enabled = last_s > 0
-        self.fills = self.enabled and session.throttle.interval > 1
+        self.fills = self.enabled and throttle.interval > 1
         self.busy = False
 
     # -- the loop ------------------------------------------------------------------------------
@@ -135,10 +141,11 @@ class Keeper:
             else:
                 self._ring.add(row)
 
-    def look_at_cameras(self, *, at_once: bool) -> None:
+    def take_camera_frames(self, *, at_once: bool) -> None:
         """Take a small frame of each camera whose frame is due; `at_once` of all cameras."""
         now_s = self._clock.sim_time_s
-        frames = self.frames.look(now_s, at_once=at_once)  # without the lock: Webots may be slow
+        # Without the lock, since Webots may be slow.
+        frames = self.frames.take_due(now_s, at_once=at_once)
         with self._lock:
             if self._clock.run is not self._run:
                 self._begin_run()
@@ -280,7 +287,7 @@ class Keeper:
         }
         self._recorder.record("kept stretch", stretch.run, values)
 
-    def _keep_frame(self, stretch: Stretch, frame: Frame) -> None:
+    def _keep_frame(self, stretch: Stretch, frame: HeldFrame) -> None:
         if len(self._unwritten_frames) < 2 * MOST_FRAMES:
             self._unwritten_frames.append((stretch, frame))
         else:  # frames arrive faster than one file per call can be written
@@ -292,7 +299,7 @@ class Keeper:
             if self._unwritten_frames:
                 self._write_frame(*self._unwritten_frames[0])
 
-    def _write_frame(self, stretch: Stretch, frame: Frame) -> None:
+    def _write_frame(self, stretch: Stretch, frame: HeldFrame) -> None:
         """Write one frame: to compress and write a file takes about a millisecond."""
         try:
             self._album.add_kept(stretch.run, stretch.uuid, frame)
@@ -404,21 +411,6 @@ class Ring:
         self.starts_s = self._rows[0].sim_time_s if self._rows else row.sim_time_s
 
 
-class Frame(NamedTuple):
-    """A camera's newest image at some moment, scaled down.
-
-    Attributes:
-        bgra: Four bytes a pixel, rows from the top left.
-    """
-
-    device: str
-    sim_time_s: float
-    wall_time_s: float
-    width: int
-    height: int
-    bgra: bytes
-
-
 class _Camera:
     """A camera of which frames are taken.
 
@@ -434,13 +426,13 @@ class _Camera:
         self.due_s = self.taken_s = -math.inf
         self.missed = 0
 
-    def frame(self, now_s: float) -> Frame:
+    def frame(self, now_s: float) -> HeldFrame:
         """Its newest image, scaled down; the next frame is due no sooner than its next image."""
         self.taken_s = now_s
         period_s = self.device.getSamplingPeriod() / 1000
         self.due_s = now_s + max(self.interval_s, period_s) - _EARLY_S
         scaled = scale_down(*image_of(self.device))
-        return Frame(self.name, now_s, time.time(), *scaled)
+        return HeldFrame(self.name, now_s, time.time(), *scaled)
 
 
 class CameraFrames:
@@ -457,8 +449,8 @@ class CameraFrames:
     def __init__(self, journal: Journal, last_s: float) -> None:
         self._journal = journal
         self._last_s = last_s
-        self._held: deque[Frame] = deque(maxlen=MOST_FRAMES)
-        self._looked_s = self._due_s = -math.inf
+        self._held: deque[HeldFrame] = deque(maxlen=MOST_FRAMES)
+        self._taken_s = self._due_s = -math.inf
         self.cameras: dict[str, _Camera] = {}
         self.missed = 0
 
@@ -482,34 +474,34 @@ class CameraFrames:
 
     def is_due(self, now_s: float) -> bool:
         """Whether a frame is due, or simulation time has gone back."""
-        return not self._looked_s <= now_s < self._due_s
+        return not self._taken_s <= now_s < self._due_s
 
-    def look(self, now_s: float, *, at_once: bool) -> list[Frame]:
+    def take_due(self, now_s: float, *, at_once: bool) -> list[HeldFrame]:
         """The frames that are due; `at_once` one of each camera."""
-        again = now_s < self._looked_s  # a new run
+        again = now_s < self._taken_s  # a new run
         due = [
             each
             for each in self.cameras.values()
             if again or now_s >= each.due_s or (at_once and now_s > each.taken_s)
         ]
         frames = [frame for each in due if (frame := self._frame_of(each, now_s)) is not None]
-        self._looked_s = now_s
+        self._taken_s = now_s
         self._due_s = min((each.due_s for each in self.cameras.values()), default=math.inf)
         return frames
 
-    def add(self, frame: Frame) -> None:
+    def add(self, frame: HeldFrame) -> None:
         """Hold the newest frame, and forget those that are too old."""
         while self._held and self._held[0].sim_time_s < frame.sim_time_s - self._last_s:
             self._held.popleft()
         self._held.append(frame)
 
-    def take(self, start_s: float) -> list[Frame]:
+    def take(self, start_s: float) -> list[HeldFrame]:
         """The frames taken since a simulation time; all held frames are forgotten."""
         frames = [frame for frame in self._held if frame.sim_time_s >= start_s]
         self._held.clear()
         return frames
 
-    def _frame_of(self, camera: _Camera, now_s: float) -> Frame | None:
+    def _frame_of(self, camera: _Camera, now_s: float) -> HeldFrame | None:
         """A frame of a camera, or None where it has none; its second failure is logged."""
         try:
             return camera.frame(now_s)

@@ -9,13 +9,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from webots_mcp.bridge.attachment import Attachment
 from webots_mcp.bridge.commands import ClaimedCommand, Handler
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport, describe
 from webots_mcp.bridge.parameters import Parameter, V
 from webots_mcp.bridge.pictures import MOST_FRAMES
-from webots_mcp.bridge.session import Attachment, Session, Throttle
+from webots_mcp.bridge.session import Session
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
     ENDED_BY,
     HANG_AFTER_S,
@@ -170,8 +172,7 @@ class MCPBridge:
                 "that bridge first, or call attach(robot) without options"
             )
         if bridge._attachment is None:
-            bridge._attachment = Attachment(bridge._session, bridge._serve)
-            bridge._attachment.begin()
+            bridge._attachment = bridge._session.attach(bridge._serve)
         return bridge
 
     def detach(self) -> None:
@@ -375,7 +376,7 @@ class MCPBridge:
             ValueError: The name is empty, over 100 characters, or not printable.
             TypeError: The name is not a text, or the handler is not a plain function.
         """
-        self._session.control.handlers.register(action, handler)
+        self._session.handlers.register(action, handler)
 
     def parameter(
         self,
@@ -486,7 +487,7 @@ class MCPBridge:
         """Whether the world was reloaded or reset since the last call; true once for each."""
         reloads = self._session.reloads
         try:
-            self._session.look()
+            self._session.check_clock()
             reloads.fire()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("detect_reload", error)
@@ -534,15 +535,15 @@ class MCPBridge:
         """
         if self._closed:
             return
-        if reason is None and self._session.control.handlers.running:
+        if reason is None and self._session.handlers.running:
             self._close_after_answer = True  # a closed bridge could not write the answer
             return
         try:
             if self._attachment is not None:
                 self._attachment.publish_missing()
-                self._attachment.look_for_unseen()
+                self._attachment.report_unseen()
             elif self._session.clock.moved_s is None:
-                self._session.look_for_unseen(self._session.clock.sim_time_s)
+                self._session.unseen.check(self._session.clock.sim_time_s)
             self.detach()
             self._session.let_go()
         except Exception as error:  # noqa: BLE001  (the robot comes first)

@@ -6,17 +6,17 @@ import json
 import os
 import time
 from collections.abc import Callable, Container, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, cast
+from typing import Any, Final, Generic, NamedTuple, TypeVar, cast
 
+from webots_mcp.bridge.commands import Handlers
 from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import PARAMETERS_VARIABLE, recorded_name
 from webots_mcp.database.waiting_file import Kind, Values
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.signals.parameter import MOST_PARAMETERS, Declaration, Value, require_known
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
-
 
 MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database
 
@@ -68,6 +68,12 @@ class Setter(NamedTuple):
     command_id: int | None = None
 
 
+def setter_of(params: dict[str, Any], command_id: int) -> Setter:
+    """Return who sets the parameters: the command itself, or the trial that sent it."""
+    by = params.get("by")
+    return Setter(by if by in SETTERS else "command", command_id)
+
+
 class _Held:
     """A declared parameter, and who set its value."""
 
@@ -104,17 +110,26 @@ class Parameters:
         robot_name: Of whom the environment may have values.
     """
 
-    def __init__(self, session: Session, robot_name: str) -> None:
-        self._clock = session.clock
-        self._recorder = session.recorder
-        self._journal = session.journal
-        self._session = session
-        self._start_values = StartValues(robot_name, session.errors)
+    def __init__(
+        self,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        handlers: Handlers,
+        errors: ErrorReport,
+        robot_name: str,
+    ) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._handlers = handlers
+        self._errors = errors
+        self._start_values = StartValues(robot_name, errors)
         self._held: dict[str, _Held] = {}
         self._wanted: dict[str, Value] = {}
         self._from_reset: dict[str, tuple[Value, Setter]] = {}
         self._changes = 0
-        session.recorder.new_database_entries.append(self._entries_for_new_database)
+        recorder.new_database_entries.append(self._entries_for_new_database)
 
     def declare(self, declaration: Declaration) -> Parameter[Any]:
         """The parameter of that name, created or updated to this declaration.
@@ -174,13 +189,13 @@ class Parameters:
 
         Within a round of the loop values must not change, so it waits for `get_command()` there.
         """
-        if self._session.control.handlers.running:
+        if self._handlers.running:
             self.set_now({name: value}, CODE)
             return
         try:
             self._wanted |= self._checked({name: value})
         except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self._session.errors.failed("Parameter.set", error)
+            self._errors.failed("Parameter.set", error)
 
     def take_wanted(self) -> None:
         """Apply what the controller's code has set since the last `get_command()`."""
@@ -191,7 +206,7 @@ class Parameters:
             try:
                 self.set_now(wanted, CODE)
             except WebotsMCPError as error:
-                self._session.errors.failed("Parameter.set", error)
+                self._errors.failed("Parameter.set", error)
 
     def begin_run(self) -> None:
         """The world was reset: apply the values that waited for it, and record all values."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
-from webots_mcp.bridge.simulation import QUIT, Step
+from webots_mcp.bridge.journal import Heartbeat, Journal
+from webots_mcp.bridge.simulation import QUIT, Simulation, Step
 from webots_mcp.database.pauses import (
     BRIDGE_CLOSED,
     IN_WEBOTS,
@@ -19,10 +20,6 @@ from webots_mcp.database.pauses import (
     STEPPING_WORLD,
     Cause,
 )
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
-
 
 PUMP_INTERVAL_S: Final = 0.01
 
@@ -46,17 +43,29 @@ class Pause:
     `get_command()`, calls `step(0)` repeatedly, and serves commands there. Code of the user that
     runs there (a handler, a callback) may step nevertheless: time advances for just that step.
 
+    Args:
+        before_pause: Called before a pause begins: no call of the loop follows that could write.
+        after_step: Called after each step that was guarded, before the loop's own code runs.
+
     Attributes:
         active: The loop is paused.
         cause: Why the newest pause was begun.
         serve: Serves commands until the pause has ended: for a loop that steps during it.
     """
 
-    def __init__(self, session: Session) -> None:
-        self._simulation = session.simulation
-        self._journal = session.journal
-        self._heartbeat = session.heartbeat
-        self._session = session
+    def __init__(
+        self,
+        simulation: Simulation,
+        journal: Journal,
+        heartbeat: Heartbeat,
+        before_pause: Callable[[], object],
+        after_step: Callable[[], object],
+    ) -> None:
+        self._simulation = simulation
+        self._journal = journal
+        self._heartbeat = heartbeat
+        self._before_pause = before_pause
+        self._after_step = after_step
         self._mode_before: str | None = None  # a pause, a run's pace or steps; None where none is
         self._user_code_depth = 0  # a count: a handler may call get_command(), which runs another
         self._awaiting_step = False
@@ -76,7 +85,7 @@ class Pause:
         if self.active:
             return
         self.cause = cause
-        self._session.keeper.write_all()  # first: no call of the loop follows that could
+        self._before_pause()
         self._activate(self.running_mode)
         self._simulation.set_mode("pause")
         self._journal.event(PAUSE, cause.data)
@@ -237,7 +246,7 @@ class Pause:
             self._simulation.end()
             self.active = False
         elif step.ends:
-            self._session.look_after_step()
+            self._after_step()
         return answer
 
     def _leave_for(self, step: Step) -> int:

@@ -11,16 +11,13 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from webots_mcp.bridge.simulation import Run
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.simulation import Clock, Run
 from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.keeping import Frame
-    from webots_mcp.bridge.session import Session
 
 MOST_FRAMES: Final = 50  # of a camera that are kept
 
@@ -37,12 +34,27 @@ _SHADES: Final = 256
 _RAMP: Final = ((220, 30, 30), (250, 220, 40), (40, 190, 80), (30, 60, 200))  # near to far
 
 
+class HeldFrame(NamedTuple):
+    """A camera's newest image at some moment, scaled down.
+
+    Attributes:
+        bgra: Four bytes a pixel, rows from the top left.
+    """
+
+    device: str
+    sim_time_s: float
+    wall_time_s: float
+    width: int
+    height: int
+    bgra: bytes
+
+
 class Album:
     """The newest camera frames of each device; older ones are deleted, with their rows."""
 
-    def __init__(self, session: Session, data_dir: Path) -> None:
-        self._recorder = session.recorder
-        self._clock = session.clock
+    def __init__(self, recorder: Recorder, clock: Clock, data_dir: Path) -> None:
+        self._recorder = recorder
+        self._clock = clock
         self._data_dir = data_dir
         self._kept: dict[str, deque[str]] = {}
 
@@ -75,7 +87,7 @@ class Album:
             self._forget(kept.popleft())
         return {"path": path, "width": width, "height": height, "size_bytes": size}
 
-    def add_kept(self, run: Run, stretch_uuid: str, frame: Frame) -> None:
+    def add_kept(self, run: Run, stretch_uuid: str, frame: HeldFrame) -> None:
         """Write a small frame of a kept stretch, which exists as long as the stretch.
 
         Raises:

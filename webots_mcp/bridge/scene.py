@@ -13,15 +13,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.commands import ClaimedCommand, Progress, whole_number
+from webots_mcp.bridge.commands import Progress, whole_number
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.naming import nearest_first
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
 
 MOST_NODES: Final = 5000  # that one walk yields
 DEEPEST: Final = 24  # levels below the root
@@ -545,9 +542,8 @@ def some(names: Sequence[str], total: int | None = None) -> str:
 # They ask Webots from within the controller's loop, for a few milliseconds per round.
 
 
-def get_scene(session: Session, command: ClaimedCommand) -> Progress:
+def get_scene(robot: Any, params: dict[str, Any]) -> Progress:
     """The nodes of the tree, or below a `path`, that match `types` and `names`."""
-    params, robot = command.params, session.simulation.robot
     types, names = _patterns(params, "types"), _patterns(params, "names")
     seen: dict[str, None] = {}
     wanted = [each for each in _patterns(params, "fields") if each != "name"]  # shown anyway
@@ -642,10 +638,10 @@ def _any_match(texts: Iterable[str], patterns: list[str]) -> bool:
     return any(fnmatchcase(text.lower(), each.lower()) for text in texts for each in patterns)
 
 
-def get_field(session: Session, command: ClaimedCommand) -> Progress:
+def get_field(robot: Any, params: dict[str, Any]) -> Progress:
     """The value of the field, or all fields of the node, at a `path`."""
-    place = yield from find(session.simulation.robot, command.params.get("path"))
-    start = whole_number(command.params, "start", 0, 10**9, default=0)
+    place = yield from find(robot, params.get("path"))
+    start = whole_number(params, "start", 0, 10**9, default=0)
     facts: dict[str, Any] = {"path": place.path}
     if place.is_hidden:
         facts["read_only"] = "it is inside a PROTO"

@@ -11,10 +11,11 @@ import json
 import re
 import time
 from collections.abc import Collection, Generator
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
-from webots_mcp.bridge.error_report import cut
+from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress
+from webots_mcp.bridge.error_report import ErrorReport, cut
+from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.scene import (
     MOST_ENTRIES,
     Pace,
@@ -24,6 +25,8 @@ from webots_mcp.bridge.scene import (
     entries,
     find,
     find_node,
+    get_field,
+    get_scene,
     is_nearer,
     is_same,
     label,
@@ -32,10 +35,8 @@ from webots_mcp.bridge.scene import (
     require_no_path,
     write,
 )
+from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
 _LONGEST_REMOVED: Final = 200_000  # characters of a node that is remembered
@@ -56,38 +57,138 @@ MOST_EDITS: Final = 200  # that are put back
 _TOO_MANY: Final = f"does not undo it: at most {MOST_EDITS} changes are remembered"
 
 
-def set_field(session: Session, command: ClaimedCommand) -> Progress:
-    """Set the field, or the entry of a field, at a `path` to a `value`."""
-    robot, params = session.simulation.robot, command.params
-    if (stops := params.get("stop")) is not None and not isinstance(stops, bool):
-        raise InvalidInputError(f"stop must be true or false, not {stops!r:.80}")
-    place = yield from find(robot, params.get("path"))
-    _require_settable(robot, place)
-    value = checked(place.path, place.type_name, params.get("value"))
-    require_no_path(str(place.webots_field.getName()), value)
-    before = read(place.field, place.entry)
-    reset = session.scene.remember_field(_edit(place, before, value), place.node)
-    write(place.field, value, place.entry)
-    if stops:
-        place.node.resetPhysics()
-    facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
-    facts |= {"from": _shown(before), "to": _shown(value)}
-    is_stepped = yield from _until_stepped(session)
-    now = _read_again(robot, place)
-    if not is_stepped and not is_same(place.type_name, now, value):
-        facts["now"] = _shown(now)
-        facts["when"] = "it is set with the next step: simulation time stands still"
-    elif not is_nearer(place.type_name, now, value, before) and not is_same(
-        place.type_name, before, value
-    ):
-        raise CommandRefusedError(
-            f"{place.path} is {now!r:.200} after it was set: a controller set it again, or Webots "
-            f"refused the value; {_SAYS}. Fields inside a PROTO cannot be set"
+class SceneActions:
+    """The built-in actions on the scene tree: read it, set fields, add and remove nodes.
+
+    They ask Webots from within the controller's loop, for a few milliseconds per round.
+    """
+
+    def __init__(
+        self, simulation: Simulation, clock: Clock, journal: Journal, edits: SceneEdits
+    ) -> None:
+        self._simulation = simulation
+        self._clock = clock
+        self._journal = journal
+        self._edits = edits
+
+    def by_name(self) -> dict[str, Action]:
+        """Return the functions by the name of their action."""
+        return {
+            "get_scene": self.get_scene,
+            "get_field": self.get_field,
+            "set_field": self.set_field,
+            "add_node": self.add_node,
+            "remove_node": self.remove_node,
+        }
+
+    def get_scene(self, command: ClaimedCommand) -> Progress:
+        """Find nodes of the tree, see `scene.get_scene`."""
+        return get_scene(self._simulation.robot, command.params)
+
+    def get_field(self, command: ClaimedCommand) -> Progress:
+        """Read a field or the fields of a node, see `scene.get_field`."""
+        return get_field(self._simulation.robot, command.params)
+
+    def set_field(self, command: ClaimedCommand) -> Progress:
+        """Set the field, or the entry of a field, at a `path` to a `value`."""
+        robot, params = self._simulation.robot, command.params
+        if (stops := params.get("stop")) is not None and not isinstance(stops, bool):
+            raise InvalidInputError(f"stop must be true or false, not {stops!r:.80}")
+        place = yield from find(robot, params.get("path"))
+        _require_settable(robot, place)
+        value = checked(place.path, place.type_name, params.get("value"))
+        require_no_path(str(place.webots_field.getName()), value)
+        before = read(place.field, place.entry)
+        reset = self._edits.remember_field(_edit(place, before, value), place.node)
+        write(place.field, value, place.entry)
+        if stops:
+            place.node.resetPhysics()
+        facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
+        facts |= {"from": _shown(before), "to": _shown(value)}
+        is_stepped = yield from self._until_stepped()
+        now = _read_again(robot, place)
+        if not is_stepped and not is_same(place.type_name, now, value):
+            facts["now"] = _shown(now)
+            facts["when"] = "it is set with the next step: simulation time stands still"
+        elif not is_nearer(place.type_name, now, value, before) and not is_same(
+            place.type_name, before, value
+        ):
+            raise CommandRefusedError(
+                f"{place.path} is {now!r:.200} after it was set: a controller set it again, or "
+                f"Webots refused the value; {_SAYS}. Fields inside a PROTO cannot be set"
+            )
+        elif not is_same(place.type_name, now, value):
+            facts["now"] = _shown(now)  # the simulation has changed it since
+        self._journal.event("set_field", facts | _asked_by(command), place.path)
+        return facts | {"sim_time_s": self._clock.sim_time_s, "a_reset": reset}
+
+    def add_node(self, command: ClaimedCommand) -> Progress:
+        """Add the node in `vrml` to the children of the node, or to the field, at a `path`."""
+        robot, params = self._simulation.robot, command.params
+        text = _require_one_node(params.get("vrml"))
+        place = yield from _find_room(robot, params.get("path") or "root")
+        before = _count(place)
+        node = import_node(place.field, text)
+        if node is None:
+            yield from self._until_stepped()
+            node = _newest(robot, place, before)
+        if node is None:
+            raise CommandRefusedError(
+                f"Webots added nothing to {place.path}; {_SAYS}. A PROTO has to be declared in the "
+                "world file first: IMPORTABLE EXTERNPROTO"
+            )
+        path = _path_of(robot, node)
+        self._edits.added.add(int(node.getId()))
+        facts: dict[str, Any] = {
+            "path": path,
+            "type": str(node.getTypeName()),
+            "parent": place.path,
+        }
+        yield from self._until_stepped()
+        self._journal.event(
+            "add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path
         )
-    elif not is_same(place.type_name, now, value):
-        facts["now"] = _shown(now)  # the simulation has changed it since
-    session.journal.event("set_field", facts | _asked_by(command), place.path)
-    return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
+        now_s = self._clock.sim_time_s
+        return facts | {"node": label(node), "sim_time_s": now_s, "a_reset": "removes it"}
+
+    def remove_node(self, command: ClaimedCommand) -> Progress:
+        """Remove the node at a `path`, with everything in it."""
+        robot = self._simulation.robot
+        place = yield from find_node(robot, command.params.get("path"))
+        _require_removable(robot, place)
+        node, node_id = place.node, int(place.node.getId())
+        facts: dict[str, Any] = {
+            "path": place.path,
+            "type": str(node.getTypeName()),
+            "node": label(node),
+        }
+        is_added = self._edits.is_added(node)
+        is_known = is_added or self._edits.is_put_back(node)
+        removal = None if is_known else (yield from _removal(robot, place))
+        is_proto = bool(node.isProto())
+        node.remove()
+        if robot.getFromId(node_id) is not None:
+            yield from self._until_stepped()
+        if robot.getFromId(node_id) is not None:
+            raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
+        reset = "puts it back"
+        if is_added:
+            reset = _ADDED_BEFORE
+        elif not is_known:
+            reset = self._edits.remember_removed(removal, is_proto=is_proto)
+        self._journal.event("remove_node", facts | _asked_by(command), place.path)
+        return facts | {"sim_time_s": self._clock.sim_time_s, "a_reset": reset}
+
+    def _until_stepped(self) -> Generator[None, None, bool]:
+        """Wait for a step of the simulation; False where simulation time stands still."""
+        clock, from_step = self._clock, self._clock.steps_seen
+        until_s = time.monotonic() + _LONGEST_STEP_S
+        while clock.steps_seen == from_step:
+            yield
+            stands = self._simulation.paused or time.monotonic() > until_s
+            if stands and clock.steps_seen == from_step:
+                return False
+        return True
 
 
 def _shown(value: Any) -> Any:
@@ -134,44 +235,8 @@ def _read_again(robot: Any, place: Place) -> Any:
     return read(field, place.entry)
 
 
-def _until_stepped(session: Session) -> Generator[None, None, bool]:
-    """Wait for a step of the simulation; False where simulation time stands still."""
-    clock, from_step = session.clock, session.clock.steps_seen
-    until_s = time.monotonic() + _LONGEST_STEP_S
-    while clock.steps_seen == from_step:
-        yield
-        stands = session.simulation.paused or time.monotonic() > until_s
-        if stands and clock.steps_seen == from_step:
-            return False
-    return True
-
-
 def _asked_by(command: ClaimedCommand) -> dict[str, Any]:
     return {"command_id": command.id, "requested_by": command.requested_by}
-
-
-def add_node(session: Session, command: ClaimedCommand) -> Progress:
-    """Add the node of the text `vrml` to the children of the node, or to the field, at a `path`."""
-    robot, params = session.simulation.robot, command.params
-    text = _require_one_node(params.get("vrml"))
-    place = yield from _find_room(robot, params.get("path") or "root")
-    before = _count(place)
-    node = import_node(place.field, text)
-    if node is None:
-        yield from _until_stepped(session)
-        node = _newest(robot, place, before)
-    if node is None:
-        raise CommandRefusedError(
-            f"Webots added nothing to {place.path}; {_SAYS}. A PROTO has to be declared in the "
-            "world file first: IMPORTABLE EXTERNPROTO"
-        )
-    path = _path_of(robot, node)
-    session.scene.added.add(int(node.getId()))
-    facts: dict[str, Any] = {"path": path, "type": str(node.getTypeName()), "parent": place.path}
-    yield from _until_stepped(session)
-    session.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
-    now_s = session.clock.sim_time_s
-    return facts | {"node": label(node), "sim_time_s": now_s, "a_reset": "removes it"}
 
 
 def _count(place: Place) -> int:
@@ -239,35 +304,6 @@ def _path_of(robot: Any, node: Any) -> str:
     found = robot.getFromDef(definition) if definition else None
     is_first = found is not None and found.getId() == node.getId()
     return definition if is_first else f"#{node.getId()}"
-
-
-def remove_node(session: Session, command: ClaimedCommand) -> Progress:
-    """Remove the node at a `path`, with everything in it."""
-    robot = session.simulation.robot
-    place = yield from find_node(robot, command.params.get("path"))
-    _require_removable(robot, place)
-    node, node_id = place.node, int(place.node.getId())
-    facts: dict[str, Any] = {
-        "path": place.path,
-        "type": str(node.getTypeName()),
-        "node": label(node),
-    }
-    is_added = session.scene.is_added(node)
-    is_known = is_added or session.scene.is_put_back(node)
-    removal = None if is_known else (yield from _removal(robot, place))
-    is_proto = bool(node.isProto())
-    node.remove()
-    if robot.getFromId(node_id) is not None:
-        yield from _until_stepped(session)
-    if robot.getFromId(node_id) is not None:
-        raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
-    reset = "puts it back"
-    if is_added:
-        reset = _ADDED_BEFORE
-    elif not is_known:
-        reset = session.scene.remember_removed(removal, is_proto=is_proto)
-    session.journal.event("remove_node", facts | _asked_by(command), place.path)
-    return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
 
 
 def _require_removable(robot: Any, place: Place) -> None:
@@ -399,8 +435,10 @@ class SceneEdits:
             of their removal.
     """
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, simulation: Simulation, journal: Journal, errors: ErrorReport) -> None:
+        self._simulation = simulation
+        self._journal = journal
+        self._errors = errors
         self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
         self.added: set[int] = set()
         self.removed: list[Removal] = []
@@ -444,7 +482,7 @@ class SceneEdits:
         put_back = {"paths": [path for path, is_set in outcomes.items() if is_set]}
         put_back |= self._bring_back()
         if facts := {name: paths for name, paths in put_back.items() if paths}:
-            self._session.journal.event("put_back", dict[str, object](facts))
+            self._journal.event("put_back", dict[str, object](facts))
 
     def _bring_back(self) -> dict[str, list[str]]:
         """Add the removed nodes again, the last one first, so that each index is right.
@@ -469,7 +507,7 @@ class SceneEdits:
     def _added_again(self, removal: Removal) -> Removal | None:
         """With the number that it has now; None where Webots did not add it."""
         try:
-            robot = self._session.simulation.robot
+            robot = self._simulation.robot
             if robot.getFromId(removal.node_id) is not None:
                 return removal
             top = removal.parent_id is None
@@ -478,20 +516,20 @@ class SceneEdits:
             node = None if field is None else import_node(field, removal.text, removal.entry)
             return None if node is None else removal._replace(node_id=int(node.getId()))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self._session.errors.failed(f"putting {removal.path} back", error)
+            self._errors.failed(f"putting {removal.path} back", error)
             return None
 
     def _set_back(self, edit: FieldEdit) -> bool:
         """Set a field to its value before; False where Webots or someone else has set it since."""
         try:
-            field = find_again(self._session.simulation.robot, edit.node_id, edit.name)
+            field = find_again(self._simulation.robot, edit.node_id, edit.name)
             if field is None or edit.name in _MOVED_BY_PHYSICS:
                 return False
             if not is_same(edit.type_name, read(field, edit.entry), edit.value):
                 return False
             write(field, edit.before, edit.entry)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self._session.errors.failed(f"putting {edit.path} back", error)
+            self._errors.failed(f"putting {edit.path} back", error)
             return False
         return True
 

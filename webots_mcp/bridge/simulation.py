@@ -445,14 +445,16 @@ class Clock:
         self.sim_time_s = simulation.time_s
         self.moved_s: float | None = None  # by the monotonic clock
         self.stepped_s = self.sim_time_s  # at the end of the newest step that the bridge saw
-        self.steps_seen = 0  # calls of `look` at which time had advanced, or the steps between them
+        self.steps_seen = (
+            0  # calls of `update` at which time had advanced, or the steps between them
+        )
         self.step_s: float | None = None  # of a loop that only watches the steps of others
         self.run = Run("start", self.sim_time_s)
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
         self._reset_from_s: float | None = None
 
-    def look(self, *, after_step: bool = False) -> bool:
-        """Read the time; True if it went back since the last look: a new run has begun.
+    def update(self, *, after_step: bool = False) -> bool:
+        """Read the time; return True if it went back since the last call: a new run has begun.
 
         Args:
             after_step: A step has just ended. Where the time is the same as before, only this
@@ -546,3 +548,8 @@ class Run:
         self.id = None
         self.uuid = new_uuid()
         self.rows = 0
+
+
+def mode_now(simulation: Simulation, clock: Clock) -> dict[str, object]:
+    """Return the simulation's mode and time, as answers of commands name them."""
+    return {"mode": simulation.mode_name, "sim_time_s": clock.sim_time_s}

@@ -19,15 +19,15 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.database.files import PRIVATE_FILE
 from webots_mcp.database.location import Database
 from webots_mcp.database.stacks import FORMAT, LIBRARIES, SIGNAL, VERSION, read_stacks, stacks_path
 from webots_mcp.database.waiting_file import lock
-
-if TYPE_CHECKING:
-    from webots_mcp.bridge.session import Session
 
 _MOST_LOGGED: Final = 20  # in a session: a loop that is slow by design would fill the log
 _WEBOTS: Final = ("controller", "vehicle")  # its packages
@@ -37,20 +37,29 @@ class Watchdog:
     """Of the loop of one session; it is off for a database in memory, and with a limit of 0.
 
     Args:
-        session: The session.
         database: Next to which the file is.
         limit_s: So long may the loop be silent, in seconds of wall time.
     """
 
-    def __init__(self, session: Session, database: Database, limit_s: float) -> None:
-        self._session = session
-        self._meter = session.simulation.meter
+    def __init__(
+        self,
+        simulation: Simulation,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        database: Database,
+        limit_s: float,
+    ) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._meter = simulation.meter
         self._limit_s = limit_s
         self._is_on = limit_s > 0 and isinstance(database, Path)
-        self._path = stacks_path(Path(str(database)), session.recorder.uuid)
+        self._path = stacks_path(Path(str(database)), recorder.uuid)
         self._lock = threading.Lock()
         self._about = {VERSION: FORMAT, "limit_s": limit_s}
-        files = session.simulation.step_files
+        files = simulation.step_files
         folders = [folder for file in files if (folder := Path(file).parent).name in _WEBOTS]
         libraries = [*LIBRARIES, *(f"{folder}{os.sep}" for folder in folders)]
         self._about |= {"step_files": files, "libraries": libraries}
@@ -63,19 +72,19 @@ class Watchdog:
     def begin(self) -> None:
         """What the loop's thread does from now on counts."""
         self._began_s = self._meter.at_s = time.perf_counter()
-        self.look()
+        self.check()
 
-    def look(self) -> None:
-        """In the maintainer's thread: write where a silent loop is, and log it once."""
+    def check(self) -> None:
+        """Write the stacks of a silent loop and log it once; called in the maintainer's thread."""
         with self._lock:
             if not self._is_on:
                 return
             try:
-                self._look()
+                self._write_if_silent()
             except (OSError, RuntimeError) as error:
                 self._end()
                 text = f"hangs of the loop are not looked for: {error}"
-                self._session.journal.log("warning", "bridge", text)
+                self._journal.log("warning", "bridge", text)
 
     def close(self) -> None:
         """Log what was written last, and remove the file."""
@@ -97,7 +106,7 @@ class Watchdog:
             self._leave_file()
         self._is_on = False
 
-    def _look(self) -> None:
+    def _write_if_silent(self) -> None:
         if self._file < 0 or not os.fstat(self._file).st_nlink:
             self._open()
         if self._judge():  # what came of a signal, which may have woken the loop: who sent it looks
@@ -125,21 +134,21 @@ class Watchdog:
 
     def _leave_file(self) -> None:
         """Close it; a signal that was sent meanwhile must neither end the process nor find it."""
-        self._look_at_signal()
+        self._check_signal()
         if "signal" in self._about:
             faulthandler.register(SIGNAL, _nowhere(), all_threads=False)
         file, self._file = self._file, -1  # first: the number may be another file's at once
         os.close(file)
 
-    def _look_at_signal(self) -> None:
+    def _check_signal(self) -> None:
         """Leave it to a controller that has taken it for itself."""
         if "signal" in self._about and signal.getsignal(SIGNAL) is not signal.SIG_DFL:
             del self._about["signal"]
 
     def _begin_anew(self) -> None:
         """Whose stacks will follow; the time of the file shows that Python runs."""
-        self._look_at_signal()
-        now = {"run": self._session.clock.run.uuid, "thread": self._meter.thread}
+        self._check_signal()
+        now = {"run": self._clock.run.uuid, "thread": self._meter.thread}
         head = json.dumps(self._about | now).encode() + b"\n"
         if head == self._head and os.fstat(self._file).st_size == len(head):
             os.utime(self._file)
@@ -157,8 +166,8 @@ class Watchdog:
         self._judged_s = stacks.wall_time_s
         if self._meter.at_s > self._began_s and self._logged < _MOST_LOGGED:
             self._logged += 1
-            clock = self._session.clock
-            self._session.recorder.record("stacks", clock.run, stacks.log_values(clock.sim_time_s))
+            clock = self._clock
+            self._recorder.record("stacks", clock.run, stacks.log_values(clock.sim_time_s))
         return True
 
 

@@ -43,7 +43,7 @@ from webots_mcp.cli.terminal import (
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.declaring import FOR_A_PERSON, SCOPE, Caller, Question, Reply, faults_of
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 # How options are called whose argument has another name in all questions.
 OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
@@ -181,7 +181,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
 
 
 @contextmanager
-def _caller(question: Question, recording: Recording) -> Generator[Caller | None]:
+def _caller(question: Question, recording: RecordingAccess) -> Generator[Caller | None]:
     """Who asks, where the question wants to know; what it starts ends with the command."""
     if not question.has_caller:
         yield None
@@ -196,7 +196,9 @@ def _caller(question: Question, recording: Recording) -> Generator[Caller | None
         companions.stop()
 
 
-def _valid(question: Question, given: Mapping[str, Any], recording: Recording) -> dict[str, Any]:
+def _valid(
+    question: Question, given: Mapping[str, Any], recording: RecordingAccess
+) -> dict[str, Any]:
     """The arguments as the question takes them; what was not given is left to their defaults."""
     meant: dict[str, Any] = {}
     for parameter in question.parameters:
@@ -223,7 +225,7 @@ def _valid(question: Question, given: Mapping[str, Any], recording: Recording) -
     return {name: getattr(model, name) for name in question.arguments.model_fields}
 
 
-def _kinds_in(recording: Recording) -> Mapping[str, str]:
+def _kinds_in(recording: RecordingAccess) -> Mapping[str, str]:
     """Of the parameters that robots have, by name."""
     from webots_mcp.store.parameters import kinds_of
 

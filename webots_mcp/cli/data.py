@@ -48,9 +48,9 @@ if TYPE_CHECKING:
     import sqlite3
 
     from webots_mcp.plotting.canvas import Picture
-    from webots_mcp.store.logs import Line
+    from webots_mcp.store.logs import FollowedLine
     from webots_mcp.store.reading.ranges import TimeRange
-    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.recording import RecordingAccess
     from webots_mcp.store.retention import Retention
     from webots_mcp.store.retention_plan import Plan
 
@@ -268,15 +268,25 @@ def import_(
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
     """What the import has brought, of the runs that are in both recordings now."""
-    from webots_mcp.store.merging import merge, settled
+    from webots_mcp.database.upgrade import in_current_schema
+    from webots_mcp.store.merging import settled
 
-    settled(source)  # first: no database is made for what is no recording
+    with in_current_schema(source) as current:
+        settled(current)  # first: no database is made for what is no recording
+        return _merge_into(recorded, source, current)
+
+
+def _merge_into(recorded: Where, source: Path, current: Path) -> dict[str, Any]:
+    """Merge a settled recording; `current` is the source, or its copy in the current schema."""
+    from webots_mcp.store.merging import merge
+
     with recorded.writer("import", {"source": source}, create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
-        runs = sorted(merge(connection, recording.data_dir, source).values())
+        runs = merge(connection, recording.data_dir, current, pictures=source.parent).values()
+        runs = sorted(runs)
         return {
             "new_run_ids": [run_id for run_id in runs if run_id > newest],
             "known_run_ids": [run_id for run_id in runs if run_id <= newest],
@@ -368,7 +378,9 @@ def retain(
             print_json({**done, "limits": described(connection)})
 
 
-def _prune(recording: Recording, connection: sqlite3.Connection, retention: Retention) -> Purged:
+def _prune(
+    recording: RecordingAccess, connection: sqlite3.Connection, retention: Retention
+) -> Purged:
     """Purge, with somebody who keeps the log of the database short meanwhile."""
     from webots_mcp.database.connection import CHECKPOINT_TIMEOUT_MS
     from webots_mcp.database.maintenance import Maintainer
@@ -494,15 +506,15 @@ def tail(
     with recorded.reader() as connection:
         found = robot and resolve_robot(connection, robot, time.time())
         follower = Follower(connection, found.id if found else None)
-        _print_lines(follower.look(limit), as_json=json)
+        _print_lines(follower.read_new(limit), as_json=json)
         following = not no_follow and recorded.may_change()
         while following:
             wait(interval_s)
             recorded.recording().take_in()
-            _print_lines(_newest_states_only(follower.look()), as_json=json)
+            _print_lines(_newest_states_only(follower.read_new()), as_json=json)
 
 
-def _print_lines(lines: Sequence[Line], *, as_json: bool) -> None:
+def _print_lines(lines: Sequence[FollowedLine], *, as_json: bool) -> None:
     for line in lines:
         if as_json:
             print(json.dumps(line._asdict(), ensure_ascii=False), flush=True)
@@ -512,7 +524,7 @@ def _print_lines(lines: Sequence[Line], *, as_json: bool) -> None:
         print(printable(f"{clock} {line.robot} {at:>11} {line.kind:<8} {line.text}"), flush=True)
 
 
-def _newest_states_only(lines: Sequence[Line]) -> list[Line]:
+def _newest_states_only(lines: Sequence[FollowedLine]) -> list[FollowedLine]:
     """A robot that publishes a hundred times a second would scroll all else away."""
     newest = {line.robot: line for line in lines if line.kind == "state"}
     return [line for line in lines if line.kind != "state" or newest[line.robot] is line]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import sqlite3
 
     from webots_mcp.store.reading.ranges import Scope, TimeRange
-    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.recording import RecordingAccess
 
 if TYPE_CHECKING or hasattr(cyclopts.Parameter(), "metavar"):
     Parameter = cyclopts.Parameter
@@ -156,13 +156,13 @@ class Where:
         Path | None, Parameter("--database", metavar="FILE", help="The database file itself.")
     ] = None
 
-    def recording(self, *, read_only: bool = True) -> Recording:
+    def recording(self, *, read_only: bool = True) -> RecordingAccess:
         """The recording."""
         from webots_mcp.database.location import resolve_database
-        from webots_mcp.store.recording import Recording
+        from webots_mcp.store.recording import RecordingAccess
 
         where = resolve_database(self.database, self.data_dir)
-        return Recording(*where, read_only=read_only, asker="cli")
+        return RecordingAccess(*where, read_only=read_only, asker="cli")
 
     def typed(self) -> list[str]:
         """The options that name it in another command line."""
@@ -189,7 +189,7 @@ class Where:
     @contextmanager
     def writer(
         self, command: str, arguments: Mapping[str, Any] = _NO_KINDS, *, create: bool = False
-    ) -> Generator[tuple[Recording, sqlite3.Connection]]:
+    ) -> Generator[tuple[RecordingAccess, sqlite3.Connection]]:
         """The recording, and a connection that may write to it for a command with such arguments.
 
         Raises:
@@ -315,7 +315,7 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
         print(f"webots-mcp: left out: {said}", file=sys.stderr)
 
 
-def make_chunks_first(recording: Recording) -> None:
+def make_chunks_first(recording: RecordingAccess) -> None:
     """Put into chunks what no server has, so that a question of any length is answered."""
     from webots_mcp.cli.terminal import shown_progress
     from webots_mcp.store.chunk_making import make_missing_chunks

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from webots_mcp.database.location import Database
     from webots_mcp.simulator.launch import Launch, SessionStart
     from webots_mcp.simulator.orders import WebotsLine
-    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.recording import RecordingAccess
     from webots_mcp.store.retention import Asked
 
 _AS_BEFORE: Final = Limits()
@@ -202,11 +202,11 @@ def _keeping_what_is_made() -> Generator[None]:
 def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
     """Set the limits where that is this server's to do; say which others hold."""
     from webots_mcp.errors import NoDatabaseError
-    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.recording import RecordingAccess
     from webots_mcp.store.retention import ask
 
     try:
-        with Recording(database, data_dir).writer() as connection:
+        with RecordingAccess(database, data_dir).writer() as connection:
             notes = ask(connection, limits)
     except NoDatabaseError:
         return  # they are set when there is one
@@ -401,7 +401,7 @@ def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
     return named
 
 
-def _has_recorded(recording: Recording, before: int) -> bool:
+def _has_recorded(recording: RecordingAccess, before: int) -> bool:
     """Whether a session after `before` has a run."""
     from webots_mcp.simulator.launch import starts_since
 
@@ -412,7 +412,7 @@ def _has_recorded(recording: Recording, before: int) -> bool:
         return True
 
 
-def _watch(recording: Recording, before: int, world: Path, patience_s: float) -> None:
+def _watch(recording: RecordingAccess, before: int, world: Path, patience_s: float) -> None:
     """Say which controller records in the stand-in, after the session `before`; or why none."""
     from webots_mcp.simulator.launch import starts_since, why_silent
 
@@ -432,14 +432,16 @@ def _watch(recording: Recording, before: int, world: Path, patience_s: float) ->
         time.sleep(_LOOK_EVERY_S)
 
 
-def _recording(data_dir: Path | None, project: Path) -> Recording:
+def _recording(data_dir: Path | None, project: Path) -> RecordingAccess:
     """Where the controllers of the project record, whatever folder this one is started in."""
     from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER
     from webots_mcp.database.location import resolve_database
-    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.recording import RecordingAccess
 
     named = data_dir or os.environ.get(DATA_DIR_VARIABLE)
-    return Recording(*resolve_database(None, named or project / PROJECT_DATA_FOLDER), asker="cli")
+    return RecordingAccess(
+        *resolve_database(None, named or project / PROJECT_DATA_FOLDER), asker="cli"
+    )
 
 
 def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _Recorder) -> int:
@@ -493,7 +495,7 @@ class _Console:
 class _Recorder(ExitStack):
     """Records Webots' console, from when it listens."""
 
-    def __init__(self, launched: Launch, recording: Recording) -> None:
+    def __init__(self, launched: Launch, recording: RecordingAccess) -> None:
         super().__init__()
         self._launched = launched
         self._recording = recording

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from webots_mcp.questions.declaring import Question
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.steering.trial_run import Simulators
-    from webots_mcp.store.parameters import Result, Trial
-    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.parameters import TrialRecord, TrialResult
+    from webots_mcp.store.recording import RecordingAccess
 
 _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
@@ -359,7 +359,7 @@ def trials(
         draw(recording, set_id)
 
 
-def run_plan(recording: Recording, plan: WorldPlan, options: TrialOptions) -> int:
+def run_plan(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) -> int:
     """Run what is left of the plan's set; returns its id."""
     from webots_mcp.steering.trial_run import SetRun, require_optuna, run_trials
     from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
@@ -408,7 +408,7 @@ def _cluster(options: TrialOptions, plan: WorldPlan) -> Generator[Simulators]:
         yield simulators
 
 
-def _picture_of(file: Path | None) -> Callable[[Recording, int], None] | None:
+def _picture_of(file: Path | None) -> Callable[[RecordingAccess, int], None] | None:
     """What draws the picture that is asked for; None where none is."""
     if file is None:
         return None
@@ -417,7 +417,7 @@ def _picture_of(file: Path | None) -> Callable[[Recording, int], None] | None:
 
     sheet = Sheet(image_format=image_format_of(file))
 
-    def draw(recording: Recording, set_id: int) -> None:
+    def draw(recording: RecordingAccess, set_id: int) -> None:
         with recording.reader() as connection:
             picture = plot_trials(connection, set_id, sheet=sheet)
         with redirect_stdout(sys.stderr):  # stdout may be JSON
@@ -426,7 +426,7 @@ def _picture_of(file: Path | None) -> Callable[[Recording, int], None] | None:
     return draw
 
 
-def _set_of(recording: Recording, plan: WorldPlan, options: TrialOptions) -> int:
+def _set_of(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) -> int:
     """The set that was begun with this plan, or a new one."""
     from webots_mcp.store.parameters import create_trial_set, find_trial_set
 
@@ -436,7 +436,9 @@ def _set_of(recording: Recording, plan: WorldPlan, options: TrialOptions) -> int
         return known or create_trial_set(connection, text, plan.trials)
 
 
-def _begun_set(recording: Recording, file: Path, plan: WorldPlan, options: TrialOptions) -> int:
+def _begun_set(
+    recording: RecordingAccess, file: Path, plan: WorldPlan, options: TrialOptions
+) -> int:
     """The set that was begun with this plan.
 
     Raises:
@@ -459,7 +461,7 @@ def _text_of(plan: WorldPlan, options: TrialOptions) -> str:
 class _Progress:
     """A line on stderr for each trial that is over, and for each set that takes the lead."""
 
-    def __init__(self, recording: Recording, set_id: int, plan: WorldPlan) -> None:
+    def __init__(self, recording: RecordingAccess, set_id: int, plan: WorldPlan) -> None:
         from webots_mcp.store.parameters import trials_of
 
         with recording.reader() as connection:
@@ -472,7 +474,7 @@ class _Progress:
             print(f"trial set {set_id}: {self._over} of {self._of} trials were done before",
                   file=sys.stderr)  # fmt: skip
 
-    def tell(self, trial: Trial, result: Result) -> None:
+    def tell(self, trial: TrialRecord, result: TrialResult) -> None:
         """That a trial is over, and what came of it."""
         self._over += 1
         came = text_of(result.score) if result.status == "done" else result.error
@@ -499,7 +501,9 @@ class _Progress:
             print(f"      best so far: {said}", file=sys.stderr, flush=True)
 
 
-def _show_trials(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
+def _show_trials(
+    recording: RecordingAccess, set_id: int, plan: WorldPlan, *, as_json: bool
+) -> None:
     from webots_mcp.judging.divergence import repeats_noted
     from webots_mcp.judging.run_score import unseen
     from webots_mcp.store.parameters import ranking_of, trials_of

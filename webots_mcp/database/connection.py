@@ -15,7 +15,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
-from webots_mcp.contract import APPLICATION_ID, SCHEMA_VERSION, new_uuid
+from webots_mcp.contract import (
+    APPLICATION_ID,
+    PREVIOUS_SCHEMA_VERSION,
+    SCHEMA_VERSION,
+    new_uuid,
+)
 from webots_mcp.database.files import PRIVATE_FILE, make_folder
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.errors import (
@@ -293,10 +298,12 @@ def require_current(connection: sqlite3.Connection) -> None:
             "upgrade it with 'pip install --upgrade', from where it was installed"
         )
     if version < SCHEMA_VERSION:
+        fix = "read it with the webots-mcp that made it"
+        if version == PREVIOUS_SCHEMA_VERSION:
+            fix = "bring its runs over with 'webots-mcp import FILE'"
         raise SchemaTooOldError(
             f"{_file(connection, 'main')} has schema {version}, of an older webots-mcp, and this "
-            f"one knows {SCHEMA_VERSION}: move it aside, so that a new one is begun, and read it "
-            "with the webots-mcp that made it"
+            f"one knows {SCHEMA_VERSION}: move it aside, so that a new one is begun, and {fix}"
         )
 
 
@@ -315,18 +322,33 @@ def create_schema(connection: sqlite3.Connection) -> None:
 
 @cache
 def shipped_statements() -> tuple[str, ...]:
-    """The statements of `schema.sql`; each ends with a semicolon at the end of a line."""
-    return tuple(each for each in SCHEMA_FILE.read_text("utf-8").split(";\n") if each.strip())
+    """Return the statements of `schema.sql`."""
+    return statements_of(SCHEMA_FILE)
+
+
+def statements_of(file: Path) -> tuple[str, ...]:
+    """Return the statements of a file; each ends with a semicolon at the end of a line."""
+    return tuple(each for each in file.read_text("utf-8").split(";\n") if each.strip())
+
+
+def shipped_objects() -> dict[str, str]:
+    """Return by their names the statements that make what each recording has."""
+    return _objects_of(shipped_statements())
 
 
 @cache
-def shipped_objects() -> dict[str, str]:
-    """By their names, the statements that make tables, views and indexes."""
-    made = ((_MADE.match(each), each.rstrip()) for each in shipped_statements())
+def _objects_of(statements: tuple[str, ...]) -> dict[str, str]:
+    """Return by their names the statements that make tables, views, indexes and triggers."""
+    made = ((_MADE.match(each), each.rstrip()) for each in statements)
     return {match[1].lower(): each for match, each in made if match}
 
 
-def require_shipped(connection: sqlite3.Connection, *, schema: str = "main") -> None:
+def require_shipped(
+    connection: sqlite3.Connection,
+    *,
+    schema: str = "main",
+    statements: tuple[str, ...] | None = None,
+) -> None:
     """Raise where a table, view or index of ours is not what we ship, or something runs on one.
 
     A table or view that is missing is as wrong; an index is not.
@@ -334,11 +356,12 @@ def require_shipped(connection: sqlite3.Connection, *, schema: str = "main") -> 
     Args:
         connection: Nothing but PRAGMAs was asked of that database yet.
         schema: The name that the database was attached under.
+        statements: Those that made the tables; None for those of this version.
 
     Raises:
         ForeignDatabaseError: The text names what it is, and what to do.
     """
-    shipped = shipped_objects()
+    shipped = _objects_of(statements or shipped_statements())
     texts = set(shipped.values())
     found = connection.execute(_OBJECTS.format(schema)).fetchall()
     names = {name.lower() for _, name, _, _ in found}

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 10;
+PRAGMA user_version = 11;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -7,6 +7,7 @@ CREATE TABLE alembic_version (
 CREATE TABLE recording (
 	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
 	created_wall_time_s FLOAT NOT NULL, 
+	reserved_state_id INTEGER DEFAULT 0 NOT NULL /* no state gets this id or a smaller one: the newest states were deleted up to it */, 
 	PRIMARY KEY (uuid)
 );
 CREATE TABLE robot (
@@ -82,14 +83,18 @@ CREATE INDEX ix_run_robot_id_id ON run (robot_id, id);
 CREATE INDEX ix_run_session_id ON run (session_id);
 CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
 CREATE TABLE state (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	id INTEGER NOT NULL, 
 	run_id INTEGER NOT NULL, 
 	sim_time_s FLOAT NOT NULL, 
 	wall_time_s FLOAT NOT NULL, 
 	data TEXT NOT NULL /* JSON object */, 
 	replaced TEXT /* JSON object: path of a replaced value to what it was (nan, inf, ...) */, 
+	PRIMARY KEY (id), 
 	CONSTRAINT fk_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
+CREATE TRIGGER state_ids_stay AFTER DELETE ON state
+WHEN old.id > (SELECT coalesce(max(id), 0) FROM state)
+BEGIN UPDATE recording SET reserved_state_id = max(reserved_state_id, old.id); END;
 CREATE INDEX ix_state_run_id_sim_time_s ON state (run_id, sim_time_s);
 CREATE TABLE signal (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
@@ -537,4 +542,4 @@ SELECT r.name AS robot, g.run_id, s.name AS signal, g.start_sim_time_s AS start_
   c.sum / nullif(c.value_count, 0) AS mean, c.first, c.last, c.largest_step, c.change_count
 FROM chunk c JOIN row_group g ON g.id = c.group_id AND g.is_complete
 JOIN signal s ON s.id = c.signal_id JOIN robot r ON r.id = s.robot_id;
-INSERT INTO alembic_version (version_num) VALUES ('0010');
+INSERT INTO alembic_version (version_num) VALUES ('0011');

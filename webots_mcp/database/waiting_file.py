@@ -75,8 +75,11 @@ STATEMENTS: Final[dict[Kind, str]] = {
         # A conflict, instead of this question, would use up an id.
         "AND NOT EXISTS (SELECT 1 FROM run WHERE uuid = :uuid)"
     ),
+    # An id that a deleted state had is given to no other: see `recording.reserved_state_id`.
     "state": (
-        "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, replaced) VALUES (?, ?, ?, ?, ?)"
+        "INSERT INTO state (id, run_id, sim_time_s, wall_time_s, data, replaced) VALUES ("
+        "max((SELECT coalesce(max(id), 0) FROM state), "
+        "(SELECT CAST(reserved_state_id AS INTEGER) FROM recording)) + 1, ?, ?, ?, ?, ?)"
     ),
     "event": (
         "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name, data) "

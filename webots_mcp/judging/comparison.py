@@ -26,7 +26,7 @@ from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_infos
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 # -- how a signal differs between groups of runs ---------------------------------------------------
 
@@ -78,7 +78,7 @@ class Difference:
 
 
 def difference_of(
-    signal: Signal,
+    signal: RegisteredSignal,
     groups: Sequence[Sequence[dict[str, Summary] | None]],
     tests: int,
     min_effect_sd: float,
@@ -409,7 +409,7 @@ def _part(
 def _summarise(
     connection: sqlite3.Connection,
     part: RunPart,
-    signals: Sequence[Signal],
+    signals: Sequence[RegisteredSignal],
     deadline: Deadline,
     unread: dict[str, None],
 ) -> dict[str, Summary] | None:

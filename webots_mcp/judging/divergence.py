@@ -27,7 +27,7 @@ from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot, just_after
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 _MATTERS: Final = 0.001  # of metres, of radians, of the largest value where there is no scale
 _SHORT_ROWS: Final = 2  # between the last row and the time up to which rows are compared
@@ -207,7 +207,7 @@ def compare_rows(
 
 def _read(
     connection: sqlite3.Connection, run_id: int, until_s: float, deadline: Deadline
-) -> tuple[Frame, dict[str, Signal]]:
+) -> tuple[Frame, dict[str, RegisteredSignal]]:
     """A run, and the signals that it has."""
     subject = Subject(fetch_run(connection, run_id).robot_id, "", run_id)
     segment = whole_run(connection, run_id)
@@ -256,7 +256,7 @@ def _aligned(frames: tuple[Frame, Frame]) -> _Pair:
     return _Pair(frames, rows, frames[0].times[rows[0]], notes)
 
 
-def _parted(signal: Signal, pair: _Pair, within: float | None) -> PartedSignal | None:
+def _parted(signal: RegisteredSignal, pair: _Pair, within: float | None) -> PartedSignal | None:
     """How a signal differs; None where it is the same in all rows that were read."""
     name, unit = signal.name, signal.unit
     if (signal.role or "").rstrip("23456789") in ("x", "y", "z"):
@@ -316,7 +316,7 @@ def _value(values: Decoded, row: int) -> Value:
     return shown[:_LONGEST_TEXT] if isinstance(shown, str) else shown
 
 
-def _tolerance(signal: Signal, unit: str | None, values: Sequence[Array]) -> float:
+def _tolerance(signal: RegisteredSignal, unit: str | None, values: Sequence[Array]) -> float:
     if unit in METRES:
         return _MATTERS / METRES[unit]
     if signal.turn is not None:

@@ -30,7 +30,7 @@ from webots_mcp.store.reading.frame_summary import change_points
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.runs import run_info
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 _SHARE: Final = "share of "
 _DUST: Final = 1e-9  # of a figure
@@ -67,7 +67,7 @@ class Way:
         return travelled(tracks_of(self.times, self.x_m, self.y_m))
 
 
-def way_in(frame: Frame, position: tuple[Signal, Signal]) -> Way:
+def way_in(frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal]) -> Way:
     """The way of a robot in a frame, as far as it is read before the deadline."""
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
@@ -80,7 +80,7 @@ class RunPart:
 
     robot_id: int
     segment: Segment
-    known: dict[str, Signal]
+    known: dict[str, RegisteredSignal]
     motion: Motion
 
     def cut(self, compared_s: float) -> RunPart:

@@ -20,7 +20,7 @@ from webots_mcp.store.reading.ranges import TimeRange, unrecorded, whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot, kept_parts
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import run_info
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 SCORE_DEADLINE_S: Final = 60.0
 _STORED: Final = (
@@ -119,7 +119,7 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
 def _found(
     score: Score,
     frame: Frame,
-    known: Mapping[str, Signal],
+    known: Mapping[str, RegisteredSignal],
     duration_s: float,
     counts: Mapping[str, int | str],
 ) -> Scored:

@@ -12,9 +12,9 @@ from webots_mcp.analysis.arrays import Array, Indexes, np
 from webots_mcp.analysis.summary import (
     FLAT_BAND,
     LARGEST,
-    Line,
+    FittedLine,
+    LevelStep,
     Spike,
-    Step,
     Summary,
     find_spikes,
     find_step,
@@ -39,7 +39,12 @@ from webots_mcp.store import chunk_making
 from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.frame import Frame, Zones, read_frame, read_kept
-from webots_mcp.store.reading.frame_summary import Changes, change_points, reads_values, summary_of
+from webots_mcp.store.reading.frame_summary import (
+    ChangePoints,
+    change_points,
+    reads_values,
+    summary_of,
+)
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import (
     QUESTION_DEADLINE_S,
@@ -49,7 +54,7 @@ from webots_mcp.store.reading.segment import (
     shown_time,
 )
 from webots_mcp.store.series import STATES_SHARE, signals_left
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
 
@@ -119,7 +124,7 @@ class Trend:
     resolution_s: float | None
     flat_since_s: float | None
     spikes: tuple[Spike, ...] | None
-    step: Step | None
+    step: LevelStep | None
     missing: int
     too_large: int | None
     change: float
@@ -250,7 +255,7 @@ def _monotonic_chunks(zones: Zones, held: Indexes) -> Monotonic | None:
 
 
 def judge(
-    signal: Signal,
+    signal: RegisteredSignal,
     summary: Summary,
     course: Course,
     spikes: list[Spike] | None = None,
@@ -315,7 +320,7 @@ def _slow_share(means: Summary, inner_variance: float) -> float:
     return between / (between + inner_variance)
 
 
-def _of_all(line: Line | None, slow: float) -> Line | None:
+def _of_all(line: FittedLine | None, slow: float) -> FittedLine | None:
     """Of the variance of all values, the line through their means explains so much less."""
     return line and replace(line, r2=line.r2 * slow)
 
@@ -350,7 +355,7 @@ def _monotonic(values: Array) -> Monotonic | None:
 
 def _shape(
     summary: Summary,
-    line: Line | None,
+    line: FittedLine | None,
     monotonic: Monotonic | None,
     swings: Sequence[Swing],
     rest_s: float | None,
@@ -592,7 +597,7 @@ def _unseen_swings(run: RunTrends) -> str:
 def _run_trends(
     connection: sqlite3.Connection,
     segment: Segment,
-    signals: Sequence[Signal],
+    signals: Sequence[RegisteredSignal],
     limit: int,
     deadline: Deadline,
 ) -> RunTrends:
@@ -642,7 +647,7 @@ def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[
             yield name
 
 
-def _trend(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
+def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend | None:
     """That of every value; of many rows that of the means of chunks."""
     name, is_long = signal.name, len(frame) > frame_summary.FULL_ROWS
     summary = summary_of(frame, signal)
@@ -690,7 +695,7 @@ def _with_kept(
 
 
 def _state_trends(
-    connection: sqlite3.Connection, found: Changes, states: Sequence[Signal]
+    connection: sqlite3.Connection, found: ChangePoints, states: Sequence[RegisteredSignal]
 ) -> tuple[StateTrend, ...]:
     """Text, flags and numbers that name a mode, those that changed most often first."""
     segment = found.segment

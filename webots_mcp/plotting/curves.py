@@ -16,7 +16,7 @@ from webots_mcp.plotting.parts import Part
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.series import NumberColumns, RunHistory
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum
 _BREAK: Point = (math.nan, math.nan, math.nan, math.nan)
@@ -225,7 +225,11 @@ class Path:
 
 
 def read_path(
-    connection: sqlite3.Connection, part: Part, x: Signal, y: Signal, deadline_s: float
+    connection: sqlite3.Connection,
+    part: Part,
+    x: RegisteredSignal,
+    y: RegisteredSignal,
+    deadline_s: float,
 ) -> Path:
     """The places of one run: of every row, or of every so many if the rows are many."""
     (segment,) = part.range.segments

@@ -30,9 +30,9 @@ from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.series import MOST_POINTS, History, RunHistory, query_history
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
-Known = dict[str, Signal]
+Known = dict[str, RegisteredSignal]
 
 MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze
 MOST_RUNS: Final = 10  # each with a colour and dashes of its own

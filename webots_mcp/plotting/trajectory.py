@@ -62,7 +62,7 @@ from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 _FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
 _SIGNALS_SHARE: Final = 0.5  # of the time; the rest is for the way, and for when it was stuck
@@ -161,7 +161,7 @@ def position_of(
     newest: TimeRange,
     named: tuple[str, str] | None = None,
     deadline: Deadline | None = None,
-) -> tuple[Signal, Signal]:
+) -> tuple[RegisteredSignal, RegisteredSignal]:
     """The position that is drawn: the one named, else the one of the newest run.
 
     Raises:
@@ -181,7 +181,7 @@ def position_of(
     return position
 
 
-def _number(known: Known, name: str) -> Signal:
+def _number(known: Known, name: str) -> RegisteredSignal:
     signal = one_signal(known, name)
     if not signal.is_number:
         raise InvalidInputError(f"{name!r} holds no numbers: it cannot be a position")
@@ -205,7 +205,7 @@ def _flagged(part: Part, flag: str) -> Lane:
     return Lane(flag, [each for each in intervals if each.value == "true"], ())
 
 
-def _label(signal: Signal, usual_unit: str | None) -> str:
+def _label(signal: RegisteredSignal, usual_unit: str | None) -> str:
     """Webots measures in metres: a position whose name has no unit is taken to be one in metres."""
     unit = signal.unit or usual_unit
     return f"{signal.name} [{unit}]" if unit else signal.name

@@ -43,7 +43,7 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.signals.naming import listed, nearest_first
-from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, trials_of
+from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, trials_of
 
 _MOST_TOLD_CELLS: Final = 60  # more texts in a grid would not fit
 _DARK: Final = 0.5  # of the colour scale: on darker cells texts are white
@@ -98,13 +98,13 @@ def compose_trials(
     return TrialAxes(title, chosen, str(plan.get("score")), ranking.sets, best), tuple(notes)
 
 
-def _varied(trials: Sequence[Trial]) -> list[str]:
+def _varied(trials: Sequence[TrialRecord]) -> list[str]:
     """The parameters that had more than one value."""
     names = dict.fromkeys(name for each in trials for name in each.values)
     return [name for name in names if len({repr(each.values.get(name)) for each in trials}) > 1]
 
 
-def _chosen(trials: Sequence[Trial], names: Sequence[str]) -> list[str]:
+def _chosen(trials: Sequence[TrialRecord], names: Sequence[str]) -> list[str]:
     known = list(dict.fromkeys(name for each in trials for name in each.values))
     for name in names:
         if name not in known:
@@ -115,7 +115,7 @@ def _chosen(trials: Sequence[Trial], names: Sequence[str]) -> list[str]:
     return list(names)
 
 
-def _outcome(trial: Trial, names: Sequence[str]) -> Outcome:
+def _outcome(trial: TrialRecord, names: Sequence[str]) -> Outcome:
     values: dict[str, Any] = {name: trial.values.get(name) for name in names}
     return Outcome(values, trial.score, trial.error, pruned=trial.status == "pruned")
 

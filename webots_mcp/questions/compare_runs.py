@@ -64,7 +64,7 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
-from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
 
 RUN_COLUMNS: Final = (
@@ -107,7 +107,7 @@ _TAKE_AWAY: Final = "-"
     quotes=True,
 )
 def webots_list_runs(
-    recording: Recording,
+    recording: RecordingAccess,
     limit: Limit = 20,
     cursor: Cursor = None,
     parameters: Annotated[
@@ -123,7 +123,7 @@ def webots_list_runs(
     are not as the code declared them, or differ between these runs.
     """
     with recording.reader() as connection:
-        header = look(connection, robot).header() if robot else header_of_only(connection)
+        header = view_robot(connection, robot).header() if robot else header_of_only(connection)
         most = min(limit, MOST_RUNS)
         found = list_runs(
             connection, robot=robot, limit=most, before_id=cursor, parameters=parameters
@@ -150,7 +150,7 @@ def webots_list_runs(
     quotes=True,
 )
 def webots_compare_runs(
-    recording: Recording,
+    recording: RecordingAccess,
     run_ids: RunIds = None,
     signals: AnyNames = None,
     limit: ShownLimit = None,
@@ -193,7 +193,7 @@ def webots_compare_runs(
         return answer_about(view, ComparisonAnswer, find)
 
 
-def _first_run(recording: Recording, set_id: int) -> int:
+def _first_run(recording: RecordingAccess, set_id: int) -> int:
     """Of its best parameters, so that the answer is about the robot that was tried."""
     with recording.reader() as connection:
         return next(iter(scored_runs(connection, set_id).values()))[0]
@@ -208,7 +208,7 @@ def _first_run(recording: Recording, set_id: int) -> int:
     example="4 baseline --note 'before the new gait'",
 )
 def webots_annotate_run(
-    recording: Recording,
+    recording: RecordingAccess,
     label: Annotated[str, Field(max_length=100, description="Short name; '-' takes it away.")] = "",
     note: Annotated[str, Field(max_length=4000, description="Any text, or '-'.")] = "",
     robot: RobotName = None,
@@ -310,7 +310,7 @@ def _cell(name: str, value: Any) -> Any:
 
 
 def _compared(
-    view: View,
+    view: RobotView,
     run_ids: Sequence[int] | None,
     set_id: int | None,
     names: Sequence[str] | None,
@@ -460,7 +460,7 @@ def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: 
     quotes=True,
 )
 def webots_check_run(
-    recording: Recording,
+    recording: RecordingAccess,
     expect: Annotated[
         list[Annotated[str, Field(max_length=1100)]] | None,
         Field(
@@ -483,7 +483,7 @@ def webots_check_run(
 
 
 def _checked(
-    view: View, expected: Sequence[Expectation], project: Sequence[Expected] | None
+    view: RobotView, expected: Sequence[Expectation], project: Sequence[Expected] | None
 ) -> dict[str, Any]:
     """What became of the checks, the worst first; of those that passed the names."""
     deadline_s = _CHECKED_FOR_A_PERSON_S if is_for_a_person() else CHECK_DEADLINE_S

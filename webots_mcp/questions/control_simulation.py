@@ -31,7 +31,7 @@ from webots_mcp.simulator.orders import Order
 from webots_mcp.simulator.starting import Mode, Start, free_port
 from webots_mcp.steering.dispatch import ACTION, Dispatcher, require_possible
 from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,
@@ -51,7 +51,7 @@ _RUN_WAIT_S: Final = 60.0
 
 @question("Control the simulation", DESTROYS, core=True)
 async def webots_simulation_control(
-    recording: Recording,
+    recording: RecordingAccess,
     command: Annotated[Order, Field(description="reset and reload begin a new run at time 0.")],
     caller: Caller,
     steps: Annotated[
@@ -84,7 +84,7 @@ async def webots_simulation_control(
 
 @question("Reload the world", DESTROYS)
 async def webots_world_reload(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     force: Force = False,
     robot: RobotName = None,
@@ -97,7 +97,7 @@ async def webots_world_reload(
 
 @question("Reset the world", DESTROYS)
 async def webots_world_reset(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     force: Force = False,
     robot: RobotName = None,
@@ -110,7 +110,7 @@ async def webots_world_reset(
 
 @question("Reset the controller's state", DESTROYS)
 async def webots_reset_controller_state(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _WAIT_S,
@@ -130,7 +130,7 @@ World = Annotated[str, Field(max_length=1000, description="A .wbt file.")]
 
 @question("Launch Webots on a world", CHANGES)
 async def webots_launch_world(
-    recording: Recording,
+    recording: RecordingAccess,
     world: World,
     caller: Caller,
     mode: Annotated[Mode | None, Field(description="To begin with; else as it prefers.")] = None,
@@ -157,7 +157,7 @@ async def webots_launch_world(
 
 @question("Load another world", DESTROYS)
 async def webots_load_world(
-    recording: Recording,
+    recording: RecordingAccess,
     world: World,
     caller: Caller,
     robot: RobotName = None,
@@ -174,7 +174,7 @@ async def webots_load_world(
 
 @question("Quit Webots", DESTROYS)
 async def webots_quit(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _WORLD_WAIT_S,
@@ -184,7 +184,7 @@ async def webots_quit(
 
 
 def _request(
-    recording: Recording, caller: Caller, robot: str | None, timeout_wall_s: float
+    recording: RecordingAccess, caller: Caller, robot: str | None, timeout_wall_s: float
 ) -> WorldRequest:
     dispatcher = Dispatcher(recording, caller.report)
     return WorldRequest(recording, dispatcher, robot, timeout_wall_s, caller.companions.webots)
@@ -213,7 +213,7 @@ async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStar
 
 
 def _answer(
-    recording: Recording, launched: Launch, first: SessionStart | None, started_s: float
+    recording: RecordingAccess, launched: Launch, first: SessionStart | None, started_s: float
 ) -> CommandAnswer:
     header: dict[str, Any] = {}
     if first is not None:
@@ -263,7 +263,7 @@ def _described(launched: Launch) -> dict[str, Any]:
     of_controller="parameters",
 )
 async def webots_run(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     until: Annotated[
         str | None,

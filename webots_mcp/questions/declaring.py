@@ -54,7 +54,7 @@ from webots_mcp.errors import (
 from webots_mcp.signals.naming import perhaps_meant
 from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest, Requester
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ class Question:
         return self._parameter_of(Caller) is not None
 
     async def ask(
-        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
+        self, recording: RecordingAccess, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
         """The answer to valid arguments.
 
@@ -243,7 +243,7 @@ class Question:
         return _with_left_out(reply, invalid.described())
 
     async def _call(
-        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
+        self, recording: RecordingAccess, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
         given = dict(arguments)
         if scope := self._parameter_of(Scope):
@@ -370,7 +370,7 @@ class MergedQuestion(Question):
                 yield _keyword(name, kind, defaults[0])
 
     async def ask(
-        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
+        self, recording: RecordingAccess, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
         """The answer of the part that was chosen.
 

@@ -23,7 +23,7 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.store.recording import Recording, look
+from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.robots import find_holder, list_robots
 
 Path = Annotated[
@@ -58,7 +58,7 @@ _NONE_LIVE: Final = (
     quotes=True,
 )
 async def webots_get_scene(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     path: Annotated[str | None, Field(description="Only in this node.")] = None,
     depth: Annotated[_Count | None, Field(description="Levels; 2 unless types or names.")] = None,
@@ -80,7 +80,7 @@ async def webots_get_scene(
 
 @question("Get a field", READS, quotes=True)
 async def webots_get_field(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     path: Path,
     start: Annotated[_Start | None, Field(description="From this entry or field on.")] = None,
@@ -92,7 +92,7 @@ async def webots_get_field(
 
 @question("Set a field", CHANGES)
 async def webots_set_field(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     path: Path,
     value: Annotated[
@@ -113,7 +113,7 @@ async def webots_set_field(
 
 @question("Add a node", CHANGES)
 async def webots_add_node(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     vrml: Annotated[
         str, Field(description='As in a world file: DEF BOX Solid { name "box" children [...] }')
@@ -130,7 +130,7 @@ async def webots_add_node(
 
 @question("Remove a node", DESTROYS)
 async def webots_remove_node(
-    recording: Recording, caller: Caller, path: Path, robot: RobotName = None
+    recording: RecordingAccess, caller: Caller, path: Path, robot: RobotName = None
 ) -> CommandAnswer:
     """Remove a node with all in it; a reload of the world brings it back, a reset does not."""
     return await _ask(recording, caller, robot, "remove_node", path=path)
@@ -140,7 +140,7 @@ async def webots_remove_node(
 
 
 async def _ask(
-    recording: Recording, caller: Caller, robot: str | None, action: str, **params: Any
+    recording: RecordingAccess, caller: Caller, robot: str | None, action: str, **params: Any
 ) -> CommandAnswer:
     """Let a Supervisor read the scene, or change it; parameters that are None are left out.
 
@@ -160,7 +160,7 @@ async def _ask(
     return await Dispatcher(recording, caller.report).ask(name, action, _WAIT_S, given)
 
 
-def _find_supervisor(recording: Recording, robot: str | None) -> str:
+def _find_supervisor(recording: RecordingAccess, robot: str | None) -> str:
     """The Supervisor to ask: the one that has paused the simulation, as no other loop runs then.
 
     Else one with a fresh heartbeat, the named one, an observer (which has no other work), or the
@@ -168,7 +168,7 @@ def _find_supervisor(recording: Recording, robot: str | None) -> str:
     """
     now_s = time.time()
     with recording.reader() as connection:
-        own = look(connection, robot).session if robot is not None else None
+        own = view_robot(connection, robot).session if robot is not None else None
         meant = [
             (each, each.session)
             for each in list_robots(connection, now_s)
@@ -179,9 +179,11 @@ def _find_supervisor(recording: Recording, robot: str | None) -> str:
             where = "this simulation" if robot is None else f"the simulation of robot {robot!r}"
             if meant and not any(each.live for each, _ in meant):
                 last, _ = max(meant, key=lambda pair: pair[1].last_seen_wall_time_s)
-                why = look(connection, last.name).status.why
+                why = view_robot(connection, last.name).status.why
                 raise CommandRefusedError(_NONE_LIVE.format(where, last.name, why))
-            look(connection, robot)  # raises where nothing is recorded, and says how to record
+            view_robot(
+                connection, robot
+            )  # raises where nothing is recorded, and says how to record
             raise CommandRefusedError(_NO_SUPERVISOR.format(where))
         if len({session.instance for _, session in found}) > 1:
             listed = ", ".join(repr(each.name) for each, _ in found)

@@ -37,7 +37,7 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.store.reading.ranges import Scope, TimeRange
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 
 DEFAULT_LIMIT: Final = 50
 
@@ -76,7 +76,7 @@ TimelineKinds = Annotated[
     quotes=True,
 )
 def webots_find_events(
-    recording: Recording,
+    recording: RecordingAccess,
     scope: Scope,
     kinds: Kinds = None,
     where: Annotated[
@@ -134,7 +134,7 @@ def webots_find_events(
 
 
 def _found(
-    view: View,
+    view: RobotView,
     asked: TimeRange,
     options: EventOptions,
     group: bool,
@@ -170,7 +170,7 @@ def _found(
 
 @question("Get the timeline", READS, quotes=True)
 def webots_get_timeline(
-    recording: Recording,
+    recording: RecordingAccess,
     scope: Scope,
     kinds: TimelineKinds = None,
     log_level: LogLevel = "info",
@@ -193,7 +193,7 @@ def webots_get_timeline(
 
 
 def _timeline(
-    view: View,
+    view: RobotView,
     asked: TimeRange,
     options: EventOptions,
     limit: int | None,

@@ -30,21 +30,21 @@ from webots_mcp.store.logs import (
     OF_CONSOLE,
     LogFilter,
     LogLine,
-    Window,
+    LogWindow,
     count_lines,
     newest_lines,
     waiting_lines,
     window_of,
 )
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.robots import list_robots
 
 _COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
 _LONGEST_MESSAGE: Final = 500
 _BUDGET_TOKENS: Final = 1_500
-_ANY_LINE: Final = LogFilter(None, Window(-math.inf, math.inf), "", "debug")
+_ANY_LINE: Final = LogFilter(None, LogWindow(-math.inf, math.inf), "", "debug")
 _BELOW_LEVEL: Final = (
     "no robot has recorded yet, and no line of Webots' console has the level {} or above: these "
     "have a lower one"
@@ -69,7 +69,7 @@ _NO_RUN_YET: Final = (
     follows="lines",
 )
 def webots_get_logs(
-    recording: Recording,
+    recording: RecordingAccess,
     lines: Annotated[int, Field(ge=1, le=1000, description="The most lines.")] = 50,
     filter_text: Annotated[str, Field(max_length=200, description="In the line.")] = "",
     level: Annotated[LogLevel | None, Field(description="From this level.")] = None,
@@ -139,7 +139,7 @@ def _table(lines: list[LogLine], *, time_of_day: bool) -> Table:
 
 
 def _answer(
-    recording: Recording, view: View, asked: LogFilter, limit: int, *, time_of_day: bool
+    recording: RecordingAccess, view: RobotView, asked: LogFilter, limit: int, *, time_of_day: bool
 ) -> LogsAnswer:
     newest = newest_lines(view.connection, asked, limit)
     matching = count_lines(view.connection, asked)

@@ -52,13 +52,13 @@ from webots_mcp.questions.declaring import (
 )
 from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.series import (
     DEFAULT_POINTS,
     ChangeColumns,
     NumberColumns,
-    Page,
     RunHistory,
+    StatePage,
     query_history,
     query_rows,
 )
@@ -80,7 +80,7 @@ _ASK_FOR_OTHERS: Final = "signals=['...'] asks for others, limit for more"
     quotes=True,
 )
 def webots_list_signals(
-    recording: Recording,
+    recording: RecordingAccess,
     pattern: Annotated[
         str, Field(max_length=200, description="Of signals; '*' is any text.")
     ] = "*",
@@ -122,7 +122,7 @@ def _missing(info: SignalInfo, rows: int) -> str | None:
     return f"{told} from {seconds(info.first_s)} to {seconds(info.last_s)} s"
 
 
-def _found(view: View, pattern: str, limit: int, start: int) -> dict[str, Any]:
+def _found(view: RobotView, pattern: str, limit: int, start: int) -> dict[str, Any]:
     found = list_signals(
         view.connection,
         robot=view.robot.name,
@@ -166,7 +166,7 @@ def _hint(start: int, end: int, total: int) -> str | None:
     quotes=True,
 )
 def webots_query_history(
-    recording: Recording,
+    recording: RecordingAccess,
     scope: Scope,
     signals: Names,
     max_points: MaxPoints = None,
@@ -192,7 +192,7 @@ def webots_query_history(
 
 
 def _series(
-    view: View, asked: TimeRange, names: Sequence[str], max_points: int | None
+    view: RobotView, asked: TimeRange, names: Sequence[str], max_points: int | None
 ) -> dict[str, Any]:
     """As many buckets as were asked for, or as fit; fewer where the answer would be too long."""
     budget_tokens = room_tokens(max_points)
@@ -216,7 +216,9 @@ def _series(
     return {"runs": runs or None, "notes": notes, "hint": "; ".join(hints) or None}
 
 
-def _likely_points(view: View, asked: TimeRange, names: Sequence[str], budget_tokens: int) -> int:
+def _likely_points(
+    view: RobotView, asked: TimeRange, names: Sequence[str], budget_tokens: int
+) -> int:
     signals = signals_of(view.connection, asked, names)
     numbers = sum(signal.is_number for signal in signals)
     room = budget_tokens - _SIGNAL_TOKENS * len(signals) * len(asked.segments)
@@ -324,7 +326,7 @@ def _change_series(columns: ChangeColumns) -> ChangeSeries:
 
 
 def _page(
-    view: View, asked: TimeRange, names: Sequence[str], limit: int | None, after_id: int
+    view: RobotView, asked: TimeRange, names: Sequence[str], limit: int | None, after_id: int
 ) -> dict[str, Any]:
     page = query_rows(
         view.connection, asked, names, limit=limit or DEFAULT_POINTS, after_id=after_id
@@ -348,7 +350,7 @@ def _page(
     }
 
 
-def _no_rows(page: Page, rows: int, after_id: int) -> str | None:
+def _no_rows(page: StatePage, rows: int, after_id: int) -> str | None:
     if rows:
         return None
     if page.cut:
@@ -356,7 +358,7 @@ def _no_rows(page: Page, rows: int, after_id: int) -> str | None:
     return "no rows after that cursor" if after_id else "no row in that range"
 
 
-def _most(tokens: Callable[[int], int], page: Page, budget_tokens: int) -> int:
+def _most(tokens: Callable[[int], int], page: StatePage, budget_tokens: int) -> int:
     """How many of the page's first rows fit the budget; at least one."""
     rows = len(page.ids)
     while rows > 1 and (now := tokens(rows)) > budget_tokens:
@@ -364,7 +366,7 @@ def _most(tokens: Callable[[int], int], page: Page, budget_tokens: int) -> int:
     return rows
 
 
-def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
+def _row_columns(page: StatePage, rows: int, view: RobotView) -> RowColumns:
     """The first rows; numbers as they were recorded."""
     run_ids = page.run_ids[:rows]
     here = view.run.id if view.run else None
@@ -394,7 +396,7 @@ def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
     quotes=True,
 )
 def webots_get_trends(
-    recording: Recording,
+    recording: RecordingAccess,
     scope: Scope,
     signals: AnyNames = None,
     limit: ShownLimit = None,
@@ -413,7 +415,7 @@ def webots_get_trends(
 
 
 def _trends(
-    view: View, asked: TimeRange, names: Sequence[str], limit: int | None
+    view: RobotView, asked: TimeRange, names: Sequence[str], limit: int | None
 ) -> dict[str, Any]:
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
     budget_tokens = room_tokens(limit) // max(len(found.runs), 1)

@@ -30,7 +30,7 @@ from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.trends import RunTrends, trends
 from webots_mcp.questions.declaring import MAX_WAIT_S, READS, Caller, RobotName, question
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 
 USUAL_DURATION_S: Final = 10.0
 _REPORT_INTERVAL_S: Final = 1.0
@@ -46,7 +46,7 @@ _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 @question("Watch the robot", READS, core=True, quotes=True)
 async def webots_monitor(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     duration_wall_s: Annotated[_WatchS, Field(description="To watch; 10.")] = None,
     lookback_wall_s: Annotated[
@@ -87,7 +87,7 @@ async def webots_monitor(
     return await to_thread.run_sync(_watched, recording, name, started_s)
 
 
-def _start(recording: Recording, robot: str | None) -> tuple[str, float, bool]:
+def _start(recording: RecordingAccess, robot: str | None) -> tuple[str, float, bool]:
     """The robot, since when it is watched, and whether any controller could write meanwhile."""
     with recording.view(robot) as view:
         view.require_run()
@@ -95,18 +95,20 @@ def _start(recording: Recording, robot: str | None) -> tuple[str, float, bool]:
         return view.robot.name, time.time(), is_live
 
 
-def _doing(recording: Recording, robot: str) -> str:
+def _doing(recording: RecordingAccess, robot: str) -> str:
     with recording.view(robot) as view:
         at = f", simulation time {view.state.sim_time_s:.2f} s" if view.state else ""
         return f"{robot}: {view.status.text}{at}"
 
 
-def _watched(recording: Recording, robot: str, started_s: float) -> MonitorAnswer:
+def _watched(recording: RecordingAccess, robot: str, started_s: float) -> MonitorAnswer:
     with recording.view(robot) as view:
         return _report(view, started_s, view.now_s - started_s)
 
 
-def look_back(recording: Recording, robot: str | None, lookback_wall_s: float) -> MonitorAnswer:
+def look_back(
+    recording: RecordingAccess, robot: str | None, lookback_wall_s: float
+) -> MonitorAnswer:
     """A report of the wall seconds before the newest row."""
     with recording.view(robot) as view:
         run = view.require_run()
@@ -114,13 +116,13 @@ def look_back(recording: Recording, robot: str | None, lookback_wall_s: float) -
         return _report(view, newest_s - lookback_wall_s, lookback_wall_s)
 
 
-def _report(view: View, wall_start_s: float, window_s: float) -> MonitorAnswer:
+def _report(view: RobotView, wall_start_s: float, window_s: float) -> MonitorAnswer:
     return answer_about(
         view, MonitorAnswer, lambda: {"window_s": round(window_s, 2), **_found(view, wall_start_s)}
     )
 
 
-def _found(view: View, wall_start_s: float) -> dict[str, Any]:
+def _found(view: RobotView, wall_start_s: float) -> dict[str, Any]:
     window = window_from(view, wall_start_s)
     recorded = bool(window.rows.segments)
     told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
@@ -168,7 +170,7 @@ def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:
     return event.wall_time_s >= wall_start_s or lasted
 
 
-def _hint(recorded: bool, left_out: bool, wall_start_s: float, view: View) -> str | None:
+def _hint(recorded: bool, left_out: bool, wall_start_s: float, view: RobotView) -> str | None:
     if not recorded:
         return _why_nothing(view)
     if not left_out:
@@ -177,7 +179,7 @@ def _hint(recorded: bool, left_out: bool, wall_start_s: float, view: View) -> st
     return f"more events: {call} shows what is left out"
 
 
-def _why_nothing(view: View) -> str:
+def _why_nothing(view: RobotView) -> str:
     if view.status.is_moving:
         return (
             "time moves but no state was recorded: is bridge.publish() called in the loop? By "
@@ -207,7 +209,7 @@ class Window:
     around: TimeRange
 
 
-def window_from(view: View, wall_start_s: float) -> Window:
+def window_from(view: RobotView, wall_start_s: float) -> Window:
     """The window of a robot from that wall time (Unix) on."""
     found = find_range(view.connection, Scope(since_wall_time=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
@@ -224,7 +226,7 @@ def _from_row_before(connection: sqlite3.Connection, segment: Segment) -> float:
     return segment.start_s if before_s is None else before_s
 
 
-def _standing(view: View, wall_start_s: float) -> Segment:
+def _standing(view: RobotView, wall_start_s: float) -> Segment:
     """The current run from its newest row on, limited to what was recorded in the window."""
     run = view.require_run()
     newest_s = view.state.sim_time_s if view.state else run.started_sim_time_s

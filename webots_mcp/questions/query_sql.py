@@ -26,12 +26,12 @@ from webots_mcp.answers.models import SqlAnswer, Table
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.declaring import READS, ShownLimit, question
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.sql import (
     FOLDER,
     LINE,
     Cell,
-    Result,
+    SqlResult,
     Statement,
     as_file,
     decode,
@@ -65,7 +65,7 @@ _turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once
     quotes=True,
 )
 async def webots_query_sql(
-    recording: Recording,
+    recording: RecordingAccess,
     sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
     limit: ShownLimit = None,
 ) -> SqlAnswer:
@@ -104,14 +104,14 @@ async def webots_query_sql(
     )
 
 
-def _header(recording: Recording) -> tuple[dict[str, Any], int]:
+def _header(recording: RecordingAccess) -> tuple[dict[str, Any], int]:
     """And how many states retention has deleted."""
     with recording.reader() as connection:
         (deleted,) = connection.execute(_DELETED).fetchone()
         return header_of_only(connection), deleted
 
 
-async def _run(recording: Recording, sql: str, max_rows: int, max_bytes: int) -> Result:
+async def _run(recording: RecordingAccess, sql: str, max_rows: int, max_bytes: int) -> SqlResult:
     """Run it in a process of its own, which ends with its deadline or with the asker."""
     async with _turn():
         with as_file(recording.database) as file:
@@ -148,7 +148,7 @@ def _cut(cell: Cell, longest: int) -> Cell:
     return f"{cell[:longest]}…" if isinstance(cell, str) and len(cell) > longest else cell
 
 
-def _truncated(found: Result, shown: int, longest: int | None) -> str | None:
+def _truncated(found: SqlResult, shown: int, longest: int | None) -> str | None:
     why = found.truncated
     if shown < len(found.rows):
         why = f"only {shown} rows: their values are too long; name fewer columns"

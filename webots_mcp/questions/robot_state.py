@@ -47,12 +47,19 @@ from webots_mcp.signals.naming import OBSERVED
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.observed_pose import pose_at
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, newest_kept
-from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
+from webots_mcp.store.recording import (
+    GETTING_STARTED,
+    RecordingAccess,
+    RobotView,
+    name_of,
+    storage,
+    view_of,
+)
 from webots_mcp.store.retention import described, unheeded
 from webots_mcp.store.retention_plan import file_sizes
 from webots_mcp.store.robots import (
-    Robot,
-    Session,
+    RobotRecord,
+    SessionRecord,
     WorldSeen,
     companions,
     console_trouble,
@@ -63,8 +70,8 @@ from webots_mcp.store.robots import (
     world_seen,
 )
 from webots_mcp.store.run_rows import (
-    Run,
-    State,
+    RunRecord,
+    StateRecord,
     count_runs,
     newest_events,
     pace_of,
@@ -122,7 +129,7 @@ _WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 @question("List the robots", READS, command="status", core=True)
-def webots_list_robots(recording: Recording) -> RobotsAnswer:
+def webots_list_robots(recording: RecordingAccess) -> RobotsAnswer:
     """Every robot ever recorded: whether it is live, whether its time moves, its current run.
 
     `actions` counts its own commands; webots_list_commands describes them.
@@ -146,7 +153,7 @@ def webots_list_robots(recording: Recording) -> RobotsAnswer:
 
 
 def _hint_of_robots(
-    connection: sqlite3.Connection, robots: Sequence[Robot], shown: int
+    connection: sqlite3.Connection, robots: Sequence[RobotRecord], shown: int
 ) -> str | None:
     if len(robots) > shown:
         return f"{len(robots)} robots in all, the latest {shown} are shown"
@@ -156,7 +163,7 @@ def _hint_of_robots(
 
 @question("Get world information", READS)
 def webots_get_world_info(
-    recording: Recording, robot: RobotName = None, run_id: RunId = None
+    recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> WorldAnswer:
     """The world file, its time step, the run and its pace, the controller's code, other robots.
 
@@ -192,7 +199,7 @@ def webots_get_world_info(
         return answer.model_copy(update=seen | {"hint": "; ".join(filter(None, hints)) or None})
 
 
-def _robots(views: list[View], *, told: bool) -> Table:
+def _robots(views: list[RobotView], *, told: bool) -> Table:
     """A row for each; what could not be recorded only where there is any, or for a person."""
     columns, rows = [*_ROBOT_COLUMNS], [_row(view) for view in views]
     recorders = [_recorder(view) for view in views]
@@ -205,7 +212,7 @@ def _robots(views: list[View], *, told: bool) -> Table:
     return Table(columns=columns, rows=rows)
 
 
-def _recorder(view: View) -> dict[str, Any]:
+def _recorder(view: RobotView) -> dict[str, Any]:
     """What a robot's session has recorded of its run, and what it could not."""
     session = view.session
     error = session.last_error if session else None
@@ -253,7 +260,7 @@ def _in_world(body: dict[str, Any], columns: list[str]) -> list[Any]:
     ]
 
 
-def _retention(recording: Recording, connection: sqlite3.Connection) -> dict[str, Any]:
+def _retention(recording: RecordingAccess, connection: sqlite3.Connection) -> dict[str, Any]:
     """What is kept of the recording, how large it is, and which limits of ours do not hold."""
     notes = unheeded(connection, recording.limits)
     return {
@@ -269,13 +276,13 @@ def _liveliest(robots: list[Any]) -> list[Any]:
     return latest[::-1][:_SHOWN_ROBOTS]
 
 
-def _fitting(views: list[View]) -> list[View]:
+def _fitting(views: list[RobotView]) -> list[RobotView]:
     """The first that fit, in the order of their first appearance."""
     fitting_rows = fitting([[*_row(view), *_recorder(view).values()] for view in views])
     return sorted(views[: len(fitting_rows)], key=lambda view: view.robot.id)
 
 
-def _row(view: View) -> list[Any]:
+def _row(view: RobotView) -> list[Any]:
     header, session = view.header(), view.session
     runs = count_runs(view.connection, view.robot.id)
     newest = [header[name] for name in ("status", "run_id", "sim_time_s", "age_s")]
@@ -284,12 +291,12 @@ def _row(view: View) -> list[Any]:
     return [name, view.robot.kind, view.robot.live, *newest, runs, actions]
 
 
-def _pace(view: View, run: Run) -> float | None:
+def _pace(view: RobotView, run: RunRecord) -> float | None:
     factor = real_time_factor(view.connection, run.id)
     return None if factor is None else round_number(factor)
 
 
-def _run(view: View, run: Run) -> dict[str, Any]:
+def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
     """What the run is; `rows` is as of its last heartbeat."""
     end_reason = run.end_reason or dict(dead_sessions(view.connection)).get(run.session_id)
     ended = {"ended_by": end_reason} if end_reason is not None else {}
@@ -303,7 +310,7 @@ def _run(view: View, run: Run) -> dict[str, Any]:
     }
 
 
-def _controller(view: View, session: Session | None) -> dict[str, Any] | None:
+def _controller(view: RobotView, session: SessionRecord | None) -> dict[str, Any] | None:
     if session is None:
         return None
     if view.robot.kind == CUSTOM_DATA:  # its own process and code are not known
@@ -322,7 +329,7 @@ def _devices(devices: dict[str, str]) -> dict[str, str] | None:
     return shorten(devices, _DEVICES_TOKENS).value or None
 
 
-def _companions(view: View) -> list[list[str]]:
+def _companions(view: RobotView) -> list[list[str]]:
     if view.session is None:
         return []
     others = companions(view.connection, view.session, view.now_s)
@@ -337,7 +344,7 @@ def _companions(view: View) -> list[list[str]]:
 
 
 @question("Diagnose the set-up", READS, core=True)
-def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
+def webots_diagnose(recording: RecordingAccess) -> DiagnosisAnswer:
     """When nothing comes, or time stands still: each link from Webots and controller to here.
 
     Data folder, database, who records, what waits, why the simulation stands, which Webots run,
@@ -385,7 +392,7 @@ PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up t
 
 @question("Get the robot's state", READS, core=True, quotes=True)
 def webots_get_robot_state(
-    recording: Recording, robot: RobotName = None, run_id: RunId = None
+    recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
     """The robot now, at a glance: its newest published state, rounded, long arrays summed up.
 
@@ -411,7 +418,7 @@ def webots_get_robot_state(
 
 @question("Get the sensors", READS, quotes=True)
 def webots_get_sensors(
-    recording: Recording, robot: RobotName = None, run_id: RunId = None
+    recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> SensorsAnswer:
     """The newest sensor values: members of the state named after a sensor device or like one."""
     with recording.view(robot, run_id) as view:
@@ -436,7 +443,7 @@ def webots_get_sensors(
 
 @question("Get the full state", READS, core=True, quotes=True)
 def webots_get_full_state(
-    recording: Recording,
+    recording: RecordingAccess,
     path: PagePath = "",
     offset: Offset = 0,
     limit: PageSize = None,
@@ -466,7 +473,7 @@ def webots_get_full_state(
         return FullStateAnswer(**_page(part, path, offset, limit or _PAGE, left_tokens), **beside)
 
 
-def _with_observed_pose(view: View, state: State) -> dict[str, Any]:
+def _with_observed_pose(view: RobotView, state: StateRecord) -> dict[str, Any]:
     """The state, with where an observer saw the robot if it has no position of its own."""
     value = state.value()
     if OBSERVED in value:
@@ -477,7 +484,7 @@ def _with_observed_pose(view: View, state: State) -> dict[str, Any]:
     return {**value, OBSERVED: pose} if pose else value
 
 
-def _nothing_yet(view: View) -> str:
+def _nothing_yet(view: RobotView) -> str:
     """A robot that published before a reset will publish again."""
     run_id = view.run.id if view.run else 0
     (purged_rows,) = view.connection.execute(_PURGED, (run_id,)).fetchone() or (0,)
@@ -574,7 +581,7 @@ def _longest_that_fits(sizes: Collection[int], budget: int) -> int:
     return max(sizes, default=0)
 
 
-def _events(view: View) -> Table:
+def _events(view: RobotView) -> Table:
     """The newest events that fit, the oldest of them first."""
     events = newest_events(view.connection, view.require_run().id, _EVENTS)
     rows = [
@@ -585,7 +592,7 @@ def _events(view: View) -> Table:
     return Table(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
 
 
-def _health(view: View) -> dict[str, Any] | None:
+def _health(view: RobotView) -> dict[str, Any] | None:
     """The health of the session that recorded the run."""
     session = view.session
     if view.run is not None and (session is None or session.id != view.run.session_id):
@@ -609,7 +616,7 @@ def _health(view: View) -> dict[str, Any] | None:
     }
 
 
-def _kept(view: View) -> str | None:
+def _kept(view: RobotView) -> str | None:
     """Which seconds of the run were kept last at full rate, and why."""
     newest = newest_kept(view.connection, view.run.id) if view.run else None
     if newest is None or view.run is None:
@@ -620,7 +627,7 @@ def _kept(view: View) -> str | None:
     return f"{span}: {cut_text(newest.reason, _ERROR_CHARACTERS)}"
 
 
-def _replaced_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:
+def _replaced_in(state: StateRecord, part: dict[str, Any]) -> dict[str, str] | None:
     """The replaced values among those members of the state."""
     replaced = {
         path: kind

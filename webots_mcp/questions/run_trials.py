@@ -48,8 +48,8 @@ from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
 from webots_mcp.store.parameters import (
     Declared,
-    Trial,
-    TrialSet,
+    TrialRecord,
+    TrialSetRecord,
     best_of,
     count_planned,
     create_trial_set,
@@ -62,7 +62,7 @@ from webots_mcp.store.parameters import (
     trials_of,
 )
 from webots_mcp.store.reading.segment import in_one_snapshot
-from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import robot_name
 
@@ -113,7 +113,7 @@ Tried = Annotated[
 
 @question("Run trials", DESTROYS, quotes=True)
 async def webots_run_trials(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     parameters: Annotated[
         Tried, Field(description='Sets, [{"kp": 1.0}], or a grid, {"kp": [1.0, 2.0]}.')
@@ -173,13 +173,13 @@ async def webots_run_trials(
 
 
 @question("Get trials", READS, quotes=True)
-def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> TrialsAnswer:
+def webots_get_trials(recording: RecordingAccess, trial_set: TrialSetId = None) -> TrialsAnswer:
     """How far trials are, also those from a shell; the parameters, ranked by score."""
     return TrialsAnswer(**set_facts(recording, trial_set))
 
 
 def _begin(
-    recording: Recording,
+    recording: RecordingAccess,
     workers: TrialWorkers,
     parameters: list[dict[str, _Value]] | dict[str, list[_Value]],
     robot: str | None,
@@ -211,7 +211,7 @@ def _begin(
     return set_id
 
 
-def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: View) -> None:
+def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: RobotView) -> None:
     score = parse_score(plan.score)
     require_kinds(connection, score, view.require_run().id)
     if known := known_names(view):
@@ -229,7 +229,7 @@ def _as_declared(
     ]
 
 
-def _take_up(recording: Recording, workers: TrialWorkers, set_id: int, cancel: bool) -> None:
+def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, cancel: bool) -> None:
     """Continue a set, or end it, unless another process works on it already.
 
     Raises:
@@ -252,24 +252,26 @@ def _take_up(recording: Recording, workers: TrialWorkers, set_id: int, cancel: b
     workers.begin(set_id)  # also to restore the parameters of one that is cancelled
 
 
-def _goes_on(found: TrialSet) -> str:
+def _goes_on(found: TrialSetRecord) -> str:
     """How to continue a set that no robot's simulation runs."""
     return _IN_SIMULATORS if "world" in json.loads(found.plan) else _FROM_ELSEWHERE
 
 
-def _stop(recording: Recording, set_id: int, reason: str | None) -> None:
+def _stop(recording: RecordingAccess, set_id: int, reason: str | None) -> None:
     """Let a set stop after its current trial; without a reason, let a stopped one continue."""
     with recording.writer() as connection:
         stop_trial_set(connection, set_id, reason)
 
 
-def _end(recording: Recording, workers: TrialWorkers, set_id: int) -> None:
+def _end(recording: RecordingAccess, workers: TrialWorkers, set_id: int) -> None:
     """The client has cancelled the call: no other trial begins, and the one that runs here ends."""
     _stop(recording, set_id, CANCELLED)
     workers.end(set_id)
 
 
-async def _wait(recording: Recording, caller: Caller, set_id: int, timeout_wall_s: float) -> None:
+async def _wait(
+    recording: RecordingAccess, caller: Caller, set_id: int, timeout_wall_s: float
+) -> None:
     """Until nobody works on the set any more, or the time is over."""
     until_s, report_s = time.monotonic() + timeout_wall_s, time.monotonic() + _REPORT_EVERY_S
     with recording.reader() as connection:
@@ -285,7 +287,7 @@ async def _wait(recording: Recording, caller: Caller, set_id: int, timeout_wall_
 # -- answers ----------------------------------------------------------------------------------
 
 
-def set_facts(recording: Recording, set_id: int | None) -> dict[str, Any]:
+def set_facts(recording: RecordingAccess, set_id: int | None) -> dict[str, Any]:
     """The facts of an answer about a set, by default about the newest one.
 
     Raises:
@@ -305,14 +307,14 @@ def _set_facts(connection: sqlite3.Connection, set_id: int | None) -> dict[str, 
     return {**_header(connection, found), **_facts(connection, found)}
 
 
-def _header(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
+def _header(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, Any]:
     with suppress(NothingRecordedError):  # the robot's rows may be gone while its trials remain
         if found.robot_id is not None:
-            return look(connection, robot_name(connection, found.robot_id)).header()
+            return view_robot(connection, robot_name(connection, found.robot_id)).header()
     return header_of_only(connection)
 
 
-def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
+def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, Any]:
     trials, plan = trials_of(connection, found.id), json.loads(found.plan)
     best = best_of(plan)
     over = sum(each.is_over for each in trials)
@@ -345,7 +347,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     }
 
 
-def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | None]:
+def _state(found: TrialSetRecord, left: int, *, at_work: bool) -> tuple[str, str | None]:
     """The state of a set, and what to do next."""
     again = f"webots_run_trials(trial_set={found.id})"
     if at_work:
@@ -368,7 +370,7 @@ def _names(ranking: Ranking) -> list[str]:
     return [f"parameter {name}" if name in _FIGURES else name for name in names]
 
 
-def _rows(ranking: Ranking, trials: Sequence[Trial]) -> list[list[Any]]:
+def _rows(ranking: Ranking, trials: Sequence[TrialRecord]) -> list[list[Any]]:
     names = list(dict.fromkeys(name for each in ranking.sets for name in each.parameters))
     runs: dict[str, list[int]] = {}
     for each in trials:

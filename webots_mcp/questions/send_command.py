@@ -58,7 +58,7 @@ from webots_mcp.steering.dispatch import Dispatcher, Report, find_target, holds_
 from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, described
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.segment import Subject
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.requests import permit
 
 # -- breakpoints: stored for the robot, and read again by its controller --
@@ -98,7 +98,7 @@ _TAKES_NONE: Final = "this robot has no bridge: it takes no commands, and has no
 
 @question("Set a breakpoint", CHANGES)
 async def webots_breakpoint(
-    recording: Recording,
+    recording: RecordingAccess,
     condition: Annotated[
         str,
         Field(
@@ -144,7 +144,9 @@ async def webots_breakpoint(
 
 
 @question("List the breakpoints", READS)
-def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> BreakpointsAnswer:
+def webots_list_breakpoints(
+    recording: RecordingAccess, robot: RobotName = None
+) -> BreakpointsAnswer:
     """The robot's breakpoints, how often each was hit, and when last."""
     with recording.view(robot) as view:
         listed = stored.list_breakpoints(view.connection, view.robot.id)
@@ -163,7 +165,7 @@ def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> Br
 
 @question("Remove a breakpoint", CHANGES)
 async def webots_remove_breakpoint(
-    recording: Recording,
+    recording: RecordingAccess,
     breakpoint_id: Annotated[Id, Field(description="From webots_breakpoint.")],
     caller: Caller,
     robot: RobotName = None,
@@ -180,7 +182,7 @@ async def webots_remove_breakpoint(
 
 
 def _store(
-    recording: Recording, robot: str | None, condition: Condition, *asked: Any
+    recording: RecordingAccess, robot: str | None, condition: Condition, *asked: Any
 ) -> tuple[str, int, list[str]]:
     """Name of the robot, id of the breakpoint, and notes on its signals."""
     with recording.view(robot) as view:
@@ -189,7 +191,7 @@ def _store(
         return name, stored.set_breakpoint(connection, robot_id, condition.text, *asked), notes
 
 
-def _notes(view: View, condition: Condition) -> list[str]:
+def _notes(view: RobotView, condition: Condition) -> list[str]:
     if view.run is None:
         return condition.describe_unknown(())
     subject = Subject(view.robot.id, view.robot.name, view.run.id)
@@ -201,7 +203,7 @@ def _notes(view: View, condition: Condition) -> list[str]:
     return notes
 
 
-def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
+def _remove(recording: RecordingAccess, robot: str | None, breakpoint_id: int) -> str:
     with recording.view(robot) as view:
         name, robot_id = view.robot.name, view.robot.id
     with recording.writer() as connection:
@@ -209,7 +211,9 @@ def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
     return name
 
 
-async def _arm(recording: Recording, caller: Caller, robot: str) -> tuple[dict[str, Any], str]:
+async def _arm(
+    recording: RecordingAccess, caller: Caller, robot: str
+) -> tuple[dict[str, Any], str]:
     """Let the controller read its breakpoints again; its reply, or why there is none."""
     dispatcher = Dispatcher(recording, caller.report)
     try:
@@ -222,7 +226,7 @@ async def _arm(recording: Recording, caller: Caller, robot: str) -> tuple[dict[s
     return answer.result, ""
 
 
-def _breakpoint_row(view: View, each: stored.StoredBreakpoint) -> list[Any]:
+def _breakpoint_row(view: RobotView, each: stored.StoredBreakpoint) -> list[Any]:
     """A breakpoint as a row under `BREAKPOINT_COLUMNS`."""
     hit = stored.newest_hit(view.connection, each.robot_id, each.id) if each.hit_count else None
     run_id, time_s = hit or (None, None)
@@ -251,7 +255,7 @@ def _breakpoint_row(view: View, each: stored.StoredBreakpoint) -> list[Any]:
     of_controller="params",
 )
 async def webots_send_command(
-    recording: Recording,
+    recording: RecordingAccess,
     action: Annotated[
         str, Field(min_length=1, max_length=200, description="As in webots_list_commands.")
     ],
@@ -277,7 +281,7 @@ async def webots_send_command(
     quotes=True,
 )
 async def webots_wait_for_command(
-    recording: Recording,
+    recording: RecordingAccess,
     command_id: Annotated[Id, Field(description="From its answer.")],
     caller: Caller,
     timeout_wall_s: TimeoutS = _WAIT_S,
@@ -288,7 +292,7 @@ async def webots_wait_for_command(
 
 @question("List the commands", READS, command="commands", core=True, quotes=True)
 def webots_list_commands(
-    recording: Recording,
+    recording: RecordingAccess,
     limit: Annotated[int, Field(ge=1, le=200, description="Most shown.")] = 10,
     status: Annotated[CommandStatus | None, Field(description="Only those.")] = None,
     cursor: Cursor = None,
@@ -320,7 +324,7 @@ def _command_row(command: Command, now_s: float) -> list[Any]:
     ]
 
 
-def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
+def _answer(view: RobotView, commands: list[Command], limit: int) -> CommandsAnswer:
     rows = [_command_row(command, view.now_s) for command in commands]
     rows = fitting(rows, _COMMANDS_TOKENS)
     more = len(rows) < len(commands) or len(commands) == limit
@@ -362,7 +366,7 @@ When = Literal["now", "reset"]
 
 
 async def set_parameters(
-    recording: Recording,
+    recording: RecordingAccess,
     report: Report,
     values: Mapping[str, Value],
     *,
@@ -385,7 +389,7 @@ async def set_parameters(
     return await Dispatcher(recording, report).ask(robot, _ACTION, timeout_s, params)
 
 
-def settable(recording: Recording, robot: str | None) -> dict[str, Declared]:
+def settable(recording: RecordingAccess, robot: str | None) -> dict[str, Declared]:
     """The parameters that a live controller declares.
 
     Raises:
@@ -396,13 +400,13 @@ def settable(recording: Recording, robot: str | None) -> dict[str, Declared]:
         return declared_by(connection, session.id) if session else {}
 
 
-def _none(view: View) -> str:
+def _none(view: RobotView) -> str:
     return _NONE if view.session is None or view.session.has_bridge else _TAKES_NONE
 
 
 @question("Get the parameters", READS, quotes=True)
 def webots_get_parameters(
-    recording: Recording,
+    recording: RecordingAccess,
     names: Annotated[
         list[str] | None, Field(max_length=50, description="Of parameters; '*' is any text.")
     ] = None,
@@ -428,7 +432,7 @@ def webots_get_parameters(
 
 @question("Set parameters", SETS, core=True, of_controller="values")
 async def webots_set_parameters(
-    recording: Recording,
+    recording: RecordingAccess,
     values: Annotated[
         dict[str, Value],
         Field(min_length=1, max_length=MOST_PARAMETERS, description='{"kp": 3.0, "gait": "trot"}'),
@@ -448,7 +452,7 @@ async def webots_set_parameters(
     )
 
 
-def _shown_rows(view: View, names: list[str] | None) -> list[list[Any]]:
+def _shown_rows(view: RobotView, names: list[str] | None) -> list[list[Any]]:
     found = described(view.connection, view.run) if view.run else []
     meant = _meant(names, [each["name"] for each in found])
     return [

@@ -35,7 +35,7 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.reading.segment import just_after, kept_stretches
-from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside, opened
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ _SAME_S: Final = 0.001  # answers have times to the millisecond
 
 @question("Get the camera picture", READS, core=True)
 async def webots_get_camera(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     camera: Annotated[str, Field(max_length=200, description="Device; '' is any.")] = "",
     fresh: Annotated[
@@ -83,7 +83,7 @@ async def webots_get_camera(
 
 
 def _show_recorded(
-    recording: Recording,
+    recording: RecordingAccess,
     camera: str,
     at_s: float | None,
     frames: int,
@@ -111,7 +111,7 @@ def _far_off(at_s: float | None, found: list[StoredImage]) -> dict[str, Any]:
     return {"hint": f"no picture is nearer to {at_s:g} s than {seconds(apart_s)} s"}
 
 
-def _told_of(view: View, found: list[StoredImage]) -> dict[str, Any]:
+def _told_of(view: RobotView, found: list[StoredImage]) -> dict[str, Any]:
     """The camera, and the stretch that its frames are kept with."""
     first, last = found[0], found[-1]
     if first.kind != KEPT_FRAME:
@@ -122,7 +122,7 @@ def _told_of(view: View, found: list[StoredImage]) -> dict[str, Any]:
 
 
 def _single(
-    recording: Recording, view: View, image: StoredImage
+    recording: RecordingAccess, view: RobotView, image: StoredImage
 ) -> tuple[ShownPicture, dict[str, Any]]:
     picture, note = _load_picture(image.file(recording.data_dir))
     return picture, {
@@ -135,7 +135,9 @@ def _single(
     }
 
 
-def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[ShownPicture, dict[str, Any]]:
+def _sheet(
+    recording: RecordingAccess, found: list[StoredImage]
+) -> tuple[ShownPicture, dict[str, Any]]:
     picture = _load_sheet([image.file(recording.data_dir) for image in found])
     return picture, {
         "pictures_sim_time_s": [seconds(image.sim_time_s) for image in found],
@@ -145,7 +147,7 @@ def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[ShownPicture
 
 @question("Take a screenshot", CHANGES)
 async def webots_take_screenshot(
-    recording: Recording,
+    recording: RecordingAccess,
     caller: Caller,
     quality: Annotated[int, Field(ge=1, le=100, description="Of the file.")] = 90,
     robot: RobotName = None,
@@ -157,7 +159,7 @@ async def webots_take_screenshot(
     return await to_thread.run_sync(_show, recording, answer)
 
 
-def _show(recording: Recording, answer: CommandAnswer) -> list[str | ShownPicture]:
+def _show(recording: RecordingAccess, answer: CommandAnswer) -> list[str | ShownPicture]:
     said = answer.model_dump(mode="json", exclude_none=True)
     path = cast("dict[str, Any]", answer.result or {}).get("path")
     if answer.outcome != "done" or path is None:
@@ -171,7 +173,7 @@ def _caption(facts: dict[str, Any]) -> str:
     return compact_json({name: fact for name, fact in facts.items() if fact not in (None, "")})
 
 
-def _no_frame(view: View, camera: str) -> str:
+def _no_frame(view: RobotView, camera: str) -> str:
     """Why there is no picture, in the form of a caption."""
     known = cameras(view.connection, view.robot.id)
     saved = [f"run_id={run_id}: {names}" for run_id, names in known.items()]
@@ -189,7 +191,7 @@ def _no_frame(view: View, camera: str) -> str:
 # -- the end of a run ------------------------------------------------------------------------------
 
 
-async def show_end(recording: Recording, dispatcher: Dispatcher, answer: RunAnswer) -> None:
+async def show_end(recording: RecordingAccess, dispatcher: Dispatcher, answer: RunAnswer) -> None:
     """Add a screenshot to the answer of a run, else a camera frame of its last step.
 
     Where there is neither, the answer says why.
@@ -209,7 +211,7 @@ async def show_end(recording: Recording, dispatcher: Dispatcher, answer: RunAnsw
     _attach(answer, picture, facts, note, "webots_take_screenshot")
 
 
-def _show_frame(recording: Recording, answer: RunAnswer, why: str) -> None:
+def _show_frame(recording: RecordingAccess, answer: RunAnswer, why: str) -> None:
     """Add what a camera saw at the step at which the run ended, if that was recorded."""
     ran = answer.ran or {}
     frame = None
@@ -243,7 +245,7 @@ def _attach(
 
 @question("Plot", READS)
 def webots_plot(
-    recording: Recording,
+    recording: RecordingAccess,
     scope: Scope,
     kind: Annotated[PlotKind, Field(description="trajectory: the way from above.")] = "signals",
     signals: AnyNames = None,

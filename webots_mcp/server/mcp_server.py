@@ -67,7 +67,7 @@ from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
 from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, take_in_journals
 from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
-from webots_mcp.store.recording import OpenReaders, Recording
+from webots_mcp.store.recording import OpenReaders, RecordingAccess
 from webots_mcp.store.requests import Requester
 from webots_mcp.store.retention import Asked, ask
 from webots_mcp.store.sql import describe_schema
@@ -136,7 +136,7 @@ def create_server(
     """
     asked = dict(limits or {})
     readers = OpenReaders()
-    recording = Recording(database, data_dir, read_only, asked, readers=readers)
+    recording = RecordingAccess(database, data_dir, read_only, asked, readers=readers)
     possible = [each for each in all_questions() if each.effect.reads or not read_only]
     shown = [each for each in listed(possible) if each.core or not core]
     mcp = ToolServer(
@@ -162,7 +162,7 @@ def create_server(
 class _ChunkMaker(threading.Thread):
     """Makes the chunks that a recording lacks which is only read, once, in a temporary file."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         super().__init__(name="webots-mcp chunks", daemon=True)
         self._recording = recording
         self.ending = threading.Event()
@@ -176,7 +176,7 @@ class _ChunkMaker(threading.Thread):
 
 
 def _lifespan(
-    recording: Recording, readers: OpenReaders, retain: Upkeep, asked: Asked
+    recording: RecordingAccess, readers: OpenReaders, retain: Upkeep, asked: Asked
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[Companions]]:
     """While a server runs, trials and Webots may; what may be written is maintained and followed.
 
@@ -190,7 +190,7 @@ def _lifespan(
             unasked.clear()
         if isinstance(recording.database, Path):
             take_in_journals(connection, recording.database, MAINTAINER_BUDGET_S)
-        project.look(connection)
+        project.recompile_if_changed(connection)
         reap_if_dead(connection)
         make_chunks(connection, pause_s=_PAUSE_S)
         retain(connection)
@@ -311,7 +311,7 @@ def _too(robot: str) -> str:
 # -- resources --
 
 
-def add_resources(mcp: MCPServer, recording: Recording) -> None:
+def add_resources(mcp: MCPServer, recording: RecordingAccess) -> None:
     """Register the resources of a recording."""
 
     @mcp.resource(
@@ -344,7 +344,7 @@ def _schema_to_come() -> str:
 _log = logging.getLogger(__name__)
 
 
-def tool_of(question: Question, recording: Recording, *, output_schema: bool = False) -> Tool:
+def tool_of(question: Question, recording: RecordingAccess, *, output_schema: bool = False) -> Tool:
     """A question on a recording as a tool; its schemas, which take milliseconds, are made once."""
     tool = _tool(question, output_schema)
     return tool.model_copy(update={"fn": functools.partial(tool.fn, recording)})
@@ -371,7 +371,7 @@ def _answering(question: Question) -> Callable[..., Any]:
     """The question as the SDK calls it, after a recording; with an answer whatever happens."""
 
     @functools.wraps(question.function)
-    async def wrapper(recording: Recording, ctx: Context[Any], **arguments: Any) -> Any:
+    async def wrapper(recording: RecordingAccess, ctx: Context[Any], **arguments: Any) -> Any:
         companions = ctx.request_context.lifespan_context
         caller = Caller("mcp", ctx.report_progress, companions, _requester(ctx))
         try:

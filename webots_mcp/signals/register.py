@@ -452,7 +452,7 @@ class SignalNames:
         self._known: dict[str, tuple[Kind, bool]] = {}  # kind, and whether numbers are whole
         self._waiting: dict[str, Seen] = {}
 
-    def look(
+    def register(
         self, state: Mapping[Any, Any], text: str, enter: Callable[[dict[str, Seen]], bool]
     ) -> None:
         """Enter the names that are new, some of many.
@@ -532,7 +532,7 @@ class StateChanges:
         self._last.clear()
         self._count = 0
 
-    def look(self, state: Mapping[Any, Any]) -> list[tuple[Any, object, object]]:
+    def compare(self, state: Mapping[Any, Any]) -> list[tuple[Any, object, object]]:
         """The (key, before, after) of each change since the last call; usually none."""
         changed: list[tuple[Any, object, object]] = []
         last = self._last

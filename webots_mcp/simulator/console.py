@@ -38,7 +38,7 @@ from webots_mcp.simulator.orders import (
     console_lines,
 )
 from webots_mcp.store.logs import ConsoleRows, Said
-from webots_mcp.store.recording import Job, Recording
+from webots_mcp.store.recording import Job, RecordingAccess
 from webots_mcp.store.robots import list_robots
 
 MOST_LINES_PER_S: Final = 500  # of wall time
@@ -79,7 +79,7 @@ def job_of(instance: Instance) -> str:
 
 
 @contextmanager
-def follow_console(instance: Instance, recording: Recording) -> Generator[ConsoleFollower]:
+def follow_console(instance: Instance, recording: RecordingAccess) -> Generator[ConsoleFollower]:
     """While this lasts, what that Webots says in its console is recorded, by one process of many.
 
     It begins as soon as there is a database. Where Webots cannot be reached, `problem` says why.
@@ -99,7 +99,7 @@ class _RecordingThread(threading.Thread):
         problem: Why it does not at the moment; None where it does.
     """
 
-    def __init__(self, name: str, recording: Recording) -> None:
+    def __init__(self, name: str, recording: RecordingAccess) -> None:
         super().__init__(name=name, daemon=True)
         self.problem: str | None = "it has not started yet"
         self._recording = recording
@@ -151,7 +151,7 @@ class _RecordingThread(threading.Thread):
 class ConsoleFollower(_RecordingThread):
     """A daemon thread that records the console of one Webots until that ends."""
 
-    def __init__(self, instance: Instance, recording: Recording) -> None:
+    def __init__(self, instance: Instance, recording: RecordingAccess) -> None:
         super().__init__(f"webots-mcp console {instance.port}", recording)
         self.instance = instance
         self._rows = ConsoleRows(instance.name, instance.started_wall_time_s)
@@ -238,7 +238,7 @@ class StandInConsole(_RecordingThread):
         recording: Where the lines are to be recorded.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         super().__init__("webots-mcp console of the stand-in", recording)
         self._began_s = time.time()
         self._lines = ConsoleLines(old=False)
@@ -302,7 +302,7 @@ class ConsoleWatch(threading.Thread):
         recording: Where the lines are to be recorded.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         super().__init__(name="webots-mcp consoles", daemon=True)
         self._recording = recording
         self._ending = threading.Event()
@@ -439,7 +439,7 @@ def _about(text: str) -> Said:
 # -- whether it is followed ---------------------------------------------------------------------
 
 
-def console_state(recording: Recording, connection: sqlite3.Connection) -> str:
+def console_state(recording: RecordingAccess, connection: sqlite3.Connection) -> str:
     """In a sentence, of all Webots of a recording.
 
     Args:
@@ -457,7 +457,7 @@ def console_state(recording: Recording, connection: sqlite3.Connection) -> str:
     return "; ".join(states) or _NOBODY
 
 
-def _state(instance: Instance, recording: Recording, connection: sqlite3.Connection) -> str:
+def _state(instance: Instance, recording: RecordingAccess, connection: sqlite3.Connection) -> str:
     console = f"the console of Webots at port {instance.port}"
     if holder_of(connection, job_of(instance)) is not None:
         unsure = "" if instance.streams else _UNSURE
@@ -479,7 +479,7 @@ def _state(instance: Instance, recording: Recording, connection: sqlite3.Connect
 # unless its controllers record elsewhere.
 
 
-def own_webots(recording: Recording) -> list[Instance]:
+def own_webots(recording: RecordingAccess) -> list[Instance]:
     """Those that run on this machine.
 
     Raises:
@@ -489,7 +489,7 @@ def own_webots(recording: Recording) -> list[Instance]:
     return [each for each in running if belongs(each, recording)] if running else []
 
 
-def belongs(instance: Instance, recording: Recording) -> bool:
+def belongs(instance: Instance, recording: RecordingAccess) -> bool:
     """Whether a Webots is of a recording.
 
     Raises:
@@ -507,7 +507,7 @@ def belongs(instance: Instance, recording: Recording) -> bool:
         return False
 
 
-def _is_in_project(instance: Instance, recording: Recording) -> bool:
+def _is_in_project(instance: Instance, recording: RecordingAccess) -> bool:
     project = find_project(full_path(recording.data_dir))
     if project is None or instance.world is None:
         return False

@@ -18,7 +18,7 @@ from webots_mcp.simulator.orders import WebotsAddress, WebotsLine, address_of
 from webots_mcp.simulator.project import controllers_in, has_bridge
 from webots_mcp.simulator.starting import LaunchedWebots, Show, Start
 from webots_mcp.store.logs import ConsoleRows
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 _SHOWN_LINES: Final = 3
 _EXTERN: Final = "<extern>"
@@ -107,7 +107,7 @@ class Launch:
     """
 
     def __init__(
-        self, recording: Recording, start: Start, environment: Mapping[str, str], show: Show
+        self, recording: RecordingAccess, start: Start, environment: Mapping[str, str], show: Show
     ) -> None:
         self.start = start
         self.world = start.world
@@ -203,17 +203,17 @@ def why_silent(
     return reasons
 
 
-def newest_in(recording: Recording) -> int:
+def newest_in(recording: RecordingAccess) -> int:
     """The newest session of a recording; 0 where there is none yet."""
     return next((newest for (newest,) in _read(recording, _NEWEST)), 0)
 
 
-def starts_since(recording: Recording, session: int) -> list[SessionStart]:
+def starts_since(recording: RecordingAccess, session: int) -> list[SessionStart]:
     """The sessions of a recording after that one; those that have recorded first."""
     return [SessionStart(*row) for row in _read(recording, _SINCE, session)]
 
 
-def _read(recording: Recording, query: str, *values: object) -> list[tuple[Any, ...]]:
+def _read(recording: RecordingAccess, query: str, *values: object) -> list[tuple[Any, ...]]:
     """Nothing where there is no recording yet."""
     try:
         with recording.reader() as connection:

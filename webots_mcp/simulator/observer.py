@@ -31,7 +31,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from webots_mcp.bridge.custom_data import CustomDataReader
+from webots_mcp.bridge.custom_data import CustomDataReader, ObserverParts
 from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
@@ -157,7 +157,9 @@ class ObserverBridge(MCPBridge):
 
     def read_custom_data(self) -> CustomDataReader:
         """What records the robots that have no bridge of their own."""
-        return CustomDataReader(self._session)
+        own = self._session
+        parts = (own.identity, own.simulation, own.clock, own.recorder, own.journal, own.errors)
+        return CustomDataReader(ObserverParts(*parts))
 
     def failed(self, error: Exception) -> None:
         """Count what could not be seen, and say it once on stderr."""

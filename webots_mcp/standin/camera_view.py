@@ -5,14 +5,10 @@ from __future__ import annotations
 from array import array
 from dataclasses import dataclass
 from math import cos, hypot, inf, sin, tan
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from webots_mcp.standin.arena import SceneColors
 from webots_mcp.standin.geometry import Color, Shape, Target, targets_from
-
-if TYPE_CHECKING:
-    pass
-
 
 _LIGHT: Final = (0.8, 0.6)
 """Direction that the light comes from, so that the sides of a box differ."""

@@ -54,12 +54,12 @@ from webots_mcp.signals.naming import flatten, misfit_of_parameters, perhaps_mea
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
 from webots_mcp.store.reading.segment import Subject
-from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import (
     PRESS_PLAY,
-    Block,
-    Session,
+    BlockedLoop,
+    SessionRecord,
     companions,
     fetch_session,
     find_block,
@@ -71,7 +71,7 @@ from webots_mcp.store.robots import (
     robot_name,
     without_observers,
 )
-from webots_mcp.store.run_rows import State, state_at
+from webots_mcp.store.run_rows import StateRecord, state_at
 from webots_mcp.store.runs import pace
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
@@ -130,7 +130,7 @@ _MAKE_ONE: Final = (
 class Dispatcher:
     """Sends commands, watches their rows, and reports to the client how long it has waited."""
 
-    def __init__(self, recording: Recording, report: Report) -> None:
+    def __init__(self, recording: RecordingAccess, report: Report) -> None:
         self._recording = recording
         self._report = report
 
@@ -178,7 +178,7 @@ class Dispatcher:
         def correct(command_id: int) -> None:
             with self._recording.reader() as connection:
                 command = fetch_command(connection, command_id)
-                view = look(connection, robot_name(connection, command.robot_id))
+                view = view_robot(connection, robot_name(connection, command.robot_id))
                 _name_mode_afterwards(view, command, answer)
 
         if answer.command_id is not None:
@@ -296,7 +296,7 @@ class Dispatcher:
 
     def _answer(self, command: Command, waited_s: float) -> CommandAnswer:
         with self._recording.reader() as connection:
-            view = look(connection, robot_name(connection, command.robot_id))
+            view = view_robot(connection, robot_name(connection, command.robot_id))
             facts: dict[str, Any] = {
                 **view.header(),
                 "command_id": command.id,
@@ -313,7 +313,7 @@ class Dispatcher:
             return answer
 
 
-def withdraw_if_blocked(recording: Recording, command: Command) -> bool:
+def withdraw_if_blocked(recording: RecordingAccess, command: Command) -> bool:
     """Cancel a pending command where its loop is known to be blocked; True if it will never run.
 
     A controller that claims it in the meantime runs it, and the outcome is that of the controller.
@@ -330,14 +330,14 @@ def is_withdrawn(answer: CommandAnswer) -> bool:
     return (answer.error or "").endswith(_WITHDRAWN)
 
 
-def is_held_up(recording: Recording, command: Command) -> bool:
+def is_held_up(recording: RecordingAccess, command: Command) -> bool:
     """Whether a `step` or `run` that is under way cannot go on, since its loop is blocked."""
     if command.status != "claimed" or command.action not in LOOPING:
         return False
     return _block_of(recording, command) is not None
 
 
-def _block_of(recording: Recording, command: Command) -> Block | None:
+def _block_of(recording: RecordingAccess, command: Command) -> BlockedLoop | None:
     with recording.reader() as connection:
         name = robot_name(connection, command.robot_id)
     with recording.view(name) as view:
@@ -373,7 +373,7 @@ def shown_result(command: Command, budget_tokens: int = RESULT_BUDGET_TOKENS) ->
     return shorten(command.decoded_result(), budget_tokens, WHOLE).value
 
 
-def _name_mode_afterwards(view: View, command: Command, answer: CommandAnswer) -> None:
+def _name_mode_afterwards(view: RobotView, command: Command, answer: CommandAnswer) -> None:
     """Correct the mode in the answer of a command that a later one has followed meanwhile."""
     if command.action not in _MODES or command.status not in ("done", "failed"):
         return
@@ -406,7 +406,7 @@ def _progress(command: Command, waited_s: float) -> str:
     return f"{command.action}: {doing} for {waited_s:.0f} s"
 
 
-def _hint(view: View, command: Command) -> str | None:
+def _hint(view: RobotView, command: Command) -> str | None:
     """What to do next, where the outcome alone does not say it."""
     if command.status == "pending":
         return "no controller has claimed it yet"
@@ -427,21 +427,21 @@ def _hint(view: View, command: Command) -> str | None:
     return _after_no_answer(view)
 
 
-def _after_loss(view: View) -> str:
+def _after_loss(view: RobotView) -> str:
     """What to do after a lost command, which may have run: first start and check, then resend."""
-    look = "check the robot's state before you send it again"
+    check = "check the robot's state before you send it again"
     if view.robot.live:
-        return look
-    return f"start its controller (reload the world in Webots; an extern one by hand), then {look}"
+        return check
+    return f"start its controller (reload the world in Webots; an extern one by hand), then {check}"
 
 
-def _instructions(view: View, action: str) -> str | None:
+def _instructions(view: RobotView, action: str) -> str | None:
     """Where to find the description of a custom action, which the controller provides."""
     described = view.session is not None and action in view.session.actions
     return "webots_list_commands has the action's description" if described else None
 
 
-def _after_no_answer(view: View) -> str:
+def _after_no_answer(view: RobotView) -> str:
     session = view.session
     if block := find_block(view.connection, session, view.run, view.now_s):
         return f"{block.fix}, then ask again"
@@ -463,7 +463,12 @@ def _after_no_answer(view: View) -> str:
 
 
 def require_possible(
-    recording: Recording, robot: str | None, until: str | None, for_s: float | None, *, reset: bool
+    recording: RecordingAccess,
+    robot: str | None,
+    until: str | None,
+    for_s: float | None,
+    *,
+    reset: bool,
 ) -> None:
     """Refuse a run that could not end as requested, before anything is sent.
 
@@ -490,7 +495,7 @@ def require_possible(
                 _require_open(view, condition)
 
 
-def _require_known(view: View, condition: Condition) -> None:
+def _require_known(view: RobotView, condition: Condition) -> None:
     """Refuse signals that were never published: most likely a name is misspelt."""
     known = known_names(view)  # empty before the first row, when nothing can be said
     if known and (unknown := condition.describe_unknown(known)):
@@ -501,7 +506,7 @@ def _require_known(view: View, condition: Condition) -> None:
         )
 
 
-def known_names(view: View) -> set[str]:
+def known_names(view: RobotView) -> set[str]:
     """The signals that a robot published in its newest runs; empty before the first row."""
     runs = view.connection.execute(_NEWEST_RUNS, (view.robot.id, _RUNS_SEARCHED)).fetchall()
     found = (whole_run(view.connection, run_id) for (run_id,) in runs)
@@ -512,7 +517,7 @@ def known_names(view: View) -> set[str]:
     return set(known_signals(view.connection, asked))
 
 
-def _require_open(view: View, condition: Condition) -> None:
+def _require_open(view: RobotView, condition: Condition) -> None:
     """Refuse a condition that holds at the newest row: the run would be over at once.
 
     A condition with `changed` may hold: a change lasts one step, so the next one is awaited.
@@ -633,7 +638,7 @@ def _params_of(command: Command) -> Mapping[str, Any]:
 # -- when it is over --------------------------------------------------------------------------
 
 
-def run_facts(view: View, command: Command) -> dict[str, Any]:
+def run_facts(view: RobotView, command: Command) -> dict[str, Any]:
     """The facts of an answer about a `run` command: why it stopped, its progress, its events."""
     progress, result = _progress_in(view.connection, command), _result_of(command)
     stopped, why = _stop_reason(command, result)
@@ -662,7 +667,7 @@ def _stop_reason(command: Command, result: Mapping[str, Any]) -> tuple[str | Non
     return result.get("ended"), result.get("why")
 
 
-def _what_happened(view: View, command: Command, progress: Progress) -> dict[str, Any]:
+def _what_happened(view: RobotView, command: Command, progress: Progress) -> dict[str, Any]:
     """The state at the end, trends and events in between, and the rows before the end."""
     assert progress.run_id is not None
     subject = Subject(view.robot.id, view.robot.name, progress.run_id)
@@ -678,12 +683,12 @@ def _what_happened(view: View, command: Command, progress: Progress) -> dict[str
     return facts | _in_between(view, command, asked)
 
 
-def _as_shown(state: State) -> dict[str, Any]:
+def _as_shown(state: StateRecord) -> dict[str, Any]:
     short = shorten(state.value(), _STATE_TOKENS)
     return {"state": short.value, "state_at_s": seconds(state.sim_time_s), "shortened": short.rule}
 
 
-def _in_between(view: View, command: Command, asked: TimeRange) -> dict[str, Any]:
+def _in_between(view: RobotView, command: Command, asked: TimeRange) -> dict[str, Any]:
     (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
     found = search_events(view.connection, asked)
     of_others = found.only([each for each in found.events if not _is_own(each, command)])
@@ -706,7 +711,7 @@ def _is_own(event: Event, command: Command) -> bool:
     return event.kind == "bridge_event" and data.get("command_id") == command.id
 
 
-def _last_rows(view: View, command: Command, progress: Progress, end_s: float) -> Any:
+def _last_rows(view: RobotView, command: Command, progress: Progress, end_s: float) -> Any:
     """The last rows, of the condition's signals."""
     until = _params_of(command).get("until")
     rows = view.connection.execute(_LAST_ROWS, (progress.run_id, end_s, _ROWS_AROUND)).fetchall()
@@ -726,7 +731,7 @@ def _last_rows(view: View, command: Command, progress: Progress, end_s: float) -
 # -- the robot whose controller is to run a command --
 
 
-def find_target(connection: sqlite3.Connection, robot: str | None, action: str) -> View:
+def find_target(connection: sqlite3.Connection, robot: str | None, action: str) -> RobotView:
     """The robot that is to run an action.
 
     Without a name it is the only live robot; for what steers the simulation, the only live
@@ -740,7 +745,7 @@ def find_target(connection: sqlite3.Connection, robot: str | None, action: str) 
     """
     if robot is None and _needs_supervisor(action):
         robot = _only_supervisor(connection)
-    view = look(connection, robot)
+    view = view_robot(connection, robot)
     _require_action(view, action)
     session = _require_live(view)
     if _needs_supervisor(action) and not session.supervisor:
@@ -761,7 +766,7 @@ def _only_supervisor(connection: sqlite3.Connection) -> str | None:
     return names[0] if len(names) == 1 else None
 
 
-def _require_action(view: View, action: str) -> None:
+def _require_action(view: RobotView, action: str) -> None:
     """Refuse an action that the controller does not know.
 
     Without registered actions nothing is refused: the loop may handle what get_command() returns.
@@ -778,7 +783,7 @@ def _require_action(view: View, action: str) -> None:
     )
 
 
-def _require_parameters(view: View, action: str, params: Mapping[str, Any]) -> None:
+def _require_parameters(view: RobotView, action: str, params: Mapping[str, Any]) -> None:
     """Refuse parameters that do not fit a built-in action; the bridge would refuse them too."""
     built_in = BUILT_IN_ACTIONS.get(action)
     if built_in is None or (view.session and action in view.session.actions):
@@ -788,7 +793,7 @@ def _require_parameters(view: View, action: str, params: Mapping[str, Any]) -> N
         raise InvalidInputError(misfit)
 
 
-def _require_live(view: View) -> Session:
+def _require_live(view: RobotView) -> SessionRecord:
     """The robot's session; during a reload the old one, since its successor runs the command."""
     session = view.session
     if session is not None and not session.has_bridge:
@@ -808,7 +813,7 @@ def _require_live(view: View) -> Session:
     )
 
 
-def _who_may(view: View, session: Session, action: str) -> str:
+def _who_may(view: RobotView, session: SessionRecord, action: str) -> str:
     others = [s for s in companions(view.connection, session, view.now_s) if s.supervisor]
     next_step = _MAKE_ONE
     if others:
@@ -819,7 +824,7 @@ def _who_may(view: View, session: Session, action: str) -> str:
     return f"{action} needs a Supervisor and robot {view.robot.name!r} is not one: {next_step}"
 
 
-def _require_free(view: View, session: Session, action: str) -> None:
+def _require_free(view: RobotView, session: SessionRecord, action: str) -> None:
     """Refuse while another robot's bridge has paused the simulation: this loop cannot run then."""
     holder = find_holder(view.connection, session, view.now_s)
     if holder is None or holder.id == session.id:

@@ -52,9 +52,9 @@ from webots_mcp.steering.dispatch import (
 )
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.policy import LAUNCH
-from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
+from webots_mcp.store.robots import SessionRecord, find_holder, list_robots, live_observer
 
 CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # a loop that has just stopped is detected within it
 UNCLAIMED: Final = ("cancelled", "expired")
@@ -90,7 +90,7 @@ class Request:
         failed_routes: Why each route did not work, by its name.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     dispatcher: Dispatcher
     robot: str | None
     timeout_s: float
@@ -376,7 +376,7 @@ class Attempt(Request):
         )
 
 
-def assess(recording: Recording, robot: str | None, action: str) -> Situation:
+def assess(recording: RecordingAccess, robot: str | None, action: str) -> Situation:
     """Find out which controllers could run an action that steers the simulation.
 
     Raises:
@@ -392,7 +392,7 @@ def assess(recording: Recording, robot: str | None, action: str) -> Situation:
                     raise
                 return Situation(None, False, _NONE_LIVES, None, Moment(None, None))
             except CommandRefusedError as error:
-                view = look(connection, robot)
+                view = view_robot(connection, robot)
                 _require_not_held_elsewhere(view, error)
                 return _situation(view, can_command=False, silent=str(error))
             return _situation(view, can_command=True, silent=_why_silent(view))
@@ -400,7 +400,7 @@ def assess(recording: Recording, robot: str | None, action: str) -> Situation:
         return Situation(None, False, str(error).rstrip("."), None, Moment(None, None))
 
 
-def _require_not_held_elsewhere(view: View, error: CommandRefusedError) -> None:
+def _require_not_held_elsewhere(view: RobotView, error: CommandRefusedError) -> None:
     """Refuse a simulation that another robot's bridge has paused: only that bridge resumes it."""
     session = view.session
     if session is None or not session.is_alive(view.now_s):
@@ -413,7 +413,7 @@ def _require_not_held_elsewhere(view: View, error: CommandRefusedError) -> None:
         raise error
 
 
-def _situation(view: View, *, can_command: bool, silent: str | None) -> Situation:
+def _situation(view: RobotView, *, can_command: bool, silent: str | None) -> Situation:
     moment = Moment(view.run.id if view.run else None, view.header()["sim_time_s"])
     address = address_of(view.session.instance) if view.session else None
     observer = live_observer(view.connection, view.session, view.now_s)
@@ -422,7 +422,7 @@ def _situation(view: View, *, can_command: bool, silent: str | None) -> Situatio
     return Situation(view.robot.name, can_command, silent, address, moment, name, is_there)
 
 
-def _why_silent(view: View) -> str | None:
+def _why_silent(view: RobotView) -> str | None:
     """Why a command would not be claimed soon; None where it would, or this is unknown."""
     session = view.session
     if session is None or not session.is_alive(view.now_s):
@@ -434,31 +434,31 @@ def _why_silent(view: View) -> str | None:
     return None
 
 
-def _never_asks(session: Session, now_s: float) -> bool:
+def _never_asks(session: SessionRecord, now_s: float) -> bool:
     """Whether the loop has run for two heartbeats without calling `get_command()`."""
     since_s = session.last_poll_wall_time_s or session.started_wall_time_s
     return session.age_s(since_s, now_s) > 2 * HEARTBEAT_LATE_S
 
 
-def _begun(before: Moment, view: View) -> str | None:
+def _begun(before: Moment, view: RobotView) -> str | None:
     if view.run is None or view.run.id == before.run_id:
         return None
     return f"run {view.run.id} began"
 
 
-def _moved(before: Moment, view: View) -> str | None:
+def _moved(before: Moment, view: RobotView) -> str | None:
     now_s = view.header()["sim_time_s"]
     if now_s is None or (before.sim_time_s is not None and now_s <= before.sim_time_s):
         return _begun(before, view)
     return f"simulation time advanced to {now_s} s"
 
 
-def _standing(before: Moment, view: View) -> str | None:
+def _standing(before: Moment, view: RobotView) -> str | None:
     unknown = view.status.is_moving or view.status.why == UNMOVED
     return None if unknown else f"status: {view.status.text}"
 
 
-_SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
+_SIGNS: Final[dict[Order, Callable[[Moment, RobotView], str | None]]] = {
     "pause": _standing,
     "resume": _moved,
     "fast": _moved,
@@ -479,7 +479,7 @@ def why_no_reply(address: WebotsAddress, reply: OrderReply) -> str:
     return why_not_obeyed(address, reply)
 
 
-def find_webots(recording: Recording, situation: Situation) -> WebotsAddress:
+def find_webots(recording: RecordingAccess, situation: Situation) -> WebotsAddress:
     """The address of the wanted Webots; where that is not known, of the only one of this project.
 
     Raises:
@@ -496,7 +496,7 @@ def find_webots(recording: Recording, situation: Situation) -> WebotsAddress:
     return _only(same or ours, running).address
 
 
-def _window(recording: Recording, situation: Situation) -> Instance:
+def _window(recording: RecordingAccess, situation: Situation) -> Instance:
     """The Webots whose window receives the keys."""
     address = find_webots(recording, situation)
     found = instance_at(address.port)
@@ -540,7 +540,7 @@ class Launcher:
         launched: The Webots that was started last.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         self.launched: Launch | None = None
         self._recording = recording
         self._lock = threading.Lock()
@@ -597,7 +597,7 @@ class Companions:
         self.webots.stop()
 
 
-def project_of(recording: Recording) -> Path:
+def project_of(recording: RecordingAccess) -> Path:
     """The Webots project of a server: that of its data folder, else of its current folder.
 
     Raises:

@@ -44,11 +44,11 @@ from webots_mcp.signals.conditions import Evaluator, parse_condition
 from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, any_port, end_left_over
 from webots_mcp.steering.trial_plan import Range, TrialPlan, WorldPlan
 from webots_mcp.store.chunks import parse
-from webots_mcp.store.logs import LogFilter, Window, newest_lines
+from webots_mcp.store.logs import LogFilter, LogWindow, newest_lines
 from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.parameters import (
-    Result,
-    Trial,
+    TrialRecord,
+    TrialResult,
     add_trial,
     begin_trial,
     fetch_trial_set,
@@ -60,7 +60,7 @@ from webots_mcp.store.parameters import (
     trials_of,
 )
 from webots_mcp.store.policy import LAUNCH
-from webots_mcp.store.recording import Job, Recording
+from webots_mcp.store.recording import Job, RecordingAccess
 from webots_mcp.store.requests import permit
 from webots_mcp.store.runs import run_info
 
@@ -129,7 +129,7 @@ class Simulators(Protocol):
         """How many can run at once, now."""
         ...
 
-    def run(self, attempt: TrialAttempt) -> Result:
+    def run(self, attempt: TrialAttempt) -> TrialResult:
         """Run a trial; its recording is in its folder then, and the result has its run's id there.
 
         Raises:
@@ -152,7 +152,7 @@ class LocalSimulators:
     command: Command
     count: int
 
-    def run(self, attempt: TrialAttempt) -> Result:
+    def run(self, attempt: TrialAttempt) -> TrialResult:
         """As `Simulators.run`."""
         return run_attempt(attempt, self.command)
 
@@ -192,7 +192,7 @@ class TrialSimulator(KeptProgram):
 # -- one trial --------------------------------------------------------------------------------
 
 
-def run_attempt(attempt: TrialAttempt, command: Command) -> Result:
+def run_attempt(attempt: TrialAttempt, command: Command) -> TrialResult:
     """Run a trial in a simulator of this machine.
 
     Raises:
@@ -213,7 +213,7 @@ def run_attempt(attempt: TrialAttempt, command: Command) -> Result:
     return _concluded(attempt, watch, end, why)
 
 
-def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> Result | None:
+def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> TrialResult | None:
     """The result of a trial that had ended before its process was killed; None where it had not."""
     watch = TrialWatch(plan)
     recording = _settled(folder)
@@ -229,7 +229,7 @@ def _watched(
 ) -> tuple[End | None, str]:
     """Until the trial is over; the end that it reached, or why it reached none."""
     folder, timeout_s = attempt.folder, attempt.plan.timeout_s
-    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
     until_s = time.monotonic() + timeout_s
     while True:
         over = simulator.is_over  # before the look: what came last is seen
@@ -255,7 +255,7 @@ def _watched(
             return None, ended
 
 
-def _ended(recording: Recording, watch: TrialWatch) -> str | None:
+def _ended(recording: RecordingAccess, watch: TrialWatch) -> str | None:
     """Why the run cannot continue: its controller's process has ended."""
     if watch.run_id is None:
         return None
@@ -266,23 +266,23 @@ def _ended(recording: Recording, watch: TrialWatch) -> str | None:
     return f"its run ended ({reason})"
 
 
-def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: str) -> Result:
+def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: str) -> TrialResult:
     recording = _settled(attempt.folder)
     if recording is None:
         text = "the controller recorded nothing in its data folder: does it name another one?"
-        return Result(None, None, f"{why}; {text}" if why else text)
+        return TrialResult(None, None, f"{why}; {text}" if why else text)
     with recording.reader() as connection:
         end = end or watch.look(connection)  # rows that waited next to the database are in it now
         if end is not None:
             return _scored(connection, attempt.plan, attempt.values, watch, end)
         why = _ending_line(connection, watch.run_id) or why
     reached = "nothing" if watch.reached_s is None else f"{watch.reached_s:.3f} s"
-    return Result(watch.run_id, None, f"did not reach its end, only {reached}: {why}")
+    return TrialResult(watch.run_id, None, f"did not reach its end, only {reached}: {why}")
 
 
 def _ending_line(connection: sqlite3.Connection, run_id: int | None) -> str | None:
     """By which exception the controller ended, where it did."""
-    wanted = LogFilter(run_id, Window(-math.inf, math.inf), ENDED_BY, "error")
+    wanted = LogFilter(run_id, LogWindow(-math.inf, math.inf), ENDED_BY, "error")
     found = newest_lines(connection, wanted, 1) if run_id is not None else []
     return found[0].message if found else None
 
@@ -293,21 +293,21 @@ def _scored(
     values: dict[str, Any],
     watch: TrialWatch,
     end: End,
-) -> Result:
+) -> TrialResult:
     assert watch.run_id is not None  # it has an end
     ended: tuple[Any, Any] = (end.by, end.sim_time_s)
     try:
         watch.require_parameters(connection, values)
     except ValueError as error:
-        return Result(watch.run_id, None, str(error), *ended)
+        return TrialResult(watch.run_id, None, str(error), *ended)
     if end.by == "prune":
         why = f"{plan.prune!r} held at {end.sim_time_s:.3f} s"
-        return Result(watch.run_id, None, why, *ended, pruned=True)
+        return TrialResult(watch.run_id, None, why, *ended, pruned=True)
     scored = score_run(connection, watch.run_id, plan.score, end_s=end.sim_time_s)
-    return Result(watch.run_id, scored.value, scored.why, *ended)
+    return TrialResult(watch.run_id, scored.value, scored.why, *ended)
 
 
-def _settled(folder: Path) -> Recording | None:
+def _settled(folder: Path) -> RecordingAccess | None:
     """The recording of a trial whose processes have ended, with all rows that waited next to it."""
     try:
         return settled(folder / DATABASE_NAME)
@@ -416,7 +416,7 @@ class TrialWatch:
 # -- a set of trials ---------------------------------------------------------------------------
 
 
-Report = Callable[[Trial, Result], object]
+Report = Callable[[TrialRecord, TrialResult], object]
 
 
 @dataclass(frozen=True)
@@ -431,7 +431,7 @@ class SetRun:
         job: The set, as long as this process works on it.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     plan: WorldPlan
     simulators: Simulators
     stopping: threading.Event
@@ -447,7 +447,7 @@ class SetRun:
         with self.writer():
             pass
 
-    def folder(self, trial: Trial) -> Path:
+    def folder(self, trial: TrialRecord) -> Path:
         """The data folder of a trial."""
         return self.recording.data_dir / FOLDER / trial.uuid
 
@@ -490,7 +490,7 @@ def _run_left(set_run: SetRun, set_id: int, report: Report) -> None:
         if trial.is_over:
             shutil.rmtree(set_run.folder(trial), ignore_errors=True)
     left = deque(trial for trial in trials if not trial.is_over)
-    running: dict[Future[Result], Trial] = {}
+    running: dict[Future[TrialResult], TrialRecord] = {}
     pool = ThreadPoolExecutor(_MOST_THREADS)
     try:
         while True:
@@ -521,7 +521,7 @@ def _require_wanted(set_run: SetRun, set_id: int) -> None:
         raise CommandRefusedError(f"trial set {set_id} stopped: {reason}")
 
 
-def _next_trial(set_run: SetRun, set_id: int, left: deque[Trial]) -> Trial | None:
+def _next_trial(set_run: SetRun, set_id: int, left: deque[TrialRecord]) -> TrialRecord | None:
     """One that waits, or a new one of a search; None where there is none."""
     if left:
         return left.popleft()
@@ -536,7 +536,7 @@ def _next_trial(set_run: SetRun, set_id: int, left: deque[Trial]) -> Trial | Non
         return add_trial(connection, set_id, values)
 
 
-def run_trial(set_run: SetRun, trial: Trial) -> Result:
+def run_trial(set_run: SetRun, trial: TrialRecord) -> TrialResult:
     """Run one trial, or only score and merge it where it has run to its end already.
 
     Raises:
@@ -561,14 +561,14 @@ def run_trial(set_run: SetRun, trial: Trial) -> Result:
     return result
 
 
-def _with_run(result: Result, merged: dict[str, int], folder: Path) -> Result:
+def _with_run(result: TrialResult, merged: dict[str, int], folder: Path) -> TrialResult:
     """With the id that its run has where it was merged."""
-    with Recording(folder / DATABASE_NAME, folder).reader() as connection:
+    with RecordingAccess(folder / DATABASE_NAME, folder).reader() as connection:
         row = connection.execute("SELECT uuid FROM run WHERE id = ?", (result.run_id,)).fetchone()
     return replace(result, run_id=merged[row[0]])
 
 
-def _run(set_run: SetRun, trial: Trial) -> Result:
+def _run(set_run: SetRun, trial: TrialRecord) -> TrialResult:
     folder = set_run.folder(trial)
     set_run.require_held()  # in that folder another process may record by now
     shutil.rmtree(folder, ignore_errors=True)
@@ -606,7 +606,7 @@ def require_optuna() -> None:
         raise InvalidInputError(explain_extra("a search", "search")) from error
 
 
-def next_parameters(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any] | None:
+def next_parameters(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any] | None:
     """The parameters of the trial after these; None where there is none.
 
     Each set is tried `plan.repeats` times in a row.
@@ -618,7 +618,7 @@ def next_parameters(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any] 
     return trials[first].values if first < number else _suggested(plan, trials)
 
 
-def _suggested(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any]:
+def _suggested(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any]:
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)

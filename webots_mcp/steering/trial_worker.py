@@ -27,9 +27,9 @@ from webots_mcp.steering.dispatch import (
 )
 from webots_mcp.steering.trial_plan import TrialPlan, stored_plan
 from webots_mcp.store.parameters import (
-    Result,
-    Trial,
-    TrialSet,
+    TrialRecord,
+    TrialResult,
+    TrialSetRecord,
     begin_trial,
     borrow_parameters,
     described,
@@ -43,7 +43,7 @@ from webots_mcp.store.parameters import (
     take_up,
     trials_of,
 )
-from webots_mcp.store.recording import Job, Recording, View
+from webots_mcp.store.recording import Job, RecordingAccess, RobotView
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import find_block, robot_name
 
@@ -90,7 +90,7 @@ class TrialWorker(threading.Thread):
         CommandRefusedError: Another process works on it.
     """
 
-    def __init__(self, recording: Recording, set_id: int) -> None:
+    def __init__(self, recording: RecordingAccess, set_id: int) -> None:
         super().__init__(name=f"trial set {set_id}", daemon=True)
         self._context = copy_context()  # in which it is known who asked for the trials
         self._recording = recording
@@ -133,7 +133,7 @@ class TrialWorker(threading.Thread):
 
     # -- one trial -----------------------------------------------------------------------------
 
-    def _next(self) -> Trial | None:
+    def _next(self) -> TrialRecord | None:
         """The next trial, first one that a killed server has begun; None where the set stops."""
         if self._stopping.is_set():
             raise _StopError
@@ -142,7 +142,7 @@ class TrialWorker(threading.Thread):
             stops = fetch_trial_set(connection, self.set_id).stop_reason is not None
         return None if trial and trial.status == "waiting" and stops else trial
 
-    def _try(self, trial: Trial) -> None:
+    def _try(self, trial: TrialRecord) -> None:
         try:
             command = self._watched(self._sent(trial), self._plan.timeout_s)
             result = self._result(trial, command)
@@ -155,7 +155,7 @@ class TrialWorker(threading.Thread):
         if not command.is_final:
             raise CommandRefusedError(_HANGS.format(self._robot))
 
-    def _sent(self, trial: Trial) -> Command:
+    def _sent(self, trial: TrialRecord) -> Command:
         """The command that runs a trial; one that was sent already is not sent again."""
         with self._job.writer() as connection:
             known = find_command(connection, _key(trial))
@@ -192,7 +192,7 @@ class TrialWorker(threading.Thread):
         }
         return {name: value for name, value in asked.items() if value is not None}
 
-    def _borrow(self, connection: sqlite3.Connection) -> View:
+    def _borrow(self, connection: sqlite3.Connection) -> RobotView:
         """The robot; the parameters' values are stored first, once for each of its sessions."""
         view = find_target(connection, self._robot, ACTION)
         noted = fetch_trial_set(connection, self.set_id)
@@ -246,7 +246,7 @@ class TrialWorker(threading.Thread):
 
     # -- results -------------------------------------------------------------------------------
 
-    def _result(self, trial: Trial, command: Command) -> Result:
+    def _result(self, trial: TrialRecord, command: Command) -> TrialResult:
         """The result of a trial.
 
         Raises:
@@ -261,17 +261,17 @@ class TrialWorker(threading.Thread):
             run_id = connection.execute(_RUN_OF, (command.session_id, command.id)).fetchone()[0]
             if command.status != "done":
                 why = self._too_long if command.status == "claimed" else command.error
-                return Result(run_id, None, f"{_reached(connection, run_id)}: {why}")
+                return TrialResult(run_id, None, f"{_reached(connection, run_id)}: {why}")
             answer: Mapping[str, Any] = command.decoded_result() or {}
             if answer.get("ended") in _ENDS:
                 _require_untouched(connection, trial, run_id, answer["sim_time_s"])
                 return self._scored(connection, run_id, answer)
-            return Result(run_id, None, self._why_not(connection, trial, run_id, answer))
+            return TrialResult(run_id, None, self._why_not(connection, trial, run_id, answer))
 
     def _why_not(
         self,
         connection: sqlite3.Connection,
-        trial: Trial,
+        trial: TrialRecord,
         run_id: int | None,
         answer: Mapping[str, Any],
     ) -> str:
@@ -289,19 +289,19 @@ class TrialWorker(threading.Thread):
 
     def _scored(
         self, connection: sqlite3.Connection, run_id: int, answer: Mapping[str, Any]
-    ) -> Result:
+    ) -> TrialResult:
         end_s = answer["sim_time_s"]
         ended = (_ENDS[answer["ended"]], end_s)
         if answer["ended"] == "pruned":
             why = f"{self._plan.prune!r} held at {end_s:.3f} s"
-            return Result(run_id, None, why, *ended, pruned=True)
+            return TrialResult(run_id, None, why, *ended, pruned=True)
         try:
             scored = score_run(connection, run_id, self._plan.score, end_s=end_s)
         except InvalidInputError as error:
             if not any(each.score is not None for each in trials_of(connection, self.set_id)):
                 raise
-            return Result(run_id, None, str(error), *ended)
-        return Result(run_id, scored.value, scored.why, *ended)
+            return TrialResult(run_id, None, str(error), *ended)
+        return TrialResult(run_id, scored.value, scored.why, *ended)
 
     # -- at the end ----------------------------------------------------------------------------
 
@@ -347,7 +347,7 @@ class TrialWorker(threading.Thread):
                 f"its parameters were not restored: {command.error or command.status}"
             )
 
-    def _ask_back(self, connection: sqlite3.Connection, noted: TrialSet) -> Command | None:
+    def _ask_back(self, connection: sqlite3.Connection, noted: TrialSetRecord) -> Command | None:
         """The command that restores the parameters; None without any, or without its controller."""
         assert noted.robot_id is not None and noted.former_values is not None
         former = json.loads(noted.former_values)
@@ -373,7 +373,7 @@ class TrialWorkers:
         recording: The recording of the robots.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         self._recording = recording
         self._workers: list[TrialWorker] = []
 
@@ -404,7 +404,7 @@ def _new_run_with(values: Mapping[str, Any]) -> dict[str, Any]:
     return {"for_s": _SOME_STEPS_S, "parameters": values, "by": "trial", **OF_EACH_TRIAL}
 
 
-def _key(trial: Trial) -> str:
+def _key(trial: TrialRecord) -> str:
     """The idempotency key of a trial's command; a trial that is begun again has another one."""
     return f"trial {trial.uuid} {trial.started_wall_time_s}"
 
@@ -415,7 +415,7 @@ def _value(parameter: Mapping[str, Any]) -> Any:
 
 
 def _require_untouched(
-    connection: sqlite3.Connection, trial: Trial, run_id: int, end_s: float
+    connection: sqlite3.Connection, trial: TrialRecord, run_id: int, end_s: float
 ) -> None:
     """Refuse a trial whose parameters a command changed, since its score would be misattributed.
 

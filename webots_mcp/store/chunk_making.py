@@ -32,7 +32,7 @@ from webots_mcp.store.chunks import (
     STATE_COLUMNS,
     STATE_IDS,
     WALL_TIMES,
-    Reached,
+    ChunkProgress,
     StateColumns,
     Statistics,
     chunks_aside,
@@ -42,10 +42,10 @@ from webots_mcp.store.chunks import (
     statistics_of,
     watermark,
 )
-from webots_mcp.store.recording import Recording, is_over_a_value
+from webots_mcp.store.recording import RecordingAccess, is_over_a_value
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.run_rows import reading_texts
-from webots_mcp.store.signals import Signal, enter_signals, registered, seen_in, tell_more
+from webots_mcp.store.signals import RegisteredSignal, enter_signals, registered, seen_in, tell_more
 
 GROUP_ROWS: Final = 1024
 LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
@@ -262,7 +262,7 @@ class _RunChunks:
             at = reached(self._connection, self._run_id)
         return rows
 
-    def _late(self, at: Reached, last_id: int) -> StateColumns:
+    def _late(self, at: ChunkProgress, last_id: int) -> StateColumns:
         """Rows in no chunk that came after others of later times were put into one."""
         first_id, newest_id = self._new_ids
         after_id, last_id = max(at.max_state_id, first_id - 1), min(last_id, newest_id)
@@ -271,13 +271,13 @@ class _RunChunks:
         place = (at.end_s, at.last_state_id)
         return _read(self._connection, _LATE, (after_id, last_id, self._run_id, *place))
 
-    def _has_tail(self, at: Reached, last_id: int, least_rows: int) -> bool:
+    def _has_tail(self, at: ChunkProgress, last_id: int, least_rows: int) -> bool:
         """Whether there are so many rows after those that are in chunks."""
         place = (at.end_s, at.last_state_id)
         asked = (self._run_id, *place, last_id, least_rows)
         return bool(self._connection.execute(_COUNT, asked).fetchone()[0] >= least_rows)
 
-    def _tail(self, at: Reached, last_id: int) -> StateColumns:
+    def _tail(self, at: ChunkProgress, last_id: int) -> StateColumns:
         """The first rows after those that are in chunks."""
         place = (at.end_s, at.last_state_id)
         return _read(self._connection, _TAIL, (self._run_id, *place, last_id))
@@ -286,7 +286,7 @@ class _RunChunks:
         ended = "SELECT ended_wall_time_s IS NOT NULL FROM run WHERE id = ?"
         return bool(self._connection.execute(ended, (self._run_id,)).fetchone()[0])
 
-    def _store(self, columns: StateColumns, at: Reached) -> bool:
+    def _store(self, columns: StateColumns, at: ChunkProgress) -> bool:
         """Store a group; False where another process has stored some of its rows meanwhile."""
         signals = _signals_of(self._connection, self._robot_id, columns)
         ids = {name: each.id for name, each in signals.items() if each.id is not None}
@@ -360,7 +360,7 @@ def _is_valid(row: tuple[Any, ...]) -> bool:
 
 def _signals_of(
     connection: sqlite3.Connection, robot_id: int, columns: StateColumns
-) -> dict[str, Signal]:
+) -> dict[str, RegisteredSignal]:
     """The robot's signals by name; what some rows tell of them is entered."""
     known = registered(connection, robot_id)
     room = max(0, MAX_SIGNALS - len(known))
@@ -373,7 +373,7 @@ def _signals_of(
     return known
 
 
-def count_lost(columns: StateColumns, signals: dict[str, Signal]) -> int:
+def count_lost(columns: StateColumns, signals: dict[str, RegisteredSignal]) -> int:
     """How many values of some rows chunks do not hold as they were (docs/database.md)."""
     lost = 0
     for name, values in columns.values.items():
@@ -441,7 +441,7 @@ def _delete_left_behind(connection: sqlite3.Connection, pause_s: float) -> None:
 
 
 def make_missing_chunks(
-    recording: Recording,
+    recording: RecordingAccess,
     progress: Callable[[int, int], object] | None = None,
     *,
     limit_s: float = math.inf,
@@ -502,7 +502,9 @@ def _rows_left(connection: sqlite3.Connection) -> int:
 
 
 @contextmanager
-def _opened(recording: Recording, *, write: bool, frozen: bool) -> Generator[sqlite3.Connection]:
+def _opened(
+    recording: RecordingAccess, *, write: bool, frozen: bool
+) -> Generator[sqlite3.Connection]:
     """A connection to make chunks on, with a maintainer that keeps the log short meanwhile."""
     database = recording.database
     if isinstance(database, Path) and (frozen or not write):

@@ -47,7 +47,7 @@ _ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
 
 
 @dataclass(frozen=True)
-class Part:
+class RunColumns:
     """The rows of one run in such a table.
 
     Attributes:
@@ -69,7 +69,7 @@ class Part:
 
 def chunk_table(
     connection: sqlite3.Connection, segments: Sequence[Segment], counts: Sequence[int], last_id: int
-) -> list[Part] | None:
+) -> list[RunColumns] | None:
     """The rows of some segments by columns; None where chunks do not hold all as it was.
 
     Args:
@@ -78,7 +78,7 @@ def chunk_table(
         counts: How many state rows each has.
         last_id: Of them.
     """
-    parts = list[Part]()
+    parts = list[RunColumns]()
     for segment, count in zip(segments, counts, strict=True):
         part = _part(connection, segment, count, last_id)
         if part is None:
@@ -89,7 +89,7 @@ def chunk_table(
 
 def _part(
     connection: sqlite3.Connection, segment: Segment, count: int, last_id: int
-) -> Part | None:
+) -> RunColumns | None:
     run_id = segment.run_id
     (waiting,) = connection.execute(_UNCHUNKED, {"run": run_id}).fetchone()
     asked = (run_id, segment.end_s, segment.start_s)
@@ -119,7 +119,7 @@ def _part(
             return None
         if first < count:
             kinds[name], first_rows[name] = found, int(ids[first])
-    return None if frame.unread else Part(run_id, frame, kinds, first_rows)
+    return None if frame.unread else RunColumns(run_id, frame, kinds, first_rows)
 
 
 def _is_in_wall_time(frame: Frame, segment: Segment) -> bool:
@@ -182,7 +182,7 @@ def _kind_of_label(label: object) -> Kind:
     return "null" if label is None else "text"
 
 
-class Cells:
+class ColumnCells:
     """The values of a signal in some rows, as a library for columns takes them.
 
     Attributes:

@@ -59,9 +59,12 @@ _LAST_AT: Final = (
     "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
     "AND end_sim_time_s = ?"
 )
+NEWEST_STATE_ID: Final = (  # that was ever given
+    "max((SELECT coalesce(max(id), 0) FROM state), (SELECT coalesce(max(CAST(reserved_state_id "
+    "AS INTEGER)), 0) FROM recording))"
+)
 IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
-    "typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= "
-    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'state')"
+    f"typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= {NEWEST_STATE_ID}"
 )
 _WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
@@ -80,10 +83,6 @@ _COPIED: Final = ("robot", "session", "run", *_SEEN)
 _OTHERS: Final = (
     "SELECT type, name FROM main.sqlite_master WHERE type = 'view' OR type = 'table' AND name "
     f"NOT IN {_COPIED} AND name NOT LIKE 'sqlite_%'"
-)
-_LAST_IDS: Final = (
-    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
-    "INSERT INTO main.sqlite_sequence SELECT * FROM recorded.sqlite_sequence WHERE name = 'state'",
 )
 _UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may have the number of a deleted one
 _MARK: Final = f"SELECT state_id FROM main.watermark WHERE name = 'chunk' AND {IS_MARK}"
@@ -108,7 +107,7 @@ class DamagedChunkError(DatabaseError):
     """A chunk cannot be read; the text says why."""
 
 
-class Encoded(NamedTuple):
+class EncodedChunk(NamedTuple):
     """The values of a signal as a row of the table `chunk` holds them.
 
     Attributes:
@@ -154,7 +153,7 @@ def decoded_of(values: Sequence[Recorded]) -> Decoded:
     return Decoded(numbers, codes, labels, float not in types and _is_exact(held))
 
 
-def encode(values: Sequence[Recorded]) -> Encoded:
+def encode(values: Sequence[Recorded]) -> EncodedChunk:
     """Compress the values of some rows; see `pack`.
 
     What is lost: integers beyond 2^53 become floats, texts are cut after 200 characters, and where
@@ -163,20 +162,20 @@ def encode(values: Sequence[Recorded]) -> Encoded:
     return pack(decoded_of(values))
 
 
-def pack(values: Decoded) -> Encoded:
+def pack(values: Decoded) -> EncodedChunk:
     """Compress values that are numbers and codes already."""
     if values.codes is None:
-        return Encoded(*_compressed(values.numbers, values.is_whole), None, None)
+        return EncodedChunk(*_compressed(values.numbers, values.is_whole), None, None)
     listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
     width = np.uint8 if len(listed) + FIRST_LABEL < 2**8 else np.uint16
-    return Encoded(
+    return EncodedChunk(
         *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
         zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
         json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
     )
 
 
-def decode(encoded: Encoded, rows: int) -> Decoded:
+def decode(encoded: EncodedChunk, rows: int) -> Decoded:
     """The values of some rows.
 
     Raises:
@@ -198,7 +197,7 @@ def decode(encoded: Encoded, rows: int) -> Decoded:
         raise DamagedChunkError(f"damaged: {error}") from error
 
 
-def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
+def _decode_coded(encoded: EncodedChunk, rows: int) -> Decoded:
     assert encoded.codes is not None
     raw = zlib.decompress(encoded.codes)
     width: Any = np.uint8 if len(raw) == rows else np.uint16
@@ -295,7 +294,7 @@ def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
     return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
 
 
-def _decompress(encoded: Encoded, into: Array) -> None:
+def _decompress(encoded: EncodedChunk, into: Array) -> None:
     if encoded.codec not in (_FLOATS, _INTEGERS):
         raise DamagedChunkError(
             f"compressed by {encoded.codec!r}, which this version of webots-mcp does not know"
@@ -462,7 +461,7 @@ def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]
 _STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
 
 
-class Group(NamedTuple):
+class ChunkGroup(NamedTuple):
     """Rows that follow each other, of which each signal has a chunk. Columns of `row_group`."""
 
     id: int
@@ -473,7 +472,7 @@ class Group(NamedTuple):
     row_count: int
 
 
-class Reached(NamedTuple):
+class ChunkProgress(NamedTuple):
     """Which rows of a run are in chunks: those up to a place, but for rows that came later.
 
     Attributes:
@@ -491,10 +490,10 @@ class Reached(NamedTuple):
 
 def groups_in(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
-) -> list[Group]:
+) -> list[ChunkGroup]:
     """The groups of a run that reach into [start_s, end_s), in order of time."""
     rows = connection.execute(_GROUPS, (run_id, end_s, start_s)).fetchall()
-    return list(map(Group._make, rows))
+    return list(map(ChunkGroup._make, rows))
 
 
 def groups_as_array(
@@ -506,13 +505,13 @@ def groups_as_array(
     return table[np.lexsort((table[:, 0], table[:, 2], table[:, 1]))]
 
 
-def reached(connection: sqlite3.Connection, run_id: int) -> Reached:
+def reached(connection: sqlite3.Connection, run_id: int) -> ChunkProgress:
     """Up to where a run is in chunks."""
     end_s, max_id = connection.execute(_IN_CHUNKS, {"run": run_id}).fetchone()
     if end_s is None:
-        return Reached(float("-inf"), 0, 0, 0)
+        return ChunkProgress(float("-inf"), 0, 0, 0)
     (last_id,) = connection.execute(_LAST_AT, (run_id, end_s)).fetchone()
-    return Reached(end_s, last_id, max(max_id, watermark(connection)), max_id)
+    return ChunkProgress(end_s, last_id, max(max_id, watermark(connection)), max_id)
 
 
 def watermark(connection: sqlite3.Connection) -> int:
@@ -566,7 +565,7 @@ def values_in(
         if rows is None:
             continue
         try:
-            yield group_id, decode(Encoded(*encoded), rows)
+            yield group_id, decode(EncodedChunk(*encoded), rows)
         except DamagedChunkError as error:
             yield group_id, error
 
@@ -632,8 +631,6 @@ def chunks_aside(database: Path, *, frozen: bool) -> Generator[sqlite3.Connectio
             for table in _COPIED:
                 connection.execute(f"DELETE FROM main.{table}")
                 connection.execute(f"INSERT INTO main.{table} SELECT * FROM recorded.{table}")
-        for statement in _LAST_IDS:  # up to which a watermark is believed
-            connection.execute(statement)
         try:
             yield connection
         finally:

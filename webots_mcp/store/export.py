@@ -23,28 +23,28 @@ from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.plugins import ExportFormat, export_formats, load
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, flatten
-from webots_mcp.store.chunk_table import Cells, Kind, Part, chunk_table
+from webots_mcp.store.chunk_table import ColumnCells, Kind, RunColumns, chunk_table
 from webots_mcp.store.chunks import (
     ABSENT,
     IS_NUMBER,
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
+    ChunkGroup,
     Decoded,
-    Group,
     Replaced,
     groups_in,
     parse,
     signals_in,
     values_in,
 )
-from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, ranking_of, trials_of
+from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 from webots_mcp.store.reading.frame import deleted_part
 from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.segment import kept_parts
 from webots_mcp.store.run_rows import put_back
-from webots_mcp.store.signals import Signal, registered
+from webots_mcp.store.signals import RegisteredSignal, registered
 
 # Rows to be exported: those of a range, flattened, and trials; one value per dotted name.
 #
@@ -164,7 +164,7 @@ class PurgedRows:
             waiting = sorted([*waiting[len(ready) :], *self._rows(group)], key=lambda row: row[1])
         yield from waiting
 
-    def _places(self, group: Group) -> Indexes:
+    def _places(self, group: ChunkGroup) -> Indexes:
         """Which rows of a group are meant, in order; of a group the lowest ids go first."""
         times, walls, ids = (
             self._numbers(each, group) for each in (SIM_TIMES, WALL_TIMES, STATE_IDS)
@@ -181,7 +181,7 @@ class PurgedRows:
             wanted &= (times != time_s) | (walls != wall_s)
         return np.flatnonzero(wanted)
 
-    def _rows(self, group: Group) -> list[StoredRow]:
+    def _rows(self, group: ChunkGroup) -> list[StoredRow]:
         places = self._places(group)
         tree, columns = _Tree(), list[list[Any]]()
         for name, signal in self._signals.items():
@@ -199,18 +199,18 @@ class PurgedRows:
         ]
 
     @cached_property
-    def _signals(self) -> dict[str, Signal]:
+    def _signals(self) -> dict[str, RegisteredSignal]:
         run_id = self._segment.run_id
         (robot_id,) = self._connection.execute(_ROBOT, (run_id,)).fetchone()
         here = signals_in(self._connection, run_id)
         known = registered(self._connection, robot_id)
         return {name: signal for name, signal in known.items() if signal.id in here}
 
-    def _numbers(self, signal_id: int, group: Group) -> Array:
+    def _numbers(self, signal_id: int, group: ChunkGroup) -> Array:
         values = self._values(signal_id, "times", group)
         return np.zeros(0) if values is None else values.numbers
 
-    def _values(self, signal_id: int, name: str, group: Group) -> Decoded | None:
+    def _values(self, signal_id: int, name: str, group: ChunkGroup) -> Decoded | None:
         wanted = {group.id: group.row_count}
         for _, values in values_in(self._connection, self._segment.run_id, signal_id, wanted):
             if isinstance(values, Decoded):
@@ -221,7 +221,7 @@ class PurgedRows:
         return None
 
 
-def _put(tree: _Tree, signal: Signal, column: int) -> None:
+def _put(tree: _Tree, signal: RegisteredSignal, column: int) -> None:
     """Note at which place of a state a signal stands."""
     steps = [int(index) if index else key or json.loads(f'"{quoted}"')
              for quoted, key, index in _STEP.findall(signal.path)]  # fmt: skip
@@ -288,11 +288,12 @@ class Recorded(NamedTuple):
     replaced: str | None
 
 
-class Row(NamedTuple):
+class FlatRow(NamedTuple):
     """A row of a table.
 
     Attributes:
-        head: What `Table.head` names. The id of a state that only a kept stretch has is below 0.
+        head: One value per column of `ExportTable.head`. The id of a state that only a full-rate
+            segment has is below 0.
         values: By dotted name. What was not finite is so again; an array of more than 16 items
             is one value.
         replaced: Path of every value that JSON could not hold, and what it was.
@@ -319,7 +320,7 @@ _HEAD: Final = (
 _RESERVED: Final = frozenset((*(column.name for column in _HEAD), "replaced"))
 
 
-class Table(ABC):
+class ExportTable(ABC):
     """Rows that can be read more than once.
 
     Attributes:
@@ -329,7 +330,7 @@ class Table(ABC):
     head: ClassVar[tuple[Column, ...]]
 
     @abstractmethod
-    def rows(self, pass_number: int = 1) -> Iterator[Row]:
+    def rows(self, pass_number: int = 1) -> Iterator[FlatRow]:
         """All of them; the second pass reports its own progress."""
 
     def columns(self) -> list[Column]:
@@ -348,29 +349,29 @@ class ByColumn:
     """The rows of a source by columns, for formats that have columns.
 
     Attributes:
-        columns: As `Table.columns`, each after the name of its signal.
+        columns: As `ExportTable.columns`, each after the name of its signal.
     """
 
-    parts: Sequence[Part]
+    parts: Sequence[RunColumns]
     columns: Sequence[tuple[str, Column]]
     total: int
     progress: Progress | None = None
 
-    def slices(self, rows: int) -> Iterator[tuple[list[Any], list[Cells]]]:
-        """So many rows at a time: what `Source.head` names, and the cells of each column."""
+    def slices(self, rows: int) -> Iterator[tuple[list[Any], list[ColumnCells]]]:
+        """So many rows at a time: what `StateTable.head` names, and the cells of each column."""
         done = 0
         for part in self.parts:
             for frame in part.slices(rows):
                 runs = np.full(len(frame), part.run_id)
                 head: list[Any] = [runs, frame.ids, frame.times, frame.wall_times]
-                yield head, [Cells(frame, name, column.kind) for name, column in self.columns]
+                yield head, [ColumnCells(frame, name, column.kind) for name, column in self.columns]
                 done += len(frame)
                 if self.progress is not None:
                     self.progress(done, self.total)
 
 
 @dataclass(frozen=True)
-class Source(Table):
+class StateTable(ExportTable):
     """The state rows that were there when the export began; they can be read more than once.
 
     Attributes:
@@ -397,7 +398,7 @@ class Source(Table):
         segments: Sequence[Segment],
         passes: int,
         progress: Progress | None,
-    ) -> Source:
+    ) -> StateTable:
         """The rows that these segments have now; ids are given in the order of writing."""
         bounds = [(part.run_id, part.start_s, part.end_s) for part in segments]
         last_ids, counts = dict[str, int](), dict[str, list[int]]()
@@ -420,7 +421,7 @@ class Source(Table):
         return [*notes, *map(str, unread)]
 
     @cached_property
-    def _parts(self) -> list[Part] | None:
+    def _parts(self) -> list[RunColumns] | None:
         return chunk_table(self.connection, self.segments, self.counts, self.last_id)
 
     def by_column(self) -> ByColumn | None:
@@ -453,11 +454,11 @@ class Source(Table):
         (time_s,) = self.connection.execute(_TIME, (state_id,)).fetchone() or (math.inf,)
         return time_s, state_id
 
-    def _state(self, run_id: int, state_id: int) -> Row | None:
+    def _state(self, run_id: int, state_id: int) -> FlatRow | None:
         row = self.connection.execute(_STATE, (state_id,)).fetchone()
         return flat_row(Recorded(run_id, *row)) if row else None
 
-    def rows(self, pass_number: int = 1) -> Iterator[Row]:
+    def rows(self, pass_number: int = 1) -> Iterator[FlatRow]:
         """All of them, run by run, in the order of simulation time."""
         return (flat_row(recorded) for recorded in self.recorded(pass_number))
 
@@ -490,7 +491,7 @@ class Source(Table):
             values["after_id"], values["start_s"], values["after_wall_s"] = chunk[-1][:3]
 
 
-def flat_row(recorded: Recorded) -> Row:
+def flat_row(recorded: Recorded) -> FlatRow:
     """A stored row as one value per dotted name."""
     *head, data, replaced_text = recorded
     state = parse(data)
@@ -502,7 +503,7 @@ def flat_row(recorded: Recorded) -> Row:
     _spread("", state.items(), values)
     for name in _RESERVED.intersection(values):
         values[f"state.{name}"] = values.pop(name)
-    return Row(tuple(head), values, replaced)
+    return FlatRow(tuple(head), values, replaced)
 
 
 def value_at(state: dict[str, Any], name: str) -> Any:
@@ -627,12 +628,12 @@ def export(
     if isinstance(wanted, TrialTable):
         source = wanted
     else:
-        source = Source.of(connection, wanted.segments, chosen.passes, progress)
+        source = StateTable.of(connection, wanted.segments, chosen.passes, progress)
     if safe_cells and form == "csv":
         write_csv(source, sink, safe_cells=True)
     else:
         load(chosen.write)(source, sink)
-    if notes is not None and isinstance(source, Source):
+    if notes is not None and isinstance(source, StateTable):
         notes += source.notes
     return source.total
 
@@ -710,7 +711,7 @@ _encode_export: Final = json.JSONEncoder(
 ).encode
 
 
-def write_csv(source: Table, sink: BinaryIO, *, safe_cells: bool = False) -> None:
+def write_csv(source: ExportTable, sink: BinaryIO, *, safe_cells: bool = False) -> None:
     r"""One line per row under a line of column names; UTF-8, lines end as in RFC 4180.
 
     What a row lacks, or is null, is empty; flags are `true` and `false`; what was not finite is
@@ -746,7 +747,7 @@ def _harmless(text: str | None) -> str | None:
     return f"'{plain}" if plain and plain.startswith(_FORMULAS) else plain
 
 
-def write_json_lines(source: Table, sink: BinaryIO) -> None:
+def write_json_lines(source: ExportTable, sink: BinaryIO) -> None:
     """One JSON object per row and line: what it holds by dotted name, null where it is not finite.
 
     `replaced`, where a row has it, names the path of every value that JSON cannot hold, and what
@@ -784,7 +785,7 @@ def _finite(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class TrialTable(Table):
+class TrialTable(ExportTable):
     """The trials of a set, in order.
 
     Columns are those of the table `trial`, the parameters by name, and how trials with the same
@@ -793,7 +794,7 @@ class TrialTable(Table):
     """
 
     head: ClassVar[tuple[Column, ...]] = ()
-    trials: Sequence[Trial]
+    trials: Sequence[TrialRecord]
     figures: dict[str, tuple[Any, ...]]
     notes: Sequence[str] = ()
 
@@ -816,14 +817,14 @@ class TrialTable(Table):
         """How many there are."""
         return len(self.trials)
 
-    def rows(self, pass_number: int = 1) -> Iterator[Row]:
+    def rows(self, pass_number: int = 1) -> Iterator[FlatRow]:
         """All of them; `pass_number` makes no difference."""
         for each in self.trials:
             values: dict[str, Any] = {name: getattr(each, name) for name in _OF_TRIAL}
             for name, value in each.values.items():
                 values[_column(name)] = value
             figures = self.figures.get(_key(each.values), (None,) * len(_OF_PARAMETERS))
-            yield Row((), values | dict(zip(_OF_PARAMETERS, figures, strict=True)), {})
+            yield FlatRow((), values | dict(zip(_OF_PARAMETERS, figures, strict=True)), {})
 
 
 def _figures(rank: int, ranked: Ranked) -> tuple[Any, ...]:

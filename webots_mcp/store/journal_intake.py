@@ -130,7 +130,7 @@ class _Faults(NamedTuple):
 _NO_FAULTS: Final = _Faults()
 
 
-class _Place(NamedTuple):
+class _JournalPosition(NamedTuple):
     """How far this process has read a part of a journal.
 
     Attributes:
@@ -178,11 +178,11 @@ class _Looks:
         self.lost_runs: dict[str, dict[str, Any]] = {}
         self.names = signal_register.SignalNames()
         self.changes = signal_register.StateChanges()
-        self.changes.look(json.loads(newest or "{}"))
+        self.changes.compare(json.loads(newest or "{}"))
 
 
 _lock = threading.Lock()
-_places: dict[Path, _Place] = {}
+_places: dict[Path, _JournalPosition] = {}
 _looks: dict[str, _Looks] = {}
 _kept: dict[Path, str] = {}  # of which nothing fits, and why
 
@@ -316,7 +316,7 @@ class _Reading:
         place = _places.get(self.path)
         if place is None or place.file != self.identity or place.number > number:
             offset = _skip(self.file, start, number)
-            place = _Place(self.identity, offset, number, offset > start, self.faults)
+            place = _JournalPosition(self.identity, offset, number, offset > start, self.faults)
             _looks[self.uuid] = _Looks(*newest)  # another process may have read on meanwhile
         looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(*newest))
         while lines := _read_lines(self.file, place.offset):
@@ -328,7 +328,7 @@ class _Reading:
                 begin = partial(self._begin, looks)
                 taken = waiting_file.take_in(self.connection, session_id, entries, finish, begin)
                 done = _until(lines, taken.number)[-1].end
-                place = _Place(self.identity, done, taken.number, True, self.faults)
+                place = _JournalPosition(self.identity, done, taken.number, True, self.faults)
             else:
                 faults = self.faults.and_those(each.fault for each in lines)
                 place = place._replace(offset=lines[-1].end, faults=faults)
@@ -347,7 +347,7 @@ class _Reading:
                 entry.values["dropped"] += dropped
         return entries
 
-    def _counted(self, session_id: int, place: _Place) -> _Place:
+    def _counted(self, session_id: int, place: _JournalPosition) -> _JournalPosition:
         """Count what was dropped and no entry followed; a part of which nothing fits is kept."""
         _kept.pop(self.path, None)
         if not place.faults.lines:
@@ -430,7 +430,7 @@ class _Reading:
                 looks.changes.forget()
                 if entry.run in begun_here:
                     ends["run"] = {"uuid": begins}
-            changed = looks.changes.look(state) if state is not None else ()
+            changed = looks.changes.compare(state) if state is not None else ()
             if entry.number not in written:  # taken in by another process, or refused
                 continue
             if isinstance(entry.values, dict):  # a run or an end, after which others are over
@@ -442,7 +442,7 @@ class _Reading:
             seen_s = min(wall_time_s, time.time())  # what is dated later than now was seen now
             runs[run] = sim_time_s, seen_s, rows + (entry.kind == "state")
             if state is not None:
-                looks.names.look(state, entry.values[2], partial(self._enter_names, robot_id))
+                looks.names.register(state, entry.values[2], partial(self._enter_names, robot_id))
             for name, before, after in changed:
                 data = json.dumps({"from": before, "to": after}, ensure_ascii=False)
                 self._event(entry, "change", name[:200], data)

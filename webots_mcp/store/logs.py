@@ -173,7 +173,7 @@ _NEWS: Final = {
 }
 
 
-class Window(NamedTuple):
+class LogWindow(NamedTuple):
     """The part of a run whose log lines are asked for: from `start_s`, up to and without `end_s`.
 
     Its bounds are simulation seconds, compared as those of the ranges of `store.reading.ranges`.
@@ -200,7 +200,7 @@ class LogFilter:
     """
 
     run_id: int | None
-    window: Window
+    window: LogWindow
     text: str = ""
     lowest_level: str = "debug"
     before_id: int | None = None
@@ -208,7 +208,7 @@ class LogFilter:
     source: LogSource | None = None
 
 
-def window_of(scope: Scope, newest_s: float) -> Window:
+def window_of(scope: Scope, newest_s: float) -> LogWindow:
     """The window that was asked for in simulation time; without any bound the whole run.
 
     Args:
@@ -216,9 +216,9 @@ def window_of(scope: Scope, newest_s: float) -> Window:
         newest_s: Simulation time of the newest row of the run.
     """
     if scope.last_s is not None:
-        return Window(moment_of(newest_s - scope.last_s), math.inf)
+        return LogWindow(moment_of(newest_s - scope.last_s), math.inf)
     start_s = -math.inf if scope.start_s is None else moment_of(scope.start_s)
-    return Window(start_s, math.inf if scope.end_s is None else moment_of(scope.end_s))
+    return LogWindow(start_s, math.inf if scope.end_s is None else moment_of(scope.end_s))
 
 
 def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
@@ -264,7 +264,7 @@ def _values(asked: LogFilter) -> dict[str, object]:
     }
 
 
-class Line(NamedTuple):
+class FollowedLine(NamedTuple):
     """Something recorded. `kind` is state, event, command, or a log line's level."""
 
     wall_time_s: float
@@ -289,17 +289,17 @@ class Follower:
         self._robot_id = robot_id
         self._cursors = dict.fromkeys(_NEWS, 0.0)
 
-    def look(self, limit: int = _MOST_FOLLOWED_LINES) -> list[Line]:
-        """The newest lines recorded since the last look, at most `limit`, oldest first."""
+    def read_new(self, limit: int = _MOST_FOLLOWED_LINES) -> list[FollowedLine]:
+        """Return the newest lines recorded since the last call, at most `limit`, oldest first."""
         lines = [line for news in _NEWS for line in self._read(news, limit)]
         return sorted(lines, key=lambda line: line.wall_time_s)[-limit:] if limit else []
 
-    def _read(self, news: str, limit: int) -> list[Line]:
+    def _read(self, news: str, limit: int) -> list[FollowedLine]:
         values = {"after": self._cursors[news], "robot_id": self._robot_id, "limit": max(limit, 1)}
         rows: list[Any] = self._connection.execute(_NEWS[news], values).fetchall()
         if rows:
             self._cursors[news] = rows[0][0]
-        return [Line(*row[1:]) for row in rows]
+        return [FollowedLine(*row[1:]) for row in rows]
 
 
 def _joined(*parts: object) -> str:

@@ -37,7 +37,7 @@ from webots_mcp.store.chunks import (
     STATE_IDS,
     WALL_TIMES,
     DamagedChunkError,
-    Encoded,
+    EncodedChunk,
     Statistics,
     decode,
     decoded_of,
@@ -47,7 +47,7 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.export import Progress
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.parameters import fetch_trial_set, is_at_work
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.signals import enter_signals
 
@@ -151,11 +151,9 @@ _IDS: Final = (
     f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
     f"AND signal_id = {STATE_IDS})"
 )
-_LAST_HERE: Final = "SELECT coalesce(max(seq), 0) FROM main.sqlite_sequence WHERE name = 'state'"
-_RESERVE: Final = (
-    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
-    "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
-)
+_NEWEST_HERE: Final = "SELECT coalesce(max(id), 0) FROM main.state"
+_RESERVED_HERE: Final = "SELECT coalesce(max(reserved_state_id), 0) FROM main.recording"
+_RESERVE: Final = "UPDATE main.recording SET reserved_state_id = max(reserved_state_id, ?)"
 _SIGNALS: Final = (
     "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
     "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
@@ -241,7 +239,7 @@ def merge(
         return dict(connection.execute(_RUNS).fetchall())
 
 
-def settled(database: Path) -> Recording:
+def settled(database: Path) -> RecordingAccess:
     """A recording with all rows that waited next to it, and its sessions ended that are over.
 
     A session of another host is over when its last heartbeat is more than 10 s old.
@@ -249,7 +247,7 @@ def settled(database: Path) -> Recording:
     Raises:
         DatabaseError: There is none, or it is none of ours.
     """
-    recording = Recording(database, database.parent)
+    recording = RecordingAccess(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
         take_in_journals(connection, database)
@@ -384,6 +382,8 @@ def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id
     shift = None
     if is_purged:
         shift = take_in_chunks(connection, run_id, run, robot_id)
+    elif _number(connection, _RESERVED_HERE) > _number(connection, _NEWEST_HERE):
+        shift = _reserve_ids(connection, run_id)  # SQLite would give ids that other rows had
     _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)
 
 
@@ -661,13 +661,13 @@ def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_
 
 def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
     """A chunk of ids that are so much greater."""
-    numbers = decode(Encoded(*packed), rows).numbers.tolist()
+    numbers = decode(EncodedChunk(*packed), rows).numbers.tolist()
     ids = [int(number) + shift for number in numbers]
     return *statistics_of(decoded_of(ids)), *encode(ids)
 
 
 def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
-    (last_here,) = connection.execute(_LAST_HERE).fetchone()
+    last_here = max(_number(connection, _NEWEST_HERE), _number(connection, _RESERVED_HERE))
     first, last = connection.execute(_IDS, {"run": there}).fetchone()
     if first is None:
         return 0
@@ -677,7 +677,9 @@ def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
             "gives: the recording is damaged"
         )
     shift = last_here + 1 - first
-    delete, insert = _RESERVE
-    connection.execute(delete)
-    connection.execute(insert, (last + shift,))
+    connection.execute(_RESERVE, (last + shift,))
     return shift
+
+
+def _number(connection: sqlite3.Connection, query: str) -> int:
+    return int(connection.execute(query).fetchone()[0])

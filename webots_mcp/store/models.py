@@ -1,8 +1,8 @@
 """The tables. The one place where their columns are explained.
 
 `sim_time_s` is simulation time, `wall_time_s` is Unix time, both in seconds. Ids never come back
-after a deletion (AUTOINCREMENT), so "after this id" is a safe cursor. The comments travel into
-the database: `.schema` in the `sqlite3` shell shows them.
+after a deletion (by AUTOINCREMENT, or see `State`), so "after this id" is a safe cursor. The
+comments travel into the database: `.schema` in the `sqlite3` shell shows them.
 """
 
 from __future__ import annotations
@@ -77,6 +77,9 @@ class Recording(SQLModel, table=True):
 
     uuid: str = Field(sa_column=Column(Text, primary_key=True, comment=_UUID))
     created_wall_time_s: float = _number(nullable=False)
+    reserved_state_id: int = _count(
+        "no state gets this id or a smaller one: the newest states were deleted up to it"
+    )
 
 
 class Robot(SQLModel, table=True):
@@ -166,9 +169,14 @@ class Run(SQLModel, table=True):
 
 
 class State(SQLModel, table=True):
-    """What one publish() recorded."""
+    """What one publish() recorded.
 
-    __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
+    AUTOINCREMENT would write another page of the file with each row. Instead, a trigger notes the
+    id of a newest state that is deleted in `recording.reserved_state_id`, and later states get
+    greater ones.
+    """
+
+    __table_args__ = (Index(None, "run_id", "sim_time_s"),)
     id: int | None = _id()
     run_id: int = _to("run")
     sim_time_s: float = _number(nullable=False)

@@ -24,7 +24,7 @@ from webots_mcp.database.liveness import (
 )
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.signals.parameter import Declaration, Value, require_known
-from webots_mcp.store.run_rows import Run, columns_of
+from webots_mcp.store.run_rows import RunRecord, columns_of
 
 COLUMNS: Final = (
     "name", "value", "unit", "default", "low", "high", "choices", "next", "since_s", "set_by",
@@ -92,7 +92,7 @@ class Declared(NamedTuple):
     next_value: Value | None
 
 
-class Setting(NamedTuple):
+class ParameterSetting(NamedTuple):
     """A value, from a simulation time of its run on.
 
     Attributes:
@@ -111,7 +111,7 @@ class Setting(NamedTuple):
 class RunParameter:
     """What a parameter was in a run: its settings in order, each unlike the one before."""
 
-    settings: list[Setting] = field(default_factory=list[Setting])
+    settings: list[ParameterSetting] = field(default_factory=list[ParameterSetting])
 
     @property
     def value(self) -> Value:
@@ -138,7 +138,7 @@ class RunParameter:
         left_out = f"{len(changes) - 2} others, " if len(changes) > 2 else ""
         return f"{_text(first.value)}, then {left_out}{', '.join(steps)}"
 
-    def add(self, setting: Setting) -> None:
+    def add(self, setting: ParameterSetting) -> None:
         """The next row; one that repeats the value says nothing new."""
         last = self.settings[-1] if self.settings else None
         if last is None or (last.value, type(last.value)) != (setting.value, type(setting.value)):
@@ -161,12 +161,12 @@ def parameters_of(
     for run_id, name, sim_time_s, value, *rest in connection.execute(
         _VALUES, (json.dumps(list(found)),)
     ):
-        setting = Setting(sim_time_s, json.loads(value), bool(rest[0]), rest[1], rest[2])
+        setting = ParameterSetting(sim_time_s, json.loads(value), bool(rest[0]), rest[1], rest[2])
         found[run_id].setdefault(name, RunParameter()).add(setting)
     return found
 
 
-def described(connection: sqlite3.Connection, run: Run) -> list[dict[str, Any]]:
+def described(connection: sqlite3.Connection, run: RunRecord) -> list[dict[str, Any]]:
     """Each parameter of a run, under `COLUMNS`: its last value, and how it is declared now.
 
     What a controller does not declare any more, or a later one declared, has only its values.
@@ -251,7 +251,7 @@ def _text(value: Value) -> str:
 
 
 @dataclass(frozen=True)
-class TrialSet:
+class TrialSetRecord:
     """Runs with chosen parameters. Columns as in `store.models`; two are JSON text."""
 
     id: int
@@ -280,7 +280,7 @@ class TrialSet:
 
 
 @dataclass(frozen=True)
-class Trial:
+class TrialRecord:
     """One run of a trial set. Columns as in `store.models`; `parameters` is JSON text."""
 
     id: int
@@ -311,7 +311,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Result:
+class TrialResult:
     """What became of a trial: a score, or an error.
 
     Attributes:
@@ -335,12 +335,14 @@ class Result:
         return "failed" if self.score is None else "done"
 
 
-_SET: Final = f"SELECT {columns_of(TrialSet)} FROM trial_set WHERE id = ?"
+_SET: Final = f"SELECT {columns_of(TrialSetRecord)} FROM trial_set WHERE id = ?"
 _NEXT: Final = (
-    f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? AND status IN ('running', "
+    f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? AND status IN ('running', "
     "'waiting') ORDER BY status = 'waiting', number LIMIT 1"
 )
-_TRIALS: Final = f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? ORDER BY number"
+_TRIALS: Final = (
+    f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? ORDER BY number"
+)
 
 
 def create_trial_set(
@@ -370,7 +372,7 @@ def create_trial_set(
     return set_id
 
 
-def add_trial(connection: sqlite3.Connection, set_id: int, values: dict[str, Any]) -> Trial:
+def add_trial(connection: sqlite3.Connection, set_id: int, values: dict[str, Any]) -> TrialRecord:
     """Enter one more trial of a set that is searched as it goes on."""
     _enter(connection, set_id, len(trials_of(connection, set_id)) + 1, values)
     return trials_of(connection, set_id)[-1]
@@ -406,7 +408,7 @@ def find_trial_set(connection: sqlite3.Connection, plan: str | None = None) -> i
     return connection.execute(_NEWEST, (plan,)).fetchone()[0]
 
 
-def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSet:
+def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetRecord:
     """The set of that id.
 
     Raises:
@@ -417,18 +419,18 @@ def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSet:
         newest = find_trial_set(connection)
         there = "none was begun" if newest is None else f"the newest is {newest}"
         raise InvalidInputError(f"there is no trial set {set_id}: {there}")
-    return TrialSet(*row)
+    return TrialSetRecord(*row)
 
 
-def is_at_work(connection: sqlite3.Connection, found: TrialSet) -> bool:
+def is_at_work(connection: sqlite3.Connection, found: TrialSetRecord) -> bool:
     """Whether a process works on a set: it is alive, as far as is known, and renews its lease."""
     return not found.is_left and holder_of(connection, found.job) is not None
 
 
-def next_trial(connection: sqlite3.Connection, set_id: int) -> Trial | None:
+def next_trial(connection: sqlite3.Connection, set_id: int) -> TrialRecord | None:
     """The trial that is to be run next, or was begun; None where all are over."""
     row = connection.execute(_NEXT, (set_id,)).fetchone()
-    return Trial(*row) if row else None
+    return TrialRecord(*row) if row else None
 
 
 def stop_trial_set(connection: sqlite3.Connection, set_id: int, reason: str | None) -> None:
@@ -444,14 +446,14 @@ def borrow_parameters(
     connection.execute(_BORROW, (session_id, text, set_id))
 
 
-def trials_of(connection: sqlite3.Connection, set_id: int) -> list[Trial]:
+def trials_of(connection: sqlite3.Connection, set_id: int) -> list[TrialRecord]:
     """The trials of a set, in order.
 
     Raises:
         InvalidInputError: There is no such set.
     """
     fetch_trial_set(connection, set_id)
-    return [Trial(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
+    return [TrialRecord(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
 
 
 def take_up(connection: sqlite3.Connection, set_id: int) -> Lease:
@@ -481,7 +483,9 @@ def lay_down(connection: sqlite3.Connection, set_id: int, lease: Lease) -> None:
     give_back(connection, lease)
 
 
-def begin_trial(connection: sqlite3.Connection, trial: Trial, pid: int | None = None) -> Trial:
+def begin_trial(
+    connection: sqlite3.Connection, trial: TrialRecord, pid: int | None = None
+) -> TrialRecord:
     """It runs: in a simulator of that pid, or in that of a live controller."""
     process = None if pid is None else process_identity(pid)
     now_s = time.time()
@@ -489,12 +493,12 @@ def begin_trial(connection: sqlite3.Connection, trial: Trial, pid: int | None = 
     return replace(trial, status="running", started_wall_time_s=now_s, pid=pid, process=process)
 
 
-def put_back(connection: sqlite3.Connection, trial: Trial) -> None:
+def put_back(connection: sqlite3.Connection, trial: TrialRecord) -> None:
     """It was not run to its end, and waits again."""
     connection.execute(_PUT_BACK, (trial.id,))
 
 
-def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -> None:
+def finish_trial(connection: sqlite3.Connection, trial: TrialRecord, result: TrialResult) -> None:
     """Enter what became of it; its run gets a label, unless it has one."""
     label = f"trial {trial.number} of set {trial.trial_set_id}: {spelled(trial.values)}"[:100]
     now = {"id": trial.id, "status": result.status, "now": time.time()}
@@ -531,7 +535,7 @@ def best_of(plan: Mapping[str, Any]) -> Best:
     return "lowest" if plan.get("best") == "lowest" else "highest"
 
 
-def count_planned(plan: Mapping[str, Any], trials: Sequence[Trial]) -> int:
+def count_planned(plan: Mapping[str, Any], trials: Sequence[TrialRecord]) -> int:
     """How many trials a set has in the end; those of a search are entered as it goes on."""
     return max(len(trials), int(plan.get("sets") or 0) * int(plan.get("repeats") or 1))
 
@@ -542,7 +546,7 @@ def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, flo
     return over, of, f"{over} of {of} trials" + ("" if last is None else f", the last: {last:g}")
 
 
-def ranking_of(trials: list[Trial], best: Best) -> Ranking:
+def ranking_of(trials: list[TrialRecord], best: Best) -> Ranking:
     """The parameter sets of the trials that are over, the best first."""
     return rank(
         [

@@ -141,8 +141,8 @@ class ProjectWatch:
         self._data_dir = data_dir
         self._seen: tuple[Path | None, int] | None = None
 
-    def look(self, connection: sqlite3.Connection) -> None:
-        """Compile it if it is another than at the last look; warn once of one that is invalid."""
+    def recompile_if_changed(self, connection: sqlite3.Connection) -> None:
+        """Compile the file if it has changed since the last call; warn once if it is invalid."""
         file = file_of(self._data_dir)
         seen = (file, file.stat().st_mtime_ns if file else 0)
         if seen == self._seen:

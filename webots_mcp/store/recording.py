@@ -60,15 +60,15 @@ from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
 from webots_mcp.store.robots import (
-    Robot,
-    Session,
+    RobotRecord,
+    SessionRecord,
     Status,
     ask_stuck,
     console_trouble,
     judge,
     stopped_for,
 )
-from webots_mcp.store.run_rows import Run, State, current_run, newest_state
+from webots_mcp.store.run_rows import RunRecord, StateRecord, current_run, newest_state
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "
@@ -110,7 +110,7 @@ _UNSTORABLE: Final = (
 
 
 @dataclass(frozen=True)
-class View:
+class RobotView:
     """One robot, one run, now: what an answer's header is made of.
 
     All of it was read in one moment, however long the answer takes to be put together: what comes
@@ -122,14 +122,14 @@ class View:
     """
 
     connection: sqlite3.Connection
-    robot: Robot
-    run: Run | None
+    robot: RobotRecord
+    run: RunRecord | None
     now_s: float
-    state: State | None
+    state: StateRecord | None
     status: Status
 
     @property
-    def session(self) -> Session | None:
+    def session(self) -> SessionRecord | None:
         """The robot's latest session."""
         return self.robot.session
 
@@ -172,7 +172,7 @@ class View:
         """How long ago that was."""
         return round(max(self.now_s - wall_time_s, 0.0), 2)
 
-    def require_run(self) -> Run:
+    def require_run(self) -> RunRecord:
         """The run; see `subject.require_run`."""
         return require_run(self.robot, self.run)
 
@@ -243,7 +243,7 @@ def _identity(database: Path, connection: sqlite3.Connection) -> object:
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordingAccess:
     """A database, the folder of its pictures, and whether the asker may write.
 
     Nothing is created here: without a database every question is answered with how to get one.
@@ -286,7 +286,7 @@ class Recording:
             yield connection
 
     @contextmanager
-    def view(self, robot: str | None = None, run_id: int | None = None) -> Generator[View]:
+    def view(self, robot: str | None = None, run_id: int | None = None) -> Generator[RobotView]:
         """Look at a robot (the only live one if none is named) and at its current or that run.
 
         Raises:
@@ -294,7 +294,7 @@ class Recording:
             InvalidInputError: There is no such robot or run, or several robots are possible.
         """
         with self.reader() as connection:
-            seen = look(connection, robot, run_id)
+            seen = view_robot(connection, robot, run_id)
             may_ask = not self.read_only and run_id is None and not seen.status.is_moving
             if may_ask and seen.session and ask_stuck(connection, seen.session, seen.now_s):
                 # Of the moment before: the signal may have woken the loop.
@@ -375,8 +375,10 @@ class Recording:
         require_current(connection)
 
 
-def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None = None) -> View:
-    """A view over an open connection; see `Recording.view`."""
+def view_robot(
+    connection: sqlite3.Connection, robot: str | None, run_id: int | None = None
+) -> RobotView:
+    """A view over an open connection; see `RecordingAccess.view`."""
     now_s = time.time()
     try:
         chosen, run = choose(connection, robot, run_id, now_s)
@@ -387,8 +389,8 @@ def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None =
 
 
 def view_of(
-    connection: sqlite3.Connection, robot: Robot, now_s: float, run: Run | None = None
-) -> View:
+    connection: sqlite3.Connection, robot: RobotRecord, now_s: float, run: RunRecord | None = None
+) -> RobotView:
     """A view of a robot that is already known, and of that run or its newest one."""
     current = current_run(connection, robot.id)
     run = run or current
@@ -397,10 +399,10 @@ def view_of(
     else:
         status = _of_earlier_run(run, now_s)
     state = newest_state(connection, run.id) if run else None
-    return View(connection, robot, run, now_s, state, status)
+    return RobotView(connection, robot, run, now_s, state, status)
 
 
-def _of_earlier_run(run: Run, now_s: float) -> Status:
+def _of_earlier_run(run: RunRecord, now_s: float) -> Status:
     ended_s = run.ended_wall_time_s or run.last_wall_time_s
     how = _ENDED.get(f"{run.end_reason}", f"it ended by {run.end_reason or 'an unknown cause'}")
     return Status(stopped_for(now_s - ended_s), f"this is an earlier run; {how}")
@@ -491,7 +493,7 @@ class Job:
         lease: Which this process has taken.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     lease: Lease
 
     @contextmanager

@@ -23,7 +23,7 @@ from anyio import CancelScope, to_thread
 from webots_mcp.contract import VERSION, new_uuid
 from webots_mcp.errors import DatabaseError, NoDatabaseError, NotAllowedError
 from webots_mcp.store.policy import LAUNCH, Policy, policies_of
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 LONGEST_ARGUMENTS: Final = 1_000  # characters
 _LONGEST_OUTCOME: Final = 300
@@ -87,7 +87,7 @@ class OpenRequest:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: RecordingAccess,
         by: Requester,
         names: Sequence[str],
         arguments: Mapping[str, Any],
@@ -214,7 +214,7 @@ _open: Final[ContextVar[OpenRequest]] = ContextVar("request")
 
 
 def permit(
-    recording: Recording,
+    recording: RecordingAccess,
     action: str,
     params: Mapping[str, Any],
     *,

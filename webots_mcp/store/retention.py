@@ -140,7 +140,7 @@ Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""
 
 
-class Setting(NamedTuple):
+class StoredLimit(NamedTuple):
     """A limit that was set, and when."""
 
     value: Limit | float
@@ -148,13 +148,13 @@ class Setting(NamedTuple):
     set_wall_time_s: float
 
 
-def read_settings(connection: sqlite3.Connection) -> dict[str, Setting]:
+def read_settings(connection: sqlite3.Connection) -> dict[str, StoredLimit]:
     """What was set, by the names that it has in `Retention`; of the others the defaults hold.
 
     Raises:
         InvalidInputError: The table holds something that is not a limit.
     """
-    settings: dict[str, Setting] = {}
+    settings: dict[str, StoredLimit] = {}
     for kind, size_bytes, rows, age_s, factor, set_by, set_s in connection.execute(_READ):
         try:
             name = _NAME_OF[kind]
@@ -168,7 +168,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, Setting]:
                 f"the row {kind!r} of the table retention_limit is not a limit ({error}): set it "
                 "again with 'webots-mcp retain'"
             ) from error
-        settings[name] = Setting(value, set_by, set_s)
+        settings[name] = StoredLimit(value, set_by, set_s)
     return settings
 
 
@@ -238,7 +238,7 @@ def described(connection: sqlite3.Connection) -> dict[str, str]:
     }
 
 
-def _said(setting: Setting) -> str:
+def _said(setting: StoredLimit) -> str:
     when = time.strftime("%Y-%m-%d %H:%M", time.localtime(setting.set_wall_time_s))
     return f"{_text(setting.value)} (set by {setting.set_by}, {when})"
 

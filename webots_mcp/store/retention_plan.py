@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.analysis.arrays import Array, np
 from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME
 from webots_mcp.store.chunk_making import INDEX_BYTES, disk_bytes
-from webots_mcp.store.chunks import STATE_IDS, WALL_TIMES, Decoded, Group, values_in
+from webots_mcp.store.chunks import STATE_IDS, WALL_TIMES, ChunkGroup, Decoded, values_in
 from webots_mcp.store.retention import DEFAULT, KEPT, Limit, Retention
 
 TABLES: Final = ("state", "chunk", "kept_state", "log", "event", "image")
@@ -81,7 +81,7 @@ OLD_COMMANDS: Final = (
 _COMMAND_BYTES: Final = 400
 
 
-class Run(NamedTuple):
+class RetainedRun(NamedTuple):
     """A run as retention sees it."""
 
     id: int
@@ -123,7 +123,9 @@ class Portion(NamedTuple):
         return max(self.size_bytes / max(self.rows, 1), 1.0)
 
 
-def _portions(connection: sqlite3.Connection, runs: dict[int, Run]) -> dict[str, list[Portion]]:
+def _portions(
+    connection: sqlite3.Connection, runs: dict[int, RetainedRun]
+) -> dict[str, list[Portion]]:
     """What these runs hold, by table, the newest first."""
     found: dict[str, list[Portion]] = {table: [] for table in TABLES}
     for portion in (*_grouped(connection, runs), *_in_no_group(connection, runs)):
@@ -140,7 +142,7 @@ def _portions(connection: sqlite3.Connection, runs: dict[int, Run]) -> dict[str,
     return found
 
 
-def _grouped(connection: sqlite3.Connection, runs: dict[int, Run]) -> Iterator[Portion]:
+def _grouped(connection: sqlite3.Connection, runs: dict[int, RetainedRun]) -> Iterator[Portion]:
     """The states and chunks of row groups."""
     for facts in connection.execute(_GROUPS).fetchall():
         group_id, run_id, last_id, rows, left, row_bytes, chunk_bytes, first_id, *walls = facts
@@ -154,7 +156,7 @@ def _grouped(connection: sqlite3.Connection, runs: dict[int, Run]) -> Iterator[P
         yield Portion("chunk", *of, rows, chunk_bytes, oldest_s, newest_s, is_held=left > 0)
 
 
-def _in_no_group(connection: sqlite3.Connection, runs: dict[int, Run]) -> Iterator[Portion]:
+def _in_no_group(connection: sqlite3.Connection, runs: dict[int, RetainedRun]) -> Iterator[Portion]:
     """The newest states of each run."""
     query = _IN_NO_GROUP.format(payloads=_payloads(connection, "state"))
     for run_id in runs:
@@ -200,18 +202,18 @@ def _with_frames(stretches: list[Portion], frame_bytes: dict[int, float]) -> lis
     ]  # fmt: skip
 
 
-def read_runs(connection: sqlite3.Connection) -> dict[int, Run]:
+def read_runs(connection: sqlite3.Connection) -> dict[int, RetainedRun]:
     """All runs by their ids, in the order in which they began.
 
     A run whose times are no numbers, which no bridge writes, has no place in it: it stays.
     """
-    return {row[0]: Run(*row) for row in connection.execute(_RUNS).fetchall()}
+    return {row[0]: RetainedRun(*row) for row in connection.execute(_RUNS).fetchall()}
 
 
 def rows_of(connection: sqlite3.Connection, portion: Portion) -> tuple[Array, Array]:
     """Ids of the rows that a portion had when it was counted, rising, and their wall times."""
     if portion.group_id:
-        group = Group(*connection.execute(_PLACE, (portion.group_id,)).fetchone())
+        group = ChunkGroup(*connection.execute(_PLACE, (portion.group_id,)).fetchone())
         found = [
             [values.numbers for _, values in values_in(connection, portion.run_id, signal_id,
                                                        {group.id: group.row_count})

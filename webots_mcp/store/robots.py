@@ -58,7 +58,13 @@ from webots_mcp.database.waiting_file import (
 )
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
 from webots_mcp.signals.naming import SOLIDS, WORLD
-from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
+from webots_mcp.store.run_rows import (
+    RunRecord,
+    columns_of,
+    newest_state,
+    recent_interval_s,
+    state_at,
+)
 
 # Of the newest Webots, unless a controller has begun to record since. What a controller printed
 # comes first: its traceback ends with the reason, and Webots itself only says that it exited.
@@ -189,7 +195,7 @@ _FREE_IT: Final = "mend that line, or end the controller and start it again"
 
 
 @dataclass(frozen=True)
-class Session:
+class SessionRecord:
     """One controller process; the row is its bridge's heartbeat. Columns as in `store.models`."""
 
     id: int
@@ -249,7 +255,7 @@ class Session:
         return self.host == host_name() and process_alive(*process)
 
 
-_COLUMNS: Final = columns_of(Session)
+_COLUMNS: Final = columns_of(SessionRecord)
 _NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
 _COMPANIONS: Final = (
@@ -263,31 +269,35 @@ _LEFT_HOLDING: Final = (
 )
 
 
-def newest_session(connection: sqlite3.Connection, robot_id: int) -> Session | None:
+def newest_session(connection: sqlite3.Connection, robot_id: int) -> SessionRecord | None:
     """The robot's latest controller process, alive or not."""
     return _session(connection.execute(_NEWEST, (robot_id,)).fetchone())
 
 
-def fetch_session(connection: sqlite3.Connection, session_id: int) -> Session | None:
+def fetch_session(connection: sqlite3.Connection, session_id: int) -> SessionRecord | None:
     """The session of that id."""
     return _session(connection.execute(_BY_ID, (session_id,)).fetchone())
 
 
-def companions(connection: sqlite3.Connection, session: Session, now_s: float) -> list[Session]:
+def companions(
+    connection: sqlite3.Connection, session: SessionRecord, now_s: float
+) -> list[SessionRecord]:
     """The other living sessions in the same simulation."""
     values = {"instance": session.instance, "id": session.id}
     rows = connection.execute(_COMPANIONS, values).fetchall()
     return [found for row in rows if (found := _session(row)) and found.is_alive(now_s)]
 
 
-def left_holding(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
+def left_holding(
+    connection: sqlite3.Connection, session: SessionRecord, now_s: float
+) -> SessionRecord | None:
     """The newest session in the same simulation, if it is gone and held its loop to the end."""
     values = {"instance": session.instance, "started": session.started_wall_time_s}
     found = _session(connection.execute(_LEFT_HOLDING, values).fetchone())
     return found if found is not None and not found.is_alive(now_s) else None
 
 
-def _session(row: tuple[Any, ...] | None) -> Session | None:
+def _session(row: tuple[Any, ...] | None) -> SessionRecord | None:
     if row is None:
         return None
     values = dict(zip(_COLUMNS.split(", "), row, strict=True))
@@ -295,11 +305,11 @@ def _session(row: tuple[Any, ...] | None) -> Session | None:
     values["actions"] = json.loads(values["actions"] or "{}")
     values["supervisor"] = bool(values["supervisor"])
     values["extern"] = bool(values["extern"])
-    return Session(**values)
+    return SessionRecord(**values)
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotRecord:
     """A robot name that was ever seen, with its latest session."""
 
     id: int
@@ -308,7 +318,7 @@ class Robot:
     devices: dict[str, str]
     first_seen_wall_time_s: float
     last_seen_wall_time_s: float
-    session: Session | None
+    session: SessionRecord | None
     live: bool
 
 
@@ -327,7 +337,7 @@ class WorldSeen:
     places: dict[str, dict[str, float | None]]
 
 
-def list_robots(connection: sqlite3.Connection, now_s: float) -> list[Robot]:
+def list_robots(connection: sqlite3.Connection, now_s: float) -> list[RobotRecord]:
     """Every robot ever seen, in the order in which they first appeared."""
     return [_robot(connection, row, now_s) for row in connection.execute(_ALL).fetchall()]
 
@@ -366,7 +376,7 @@ def console_trouble(connection: sqlite3.Connection) -> str | None:
     )
 
 
-def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> Robot:
+def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> RobotRecord:
     """The robot of that name; without a name the only live one, else the only one ever seen.
 
     An observer is meant without a name only where there is no other robot.
@@ -393,12 +403,12 @@ def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float
     )
 
 
-def without_observers(robots: list[Robot]) -> list[Robot]:
+def without_observers(robots: list[RobotRecord]) -> list[RobotRecord]:
     """Those that do something; the observers where there are no others."""
     return [robot for robot in robots if robot.kind != OBSERVER] or robots
 
 
-def _named(robots: list[Robot], name: str) -> Robot:
+def _named(robots: list[RobotRecord], name: str) -> RobotRecord:
     for robot in robots:
         if robot.name in (name, recorded_name(name)):
             return robot
@@ -407,13 +417,13 @@ def _named(robots: list[Robot], name: str) -> Robot:
     raise UnknownRobotError(f"no robot named {name!r} was recorded; {offer} {_listed(robots)}")
 
 
-def _listed(robots: list[Robot]) -> str:
+def _listed(robots: list[RobotRecord]) -> str:
     shown = [_described(robot) for robot in robots[:_SHOWN_NAMES]]
     more = len(robots) - len(shown)
     return ", ".join(shown) + (f" and {more} more (webots_list_robots)" if more else "")
 
 
-def _described(robot: Robot) -> str:
+def _described(robot: RobotRecord) -> str:
     return f"{robot.name!r} ({robot.kind}, {'live' if robot.live else 'not live'})"
 
 
@@ -421,17 +431,17 @@ def _robot(
     connection: sqlite3.Connection,
     row: tuple[int, str, str, str | None, float, float],
     now_s: float,
-) -> Robot:
+) -> RobotRecord:
     robot_id, name, kind, devices, first_seen_s, last_seen_s = row
     session = newest_session(connection, robot_id)
     live = session is not None and session.is_alive(now_s)
     known = json.loads(devices or "{}")
-    return Robot(robot_id, name, kind, known, first_seen_s, last_seen_s, session, live)
+    return RobotRecord(robot_id, name, kind, known, first_seen_s, last_seen_s, session, live)
 
 
 def live_observer(
-    connection: sqlite3.Connection, session: Session | None, now_s: float
-) -> Robot | None:
+    connection: sqlite3.Connection, session: SessionRecord | None, now_s: float
+) -> RobotRecord | None:
     """The observer of a session's simulation; without a session the only one that lives."""
     robots = [robot for robot in list_robots(connection, now_s) if robot.live]
     found = [robot for robot in robots if robot.kind == OBSERVER and robot.session is not None]
@@ -441,7 +451,7 @@ def live_observer(
     return found[0] if len(found) == 1 or (found and session is not None) else None
 
 
-def world_seen(connection: sqlite3.Connection, run: Run) -> WorldSeen | None:
+def world_seen(connection: sqlite3.Connection, run: RunRecord) -> WorldSeen | None:
     """What an observer saw while that run lasted, last of all; None where none was there."""
     values = {
         "session": run.session_id,
@@ -458,7 +468,7 @@ def world_seen(connection: sqlite3.Connection, run: Run) -> WorldSeen | None:
     return WorldSeen(observer, json.loads(found[0]), _places(connection, run_id, run))
 
 
-def _places(connection: sqlite3.Connection, run_id: int, run: Run) -> dict[str, Any]:
+def _places(connection: sqlite3.Connection, run_id: int, run: RunRecord) -> dict[str, Any]:
     until_s = run.last_sim_time_s if run.ended_wall_time_s is not None else float("inf")
     state = state_at(connection, run_id, until_s)
     seen = state.value() if state else {}
@@ -481,7 +491,10 @@ class Status(NamedTuple):
 
 
 def judge(
-    connection: sqlite3.Connection, session: Session | None, run: Run | None, now_s: float
+    connection: sqlite3.Connection,
+    session: SessionRecord | None,
+    run: RunRecord | None,
+    now_s: float,
 ) -> Status:
     """Say whether the robot's time is moving now.
 
@@ -524,7 +537,7 @@ def judge(
     return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
 
 
-class Block(NamedTuple):
+class BlockedLoop(NamedTuple):
     """Why a robot's loop is known not to ask for commands, until somebody does something.
 
     Attributes:
@@ -537,8 +550,11 @@ class Block(NamedTuple):
 
 
 def find_block(
-    connection: sqlite3.Connection, session: Session | None, run: Run | None, now_s: float
-) -> Block | None:
+    connection: sqlite3.Connection,
+    session: SessionRecord | None,
+    run: RunRecord | None,
+    now_s: float,
+) -> BlockedLoop | None:
     """What is known to keep a loop from asking for commands; None where it may yet ask.
 
     Only what is known counts. A loop that has been silent for a while may be slow: one that came
@@ -554,14 +570,14 @@ def find_block(
         return None
     if not session.is_alive(now_s):
         why = _why_ended(connection, session) or "its controller is gone"
-        return None if may_return(session, now_s) else Block(why, "start its controller")
+        return None if may_return(session, now_s) else BlockedLoop(why, "start its controller")
     holder = find_holder(connection, session, now_s)
     if holder is not None and holder.id != session.id:
         name = robot_name(connection, holder.robot_id)
-        return Block(HELD_ELSEWHERE.format(name), f"resume or step it there (robot={name!r})")
+        return BlockedLoop(HELD_ELSEWHERE.format(name), f"resume or step it there (robot={name!r})")
     if session.host == host_name() and is_stopped(session.pid):
         fix = f"let it go on (kill -CONT {session.pid}, or the debugger)"
-        return Block(_STOPPED_PROCESS.format(session.pid), fix)
+        return BlockedLoop(_STOPPED_PROCESS.format(session.pid), fix)
     moved_s = _moved_wall_time_s(connection, session, run)
     if session.heartbeat_is_fresh(now_s) or find_backlog(connection, session) is not None:
         return None
@@ -569,18 +585,18 @@ def find_block(
         return None
     if _has_lost_simulator(session):
         fix = f"end process {session.pid}, start Webots, then the controller"
-        return Block(CONNECTION_LOST.format(session.pid), fix)
+        return BlockedLoop(CONNECTION_LOST.format(session.pid), fix)
     seen = _seen_by_observer(connection, session, now_s)
     if seen and seen.startswith(SEEN_PAUSED):
-        return Block(seen, _RESUME_BY)
+        return BlockedLoop(seen, _RESUME_BY)
     if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= _BEGINNING_S:
         return None
     return _block_in_code(connection, session, moved_s, now_s)
 
 
 def _block_in_code(
-    connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
-) -> Block | None:
+    connection: sqlite3.Connection, session: SessionRecord, moved_s: float | None, now_s: float
+) -> BlockedLoop | None:
     """What the stacks of a silent loop show; None where they show nothing, or a slow round."""
     stacks = find_stacks(connection, session, now_s)
     if stacks is None:
@@ -592,25 +608,25 @@ def _block_in_code(
             if not _is_sure(connection, other, now_s):
                 return None
             held_up = _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
-            return Block(held_up, _FREE_IT)
+            return BlockedLoop(held_up, _FREE_IT)
         if session.silent_s(now_s) < _SLOW_STEPS * _usual_step_s(connection, session):
             return None
-        return Block(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
+        return BlockedLoop(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
     if not stacks.is_hang:
-        return Block(_AWAITS_PERSON.format(stacks.place), "let it go on")
+        return BlockedLoop(_AWAITS_PERSON.format(stacks.place), "let it go on")
     if _is_unseen(session, moved_s) or handler_at_work(connection, session, now_s):
         return None
     hang = _hang(connection, session, now_s)
-    return Block(hang, _FREE_IT) if hang and _is_sure(connection, session, now_s) else None
+    return BlockedLoop(hang, _FREE_IT) if hang and _is_sure(connection, session, now_s) else None
 
 
-def _usual_step_s(connection: sqlite3.Connection, session: Session) -> float:
+def _usual_step_s(connection: sqlite3.Connection, session: SessionRecord) -> float:
     """How long the loop has waited in a step on average, in wall seconds; 0 before it is known."""
     (usual_s,) = connection.execute(_USUAL_STEP, (session.id,)).fetchone()
     return usual_s or 0.0
 
 
-def _is_sure(connection: sqlite3.Connection, session: Session, now_s: float) -> bool:
+def _is_sure(connection: sqlite3.Connection, session: SessionRecord, now_s: float) -> bool:
     """Whether a loop is silent for much longer than its limit, and than it ever was before."""
     stacks = find_stacks(connection, session, now_s)
     if stacks is None:
@@ -622,7 +638,7 @@ def _is_sure(connection: sqlite3.Connection, session: Session, now_s: float) -> 
     return session.silent_s(now_s) >= _SURE_OF_HANG * max([stacks.limit_s, *lasted_s])
 
 
-def may_return(session: Session, now_s: float) -> bool:
+def may_return(session: SessionRecord, now_s: float) -> bool:
     """Whether Webots may start its controller again by itself: the world is being reloaded."""
     ended_s = session.ended_wall_time_s or session.last_seen_wall_time_s
     is_soon = now_s - ended_s < ISSUED_TIME_TO_LIVE_S
@@ -630,7 +646,7 @@ def may_return(session: Session, now_s: float) -> bool:
 
 
 def _moved_wall_time_s(
-    connection: sqlite3.Connection, session: Session, run: Run | None
+    connection: sqlite3.Connection, session: SessionRecord, run: RunRecord | None
 ) -> float | None:
     """When simulation time last grew: a row that is newer than the heartbeat shows it sooner."""
     row = newest_state(connection, run.id) if run and run.session_id == session.id else None
@@ -642,7 +658,7 @@ def _moved_wall_time_s(
 
 
 def _why_unpublished(
-    connection: sqlite3.Connection, session: Session, run: Run | None
+    connection: sqlite3.Connection, session: SessionRecord, run: RunRecord | None
 ) -> str | None:
     """That the loop goes on and records no state; None where it records, or has just begun."""
     if run is None or run.session_id != session.id or session.sim_time_s is None:
@@ -662,12 +678,12 @@ def _why_unpublished(
     return _unseen(session) or _UNPUBLISHED.format(unpublished_s)
 
 
-def _unseen(session: Session) -> str | None:
+def _unseen(session: SessionRecord) -> str | None:
     """That its loop stepped in a way that the bridge did not see, as its bridge found."""
     return UNSEEN if (session.last_error or "").startswith(UNSEEN) else None
 
 
-def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
+def _why_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
     (kind,) = connection.execute(_KIND, (session.robot_id,)).fetchone() or (None,)
     if kind == CUSTOM_DATA:
         return _READ_NO_MORE
@@ -685,7 +701,7 @@ def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
     return why
 
 
-def _left_stacks(connection: sqlite3.Connection, session: Session) -> str | None:
+def _left_stacks(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
     """Where a dead process had hung, as the file has it that nobody has taken in yet."""
     path = _path_of(connection, session, stacks_path)
     stacks = stacks_at(path) if path else None
@@ -700,7 +716,7 @@ def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:
 
 
 def _why_standing(
-    connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
+    connection: sqlite3.Connection, session: SessionRecord, moved_s: float | None, now_s: float
 ) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
     if session.host == host_name() and is_stopped(session.pid):
@@ -732,24 +748,26 @@ def _why_standing(
     return LEFT_PAUSED.format(robot_name(connection, left.robot_id))
 
 
-def _has_lost_simulator(session: Session) -> bool:
+def _has_lost_simulator(session: SessionRecord) -> bool:
     """Whether Webots has closed the connection to its controller."""
     return session.host == host_name() and has_lost_simulator(session.pid, session.instance)
 
 
-def _is_unseen(session: Session, moved_s: float | None) -> bool:
+def _is_unseen(session: SessionRecord, moved_s: float | None) -> bool:
     """Whether its bridge has seen nothing of the loop yet."""
     return moved_s is None and session.last_poll_wall_time_s is None
 
 
-def find_stacks(connection: sqlite3.Connection, session: Session, now_s: float) -> Stacks | None:
+def find_stacks(
+    connection: sqlite3.Connection, session: SessionRecord, now_s: float
+) -> Stacks | None:
     """Where the loop of a session is silent now; None where it is not, or that is not known."""
     path = _path_of(connection, session, stacks_path)
     stacks = stacks_at(path) if path else None
     return stacks if stacks and stacks.began_after(session.last_seen_wall_time_s) else None
 
 
-def ask_stuck(connection: sqlite3.Connection, session: Session, now_s: float) -> bool:
+def ask_stuck(connection: sqlite3.Connection, session: SessionRecord, now_s: float) -> bool:
     """Have the processes of a simulation that cannot do it otherwise write where they hang.
 
     The signal for it is sent only where the loop is silent for the limit of its bridge and the
@@ -774,7 +792,7 @@ def ask_stuck(connection: sqlite3.Connection, session: Session, now_s: float) ->
     return asked
 
 
-def _hang(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+def _hang(connection: sqlite3.Connection, session: SessionRecord, now_s: float) -> str | None:
     """That the loop is silent in the controller's code, and in which; None where it is not."""
     stacks = find_stacks(connection, session, now_s)
     if stacks is None or not stacks.is_hang:
@@ -784,7 +802,9 @@ def _hang(connection: sqlite3.Connection, session: Session, now_s: float) -> str
     return "; ".join(filter(None, (hangs, handler_at_work(connection, session, now_s))))
 
 
-def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+def _seen_by_observer(
+    connection: sqlite3.Connection, session: SessionRecord, now_s: float
+) -> str | None:
     """What a live observer of the simulation knows of it; None where there is none."""
     for each in (session, *companions(connection, session, now_s)):
         found = connection.execute(_SEEN_MODE, (each.id,)).fetchone()
@@ -794,7 +814,9 @@ def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: f
     return None
 
 
-def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+def handler_at_work(
+    connection: sqlite3.Connection, session: SessionRecord, now_s: float
+) -> str | None:
     """The custom action that the loop is inside of; it beats and steps only by itself there."""
     claimed = connection.execute(_CLAIMED, (session.robot_id, session.id)).fetchall()
     for command_id, action, since_s in claimed:
@@ -812,14 +834,18 @@ def stopped_for(seconds: float) -> str:
     return f"stopped {max(seconds, 0.0):.{1 if seconds < 10 else 0}f} s ago"
 
 
-def _stopped(session: Session, moved_s: float | None, now_s: float, why: str | None) -> Status:
+def _stopped(
+    session: SessionRecord, moved_s: float | None, now_s: float, why: str | None
+) -> Status:
     seconds = session.age_s(moved_s or session.started_wall_time_s, now_s)
     if why and why.startswith(UNMOVED):
         return Status(f"not seen moving for {max(seconds, 0.0):.0f} s", why)
     return Status(stopped_for(seconds), why)
 
 
-def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
+def find_holder(
+    connection: sqlite3.Connection, session: SessionRecord, now_s: float
+) -> SessionRecord | None:
     """The session whose bridge holds the loop: one that is held freezes its whole simulation."""
     for candidate in (session, *companions(connection, session, now_s)):
         if candidate.heartbeat_is_fresh(now_s) and _is_holding(connection, candidate):
@@ -827,17 +853,17 @@ def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) 
     return None
 
 
-def _is_holding(connection: sqlite3.Connection, session: Session) -> bool:
+def _is_holding(connection: sqlite3.Connection, session: SessionRecord) -> bool:
     since = _change_since_beat(connection, session)
     return session.pause_state == PAUSED if since is None else since == PAUSE
 
 
-def _change_since_beat(connection: sqlite3.Connection, session: Session) -> str | None:
+def _change_since_beat(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
     beat = (session.sim_time_s or 0.0, session.last_seen_wall_time_s)
     return change_since(connection, session.id, *beat)
 
 
-def _still_moving_s(connection: sqlite3.Connection, run: Run | None) -> float:
+def _still_moving_s(connection: sqlite3.Connection, run: RunRecord | None) -> float:
     """How old the last movement may be; heartbeats tell it only every so often."""
     interval_s = (recent_interval_s(connection, run.id) if run else None) or 0.0
     pace_s = min(max(_STILL_MOVING_S, 3 * interval_s), _SLOWEST_STILL_MOVING_S)
@@ -852,7 +878,7 @@ class FileBacklog(NamedTuple):
     newest_wall_time_s: float
 
 
-def rows_waiting(connection: sqlite3.Connection, session: Session | None) -> dict[str, Any]:
+def rows_waiting(connection: sqlite3.Connection, session: SessionRecord | None) -> dict[str, Any]:
     """`rows_waiting`, and `waiting_in` where there are any: a file next to the database, or memory.
 
     The session's row has the number at the last heartbeat, which waits for the same lock.
@@ -867,7 +893,7 @@ def rows_waiting(connection: sqlite3.Connection, session: Session | None) -> dic
     return {"rows_waiting": 0}
 
 
-def find_backlog(connection: sqlite3.Connection, session: Session) -> FileBacklog | None:
+def find_backlog(connection: sqlite3.Connection, session: SessionRecord) -> FileBacklog | None:
     """What waits in the file of a session; None where nothing does."""
     path = _path_of(connection, session)
     if path is None:
@@ -881,7 +907,7 @@ def find_backlog(connection: sqlite3.Connection, session: Session) -> FileBacklo
 
 def _path_of(
     connection: sqlite3.Connection,
-    session: Session,
+    session: SessionRecord,
     path_in: Callable[[Path, str], Path] = waiting_path,
 ) -> Path | None:
     """None for a database in memory, and where there is no such file."""

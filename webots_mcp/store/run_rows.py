@@ -72,7 +72,7 @@ def columns_of(row: type[Any]) -> str:
 
 
 @dataclass(frozen=True)
-class Run:
+class RunRecord:
     """A stretch of rising simulation time in one session. Columns as in `store.models`."""
 
     id: int
@@ -92,7 +92,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class State:
+class StateRecord:
     """What one `publish` recorded; `data` and `replaced` are JSON text."""
 
     id: int
@@ -115,7 +115,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Event:
+class EventRecord:
     """Something noticed in a run; `data` is JSON text."""
 
     id: int
@@ -131,12 +131,12 @@ class Event:
         return _decoded(self, self.data) if self.data else None
 
 
-def _decoded(row: State | Event, text: str) -> Any:
+def _decoded(row: StateRecord | EventRecord, text: str) -> Any:
     """The value of JSON text of a row; a MalformedRowError says which row has none."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        table = "kept_" * (row.id < 0) + type(row).__name__.lower()
+        table = "event" if isinstance(row, EventRecord) else "kept_" * (row.id < 0) + "state"
         where = f"run {row.run_id}: row {abs(row.id)} of table {table}"
         raise MalformedRowError(f"{where} holds a value that cannot be read: {error}") from error
 
@@ -160,11 +160,11 @@ def reading_texts(
         connection.text_factory = before
 
 
-_RUN_COLUMNS: Final = columns_of(Run)
+_RUN_COLUMNS: Final = columns_of(RunRecord)
 _CURRENT_RUN: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
 _RUN_BY_ID: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE id = ?"
 _RUNS_OF_ROBOT: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id"
-_STATE_COLUMNS: Final = columns_of(State)
+_STATE_COLUMNS: Final = columns_of(StateRecord)
 # Of a crash only a kept stretch has the newest state; it has a negative id.
 _NEWEST_STATE: Final = (
     "SELECT * FROM (SELECT * FROM (SELECT {columns} FROM state WHERE run_id = :run "
@@ -173,19 +173,21 @@ _NEWEST_STATE: Final = (
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1)) "
     "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
 ).format(columns=_STATE_COLUMNS, kept=_STATE_COLUMNS.partition(", ")[2])
-_EVENT_COLUMNS: Final = columns_of(Event)
+_EVENT_COLUMNS: Final = columns_of(EventRecord)
 _NEWEST_EVENTS: Final = (
     f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
 
 
-def current_run(connection: sqlite3.Connection, robot_id: int) -> Run | None:
+def current_run(connection: sqlite3.Connection, robot_id: int) -> RunRecord | None:
     """The robot's newest run, going on or not."""
     row = connection.execute(_CURRENT_RUN, (robot_id,)).fetchone()
-    return Run(*row) if row else None
+    return RunRecord(*row) if row else None
 
 
-def fetch_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None = None) -> Run:
+def fetch_run(
+    connection: sqlite3.Connection, run_id: int, robot_id: int | None = None
+) -> RunRecord:
     """The run of that id.
 
     Args:
@@ -197,14 +199,14 @@ def fetch_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None 
         UnknownRunError: There is no such run, or it is another robot's.
     """
     row = connection.execute(_RUN_BY_ID, (run_id,)).fetchone()
-    if row is None or robot_id not in (None, Run(*row).robot_id):
+    if row is None or robot_id not in (None, RunRecord(*row).robot_id):
         raise UnknownRunError(_no_such_run(connection, run_id, robot_id))
-    return Run(*row)
+    return RunRecord(*row)
 
 
-def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[Run]:
+def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[RunRecord]:
     """All runs of the robot, oldest first."""
-    return [Run(*row) for row in connection.execute(_RUNS_OF_ROBOT, (robot_id,)).fetchall()]
+    return [RunRecord(*row) for row in connection.execute(_RUNS_OF_ROBOT, (robot_id,)).fetchall()]
 
 
 def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
@@ -219,7 +221,7 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
     return f"no run {run_id}{whose}: {known}"
 
 
-def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
+def newest_state(connection: sqlite3.Connection, run_id: int) -> StateRecord | None:
     """The latest row of a run; None where retention has deleted it."""
     state = _state_up_to(connection, run_id, _LATER_THAN_ANY)
     if state is None or state.id > 0:
@@ -228,15 +230,17 @@ def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
     return None if ended_s is not None and ended_s > state.sim_time_s else state
 
 
-def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> State | None:
+def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> StateRecord | None:
     """The latest row of a run up to that simulation time."""
     return _state_up_to(connection, run_id, sim_time_s)
 
 
-def _state_up_to(connection: sqlite3.Connection, run_id: int, until: float | bytes) -> State | None:
+def _state_up_to(
+    connection: sqlite3.Connection, run_id: int, until: float | bytes
+) -> StateRecord | None:
     with reading_texts(connection):
         row = connection.execute(_NEWEST_STATE, {"run": run_id, "until": until}).fetchone()
-    return State(*row) if row else None
+    return StateRecord(*row) if row else None
 
 
 def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:
@@ -323,10 +327,10 @@ def put_back(value: Any, parts: list[str], replaced: object) -> None:
         value[key] = replaced
 
 
-def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[Event]:
+def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[EventRecord]:
     """The latest events of a run, oldest first; with a limit of -1 all of them."""
     rows = connection.execute(_NEWEST_EVENTS, (run_id, limit)).fetchall()
-    return [Event(*row) for row in reversed(rows)]
+    return [EventRecord(*row) for row in reversed(rows)]
 
 
 # Camera frames and screenshots: rows here, files in the data folder.

@@ -20,7 +20,7 @@ from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
 from webots_mcp.store.reading.frame_summary import (
     Buckets,
-    Changes,
+    ChangePoints,
     Point,
     buckets_of,
     cells_of,
@@ -30,7 +30,7 @@ from webots_mcp.store.reading.frame_summary import (
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
-from webots_mcp.store.signals import Signal, cleaned
+from webots_mcp.store.signals import RegisteredSignal, cleaned
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
@@ -186,7 +186,7 @@ def _share(max_points: int, segment: Segment, total_s: float) -> int:
 def _run_history(
     connection: sqlite3.Connection,
     segment: Segment,
-    signals: Sequence[Signal],
+    signals: Sequence[RegisteredSignal],
     max_points: int,
     max_changes: int | None,
     deadline: Deadline,
@@ -239,7 +239,9 @@ def signals_left(names: Sequence[str]) -> Iterator[str]:
         yield f"time limit reached, {len(names)} signals left: ask for {listed(names, MOST_NAMED)}"
 
 
-def _columns(frame: Frame, signal: Signal, buckets: Buckets, kept: Frame | None) -> NumberColumns:
+def _columns(
+    frame: Frame, signal: RegisteredSignal, buckets: Buckets, kept: Frame | None
+) -> NumberColumns:
     cells = cells_of(frame, signal, buckets, kept)
     whole, too_large = summary_of(frame, signal, kept), 0
     if not whole.present:
@@ -264,7 +266,9 @@ def _figures(column: Array) -> list[float | None]:
     return [None if math.isnan(figure) else figure for figure in column.tolist()]
 
 
-def _change_columns(signal: Signal, changes: Changes, newest_s: float, most: int) -> ChangeColumns:
+def _change_columns(
+    signal: RegisteredSignal, changes: ChangePoints, newest_s: float, most: int
+) -> ChangeColumns:
     points = changes.points[signal.name]
     return ChangeColumns(
         signal.name,
@@ -281,7 +285,7 @@ def _change_columns(signal: Signal, changes: Changes, newest_s: float, most: int
 
 
 @dataclass(frozen=True)
-class Page:
+class StatePage:
     """State rows as columns, in order.
 
     Attributes:
@@ -313,7 +317,7 @@ def query_rows(
     limit: int = 50,
     after_id: int = 0,
     deadline_s: float = QUESTION_DEADLINE_S,
-) -> Page:
+) -> StatePage:
     """The rows of a range with the values of some signals, at most `limit` of them.
 
     Args:
@@ -360,12 +364,12 @@ def _place_after(frame: Frame, after_id: int) -> int:
 def _page(
     connection: sqlite3.Connection,
     time_range: TimeRange,
-    signals: Sequence[Signal],
+    signals: Sequence[RegisteredSignal],
     parts: Sequence[Frame],
     limit: int,
     *,
     cut: bool,
-) -> Page:
+) -> StatePage:
     rows = sum(map(len, parts))
     more = rows > limit or (cut and rows > 0)
     shown = [*parts[:-1], parts[-1].rows(0, len(parts[-1]) - max(0, rows - limit))] if parts else []
@@ -383,7 +387,7 @@ def _page(
         values[name] = cleaned(signal, exact)
         if found := sum((part.replaced(name) for part in shown), Counter[str]()):
             replaced[name] = dict(found)
-    return Page(
+    return StatePage(
         time_range.robot,
         [part.run_id for part in shown for _ in range(len(part))],
         ids,

@@ -43,7 +43,7 @@ _TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as
 
 
 @dataclass(frozen=True)
-class Signal:
+class RegisteredSignal:
     """A signal of a robot, and where its value stands in a state row.
 
     Attributes:
@@ -80,31 +80,33 @@ class Signal:
         return self.kind in ("num", "angle", "null")
 
 
-def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, Signal]:
+def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, RegisteredSignal]:
     """The signals of a robot in the register, by name."""
     rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
-    signals = (_registered(Signal(*row)) for row in rows)
+    signals = (_registered(RegisteredSignal(*row)) for row in rows)
     return {signal.name: signal for signal in signals}
 
 
-def _registered(signal: Signal) -> Signal:
+def _registered(signal: RegisteredSignal) -> RegisteredSignal:
     is_choice = signal.kind == "num" and (signal.role or "").startswith("mode")
     return replace(signal, is_choice=True) if is_choice else signal
 
 
-def stored_roles(known: dict[str, Signal]) -> dict[str, str]:
+def stored_roles(known: dict[str, RegisteredSignal]) -> dict[str, str]:
     """The roles of signals that have one, by their names."""
     return {name: signal.role for name, signal in known.items() if signal.role is not None}
 
 
-def roles_of(known: dict[str, Signal], position: tuple[str, str] | None = None) -> dict[str, str]:
+def roles_of(
+    known: dict[str, RegisteredSignal], position: tuple[str, str] | None = None
+) -> dict[str, str]:
     """The roles that these signals have among each other; see `decide_roles`."""
     kinds: dict[str, Kind] = {name: signal.kind for name, signal in known.items()}
     choices = {name for name, signal in known.items() if signal.is_choice}
     return decide_roles(kinds, choices, position)
 
 
-def with_roles(known: dict[str, Signal]) -> dict[str, Signal]:
+def with_roles(known: dict[str, RegisteredSignal]) -> dict[str, RegisteredSignal]:
     """These signals with the roles that they have among each other."""
     roles = roles_of(known)
     return {
@@ -115,7 +117,7 @@ def with_roles(known: dict[str, Signal]) -> dict[str, Signal]:
 
 def enter_signals(
     connection: sqlite3.Connection, robot_id: int, seen: Mapping[str, Seen]
-) -> dict[str, Signal]:
+) -> dict[str, RegisteredSignal]:
     """Enter what values of a robot's signals tell; return all that are registered, by name.
 
     Names beyond `MAX_SIGNALS` of a robot stay out.
@@ -124,7 +126,7 @@ def enter_signals(
     return registered(connection, robot_id)
 
 
-def tell_more(signal: Signal | None, values: Iterable[object]) -> bool:
+def tell_more(signal: RegisteredSignal | None, values: Iterable[object]) -> bool:
     """Whether values may widen what is known of their signal; of most a look at types shows it."""
     if signal is None or signal.kind == "angle" or signal.is_choice:
         return True
@@ -171,12 +173,14 @@ def _are_choices(name: str, values: Sequence[Any]) -> bool:
     )
 
 
-def seen_with(known: dict[str, Signal], robot_id: int, columns: StateColumns) -> dict[str, Signal]:
+def seen_with(
+    known: dict[str, RegisteredSignal], robot_id: int, columns: StateColumns
+) -> dict[str, RegisteredSignal]:
     """Signals as they are known after these rows, also those that are not registered."""
     fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
     found = dict(known)
     for name, seen in seen_in(columns, fresh).items():
-        before = known.get(name) or Signal(None, robot_id, name, "null", None, *seen[:2])
+        before = known.get(name) or RegisteredSignal(None, robot_id, name, "null", None, *seen[:2])
         kind = widen(before.kind, seen.kind)
         is_choice = seen.is_choice and kind == "num" and (before.is_choice or before.kind == "null")
         if name not in known or (kind, is_choice) != (before.kind, before.is_choice):
@@ -186,7 +190,7 @@ def seen_with(known: dict[str, Signal], robot_id: int, columns: StateColumns) ->
     return with_roles(found) if changed else found
 
 
-def cleaned(signal: Signal, values: Sequence[Any]) -> list[Value]:
+def cleaned(signal: RegisteredSignal, values: Sequence[Any]) -> list[Value]:
     """Every value of the type that the signal's kind promises."""
     if signal.kind == "bool":
         return [None if value is None else value in (1, True) for value in values]

@@ -93,7 +93,7 @@ _RULES: Final = (
 
 
 @dataclass(frozen=True)
-class Result:
+class SqlResult:
     """The answer of `query_sql`.
 
     Attributes:
@@ -114,7 +114,7 @@ def query_sql(
     max_rows: int = 100,
     max_bytes: int = MAX_BYTES,
     deadline_s: float = QUESTION_DEADLINE_S,
-) -> Result:
+) -> SqlResult:
     """Run one SELECT (or WITH ... SELECT, VALUES, EXPLAIN of one) and return its first rows.
 
     Args:
@@ -153,7 +153,7 @@ def query_sql(
         if not rows:
             raise InvalidInputError(too_slow(deadline_s)) from error
         why = f"stopped after {deadline_s:g} s; further rows may exist"
-    return Result(columns, tuple(rows), why, budget.shortened)
+    return SqlResult(columns, tuple(rows), why, budget.shortened)
 
 
 def require_max_rows(max_rows: int) -> None:
@@ -330,7 +330,7 @@ class Statement:
         return json.dumps(asdict(self), ensure_ascii=False).encode()  # what is no text fails here
 
 
-def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = None) -> Result:
+def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = None) -> SqlResult:
     """What the process answered; one that ended itself before it could answer took too long.
 
     Args:
@@ -357,7 +357,7 @@ def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = N
     if "error" in found:
         raise InvalidInputError(found["error"])
     rows: tuple[tuple[Cell, ...], ...] = tuple(tuple(row) for row in found["rows"])
-    return Result(tuple(found["columns"]), rows, found["truncated"], found["shortened"])
+    return SqlResult(tuple(found["columns"]), rows, found["truncated"], found["shortened"])
 
 
 @contextlib.contextmanager
@@ -373,7 +373,7 @@ def as_file(database: Database) -> Generator[Path]:
         yield file
 
 
-def main(ask: Callable[[Statement], Result]) -> None:
+def main(ask: Callable[[Statement], SqlResult]) -> None:
     """Answer the request on stdin."""
     asked = Statement(**json.load(sys.stdin))
     end = threading.Timer(asked.deadline_s + _GRACE_S, os._exit, [_TIMED_OUT])
@@ -388,7 +388,7 @@ def main(ask: Callable[[Statement], Result]) -> None:
     sys.stdout.write(json.dumps(answer))
 
 
-def _ask(asked: Statement) -> Result:
+def _ask(asked: Statement) -> SqlResult:
     with closing(connect(Path(asked.database), "reader")) as connection:
         connection.execute(f"PRAGMA hard_heap_limit={_MAX_HEAP_BYTES}")
         return query_sql(

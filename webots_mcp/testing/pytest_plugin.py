@@ -74,7 +74,7 @@ def webots_database(
     from webots_mcp.contract import STRICT_VARIABLE
 
     monkeypatch.setenv(STRICT_VARIABLE, "1")
-    monkeypatch.setattr("webots_mcp.bridge.actions.POLL_INTERVAL_S", 0.0)
+    monkeypatch.setattr("webots_mcp.bridge.control.POLL_INTERVAL_S", 0.0)
     database = MemoryDatabase()
     yield database
     database.close()

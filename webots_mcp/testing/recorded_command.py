@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import json
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
 from webots_mcp.database.queue import Command, fetch_command
-
-if TYPE_CHECKING:
-    pass
-
 
 _UNFINISHED: Final = {
     "pending": "no get_command() of its controller has come to it yet",

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.reading.frame import Frame
-
-if TYPE_CHECKING:
-    pass
-
 
 _SHOWN_STATE_CHARACTERS: Final = 500
 

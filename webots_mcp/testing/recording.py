@@ -22,14 +22,14 @@ from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.divergence import compare_repeats
 from webots_mcp.signals.conditions.compiler import read_expectation
 from webots_mcp.signals.parameter import Value as ParameterValue
-from webots_mcp.store.export import Source
-from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
+from webots_mcp.store.export import StateTable
+from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
 from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, find_subject, whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject
-from webots_mcp.store.run_rows import Event, State, newest_events, runs_of
+from webots_mcp.store.run_rows import EventRecord, StateRecord, newest_events, runs_of
 from webots_mcp.store.signals import cleaned, registered
 from webots_mcp.testing.recorded_command import RecordedCommand
 from webots_mcp.testing.recorded_signal import RecordedSignal
@@ -129,7 +129,7 @@ class RobotRecording:
 
     # -- what happened -------------------------------------------------------------------------
 
-    def events(self, kind: str | None = None) -> list[Event]:
+    def events(self, kind: str | None = None) -> list[EventRecord]:
         """Return the events that the bridge stored in the run, all or of a kind (`pause`, ...)."""
         with self._subject() as (connection, subject):
             found = newest_events(connection, subject.run_id, _NO_LIMIT)
@@ -210,7 +210,7 @@ class RobotRecording:
         if level not in LOG_LEVELS:
             raise InvalidInputError(f"no log level {level!r}; there is {', '.join(LOG_LEVELS)}")
         with self._subject() as (connection, subject):
-            window = Window(-math.inf, math.inf)
+            window = LogWindow(-math.inf, math.inf)
             asked = LogFilter(subject.run_id, window, text, lowest_level=level)
             return newest_lines(connection, asked, _NO_LIMIT)
 
@@ -322,11 +322,11 @@ def _require_all(run: str, unread: Iterable[object]) -> None:
         raise NothingRecordedError(f"of {run} not all is there: {missing}")
 
 
-def _source(connection: sqlite3.Connection, run_id: int) -> Source:
+def _source(connection: sqlite3.Connection, run_id: int) -> StateTable:
     segment = whole_run(connection, run_id)
-    return Source.of(connection, [segment] if segment else [], 1, None)
+    return StateTable.of(connection, [segment] if segment else [], 1, None)
 
 
-def _rows(source: Source) -> Iterator[State]:
+def _rows(source: StateTable) -> Iterator[StateRecord]:
     """Return the rows of a run, in order; deleted ones come from their chunks."""
-    return (State(row.state_id, row.run_id, *row[2:]) for row in source.recorded())
+    return (StateRecord(row.state_id, row.run_id, *row[2:]) for row in source.recorded())

@@ -9,14 +9,14 @@ import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import actions
+from webots_mcp.bridge import control
 from webots_mcp.standin import InProcessSupervisor
 
 
 @pytest.fixture
 def look_in_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """A step looks into the queue, not only one in 5 ms."""
-    monkeypatch.setattr(actions, "POLL_INTERVAL_S", 0.0)
+    monkeypatch.setattr(control, "POLL_INTERVAL_S", 0.0)
     monkeypatch.setenv("WEBOTS_MCP_STRICT", "1")
 
 

@@ -21,8 +21,8 @@ from tests.bridge.conftest import (
 )
 from tests.waiting import wait_for
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import actions, backlog
-from webots_mcp.bridge.commands import ClaimedCommand
+from webots_mcp.bridge import backlog
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
@@ -149,17 +149,22 @@ def test_a_breakpoint_that_cannot_be_stored_is_stored_when_it_is_set_again_or_a_
 def test_arming_is_answered_once_the_breakpoints_could_be_read(
     bridge: MCPBridge, file: Path
 ) -> None:
-    context = bridge._session  # pyright: ignore[reportPrivateUsage]
     with write_lock(file) as other:
         _store_breakpoint(other, "n == 2")
         bridge.publish({"n": 0})
-        progress = actions.begin(context, ClaimedCommand(1, "arm_breakpoints", {}, 1))
+        progress = _arming(bridge)
         next(progress)
     catch_up(bridge)
 
     with pytest.raises(StopIteration) as answer:
         next(progress)
     assert answer.value.value == {"armed": [1]}
+
+
+def _arming(bridge: MCPBridge) -> Progress:
+    """Begin the action that reads the stored breakpoints again."""
+    actions = bridge._session.control._actions  # pyright: ignore[reportPrivateUsage]
+    return actions["arm_breakpoints"](ClaimedCommand(1, "arm_breakpoints", {}, 1))
 
 
 def _store_breakpoint(connection: sqlite3.Connection, condition: str, by: str = "mcp") -> None:

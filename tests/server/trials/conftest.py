@@ -11,7 +11,7 @@ import pytest
 from mcp import Client
 
 from tests.bridge.conftest import Recording
-from tests.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
+from tests.bridge.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import STEP_MS, Driver, ask
 from tests.server.story import rows_of
 from webots_mcp.standin import Simulation

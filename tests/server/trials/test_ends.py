@@ -16,7 +16,7 @@ from anyio import to_thread
 from mcp import Client, MCPError, StdioServerParameters
 
 from tests.bridge.conftest import Recording
-from tests.processes.stopping import stop_between_writes
+from tests.bridge.processes.stopping import stop_between_writes
 from tests.server.conftest import Connect, ask, ask_until, fail
 from tests.server.story import rows_of
 from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of

@@ -21,7 +21,7 @@ from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
-from webots_mcp.store.recording import OpenReaders, Recording
+from webots_mcp.store.recording import OpenReaders, RecordingAccess
 from webots_mcp.store.retention import Limit, Retention
 
 ROWS = 3 * LEAST_ROWS
@@ -37,14 +37,14 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def recording(built: Path, tmp_path: Path) -> Iterator[Recording]:
+def recording(built: Path, tmp_path: Path) -> Iterator[RecordingAccess]:
     shutil.copy(built, tmp_path / "webots.db")
     readers = OpenReaders()
-    yield Recording(tmp_path / "webots.db", tmp_path, read_only=True, readers=readers)
+    yield RecordingAccess(tmp_path / "webots.db", tmp_path, read_only=True, readers=readers)
     readers.close()
 
 
-def in_chunks(recording: Recording) -> int:
+def in_chunks(recording: RecordingAccess) -> int:
     with recording.reader() as connection:
         return connection.execute("SELECT total(row_count) FROM row_group").fetchone()[0]
 
@@ -53,7 +53,7 @@ def noted(told: list[tuple[int, int]]) -> Callable[[int, int], object]:
     return lambda done, of: told.append((done, of))
 
 
-def test_readers_see_chunks_that_the_file_has_not(recording: Recording) -> None:
+def test_readers_see_chunks_that_the_file_has_not(recording: RecordingAccess) -> None:
     assert isinstance(recording.database, Path)
     before = recording.database.read_bytes()
     with recording.reader() as connection:
@@ -69,7 +69,7 @@ def test_readers_see_chunks_that_the_file_has_not(recording: Recording) -> None:
             connection.execute("DELETE FROM aside.chunk")
 
 
-def test_they_are_made_once_and_what_broke_off_goes_on(recording: Recording) -> None:
+def test_they_are_made_once_and_what_broke_off_goes_on(recording: RecordingAccess) -> None:
     assert "ask again" in make_missing_chunks(recording, called_off=lambda: True, write=False)
     assert LEAST_ROWS <= in_chunks(recording) < ROWS
     assert make_missing_chunks(recording, write=False) == ""
@@ -81,7 +81,7 @@ def test_they_are_made_once_and_what_broke_off_goes_on(recording: Recording) -> 
 
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="permissions do not stop this user here")
 def test_a_question_of_the_command_line_makes_them_where_nothing_can_be_written(
-    recording: Recording, tmp_path: Path
+    recording: RecordingAccess, tmp_path: Path
 ) -> None:
     command = ["-m", "webots_mcp", "trends", "--database", str(recording.database)]
     with unprivileged.unwritable(tmp_path):
@@ -93,7 +93,7 @@ def test_a_question_of_the_command_line_makes_them_where_nothing_can_be_written(
 
 
 def test_what_a_server_purges_that_begins_later_is_read_from_its_chunks(
-    recording: Recording, tmp_path: Path
+    recording: RecordingAccess, tmp_path: Path
 ) -> None:
     def values() -> Sequence[object]:
         with recording.reader() as connection:
@@ -112,7 +112,7 @@ def test_what_a_server_purges_that_begins_later_is_read_from_its_chunks(
 
 
 def test_chunks_of_a_recording_that_is_gone_are_not_those_of_the_next(
-    recording: Recording,
+    recording: RecordingAccess,
 ) -> None:
     make_missing_chunks(recording, write=False)
     with closing(connect(recording.database, "writer")) as connection:

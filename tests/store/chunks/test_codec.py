@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from webots_mcp.store.chunks import (
     ABSENT,
     DamagedChunkError,
-    Encoded,
+    EncodedChunk,
     Replaced,
     decode,
     decoded_of,
@@ -50,7 +50,7 @@ STORED_BY = {  # 0.0, 0.1, ... 1.1
 
 @pytest.mark.parametrize("version", STORED_BY)
 def test_what_a_version_of_pcodec_has_stored_every_other_one_reads(version: str) -> None:
-    stored = Encoded("pcodec/float64", bytes.fromhex(STORED_BY[version]), None, None)
+    stored = EncodedChunk("pcodec/float64", bytes.fromhex(STORED_BY[version]), None, None)
     assert decode(stored, 12).numbers.tolist() == [round(0.1 * step, 1) for step in range(12)]
 
 

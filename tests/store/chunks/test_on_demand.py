@@ -14,7 +14,7 @@ from tests.recordings.long import build
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.store.chunk_making import LEAST_ROWS, make_missing_chunks
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 ROWS = 4 * LEAST_ROWS
 
@@ -27,23 +27,23 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def recording(built: Path, tmp_path: Path) -> Iterator[Recording]:
+def recording(built: Path, tmp_path: Path) -> Iterator[RecordingAccess]:
     shutil.copy(built, tmp_path / "webots.db")
-    yield Recording(tmp_path / "webots.db", tmp_path, read_only=True)
+    yield RecordingAccess(tmp_path / "webots.db", tmp_path, read_only=True)
 
 
-def in_chunks(recording: Recording) -> int:
+def in_chunks(recording: RecordingAccess) -> int:
     with recording.reader() as connection:
         return connection.execute("SELECT total(row_count) FROM row_group").fetchone()[0]
 
 
-def hold_lease(recording: Recording, holder: str) -> None:
+def hold_lease(recording: RecordingAccess, holder: str) -> None:
     with closing(connect(recording.database, "writer")) as connection:
         values = ("maintainer", f"{holder} 1 ab", time.time() + 5)
         connection.execute("INSERT INTO lease VALUES (?, ?, ?)", values)
 
 
-def test_all_rows_are_put_into_chunks_and_counted_on_the_way(recording: Recording) -> None:
+def test_all_rows_are_put_into_chunks_and_counted_on_the_way(recording: RecordingAccess) -> None:
     told: list[tuple[int, int]] = []
     assert make_missing_chunks(recording, lambda done, of: told.append((done, of))) == ""
     assert in_chunks(recording) == ROWS
@@ -51,7 +51,7 @@ def test_all_rows_are_put_into_chunks_and_counted_on_the_way(recording: Recordin
     assert told[-1] == (ROWS, ROWS)
 
 
-def test_a_server_that_maintains_it_is_left_to_it(recording: Recording) -> None:
+def test_a_server_that_maintains_it_is_left_to_it(recording: RecordingAccess) -> None:
     hold_lease(recording, "server")
     assert make_missing_chunks(recording).startswith(
         f"the newest {ROWS} rows are in no chunk yet: the serv"
@@ -59,14 +59,14 @@ def test_a_server_that_maintains_it_is_left_to_it(recording: Recording) -> None:
     assert in_chunks(recording) == 0
 
 
-def test_beside_a_bridge_it_is_done_because_a_bridge_does_not(recording: Recording) -> None:
+def test_beside_a_bridge_it_is_done_because_a_bridge_does_not(recording: RecordingAccess) -> None:
     hold_lease(recording, "bridge")
     assert make_missing_chunks(recording) == ""
     assert in_chunks(recording) == ROWS
 
 
 def test_what_is_called_off_or_interrupted_goes_on_with_the_next_question(
-    recording: Recording,
+    recording: RecordingAccess,
 ) -> None:
     assert "ask again" in make_missing_chunks(recording, called_off=lambda: True)
     first = in_chunks(recording)
@@ -82,7 +82,7 @@ def test_what_is_called_off_or_interrupted_goes_on_with_the_next_question(
     assert in_chunks(recording) == ROWS
 
 
-def test_a_database_that_another_holds_locked_is_read_as_it_is(recording: Recording) -> None:
+def test_a_database_that_another_holds_locked_is_read_as_it_is(recording: RecordingAccess) -> None:
     with closing(connect(recording.database, "writer")) as other:
         other.execute("BEGIN IMMEDIATE")
         assert "stayed locked by another process" in make_missing_chunks(recording)
@@ -103,7 +103,7 @@ def test_a_database_that_another_holds_locked_is_read_as_it_is(recording: Record
     ids=lambda command: command[0],
 )
 def test_questions_of_the_command_line_make_chunks_before_they_answer(
-    recording: Recording,
+    recording: RecordingAccess,
     command: list[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -116,7 +116,7 @@ def test_questions_of_the_command_line_make_chunks_before_they_answer(
 
 
 def test_a_question_says_that_another_is_still_at_it(
-    recording: Recording, capsys: pytest.CaptureFixture[str]
+    recording: RecordingAccess, capsys: pytest.CaptureFixture[str]
 ) -> None:
     hold_lease(recording, "server")
     assert main(["history", "mode", "--database", str(recording.database)]) == 0

@@ -20,7 +20,7 @@ from tests.store.export.test_purged_rows import NAMES, STATES, purged
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
-from webots_mcp.store.export import Source, export
+from webots_mcp.store.export import StateTable, export
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="the extra 'parquet' is not installed")
@@ -45,17 +45,17 @@ def table(connection: sqlite3.Connection, **wanted: Any) -> tuple[Any, str]:
 def is_by_column(connection: sqlite3.Connection, **wanted: Any) -> bool:
     wanted.setdefault("run_id", 1)
     segments = find_range(connection, Scope(**wanted)).segments
-    return Source.of(connection, segments, 2, None).by_column() is not None
+    return StateTable.of(connection, segments, 2, None).by_column() is not None
 
 
-def by_rows(_: Source) -> None:
+def by_rows(_: StateTable) -> None:
     """As where chunks do not hold all."""
 
 
 def assert_alike(connection: sqlite3.Connection, **wanted: Any) -> None:
     found = table(connection, **wanted)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Source, "by_column", by_rows)
+        patched.setattr(StateTable, "by_column", by_rows)
         assert found == table(connection, **wanted)
 
 

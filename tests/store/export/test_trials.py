@@ -14,7 +14,7 @@ import pytest
 from tests.memory import memory_connection
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export import TrialTable, export
-from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 
 TRIED: list[tuple[dict[str, Any], float | None]] = [
     ({"kp": 1, "gait": "trot", "score": True}, 4.0),
@@ -33,7 +33,7 @@ def connection() -> Iterator[sqlite3.Connection]:
         set_id = create_trial_set(connection, "{}", [parameters for parameters, _ in TRIED])
         for trial, (_, score) in zip(trials_of(connection, set_id)[:5], TRIED, strict=False):
             failed = None if score else "ValueError: it fell"
-            finish_trial(connection, trial, Result(None, score, failed, "for_s", 20.0))
+            finish_trial(connection, trial, TrialResult(None, score, failed, "for_s", 20.0))
         yield connection
 
 

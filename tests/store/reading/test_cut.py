@@ -18,7 +18,7 @@ from webots_mcp.store.reading.frame_summary import change_points
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.series import query_rows
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 ROWS = 20_000
 INTERVAL_S = 0.1
@@ -55,7 +55,7 @@ def after(looks: int) -> Deadline:
     return Deadline(looks, itertools.count().__next__)
 
 
-def signals_of(connection: sqlite3.Connection, *names: str) -> list[Signal]:
+def signals_of(connection: sqlite3.Connection, *names: str) -> list[RegisteredSignal]:
     known = known_signals(connection, find_range(connection, Scope()))
     return [known[name] for name in names]
 

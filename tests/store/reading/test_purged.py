@@ -28,8 +28,8 @@ def keep_rows(connection: sqlite3.Connection, folder: Path, rows: int) -> None:
 
 
 @pytest.fixture
-def rover(_recorded: dict[str, sqlite3.Connection]) -> Iterator[sqlite3.Connection]:
-    with memory_connection(_recorded["chunked"]) as connection:
+def rover(rover_recordings: dict[str, sqlite3.Connection]) -> Iterator[sqlite3.Connection]:
+    with memory_connection(rover_recordings["chunked"]) as connection:
         yield connection
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from tests.judging.asking import ask
 from tests.recordings.rover import Recorder, start_run
-from tests.store.questions.asking import ask
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range, recorded_bounds

@@ -14,7 +14,7 @@ from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.recording import look
+from webots_mcp.store.recording import view_robot
 from webots_mcp.store.retention import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 from webots_mcp.store.run_rows import newest_state
@@ -76,7 +76,9 @@ def test_they_are_not_told_as_the_newest_state_of_a_run_whose_later_rows_are_del
     assert newest is not None
     prune(connection, tmp_path, Retention(state=NONE, kept_state=ALL), rest=False)
     assert newest_state(connection, 1) is None
-    assert look(connection, None).header()["sim_time_s"] == pytest.approx(newest.sim_time_s, abs=1)
+    assert view_robot(connection, None).header()["sim_time_s"] == pytest.approx(
+        newest.sim_time_s, abs=1
+    )
 
 
 def test_their_own_limit_takes_the_oldest_and_what_loses_a_row_is_no_stretch_any_more(

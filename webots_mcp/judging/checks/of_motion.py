@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, cast
 
-from webots_mcp.analysis.arrays import Array, Run, median, np, runs_of
+from webots_mcp.analysis.arrays import Array, RowSpan, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times, total_s
 from webots_mcp.judging.detection.condition import lasting
@@ -16,7 +16,7 @@ from webots_mcp.judging.detection.search import in_metres, places_in
 from webots_mcp.judging.detection.standstill import ON_THE_SPOT
 from webots_mcp.signals.naming import METRES, counted, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signals.register import PLACES
-from webots_mcp.store.signals import Signal, stored_roles
+from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 _OFF_THE_FLOOR_M: Final = 0.3
 APART_S: Final = 3.0  # command and measurement for so long
@@ -99,7 +99,7 @@ def follows_targets(run: RunUnderCheck) -> Finding:
     if not pairs:
         none = "no target, other than always 0, is published beside what it is the target of"
         raise NotSearchableError(none)
-    found: list[tuple[Signal, Run, float]] = []
+    found: list[tuple[RegisteredSignal, RowSpan, float]] = []
     for measured, target in pairs:
         found += _apart(run, measured, target)
     if not found:
@@ -113,7 +113,7 @@ def follows_targets(run: RunUnderCheck) -> Finding:
     return Finding("fail", evidence, since_s, len(found), shown)
 
 
-def _pairs(run: RunUnderCheck) -> Iterator[tuple[Signal, Signal]]:
+def _pairs(run: RunUnderCheck) -> Iterator[tuple[RegisteredSignal, RegisteredSignal]]:
     """Measured values with their targets, but for where the robot shall go, and what holds."""
     motion, known = run.motion, run.search.known
     there = [
@@ -134,8 +134,8 @@ def _pairs(run: RunUnderCheck) -> Iterator[tuple[Signal, Signal]]:
 
 
 def _apart(
-    run: RunUnderCheck, measured: Signal, target: Signal
-) -> Iterator[tuple[Signal, Run, float]]:
+    run: RunUnderCheck, measured: RegisteredSignal, target: RegisteredSignal
+) -> Iterator[tuple[RegisteredSignal, RowSpan, float]]:
     frame = run.frame
     values, aims = frame.numbers(measured.name), frame.numbers(target.name)
     there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
@@ -150,7 +150,7 @@ def _apart(
     nearer_by = max(_NEARER * span, _NOISE / 2 * noise)
     # For as long again: a target that was set anew may lie the other way.
     still = lasting(rows, is_apart & (was_off - off < nearer_by), APART_S)
-    for each in runs_of(still, rows).each():
+    for each in runs_of(still, rows).spans():
         began = max(0, int(np.searchsorted(rows, each.start_s - APART_S, "right")) - 1)
         lasted = each._replace(start_s=float(rows[began]))
         yield measured, lasted, float(off[each.start : each.stop].max())
@@ -184,7 +184,7 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
     if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
         raise NotSearchableError("its speed and that of its wheels have no fixed ratio")
     slips = runs_of(ratios < _SLIPS * usual, starts_s)
-    found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).each())
+    found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).spans())
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
     rolls = f"rolls {usual:.3g} m/s{unit}"
     if not found:
@@ -196,7 +196,9 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
 
 
 def _ratios(
-    run: RunUnderCheck, position: tuple[Signal, Signal], wheels: list[Signal]
+    run: RunUnderCheck,
+    position: tuple[RegisteredSignal, RegisteredSignal],
+    wheels: list[RegisteredSignal],
 ) -> tuple[Array, float, Array]:
     """From cell to cell how far it went per turn of its wheels; NaN where these do not drive it.
 
@@ -264,7 +266,9 @@ def estimates_agree(run: RunUnderCheck) -> Finding:
 
 
 def _drift(
-    run: RunUnderCheck, one: tuple[Signal, Signal], other: tuple[Signal, Signal]
+    run: RunUnderCheck,
+    one: tuple[RegisteredSignal, RegisteredSignal],
+    other: tuple[RegisteredSignal, RegisteredSignal],
 ) -> Finding | None:
     """None where they are no two of one thing, or it went too little to tell."""
     both = [in_metres(each, run.frame.numbers(each.name)) for each in (*one, *other)]

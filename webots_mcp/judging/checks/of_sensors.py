@@ -13,7 +13,7 @@ from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed, words_of
-from webots_mcp.store.signals import Signal, stored_roles
+from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
@@ -123,7 +123,7 @@ class _NamesIn:
         return self._targets[name]
 
     @cached_property
-    def sensors(self) -> dict[str, Signal]:
+    def sensors(self) -> dict[str, RegisteredSignal]:
         """The numbers that somebody measured, as far as their names tell."""
         motion = self._run.motion
         told = {motion.commanded, motion.speed, motion.mode, *motion.wheels, *motion.wheel_commands}

@@ -47,7 +47,7 @@ from webots_mcp.store.reading.catalogue import say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import recorded_share
 from webots_mcp.store.reading.segment import Segment, just_after, kept_parts
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 _MOST_VALUES: Final = 8
 _ROWS_BEFORE: Final = 20  # a range: what was there last, for `changed` and `rate`
@@ -87,7 +87,7 @@ def condition_events(search: Search) -> Iterator[Event]:
         _require_values(condition, frame, position)
     rows = search.ledger.rows = search.ledger.rows + int(np.count_nonzero(read))
     search.ledger.note_nearest("condition", rows, f"true in none of {rows} rows")
-    for run, values in zip(runs.each(), values_at(condition, frame, position, runs), strict=True):
+    for run, values in zip(runs.spans(), values_at(condition, frame, position, runs), strict=True):
         details = dict(list(values.items())[:_MOST_VALUES])
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)
 
@@ -394,7 +394,7 @@ def compared(frame: Frame, name: str, op: type[ast.cmpop], limit: float) -> Flag
     return holds
 
 
-def position_in(frame: Frame, known: Mapping[str, Signal]) -> tuple[str, str] | None:
+def position_in(frame: Frame, known: Mapping[str, RegisteredSignal]) -> tuple[str, str] | None:
     """The names of x and y of a robot, as far as they have values in a frame; None without any."""
     numbers = [name for name, signal in known.items() if signal.is_number]
     while (found := find_position(numbers)) is not None:
@@ -620,7 +620,7 @@ def every_call_of(search: Search) -> Frame:
 
 
 def judge_expectation(
-    expectation: Expectation, frame: Frame, known: dict[str, Signal]
+    expectation: Expectation, frame: Frame, known: dict[str, RegisteredSignal]
 ) -> Adherence:
     """Ask an expectation of the rows of a run.
 
@@ -703,7 +703,7 @@ def violation_events(search: Search) -> Iterator[Event]:
             continue
         position = position_in(frame, search.known) if each.asks_position else None
         values = values_at(each.violation, frame, position, held.violations)
-        for run, details in zip(held.violations.each(), values, strict=True):
+        for run, details in zip(held.violations.spans(), values, strict=True):
             here = search.segment
             if run.start_s < here.end_s and run.end_s >= here.start_s:
                 details = {"expected": each.text, **dict(list(details.items())[:8])}

@@ -36,7 +36,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     just_after,
 )
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 _ERRORS: Final = ("error", "critical")  # levels of log lines
 MOST_AROUND: Final = 6  # values that are reported with an event
@@ -131,7 +131,7 @@ class Found:
     entries: tuple[tuple[Place, Event], ...]
     verdicts: Verdicts
     notes: tuple[str, ...]
-    context: tuple[Signal, ...]
+    context: tuple[RegisteredSignal, ...]
     borders: dict[str, Place | None] = field(default_factory=dict[str, "Place | None"])
 
     @property
@@ -146,7 +146,7 @@ class Found:
         counts = count_by_kind(events)
         return replace(self, entries=entries, verdicts=replace(self.verdicts, found=dict(counts)))
 
-    def in_groups(self, known: dict[str, Signal]) -> Found:
+    def in_groups(self, known: dict[str, RegisteredSignal]) -> Found:
         """The same with many alike as one, where each was searched for by itself."""
         events = grouped(self.events, known)
         counts = count_by_kind(events)
@@ -281,8 +281,8 @@ def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[in
 
 
 def _context(
-    known: dict[str, Signal], options: EventOptions, around: Sequence[str] | None
-) -> list[Signal]:
+    known: dict[str, RegisteredSignal], options: EventOptions, around: Sequence[str] | None
+) -> list[RegisteredSignal]:
     if around is None:
         return find_motion(known, options).signals[:MOST_AROUND]
     return resolve_signals(known, around)[:MOST_AROUND] if around else []
@@ -362,7 +362,9 @@ def read_place(value: Any) -> Place:
     return float(wall_s), int(run_id), float(start_s), str(kind), int(number)
 
 
-def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence[Signal]) -> Event:
+def _with_values(
+    connection: sqlite3.Connection, event: Event, context: Sequence[RegisteredSignal]
+) -> Event:
     if event.count > 1:
         return event
     row = connection.execute(_ROW_AT, (event.start_s, event.run_id)).fetchone()
@@ -470,7 +472,7 @@ def drawn_kinds() -> list[EventKind]:
 # -- many similar events as one: "10 dropouts to 0 m, the first at 3.2 s, ..." ---------------------
 
 
-def grouped(events: Sequence[Event], known: dict[str, Signal]) -> list[Event]:
+def grouped(events: Sequence[Event], known: dict[str, RegisteredSignal]) -> list[Event]:
     """The same events; what the items of an array did at once, and many alike, is one of them.
 
     A group begins with its first event and ends with its last one. Its details say what they are,

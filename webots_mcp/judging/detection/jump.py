@@ -37,7 +37,7 @@ from webots_mcp.judging.detection.kinds import (
 from webots_mcp.judging.detection.search import MOST_NAMED, Search
 from webots_mcp.signals.naming import in_snake_case, listed, metres_in
 from webots_mcp.store.reading.frame import Frame, Zones
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
 MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
@@ -454,7 +454,7 @@ def _longest_period_s(search: Search) -> float:
     return max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
 
 
-def _found(search: Search, signals: Sequence[Signal]) -> Iterator[tuple[str, Swing]]:
+def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tuple[str, Swing]]:
     """The swings of each signal, in the chunks in which it changes."""
     frame, least = search.frame, search.options.min_half_periods
     asked = least, _longest_period_s(search)

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.analysis.summary import LARGEST
-from webots_mcp.analysis.track import PathLength, Track, tracks_of
+from webots_mcp.analysis.track import PathLength, SmoothedTrack, tracks_of
 from webots_mcp.judging.detection.kinds import (
     Event,
     EventKind,
@@ -31,7 +31,7 @@ from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after
-from webots_mcp.store.signals import Signal, roles_of, stored_roles
+from webots_mcp.store.signals import RegisteredSignal, roles_of, stored_roles
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
 TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
@@ -81,30 +81,30 @@ class Motion:
         height: z: a robot that climbs does not stand still.
     """
 
-    position: tuple[Signal, Signal] | None
-    commanded: Signal | None
-    speed: Signal | None
-    mode: Signal | None
-    heading: Signal | None = None
-    wheels: tuple[Signal, ...] = ()
-    height: Signal | None = None
-    wheel_commands: tuple[Signal, ...] = ()
+    position: tuple[RegisteredSignal, RegisteredSignal] | None
+    commanded: RegisteredSignal | None
+    speed: RegisteredSignal | None
+    mode: RegisteredSignal | None
+    heading: RegisteredSignal | None = None
+    wheels: tuple[RegisteredSignal, ...] = ()
+    height: RegisteredSignal | None = None
+    wheel_commands: tuple[RegisteredSignal, ...] = ()
 
     @property
-    def signals(self) -> list[Signal]:
+    def signals(self) -> list[RegisteredSignal]:
         """The signals that are reported with an event."""
         speed = self.commanded or self.speed
         return [*(self.position or ()), *filter(None, (speed, self.mode))]
 
     @property
-    def evidence(self) -> list[Signal]:
+    def evidence(self) -> list[RegisteredSignal]:
         """All of them."""
         others = filter(None, (self.height, self.commanded, self.speed, self.mode, self.heading))
         return [*(self.position or ()), *others, *self.wheels, *self.wheel_commands]
 
 
 def find_motion(
-    known: dict[str, Signal], options: EventOptions, here: Collection[str] | None = None
+    known: dict[str, RegisteredSignal], options: EventOptions, here: Collection[str] | None = None
 ) -> Motion:
     """Find the signals of motion: those that the options name, else those of the roles.
 
@@ -119,7 +119,7 @@ def find_motion(
         InvalidInputError: A name in them means several.
     """
     own = known if here is None else {name: known[name] for name in known if name in here}
-    position: tuple[Signal, Signal] | None = None
+    position: tuple[RegisteredSignal, RegisteredSignal] | None = None
     if options.position is not None:
         x, y = (one_signal(known, each) for each in options.position)
         position = x, y
@@ -127,13 +127,13 @@ def find_motion(
     roles = roles_of(own, names) if names else stored_roles(own)
     signals = {role: own[name] for name, role in roles.items() if name in own}
 
-    def first(role: str, name: str | None = None) -> Signal | None:
+    def first(role: str, name: str | None = None) -> RegisteredSignal | None:
         if name is not None:
             return one_signal(known, name)
         found = first_in(role, signals)
         return signals[found] if found else None
 
-    def wheels(wanted: str) -> tuple[Signal, ...]:
+    def wheels(wanted: str) -> tuple[RegisteredSignal, ...]:
         named = (own[name] for name, role in roles.items() if role == wanted)
         return tuple(wheel for wheel in named if wheel != commanded)
 
@@ -154,17 +154,19 @@ def find_motion(
     )
 
 
-def _pair(signals: dict[str, Signal], place: str | None) -> tuple[Signal, Signal] | None:
+def _pair(
+    signals: dict[str, RegisteredSignal], place: str | None
+) -> tuple[RegisteredSignal, RegisteredSignal] | None:
     return None if place is None else (signals[f"x{place}"], signals[f"y{place}"])
 
 
-def in_metres(signal: Signal, lengths: Array) -> Array:
+def in_metres(signal: RegisteredSignal, lengths: Array) -> Array:
     """Lengths that a signal holds, in metres; they are metres where its name has no unit."""
     factor = metres_in(signal.name)
     return lengths if factor == 1 else lengths * factor
 
 
-def motion_in(frame: Frame, known: dict[str, Signal], options: EventOptions) -> Motion:
+def motion_in(frame: Frame, known: dict[str, RegisteredSignal], options: EventOptions) -> Motion:
     """As `find_motion`, of what is published in a run: others of the robot may have other names.
 
     Args:
@@ -178,7 +180,9 @@ def motion_in(frame: Frame, known: dict[str, Signal], options: EventOptions) -> 
     return find_motion(known, options, here)
 
 
-def doubt_of_unit(position: tuple[Signal, Signal], speed_m_s: float) -> str | None:
+def doubt_of_unit(
+    position: tuple[RegisteredSignal, RegisteredSignal], speed_m_s: float
+) -> str | None:
     """That a position without a unit in its names is hardly in metres; None where it may be."""
     name = position[0].name
     if speed_m_s <= IMPLAUSIBLE_M_S or unit_in(name):
@@ -217,7 +221,9 @@ class RunNoise:
         return self._known[name]
 
 
-def places_in(frame: Frame, position: tuple[Signal, Signal]) -> tuple[Indexes, Array, Array]:
+def places_in(
+    frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal]
+) -> tuple[Indexes, Array, Array]:
     """The rows that have a position, and it in metres."""
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
@@ -225,8 +231,8 @@ def places_in(frame: Frame, position: tuple[Signal, Signal]) -> tuple[Indexes, A
 
 
 def tracks_in(
-    frame: Frame, position: tuple[Signal, Signal], noise: RunNoise
-) -> tuple[list[Track], list[Indexes]]:
+    frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal], noise: RunNoise
+) -> tuple[list[SmoothedTrack], list[Indexes]]:
     """The way of the robot in each stretch without a gap, and the rows of the frame in it."""
     rows, x, y = places_in(frame, position)
     times = frame.times if len(rows) == len(frame) else frame.times[rows]
@@ -394,7 +400,7 @@ class Search:
 
     connection: sqlite3.Connection
     segment: Segment
-    known: dict[str, Signal]
+    known: dict[str, RegisteredSignal]
     kinds: Sequence[EventKind]
     options: EventOptions
     deadline: Deadline
@@ -445,16 +451,16 @@ class Search:
         return motion_in(self.whole, self.known, self.options)
 
     @cached_property
-    def signals(self) -> list[Signal]:
+    def signals(self) -> list[RegisteredSignal]:
         """Those that are looked at."""
         return resolve_signals(self.known, self.options.signals) if self.known else []
 
     @cached_property
-    def numbers(self) -> list[Signal]:
+    def numbers(self) -> list[RegisteredSignal]:
         """Of the signals the numeric ones."""
         return [signal for signal in self.signals if signal.is_number]
 
-    def required_numbers(self) -> list[Signal]:
+    def required_numbers(self) -> list[RegisteredSignal]:
         """The numeric signals.
 
         Raises:
@@ -464,7 +470,7 @@ class Search:
             raise NotSearchableError("no number was published, or none with these names")
         return self.numbers
 
-    def required_quantities(self) -> list[Signal]:
+    def required_quantities(self) -> list[RegisteredSignal]:
         """The numeric signals that are no index of an array.
 
         Raises:
@@ -523,8 +529,8 @@ class Search:
         self.ledger.not_searched(kind, *reasons)
 
     def in_time(
-        self, kind: str, signals: Sequence[Signal], *, judged: bool = True
-    ) -> Iterator[Signal]:
+        self, kind: str, signals: Sequence[RegisteredSignal], *, judged: bool = True
+    ) -> Iterator[RegisteredSignal]:
         """The signals as long as there is time; which of them are not looked at is noted.
 
         Args:
@@ -550,7 +556,7 @@ class Search:
             why = f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
             self.not_searched(kind, why)
 
-    def _is_large(self, signal: Signal) -> bool:
+    def _is_large(self, signal: RegisteredSignal) -> bool:
         zones = self.frame.zones(signal.name)
         spans = zones.spans(zones.value_count < zones.held_count)
         parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)

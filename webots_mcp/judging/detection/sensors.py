@@ -14,7 +14,7 @@ from webots_mcp.analysis.arrays import (
     MOSTLY,
     Array,
     Flags,
-    Run,
+    RowSpan,
     Runs,
     noise_of,
     np,
@@ -27,7 +27,7 @@ from webots_mcp.signals.naming import find_targets, listed
 from webots_mcp.store.reading.catalogue import other_form
 from webots_mcp.store.reading.frame import Frame, Zones
 from webots_mcp.store.reading.segment import just_after
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 LEAST_CHANGES: Final = 10  # of who mostly changes
 FROZEN_SHARE: Final = 0.15  # of `flat_s`: who is noisy otherwise counts from so long on
@@ -53,7 +53,7 @@ def flat_events(search: Search) -> Iterator[Event]:
     flat_s, signals = search.options.flat_s, search.required_quantities()
     least_s = FROZEN_SHARE * flat_s
     resting: dict[str, _Resting] = {}
-    frozen: list[tuple[_Resting, Run]] = []
+    frozen: list[tuple[_Resting, RowSpan]] = []
     for signal in search.in_time("flat", signals):
         zones = (frame.zones(signal.name) for frame in (search.frame, search.whole))
         if not any(changes_in(each) >= LEAST_CHANGES for each in zones):
@@ -89,7 +89,7 @@ def changes_in(zones: Zones) -> int:
     return int(zones.change_count.sum() + over_borders)
 
 
-def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[Run]:
+def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[RowSpan]:
     """Where a signal kept its value for so long.
 
     Opened are only the chunks with so many rows that repeat the one before, and their neighbours.
@@ -104,7 +104,7 @@ def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[Run]:
         part = frame.rows(first, stop)
         numbers = part.numbers(name)
         runs = runs_alike(numbers, part.times)
-        for run in runs.only(runs.durations_s >= least_s).each():
+        for run in runs.only(runs.durations_s >= least_s).spans():
             rows = {"start": first + run.start, "stop": first + run.stop}
             yield run._replace(**rows, value=float(numbers[run.start]))
 
@@ -118,11 +118,11 @@ class _Resting:
     """
 
     search: Search
-    signal: Signal
+    signal: RegisteredSignal
     least_s: float
 
     @cached_property
-    def rests(self) -> list[Run]:
+    def rests(self) -> list[RowSpan]:
         """All of them."""
         return list(find_rests(self.search.frame, self.signal.name, self.least_s))
 
@@ -131,7 +131,7 @@ class _Resting:
         """Values unlike the one before, in all rows."""
         return changes_in(self.search.frame.zones(self.signal.name))
 
-    def changes_but_for(self, rests: Sequence[Run]) -> bool:
+    def changes_but_for(self, rests: Sequence[RowSpan]) -> bool:
         """Whether it changed in most of the rows outside of those rests, and in ten at least.
 
         What goes from one of them right to the next, as a counter does, has not changed otherwise.
@@ -144,7 +144,7 @@ class _Resting:
         changes = self.changes - sum(a.stop == b.start for a, b in pairwise(rests))
         return changes >= max(LEAST_CHANGES, MOSTLY * present * outside)
 
-    def event(self, rest: Run) -> Event:
+    def event(self, rest: RowSpan) -> Event:
         """One of its rests, and what there is to say of it, but that it is frozen."""
         value, why = f"{rest.value:.6g}", self.target_went_on(rest)
         value += f" {self.signal.unit}" if self.signal.unit else ""
@@ -158,13 +158,13 @@ class _Resting:
         details = {"value": rest.value} | ({"says": says} if says else {})
         return self.search.event("flat", rest.start_s, rest.end_s, self.signal.name, **details)
 
-    def note_near(self, rest: Run) -> None:
+    def note_near(self, rest: RowSpan) -> None:
         """It came near to an event."""
         lasted = f"for {rest.duration_s:.3g} s from {rest.start_s:.6g} s"
         what = f"{self.signal.name} stayed at {rest.value:.4g} {lasted}"
         self.search.note_nearest("flat", rest.duration_s / self.search.options.flat_s, what)
 
-    def is_limit(self, rest: Run) -> bool:
+    def is_limit(self, rest: RowSpan) -> bool:
         """Whether it was never beyond the value that it kept, and was there at other times too.
 
         Only then it is where a sensor ends, or what a gate lets through: what counts or creeps is
@@ -172,7 +172,7 @@ class _Resting:
         """
         return rest.value in self._extremes(self.signal) and self._rows_elsewhere(rest) > 0
 
-    def target_went_on(self, rest: Run) -> str | None:
+    def target_went_on(self, rest: RowSpan) -> str | None:
         """Whether its target moved, or it was commanded to move, while it stayed; None if neither.
 
         For a position in the plane `stuck` reports that.
@@ -190,7 +190,7 @@ class _Resting:
             return f"{speed.name} was {float(np.median(nonzero)):.4g}"
         return None
 
-    def _rows_elsewhere(self, rest: Run) -> int:
+    def _rows_elsewhere(self, rest: RowSpan) -> int:
         """How many other rows of the run have the same value."""
         first = int(np.searchsorted(self._sorted, rest.value))
         return (
@@ -207,7 +207,7 @@ class _Resting:
         return values
 
     @cached_property
-    def _targets(self) -> tuple[Signal | None, Signal | None]:
+    def _targets(self) -> tuple[RegisteredSignal | None, RegisteredSignal | None]:
         """Its target, and its commanded speed; of a position in the plane none."""
         known = self.search.known
         if self.signal in (self.search.motion.position or ()):
@@ -216,20 +216,20 @@ class _Resting:
         target, speed = find_targets(self.signal.name, numbers)
         return known.get(target or ""), known.get(speed or "")
 
-    def _values(self, signal: Signal | None, rest: Run) -> Array:
+    def _values(self, signal: RegisteredSignal | None, rest: RowSpan) -> Array:
         """The numbers of a signal in a rest, which may be none of those that are looked at."""
         if signal is None:
             return np.zeros(0)
         end_s = min(just_after(rest.end_s), rest.start_s + LONGEST_READ_S)
         return self.search.frame.between(rest.start_s, end_s).usable(signal.name)[1]
 
-    def _extremes(self, signal: Signal) -> tuple[float, float]:
+    def _extremes(self, signal: RegisteredSignal) -> tuple[float, float]:
         """Of the whole run."""
         zones = self.search.whole.zones(signal.name)
         low, high = (each[~np.isnan(each)] for each in (zones.min, zones.max))
         return float(low.min(initial=np.inf)), float(high.max(initial=-np.inf))
 
-    def frozen(self, rests: Sequence[Run]) -> list[Run]:
+    def frozen(self, rests: Sequence[RowSpan]) -> list[RowSpan]:
         """Of some rests those that noise never makes, if it is noisy but for them."""
         motion = self.search.motion
         if self.signal in (motion.commanded, motion.speed, *motion.wheels):
@@ -240,7 +240,7 @@ class _Resting:
         once = [rest for rest in held if keys.count(rest.value) == 1 and rest.value != 0]
         return [rest for rest in once if self._is_frozen(rest, held)]
 
-    def _is_frozen(self, rest: Run, held: Sequence[Run]) -> bool:
+    def _is_frozen(self, rest: RowSpan, held: Sequence[RowSpan]) -> bool:
         """Whether the rows around it are noisy, and beyond its value on both sides.
 
         The lowest or the highest of all is where a sensor ends.
@@ -280,7 +280,9 @@ def is_lively(run: Frame, name: str) -> bool:
     return False
 
 
-def _rests_with_others(signal: Signal, rest: Run, resting: dict[str, _Resting]) -> bool:
+def _rests_with_others(
+    signal: RegisteredSignal, rest: RowSpan, resting: dict[str, _Resting]
+) -> bool:
     """Whether something else holds one value for most of that time: then the robot rests.
 
     What never changes, or is at its limit, is no sign of that; and the items of an array freeze
@@ -325,13 +327,13 @@ def missing_events(search: Search) -> Iterator[Event]:
         if not len(runs):
             continue
         least_s = _least_silence_s(search, signal, runs)
-        for run in runs.only(runs.durations_s >= least_s).each():
+        for run in runs.only(runs.durations_s >= least_s).spans():
             replaced = search.frame.rows(run.start, run.start + 1).replaced(signal.name)
             details = {"value": next(iter(replaced))} if replaced else {}
             yield search.event("missing", run.start_s, run.end_s, signal.name, **details)
         short = runs.only((runs.durations_s > 0) & (runs.durations_s < least_s))
         if len(short):
-            longest = max(short.each(), key=lambda run: run.duration_s)
+            longest = max(short.spans(), key=lambda run: run.duration_s)
             span = f"for {longest.duration_s:.3g} s from {longest.start_s:.6g} s"
             share = longest.duration_s / least_s
             search.note_nearest("missing", share, f"{signal.name} had no value {span}")
@@ -346,7 +348,7 @@ def missing_events(search: Search) -> Iterator[Event]:
         search.ledger.note_of_run(search.segment.run_id, note)
 
 
-def _silences(search: Search, signal: Signal) -> Runs:
+def _silences(search: Search, signal: RegisteredSignal) -> Runs:
     """Where neither the signal has a value nor its array in its other form, long or short."""
     frame, other = search.frame, other_form(search.known, signal)
     signals = [each for each in (signal, other) if each]
@@ -371,7 +373,7 @@ def rows_without_value(frame: Frame, name: str) -> Flags | None:
     return lacks
 
 
-def _have_begun(search: Search, signals: Sequence[Signal], runs: Runs) -> Flags:
+def _have_begun(search: Search, signals: Sequence[RegisteredSignal], runs: Runs) -> Flags:
     """What had no value before its first one was not there yet; that is no silence."""
     begun = (runs.starts_s > search.began_s) & (signals[0].kind != "null")
     if len(runs) and begun[0] and runs.starts[0] == 0:
@@ -380,7 +382,7 @@ def _have_begun(search: Search, signals: Sequence[Signal], runs: Runs) -> Flags:
     return begun
 
 
-def _are_shorter(search: Search, signal: Signal, runs: Runs) -> Flags:
+def _are_shorter(search: Search, signal: RegisteredSignal, runs: Runs) -> Flags:
     """Whether the array was there when it began, but so short or long that it has no such item.
 
     A long one is reduced; whose items are all replaced (a lidar that sees nothing) has no number.
@@ -392,7 +394,7 @@ def _are_shorter(search: Search, signal: Signal, runs: Runs) -> Flags:
     return others[runs.starts] & ~frame.held(signal.name)[runs.starts]
 
 
-def _least_silence_s(search: Search, signal: Signal, runs: Runs) -> float:
+def _least_silence_s(search: Search, signal: RegisteredSignal, runs: Runs) -> float:
     """Longer for an intermittent signal: three times its usual interval between values."""
     least_s = search.options.missing_s
     zones = search.frame.zones(signal.name)

@@ -15,7 +15,7 @@ from webots_mcp.analysis.standstill import (
     find_standstills,
     shortest_seen_s,
 )
-from webots_mcp.analysis.track import Track, track_of
+from webots_mcp.analysis.track import SmoothedTrack, track_of
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
@@ -491,7 +491,7 @@ def _batches(places: Sequence[Place]) -> Iterator[Sequence[Place]]:
             start, rows = at + 1, 0
 
 
-def _places(track: Track, rows: Indexes, frame: Frame, search: Search) -> Iterator[Place]:
+def _places(track: SmoothedTrack, rows: Indexes, frame: Frame, search: Search) -> Iterator[Place]:
     """The standstills of a track, in parts where it climbs or sinks in between."""
     motion, options = search.motion, search.options
     limits = options.stuck_m, options.stuck_s
@@ -507,7 +507,7 @@ def _places(track: Track, rows: Indexes, frame: Frame, search: Search) -> Iterat
 
 
 def _at_one_height(
-    track: Track, heights: Array, first: int, options: EventOptions
+    track: SmoothedTrack, heights: Array, first: int, options: EventOptions
 ) -> Iterator[tuple[int, int]]:
     """The rows of a standstill, from `first` on, in which it neither climbs nor sinks.
 
@@ -525,7 +525,7 @@ def _at_one_height(
         yield first + int(there[each.start]), first + int(there[each.last]) + 1
 
 
-def _nearest(tracks: Sequence[Track], search: Search) -> tuple[float, str] | None:
+def _nearest(tracks: Sequence[SmoothedTrack], search: Search) -> tuple[float, str] | None:
     """The longest time for which it stood, else its smallest movement in the shortest one."""
     least_s, deadline = search.options.stuck_s, search.deadline
     limits = search.options.stuck_m, least_s / SHORTEST_SHARE

@@ -40,8 +40,8 @@ from webots_mcp.steering.trial_run import (
     webots,
 )
 from webots_mcp.store.merging import pack, unpack
-from webots_mcp.store.parameters import Result
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.parameters import TrialResult
+from webots_mcp.store.recording import RecordingAccess
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000
@@ -95,7 +95,7 @@ class TrialReturn(NamedTuple):
         shipped: UUID of the recording, if it was shipped.
     """
 
-    result: Result
+    result: TrialResult
     recording: bytes | None = None
     shipped: str | None = None
 
@@ -183,7 +183,7 @@ def _note_nothing(pid: int | None) -> None:
     """Store no process id: the caller cannot end a process of this machine."""
 
 
-def packed(result: Result, folder: Path) -> TrialReturn:
+def packed(result: TrialResult, folder: Path) -> TrialReturn:
     """Return a result with its recording, or with an error if that is too large."""
     bundle = folder.parent / _BUNDLE
     pack(folder, bundle)
@@ -202,7 +202,7 @@ def _shipped(folder: Path, url: str) -> str:
     from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
     from webots_mcp.plugins.pool.shipping_source import ShippingSource
 
-    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
     ship(
         ShippingJob(recording, partial(open_pool, url, ships=True), full=True, pictures=True),
         ShippingReport(),
@@ -282,7 +282,7 @@ class ClusterSimulators:
             raise CommandRefusedError(_no_workers(self._address, "any more"))
         return max(1, min(self._count, self._most or self._count))
 
-    def run(self, attempt: TrialAttempt) -> Result:
+    def run(self, attempt: TrialAttempt) -> TrialResult:
         """Run a trial; see `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text
@@ -301,13 +301,13 @@ class ClusterSimulators:
             bundle.unlink()
         return returned.result
 
-    def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
+    def _fetched(self, result: TrialResult, recording_uuid: str, folder: Path) -> TrialResult:
         """Fetch a shipped recording into the folder; return the result with the run's id there."""
         from webots_mcp.plugins.pool.fetching import fetch
         from webots_mcp.plugins.pool.pool_contents import ChosenRuns, pooled_runs
 
         assert self._needs.ship_to is not None
-        recording = Recording(folder / DATABASE_NAME, folder)
+        recording = RecordingAccess(folder / DATABASE_NAME, folder)
         recording.create()
         with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
             runs = [each for each in pooled_runs(pool) if each.recording_uuid == recording_uuid]
@@ -325,7 +325,7 @@ class ClusterSimulators:
                 f"{error.allowed_failures + 1} workers died while they ran it, the last one "
                 f"{error.last_worker.address}: see their logs"
             )
-            return TrialReturn(Result(None, None, why))
+            return TrialReturn(TrialResult(None, None, why))
         except CancelledError as error:
             raise CommandRefusedError(_LOST.format(self._address)) from error
         except WebotsMCPError:

@@ -26,7 +26,7 @@ from webots_mcp.database.liveness import give_back, holder_of, lease_of, process
 from webots_mcp.errors import CommandRefusedError, NothingRecordedError, WebotsMCPError
 from webots_mcp.extras.requirements import quoted
 from webots_mcp.setup.client_entries import server_command
-from webots_mcp.store.recording import Job, Recording
+from webots_mcp.store.recording import Job, RecordingAccess
 
 if TYPE_CHECKING:
     from mcp import Client
@@ -125,7 +125,7 @@ def run(
     from webots_mcp.standin import Simulation
     from webots_mcp.standin.in_process import DEFAULT_WORLD
 
-    recording = Recording(data_dir / DATABASE_NAME, data_dir)
+    recording = RecordingAccess(data_dir / DATABASE_NAME, data_dir)
     recording.create()  # Raises for an unusable folder, for which a robot would only wait.
     shown = contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout)
     environment = {DATA_DIR_VARIABLE: str(data_dir)}
@@ -145,7 +145,7 @@ def run(
 
 
 @contextlib.contextmanager
-def _alone(recording: Recording) -> Generator[None]:
+def _alone(recording: RecordingAccess) -> Generator[None]:
     """Prevent a second demo in the same folder, whose robot would mix with this one.
 
     Raises:

@@ -20,14 +20,14 @@ from webots_mcp.store.export import (
     CHUNK_ROWS,
     Progress,
     Recorded,
-    Source,
+    StateTable,
 )
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Segment
-from webots_mcp.store.run_rows import MAX_FILE_BYTES, Event, StoredImage, columns_of
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.run_rows import MAX_FILE_BYTES, EventRecord, StoredImage, columns_of
+from webots_mcp.store.signals import RegisteredSignal
 
 # What is counted, in the order in which it is reported.
 KINDS: Final = (
@@ -113,8 +113,8 @@ class SampledPath:
             self._every *= 2
 
 
-Item: TypeAlias = "Recorded | LogLine | Event | PlacedCommand | StoredImage"
-_Row = TypeVar("_Row", LogLine, Event, StoredImage)
+Item: TypeAlias = "Recorded | LogLine | EventRecord | PlacedCommand | StoredImage"
+_Row = TypeVar("_Row", LogLine, EventRecord, StoredImage)
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Contents:
     connection: sqlite3.Connection
     data_dir: Path
     wanted: TimeRange
-    source: Source
+    source: StateTable
 
     @classmethod
     def of(
@@ -136,7 +136,7 @@ class Contents:
         progress: Progress | None,
     ) -> Contents:
         """Return the contents of a range, whose states will be read `passes` times."""
-        source = Source.of(connection, wanted.segments, passes, progress)
+        source = StateTable.of(connection, wanted.segments, passes, progress)
         return cls(connection, data_dir, wanted, source)
 
     @property
@@ -145,7 +145,7 @@ class Contents:
         return [segment.run_id for segment in self.wanted.segments]
 
     @cached_property
-    def signals(self) -> dict[str, Signal]:
+    def signals(self) -> dict[str, RegisteredSignal]:
         """Return all signals of the robot, by name."""
         return known_signals(self.connection, self.wanted)
 
@@ -169,9 +169,9 @@ class Contents:
         """Yield the log lines of the runs."""
         return self._pages("log", LogLine)
 
-    def events(self) -> Iterator[Event]:
+    def events(self) -> Iterator[EventRecord]:
         """Yield the events that the bridge stored."""
-        return self._pages("event", Event)
+        return self._pages("event", EventRecord)
 
     def images(self) -> Iterator[StoredImage]:
         """Yield the rows of pictures, whether or not their files still exist."""
@@ -232,16 +232,18 @@ def _bounds(segment: Segment) -> dict[str, Any]:
     }
 
 
-def _number(value_of: Callable[[str], Any], signal: Signal, factor: float) -> float | None:
+def _number(
+    value_of: Callable[[str], Any], signal: RegisteredSignal, factor: float
+) -> float | None:
     value = value_of(signal.name)
     if isinstance(value, (int, float)) and abs(value) <= FARTHEST_M:
         return value * factor
     return None
 
 
-def _metres(value_of: Callable[[str], Any], signal: Signal) -> float | None:
+def _metres(value_of: Callable[[str], Any], signal: RegisteredSignal) -> float | None:
     return _number(value_of, signal, metres_in(signal.name))
 
 
-def _radians(value_of: Callable[[str], Any], heading: Signal) -> float:
+def _radians(value_of: Callable[[str], Any], heading: RegisteredSignal) -> float:
     return _number(value_of, heading, math.tau / (heading.turn or math.tau)) or 0.0

@@ -30,7 +30,7 @@ from webots_mcp.store.chunks import parse
 from webots_mcp.store.export import Exported, Progress, Recorded, json_text, value_at
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.run_rows import Event, StoredImage
+from webots_mcp.store.run_rows import EventRecord, StoredImage
 
 _PROFILE: Final = ""  # No middleware.
 _LEVELS: Final = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
@@ -120,7 +120,7 @@ class _McapWriter:
         self._encode(item, "log", "foxglove.Log", message)
 
     @write.register
-    def _(self, item: Event) -> None:
+    def _(self, item: EventRecord) -> None:
         self.counts["events"] += 1
         message = {"kind": item.kind, "name": item.name, "data": item.details()}
         self._encode(item, "events", "webots_mcp.Event", message)

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from webots_mcp.plugins.formats.contents import Contents
 from webots_mcp.plugins.formats.mcap_topics import WORLD_FRAME, Topics
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 # Message paths without quotes. Signals with other paths have to be plotted by hand.
 _PLAIN_PATH: Final = re.compile(r"\$(\.[A-Za-z_]\w*|\[\d+\])+")
@@ -48,7 +48,7 @@ def layout(contents: Contents) -> dict[str, Any]:
     }
 
 
-def main_signals(contents: Contents) -> list[Signal]:
+def main_signals(contents: Contents) -> list[RegisteredSignal]:
     """Return the signals of the robot's motion, else the first numbers that it published."""
     numbers = [signal for signal in contents.signals.values() if signal.kind in ("num", "angle")]
     moving = [signal for signal in contents.motion.evidence if signal in numbers]
@@ -67,7 +67,7 @@ def _add_signals(panels: dict[str, dict[str, Any]], contents: Contents, topics: 
             panels[name] = {"paths": paths, "isSynced": True}
 
 
-def _paths(contents: Contents, topics: Topics, signal: Signal) -> list[dict[str, Any]]:
+def _paths(contents: Contents, topics: Topics, signal: RegisteredSignal) -> list[dict[str, Any]]:
     if signal.reduction or not _PLAIN_PATH.fullmatch(signal.path):
         return []
     return [

@@ -11,20 +11,20 @@ from typing import Any, BinaryIO, Final
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import install_line
-from webots_mcp.store.chunk_table import Cells
+from webots_mcp.store.chunk_table import ColumnCells
 from webots_mcp.store.export import (
     Column,
     ColumnKind,
-    Row,
-    Source,
-    Table,
+    ExportTable,
+    FlatRow,
+    StateTable,
     as_text,
 )
 
 _GROUP_ROWS: Final = 10_000  # About 10 MB of rows in memory at a time.
 
 
-def write_parquet(source: Table, sink: BinaryIO) -> None:
+def write_parquet(source: ExportTable, sink: BinaryIO) -> None:
     """Write one column per dotted name: int64, double (NaN for invalid numbers), bool or text.
 
     A long array of numbers is a list of doubles. A column of several types is text.
@@ -33,7 +33,7 @@ def write_parquet(source: Table, sink: BinaryIO) -> None:
         InvalidInputError: pyarrow is not installed.
     """
     arrow, parquet = _pyarrow()
-    by_column = source.by_column() if isinstance(source, Source) else None
+    by_column = source.by_column() if isinstance(source, StateTable) else None
     columns = [each for _, each in by_column.columns] if by_column else source.columns()
     types = {
         "null": arrow.null(), "bool": arrow.bool_(), "int": arrow.int64(),
@@ -64,7 +64,7 @@ def _pyarrow() -> tuple[Any, Any]:
         ) from error
 
 
-def _array(arrow: Any, cells: Cells, column: Column) -> Any:
+def _array(arrow: Any, cells: ColumnCells, column: Column) -> Any:
     """Return the cells of a column as an Arrow array."""
     if column.kind == "null":
         return arrow.nulls(len(cells.is_null))
@@ -75,7 +75,7 @@ def _array(arrow: Any, cells: Cells, column: Column) -> Any:
     return arrow.array(cells.values, mask=cells.is_null)
 
 
-def _values(group: list[Row], column: Column) -> list[Any]:
+def _values(group: list[FlatRow], column: Column) -> list[Any]:
     convert = _CONVERSIONS.get(column.kind)
     values = [row.values.get(column.name) for row in group]
     return values if convert is None else [v if v is None else convert(v) for v in values]

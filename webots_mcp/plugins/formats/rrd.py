@@ -37,16 +37,16 @@ from webots_mcp.plugins.formats.contents import (
 from webots_mcp.plugins.formats.mcap_layout import main_signals
 from webots_mcp.store.export import (
     Exported,
+    FlatRow,
     Progress,
     Recorded,
-    Row,
     as_text,
     flat_row,
     kind_of,
 )
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.run_rows import Event
+from webots_mcp.store.run_rows import EventRecord
 
 _COPY_BYTES: Final = 1 << 16
 _GROUP_ROWS: Final = 10_000  # About 10 MB of rows in memory at a time.
@@ -239,7 +239,7 @@ class _RerunWriter:
                 self._stream.log(f"{self._frame(run_id)}_way", line, static=True)
 
     def _write_group(
-        self, run_id: int, group: Sequence[Recorded], rows: Sequence[Row], path: SampledPath
+        self, run_id: int, group: Sequence[Recorded], rows: Sequence[FlatRow], path: SampledPath
     ) -> None:
         numbers, texts = dict[str, list[tuple[int, Any]]](), dict[str, list[tuple[int, str]]]()
         poses: list[tuple[int, Pose]] = []
@@ -369,7 +369,7 @@ def _log_text(line: LogLine) -> tuple[str, str]:
     return f"[{who}] {line.message}", _LEVELS.get(line.level, line.level.upper())
 
 
-def _event_text(event: Event) -> tuple[str, str]:
+def _event_text(event: EventRecord) -> tuple[str, str]:
     return " ".join(filter(None, (event.kind, event.name, event.data))), "INFO"
 
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.store.chunk_making import make_missing_chunks
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 _PERIOD_S: Final = 1.0
 
@@ -23,7 +23,7 @@ class ChunkMaker(threading.Thread):
         rounds: How often it has put all rows into chunks.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingAccess) -> None:
         super().__init__(name="webots-mcp page", daemon=True)
         self._recording = recording
         self._ending = threading.Event()

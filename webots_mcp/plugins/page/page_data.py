@@ -32,11 +32,11 @@ from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
+from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
-from webots_mcp.store.recording import Recording, View, view_of
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robots import RUNNING, list_robots, nothing_recorded, without_observers
 from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
 from webots_mcp.store.runs import RunInfo, list_runs
@@ -145,7 +145,9 @@ def page_request(asked: Mapping[str, str]) -> PageRequest:
         raise InvalidInputError(f"the page asked for what cannot be read: {error}") from error
 
 
-def robot_status(recording: Recording, request: PageRequest, *, steers: bool) -> dict[str, Any]:
+def robot_status(
+    recording: RecordingAccess, request: PageRequest, *, steers: bool
+) -> dict[str, Any]:
     """Return the status of the chosen robot and run, and the choices that there are.
 
     Raises:
@@ -157,7 +159,7 @@ def robot_status(recording: Recording, request: PageRequest, *, steers: bool) ->
         run, header = view.run, view.header()
         is_newest = run == current_run(connection, view.robot.id)
         image = newest_image(connection, run.id) if run else None
-        asked = LogFilter(run.id if run else None, Window(-math.inf, math.inf),
+        asked = LogFilter(run.id if run else None, LogWindow(-math.inf, math.inf),
                           robot_id=view.robot.id)  # fmt: skip
         runs = list_runs(connection, robot=view.robot.name, limit=_LIMITS.runs).runs
         settable = steers and is_newest
@@ -178,7 +180,7 @@ def robot_status(recording: Recording, request: PageRequest, *, steers: bool) ->
         }
 
 
-def _view(connection: sqlite3.Connection, request: PageRequest) -> View:
+def _view(connection: sqlite3.Connection, request: PageRequest) -> RobotView:
     now_s = time.time()
     robots = without_observers(list_robots(connection, now_s))
     if not robots:
@@ -226,7 +228,7 @@ def run_title(run: RunInfo) -> str:
     return f"run {run.run_id}{label} · {began} · {run.duration_s:.1f} s"
 
 
-def _with_outcomes(recording: Recording, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
+def _with_outcomes(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
     """Return the runs to choose from; ended runs with a mark of the outcome of their check."""
     choices: list[dict[str, Any]] = []
     marked = 0
@@ -243,7 +245,7 @@ def _with_outcomes(recording: Recording, runs: Sequence[RunInfo]) -> list[dict[s
     return choices
 
 
-def _check(recording: Recording, key: tuple[str, int, float]) -> None:
+def _check(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
     """Check a run. A run that cannot be read now is checked with a later request."""
     try:
         with recording.reader() as connection:
@@ -275,7 +277,7 @@ def _bound(value: float | None) -> str:
     return "any" if value is None else f"{value:g}"
 
 
-def picture(recording: Recording, request: PageRequest) -> dict[str, Any]:
+def picture(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
     """Return the newest picture of a run as a data URI, and its caption."""
     with recording.reader() as connection:
         run = _view(connection, request).run
@@ -299,7 +301,7 @@ def _as_jpeg(file: Path) -> bytes:
     return buffer.getvalue()
 
 
-def draw(recording: Recording, request: PageRequest) -> dict[str, Any]:
+def draw(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
     """Return the figures of a run as markup, None where there is nothing to draw, and notes."""
     with recording.reader() as connection:
         view = _view(connection, request)

@@ -28,7 +28,7 @@ from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.page_data import draw, page_request, picture, problem, robot_status
 from webots_mcp.plugins.page.steering import steer, tune
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, recording: Recording, port: int, *, read_only: bool) -> None:
+    def __init__(self, recording: RecordingAccess, port: int, *, read_only: bool) -> None:
         super().__init__((HOST, port), _Request)
         self.recording, self.read_only = recording, read_only
         self.steered = replace(recording, read_only=False)
@@ -178,7 +178,9 @@ class PageServer(ThreadingHTTPServer):
             _log.error("the page cannot show all", exc_info=error)
 
 
-def create_page_server(recording: Recording, port: int, *, read_only: bool = False) -> PageServer:
+def create_page_server(
+    recording: RecordingAccess, port: int, *, read_only: bool = False
+) -> PageServer:
     """Make a server of the page of a recording, which need not exist yet.
 
     Args:

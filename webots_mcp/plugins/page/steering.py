@@ -15,7 +15,7 @@ from webots_mcp.signals.parameter import Value
 from webots_mcp.simulator.orders import Order
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import OpenRequest, Requester
 
 _WAIT_S: Final = 10.0
@@ -23,7 +23,7 @@ _WAIT_S: Final = 10.0
 _BY_PAGE: Final = Requester("webots-mcp view", VERSION, "page")
 
 
-def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
+def steer(recording: RecordingAccess, robot: str, order: Order) -> dict[str, Any]:
     """Send an order to the simulation of a robot; return the outcome in words."""
     params = {"steps": 1} if order == "step" else {}
     dispatcher = Dispatcher(recording, _silent)
@@ -33,7 +33,7 @@ def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
     return _carry_out(order, attempt.steer, request)
 
 
-def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str, Any]:
+def tune(recording: RecordingAccess, robot: str, name: str, value: Value) -> dict[str, Any]:
     """Set one parameter of a robot's controller; return the outcome in words."""
     setting = partial(
         set_parameters, recording, _silent, {name: value}, robot=robot, timeout_s=_WAIT_S

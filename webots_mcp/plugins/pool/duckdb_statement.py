@@ -30,7 +30,7 @@ from webots_mcp.store.sql import (
     MAX_TEXT,
     Budget,
     Cell,
-    Result,
+    SqlResult,
     Statement,
     decode,
     fetch_rows,
@@ -59,7 +59,7 @@ _AS_THEY_ARE: Final = re.compile("BOOLEAN|U?(TINY|SMALL|BIG|HUGE)INT|U?INTEGER|F
 _TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR", bytes: "BLOB"}
 
 
-def ask(url: str, sql: str, max_rows: int) -> Result:
+def ask(url: str, sql: str, max_rows: int) -> SqlResult:
     """Return the first rows of one SELECT over the pool.
 
     Raises:
@@ -97,7 +97,7 @@ def _resident_bytes(pid: int) -> int:
         return 0
 
 
-def select(storage: Storage, sql: str, max_rows: int) -> Result:
+def select(storage: Storage, sql: str, max_rows: int) -> SqlResult:
     """Return the same as `ask`, within this process and without a deadline."""
     duckdb = package("duckdb")
     threads = min(_MOST_THREADS, os.cpu_count() or 1)
@@ -117,7 +117,7 @@ def select(storage: Storage, sql: str, max_rows: int) -> Result:
             raise InvalidInputError(f"DuckDB says: {error}") from error
 
 
-def answered(names: Sequence[str], rows: Sequence[Sequence[Any]], max_rows: int) -> Result:
+def answered(names: Sequence[str], rows: Sequence[Sequence[Any]], max_rows: int) -> SqlResult:
     """Return the first rows, with long values cut.
 
     Args:
@@ -135,7 +135,7 @@ def answered(names: Sequence[str], rows: Sequence[Sequence[Any]], max_rows: int)
     budget, taken = Budget(MAX_BYTES), list[tuple[Cell, ...]]()
     why = fetch_rows((map(_cut, row) for row in rows), taken, max_rows, budget)
     shortened = sum(value is not _cut(value) for row in rows[: len(taken)] for value in row)
-    return Result(tuple(names), tuple(taken), why, shortened)
+    return SqlResult(tuple(names), tuple(taken), why, shortened)
 
 
 def _cut(value: Any) -> Any:
@@ -210,7 +210,7 @@ def _only_select(duckdb: Any, connection: Any, sql: str) -> str:
     return str(statements[0].query).rstrip().rstrip(";")
 
 
-def _ask(asked: Statement) -> Result:
+def _ask(asked: Statement) -> SqlResult:
     package("duckdb")  # Its own memory does not count.
     if sys.platform == "linux":
         import resource

@@ -49,7 +49,7 @@ from webots_mcp.plugins.pool.pool_interface import (
 from webots_mcp.plugins.pool.shipping_lease import ShippingLease
 from webots_mcp.plugins.pool.storage import Storage, package
 from webots_mcp.plugins.pool.value_columns import NameAndKind, chunks_of, columns_of
-from webots_mcp.store.sql import Result
+from webots_mcp.store.sql import SqlResult
 
 # A part is closed when its file or its rows in memory are large, or when additions are so small in
 # comparison that rewriting the file costs too much.
@@ -282,7 +282,7 @@ class ParquetPool:
         """Return a picture by the path in its row; None if it was not shipped."""
         return self._storage.read(f"{folder_of(recording_uuid)}/{picture_file(path)}")
 
-    def select(self, sql: str, max_rows: int) -> Result:
+    def select(self, sql: str, max_rows: int) -> SqlResult:
         """Return the first rows of one SELECT of DuckDB.
 
         Raises:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from webots_mcp.plugins.pool.fetching import FetchResult
     from webots_mcp.plugins.pool.pool_interface import Pool
     from webots_mcp.plugins.pool.shipping import ShippingReport
-    from webots_mcp.store.sql import Result
+    from webots_mcp.store.sql import SqlResult
 
 _MOST_NAMED: Final = 3
 _SHORT: Final = 8  # Characters of a UUID that tell it from others.
@@ -214,7 +214,7 @@ def _listed(pool: Pool, part: str, choice: RunFilter) -> _List:
     return _List("runs", runs, columns, rows)
 
 
-def _print_answer(answer: Result) -> None:
+def _print_answer(answer: SqlResult) -> None:
     rows = [["NULL" if cell is None else cell for cell in row] for row in answer.rows]
     print_table(answer.columns, rows)
     cut = f"{answer.shortened} long values are cut" if answer.shortened else None

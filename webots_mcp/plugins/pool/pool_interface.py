@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.store.sql import Result
+    from webots_mcp.store.sql import SqlResult
 
 SQLValue: TypeAlias = "int | float | str | bytes | None"
 ValueType: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
@@ -32,8 +32,9 @@ CHUNKS: Final = ("row_group", "chunk")
 # Tables of one machine or moment, which are not shipped: leases, retention, console lines that wait
 # to become log lines, and requests.
 _LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "request")
-# Columns that are not shipped: about rows that wait for chunks and about space on the disk.
+# Columns that are not shipped: about ids, rows that wait for chunks and space on the disk.
 _LOCAL_COLUMNS: Final = {
+    "recording": ("reserved_state_id",),
     "run": ("is_chunked",),
     "command": ("request_id",),
     "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
@@ -323,7 +324,7 @@ class Pool(Protocol):
         """Return a picture by the path in its row; None if it was not shipped."""
         ...
 
-    def select(self, sql: str, max_rows: int) -> Result:
+    def select(self, sql: str, max_rows: int) -> SqlResult:
         """Return the first rows of one SELECT, which cannot write and has a deadline."""
         ...
 

@@ -33,7 +33,7 @@ from webots_mcp.plugins.pool.pool_interface import (
 )
 from webots_mcp.plugins.pool.postgres_connection import Connection, clear_errors, connect, one_line
 from webots_mcp.plugins.pool.postgres_schema import OWNER, prepare, require_current
-from webots_mcp.store.sql import Result, require_max_rows
+from webots_mcp.store.sql import SqlResult, require_max_rows
 
 SELECT_S: Final = 60
 """Time limit of a SELECT."""
@@ -134,7 +134,7 @@ class PostgresPool:
         found = list(self._asked(query, (recording_uuid, path)))
         return bytes(found[0][0]) if found else None
 
-    def select(self, sql: str, max_rows: int) -> Result:
+    def select(self, sql: str, max_rows: int) -> SqlResult:
         """Return the first rows of one SELECT.
 
         Raises:

@@ -49,7 +49,7 @@ from webots_mcp.plugins.pool.shipping_source import UNCHECKED, ShippingSource, d
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.chunks import reached
 from webots_mcp.store.merging import settled
-from webots_mcp.store.recording import Recording, name_of
+from webots_mcp.store.recording import RecordingAccess, name_of
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
 
@@ -82,9 +82,11 @@ _LIMITS: Final = _ShippingLimits()
 # Names in the progress: the last shipped picture file, and the last state of a full-rate segment.
 _PICTURE: Final = "picture"
 _STRETCH: Final = "kept_stretch/"
+# The highest id that a table ever used.
 _SEQUENCE: Final = (
-    "SELECT max((SELECT coalesce(max(id), 0) FROM {}), "
-    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = '{}'))"
+    "SELECT max((SELECT coalesce(max(id), 0) FROM {0}), iif('{0}' = 'state', "
+    "(SELECT reserved_state_id FROM recording), "
+    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = '{0}')))"
 )
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {}"
 # The last group before the first incomplete one: groups with lower ids are not checked again.
@@ -120,7 +122,7 @@ class ShippingJob:
         pictures: Whether to ship the files of pictures as well.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     open_pool: Callable[[], Pool]
     full: bool = False
     pictures: bool = False
@@ -345,7 +347,7 @@ class Shipper:
             return
         ended = [each for each in source.ended_runs() if not is_whole(self._progress, each)]
         try:
-            with Recording(database, database.parent).writer() as connection:
+            with RecordingAccess(database, database.parent).writer() as connection:
                 while not make_chunks(connection, pause_s=_LIMITS.pause_s).done:
                     pass
                 for run_id in ended:
@@ -374,7 +376,7 @@ class Shipper:
             before = self._progress.get(f"{each.name}.check", UNCHECKED)
             now = source.fingerprint(each, known)
             is_other = before != now and UNCHECKED not in (before, now)
-            if source.number(_SEQUENCE.format(each.name, each.name)) < known or is_other:
+            if source.number(_SEQUENCE.format(each.name)) < known or is_other:
                 raise PoolError(
                     f"the recording {self._uuid} is not the one that was shipped to {self.address} "
                     f"before: its table {each.name!r} is not the same up to row {known}. It is an "
@@ -417,21 +419,14 @@ class Shipper:
 
         Rows are compared in groups of ids, those of a table without ids all at once.
         """
-        last = self._progress.get(each.name, 0)
+        last, count = self._progress.get(each.name, 0), _LIMITS.compared_rows
         parts, where = range(1), "? = ?"
         if each.key == ("id",):
             newest = source.number(_LAST.format(each.name))
-            parts = range(
-                (0 if thorough else last) // _LIMITS.compared_rows,
-                newest // _LIMITS.compared_rows + 1,
-            )
+            parts = range((0 if thorough else last) // count, newest // count + 1)
             where = "id >= ? AND id < ?"
         for part in parts:
-            bounds = (
-                (part * _LIMITS.compared_rows, (part + 1) * _LIMITS.compared_rows)
-                if each.key == ("id",)
-                else (0, 0)
-            )
+            bounds = (part * count, (part + 1) * count) if each.key == ("id",) else (0, 0)
             rows = source.rows(each, where, *bounds)
             name, value = f"{each.name}:{part}", digest_of_rows(rows)
             if rows and self._progress.get(name) != value:

@@ -26,7 +26,7 @@ from webots_mcp.store.chunks import (
     WALL_TIMES,
     DamagedChunkError,
     Decoded,
-    Encoded,
+    EncodedChunk,
     Replaced,
     decode,
     pack,
@@ -79,7 +79,7 @@ def _decoded(chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]) -> 
 
     def values_of(chunk: Mapping[str, Any]) -> Decoded | None:
         try:
-            return decode(Encoded(*(chunk[name] for name in Encoded._fields)), rows)
+            return decode(EncodedChunk(*(chunk[name] for name in EncodedChunk._fields)), rows)
         except DamagedChunkError:
             altered["damaged chunk"] += 1
         if chunk["signal_id"] <= SIM_TIMES:

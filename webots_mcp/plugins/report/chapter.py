@@ -31,11 +31,18 @@ from webots_mcp.plugins.report.words import (
     time_at,
 )
 from webots_mcp.signals.naming import find_mode
-from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines
+from webots_mcp.store.logs import (
+    COUNT_LIMIT,
+    LogFilter,
+    LogLine,
+    LogWindow,
+    count_lines,
+    newest_lines,
+)
 from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.robots import Session, fetch_session
+from webots_mcp.store.robots import SessionRecord, fetch_session
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_info
 
@@ -251,7 +258,7 @@ def _first_words(info: RunInfo) -> str:
     )
 
 
-def _facts(info: RunInfo, session: Session | None, step_ms: float | None) -> dict[str, str]:
+def _facts(info: RunInfo, session: SessionRecord | None, step_ms: float | None) -> dict[str, str]:
     """Return facts in the rows of run and session, without unknown ones."""
     facts: dict[str, object] = {
         "robot": info.robot,
@@ -413,7 +420,7 @@ def _commands(connection: sqlite3.Connection, stored: Found) -> Grid:
 
 def _log(connection: sqlite3.Connection, run_id: int) -> Grid:
     robot_id = fetch_run(connection, run_id).robot_id
-    asked = LogFilter(run_id, Window(-math.inf, math.inf), robot_id=robot_id)
+    asked = LogFilter(run_id, LogWindow(-math.inf, math.inf), robot_id=robot_id)
     lines = newest_lines(connection, asked, _LIMITS.log_lines)
     count = count_lines(connection, asked)
     return Grid(

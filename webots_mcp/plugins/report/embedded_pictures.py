@@ -6,7 +6,7 @@ import io
 from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import Event
@@ -14,12 +14,6 @@ from webots_mcp.plugins.report.words import (
     time_at,
 )
 from webots_mcp.store.run_rows import inside, opened
-
-if TYPE_CHECKING:
-    pass
-if TYPE_CHECKING:
-    pass
-
 
 MOST_PICTURES: Final = 24  # Of a run.
 LONGEST_SIDE_PX: Final = 640

@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import Room
@@ -17,13 +17,7 @@ from webots_mcp.plugins.report.chapter import Chapter, EventContext
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.signals import Signal
-
-if TYPE_CHECKING:
-    pass
-if TYPE_CHECKING:
-    pass
-
+from webots_mcp.store.signals import RegisteredSignal
 
 MOST_SIGNALS: Final = 16
 _ROOM: Final = Room(points=500, panels=12, lanes=8, rows=16)
@@ -106,12 +100,12 @@ def moment_key(chapter: Chapter, moment: EventContext) -> str:
     return f"moment {chapter.info.run_id} {list(chapter.moments).index(moment)}"
 
 
-def _known(connection: sqlite3.Connection, chapter: Chapter) -> dict[str, Signal]:
+def _known(connection: sqlite3.Connection, chapter: Chapter) -> dict[str, RegisteredSignal]:
     return {} if chapter.range is None else known_signals(connection, chapter.range)
 
 
 def _chosen(
-    chapters: Sequence[Chapter], known: Sequence[dict[str, Signal]], names: Sequence[str]
+    chapters: Sequence[Chapter], known: Sequence[dict[str, RegisteredSignal]], names: Sequence[str]
 ) -> dict[int, list[str]]:
     """Return the signals to draw of each run. Runs of two robots may have different signals."""
     if not names:
@@ -124,7 +118,7 @@ def _chosen(
     }
 
 
-def _why_none(known: Sequence[dict[str, Signal]], names: Sequence[str]) -> str:
+def _why_none(known: Sequence[dict[str, RegisteredSignal]], names: Sequence[str]) -> str:
     """Return why no signals are drawn over each other."""
     if names:
         return "none that was asked for is in both"

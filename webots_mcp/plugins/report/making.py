@@ -27,7 +27,7 @@ from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.segment import in_one_snapshot
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.run_rows import fetch_run
 
 if TYPE_CHECKING:
@@ -323,7 +323,7 @@ class ReportAnswer(NotedAnswer):
 
 @question("Write a report", DESTROYS)
 def webots_report(
-    recording: Recording,
+    recording: RecordingAccess,
     run_ids: RunIds = None,
     file: Annotated[str, Field(max_length=500, description="In the data folder.")] = "",
     overwrite: Annotated[bool, Field(description="A file that is there.")] = False,

@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Final
 from webots_mcp.plotting.trajectory import Obstacle
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.robots import world_seen
-from webots_mcp.store.run_rows import Run, fetch_run
+from webots_mcp.store.run_rows import RunRecord, fetch_run
 
-if TYPE_CHECKING:
-    pass
 if TYPE_CHECKING:
     from webots_mcp.standin.arena import Body
     from webots_mcp.standin.geometry import Shape
@@ -42,7 +40,7 @@ def obstacles_of(
     return _of_file(run) or _seen(connection, run)
 
 
-def _of_file(run: Run) -> tuple[Obstacle, ...]:
+def _of_file(run: RunRecord) -> tuple[Obstacle, ...]:
     file = Path(run.world or "")
     try:
         status = file.stat()
@@ -88,7 +86,7 @@ def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
     return tuple((shape.x + cos * u - sin * v, shape.y + sin * u + cos * v) for u, v in halves)
 
 
-def _seen(connection: sqlite3.Connection, run: Run) -> tuple[Obstacle, ...]:
+def _seen(connection: sqlite3.Connection, run: RunRecord) -> tuple[Obstacle, ...]:
     world = world_seen(connection, run)
     solids = world.told.get("solids", ()) if world else ()
     places = world.places if world else {}

@@ -22,7 +22,7 @@ from webots_mcp.contract import PROJECT_DATA_FOLDER
 from webots_mcp.database.connection import is_damage, text_of
 from webots_mcp.database.files import full_path
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.store.recording import Recording, View, view_of
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robots import list_robots
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class Examined:
             project name.
     """
 
-    recording: Recording
+    recording: RecordingAccess
     chosen_by: str
     project: Path
     connection: sqlite3.Connection | None = None
@@ -104,13 +104,13 @@ class Examined:
         return self.connection
 
     @cached_property
-    def views(self) -> list[View]:
+    def views(self) -> list[RobotView]:
         """All robots that were ever seen."""
         robots = list_robots(self.opened, self.now_s)
         return [view_of(self.opened, robot, self.now_s) for robot in robots]
 
     @cached_property
-    def live(self) -> list[View]:
+    def live(self) -> list[RobotView]:
         """The robots whose controllers live."""
         return [view for view in self.views if view.robot.live]
 
@@ -184,7 +184,7 @@ def worst(findings: Sequence[Diagnosis]) -> Diagnosis:
     return Diagnosis(verdict, seen, "; ".join(fixes) or None)
 
 
-def last_seen_s(view: View) -> float:
+def last_seen_s(view: RobotView) -> float:
     """When a robot last gave a sign of life, Unix time."""
     seen_s = view.robot.last_seen_wall_time_s
     return max(seen_s, view.session.last_seen_wall_time_s) if view.session else seen_s
@@ -223,12 +223,12 @@ def _look(check: Link, subject: Examined) -> Diagnosis:
         return unclear(f"{type(error).__name__}: {error}")
 
 
-def subject_of(recording: Recording, chosen_by: str) -> Examined:
+def subject_of(recording: RecordingAccess, chosen_by: str) -> Examined:
     """What is looked at of a recording: also the folder that the asker is in."""
     return Examined(replace(recording, read_only=True), chosen_by, _project(recording))
 
 
-def _project(recording: Recording) -> Path:
+def _project(recording: RecordingAccess) -> Path:
     """The folder above `mcp_data/`, where a project's recording lies, else the current one."""
     folder = full_path(recording.data_dir)
     return folder.parent if folder.name == PROJECT_DATA_FOLDER else Path.cwd()

@@ -25,7 +25,7 @@ from webots_mcp.simulator.project import (
     offer_observer,
     writes_states,
 )
-from webots_mcp.store.recording import View
+from webots_mcp.store.recording import RobotView
 from webots_mcp.store.robots import live_observer
 from webots_mcp.store.signals import registered
 
@@ -130,7 +130,7 @@ def _of_project(project: Path) -> Iterator[Diagnosis]:
             )
 
 
-def _of_robot(view: View) -> Diagnosis:
+def _of_robot(view: RobotView) -> Diagnosis:
     """What a robot that records now lacks."""
     name = view.robot.name
     observer = live_observer(view.connection, view.session, view.now_s)

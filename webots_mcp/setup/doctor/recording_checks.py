@@ -40,7 +40,7 @@ from webots_mcp.setup.doctor import (
 )
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.journal_intake import kept_journals
-from webots_mcp.store.recording import GETTING_STARTED, View, name_of
+from webots_mcp.store.recording import GETTING_STARTED, RobotView, name_of
 from webots_mcp.store.robots import (
     fetch_session,
     handler_at_work,
@@ -379,7 +379,7 @@ def commands(subject: Examined) -> Iterator[Diagnosis]:
     yield ok(f"{queued} queued, {len(unfinished) - queued} claimed, none overdue")
 
 
-def _pending(command: _Unfinished, view: View) -> Iterator[Diagnosis]:
+def _pending(command: _Unfinished, view: RobotView) -> Iterator[Diagnosis]:
     if command.expires_s >= view.now_s:
         return
     seen = f"{_named(command, view)} waits since {ago(view.now_s - command.created_s)}"
@@ -392,7 +392,7 @@ def _pending(command: _Unfinished, view: View) -> Iterator[Diagnosis]:
         yield wrong(f"{seen}: {why}", "let the simulation continue, see Simulation")
 
 
-def _claimed(command: _Unfinished, view: View) -> Iterator[Diagnosis]:
+def _claimed(command: _Unfinished, view: RobotView) -> Iterator[Diagnosis]:
     session = fetch_session(view.connection, command.session_id or 0)
     at_work_s = view.now_s - command.claimed_s
     if session is None or not session.is_alive(view.now_s):
@@ -404,7 +404,7 @@ def _claimed(command: _Unfinished, view: View) -> Iterator[Diagnosis]:
         yield warning(seen, "wait for it, or send cancel_run; a handler must return soon")
 
 
-def _named(command: _Unfinished, view: View) -> str:
+def _named(command: _Unfinished, view: RobotView) -> str:
     return f"command {command.id} ({command.action}) for {view.robot.name}"
 
 

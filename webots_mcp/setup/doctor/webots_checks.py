@@ -48,8 +48,8 @@ from webots_mcp.setup.doctor import (
 from webots_mcp.setup.wsl import WAY_OUT, ask_windows, in_wsl, is_wsl, on_windows
 from webots_mcp.simulator.instances import find_webots, installations, shown_of
 from webots_mcp.simulator.orders import address_of
-from webots_mcp.store.recording import View
-from webots_mcp.store.robots import SILENT, WAITING_IN_STEP, Session, companions
+from webots_mcp.store.recording import RobotView
+from webots_mcp.store.robots import SILENT, WAITING_IN_STEP, SessionRecord, companions
 
 if TYPE_CHECKING:
     from typing import TextIO
@@ -87,7 +87,7 @@ def simulation(subject: Examined) -> Iterator[Diagnosis]:
 
     Of the robots that stand silent in the same simulation one is watched for them all.
     """
-    watched = dict[str, View]()
+    watched = dict[str, RobotView]()
     for view in subject.live or _ran_last(subject.views):
         if view.session is not None and view.robot.live and _is_unclear(view):
             watched.setdefault(view.session.instance, view)
@@ -97,7 +97,7 @@ def simulation(subject: Examined) -> Iterator[Diagnosis]:
         yield _narrowed(subject, view)
 
 
-def _ran_last(views: list[View]) -> list[View]:
+def _ran_last(views: list[RobotView]) -> list[RobotView]:
     """The robots of the simulation that was seen last: one of them may have crashed before."""
     newest = max(views, key=last_seen_s, default=None)
     if newest is None or newest.session is None:
@@ -106,12 +106,12 @@ def _ran_last(views: list[View]) -> list[View]:
     return [each for each in views if each.session and each.session.instance == instance]
 
 
-def _is_unclear(view: View) -> bool:
+def _is_unclear(view: RobotView) -> bool:
     """Whether only the machine's processes can show which controller blocks the world."""
     return (view.status.why or "").startswith((SILENT, WAITING_IN_STEP, SEEN_RUNNING))
 
 
-def _judged(view: View) -> Diagnosis:
+def _judged(view: RobotView) -> Diagnosis:
     name, status = view.robot.name, view.status
     seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
     if view.session is None or not view.robot.live:
@@ -131,7 +131,7 @@ def _judged(view: View) -> Diagnosis:
     return wrong(seen, hangs or _SEE_PAGE)
 
 
-def _narrowed(subject: Examined, view: View) -> Diagnosis:
+def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
     """Of the reasons that look alike from inside, the one that shows from outside."""
     session = view.session
     assert session is not None
@@ -183,7 +183,7 @@ def _also_by_websocket(fix: str, order: str, webots: Instance | None) -> str:
     return _OBEYS.format(fix, order) if is_open else fix
 
 
-def _webots_of(subject: Examined, session: Session) -> Instance | None:
+def _webots_of(subject: Examined, session: SessionRecord) -> Instance | None:
     """The Webots that a session belongs to, where it runs here."""
     address = address_of(session.instance)
     return next((w for w in subject.running_webots if address and w.port == address.port), None)
@@ -203,7 +203,9 @@ class _Others(NamedTuple):
     is_all: bool
 
 
-def _controllers_beside(view: View, session: Session, webots: Instance | None) -> _Others:
+def _controllers_beside(
+    view: RobotView, session: SessionRecord, webots: Instance | None
+) -> _Others:
     recorded = {each.pid for each in companions(view.connection, session, view.now_s)}
     started = _started_for(session.instance)
     pids = recorded | started.keys()
@@ -279,7 +281,9 @@ def _program_of(pid: int) -> str:
     return Path(file).name if file else shown_of(pid, lambda p: p.name(), "a controller")
 
 
-def _missing_externs(view: View, session: Session, webots: Instance | None) -> str | None:
+def _missing_externs(
+    view: RobotView, session: SessionRecord, webots: Instance | None
+) -> str | None:
     """That the world has more extern robots than record; by its text, so only perhaps."""
     named = (view.run and view.run.world) or (webots and webots.world)
     world = Path(named) if named else None

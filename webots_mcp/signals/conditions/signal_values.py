@@ -201,7 +201,7 @@ class PositionReader:
 
     def read(self, state: State) -> tuple[float, float] | None:
         """X and y in metres; None where the state has no position."""
-        self._look(state)
+        self._read(state)
         if self._x is None or self._y is None:
             return None
         x: Any = self._x(state)
@@ -212,7 +212,7 @@ class PositionReader:
             return None
         return (x * self._metres, y * self._metres) if near else None
 
-    def _look(self, state: State) -> None:
+    def _read(self, state: State) -> None:
         """Find out the names, at first and when there are keys that were not there before."""
         self._looks += 1
         if self._looks % _LOOKS_APART != 1 or (self.names and self._keys.issuperset(state)):

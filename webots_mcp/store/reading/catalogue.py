@@ -25,7 +25,7 @@ from webots_mcp.store.reading.segment import (
     Subject,
     in_one_snapshot,
 )
-from webots_mcp.store.signals import Signal, cleaned, registered, seen_with
+from webots_mcp.store.signals import RegisteredSignal, cleaned, registered, seen_with
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
 _MOST_OFFERED: Final = 5
@@ -78,12 +78,14 @@ class SignalList:
     notes: tuple[str, ...]
 
 
-def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, Signal]:
+def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, RegisteredSignal]:
     """Every signal of the subject's robot: the registered, and those in rows in no chunk."""
     return _signals_in(connection, subject.robot_id, [subject.run_id])
 
 
-def known_signals(connection: sqlite3.Connection, time_range: TimeRange) -> dict[str, Signal]:
+def known_signals(
+    connection: sqlite3.Connection, time_range: TimeRange
+) -> dict[str, RegisteredSignal]:
     """Every signal of a range's robot: the registered, and those in rows in no chunk."""
     runs = [segment.run_id for segment in time_range.segments]
     return _signals_in(connection, time_range.robot_id, runs)
@@ -91,7 +93,7 @@ def known_signals(connection: sqlite3.Connection, time_range: TimeRange) -> dict
 
 def _signals_in(
     connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int]
-) -> dict[str, Signal]:
+) -> dict[str, RegisteredSignal]:
     known = registered(connection, robot_id)
     samples = {run_id: _new_sample(connection, run_id) for run_id in run_ids}
     for columns in samples.values():
@@ -117,21 +119,21 @@ def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
 
 def signals_of_frame(
     connection: sqlite3.Connection, subject: Subject, frame: Frame
-) -> dict[str, Signal]:
+) -> dict[str, RegisteredSignal]:
     """Every signal of the subject's robot: the registered, and those in all rows of a frame."""
     known = registered(connection, subject.robot_id)
     return _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
 
 
 def held_by(
-    connection: sqlite3.Connection, frame: Frame, known: dict[str, Signal]
-) -> dict[str, Signal]:
+    connection: sqlite3.Connection, frame: Frame, known: dict[str, RegisteredSignal]
+) -> dict[str, RegisteredSignal]:
     """Of the signals of a robot those that the run of a frame holds."""
     stored, here = signals_in(connection, frame.run_id), frame.new_rows.values
     return {name: each for name, each in known.items() if each.id in stored or name in here}
 
 
-def _without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
+def _without_placeholders(known: dict[str, RegisteredSignal]) -> dict[str, RegisteredSignal]:
     """Without names that only ever held null and have others below them.
 
     `lidar: null` before the first scan is the missing value of `lidar.min` and the others.
@@ -144,7 +146,9 @@ def _without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
     }
 
 
-def other_form(known: dict[str, Signal], signal: Signal) -> Signal | None:
+def other_form(
+    known: dict[str, RegisteredSignal], signal: RegisteredSignal
+) -> RegisteredSignal | None:
     """A signal that has a value where the same array is longer, or shorter; None without any.
 
     Of more than 16 items an array is `lidar.min` and others, of fewer `lidar.0` and so on.
@@ -156,7 +160,9 @@ def other_form(known: dict[str, Signal], signal: Signal) -> Signal | None:
     return other if last.isdigit() and other is not None and other.reduction is not None else None
 
 
-def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Signal]:
+def resolve_signals(
+    known: dict[str, RegisteredSignal], names: Sequence[str]
+) -> list[RegisteredSignal]:
     """The signals that the names mean, in the order of the names.
 
     A name may hold `*` (any characters, also dots). The name of a branch means all below it:
@@ -168,7 +174,7 @@ def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Sign
     """
     if not names:
         raise InvalidInputError("no signal is named; give names or patterns such as 'pose.*'")
-    found: dict[str, Signal] = {}
+    found: dict[str, RegisteredSignal] = {}
     for name in names:
         meant = list(_meant(known, name))
         if not meant:
@@ -179,7 +185,7 @@ def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Sign
 
 def signals_of(
     connection: sqlite3.Connection, time_range: TimeRange, names: Sequence[str]
-) -> list[Signal]:
+) -> list[RegisteredSignal]:
     """The signals of the range's robot that the names mean.
 
     Raises:
@@ -188,7 +194,7 @@ def signals_of(
     return resolve_signals(known_signals(connection, time_range), names)
 
 
-def one_signal(known: dict[str, Signal], name: str) -> Signal:
+def one_signal(known: dict[str, RegisteredSignal], name: str) -> RegisteredSignal:
     """The one signal that a name means.
 
     Raises:
@@ -201,7 +207,7 @@ def one_signal(known: dict[str, Signal], name: str) -> Signal:
     return signal
 
 
-def _meant(known: dict[str, Signal], name: str) -> Iterable[Signal]:
+def _meant(known: dict[str, RegisteredSignal], name: str) -> Iterable[RegisteredSignal]:
     if "*" not in name and name in known:
         return (known[name],)
     pattern = name if "*" in name else f"{name}.*"
@@ -209,7 +215,7 @@ def _meant(known: dict[str, Signal], name: str) -> Iterable[Signal]:
     return (known[each] for each in known if fnmatch.fnmatchcase(each, escaped))
 
 
-def say_unknown(known: dict[str, Signal], name: str) -> str:
+def say_unknown(known: dict[str, RegisteredSignal], name: str) -> str:
     """That there is no such signal, and which are near."""
     if not known:
         return f"no signal {name!r}: no state row with values has been recorded yet"
@@ -258,7 +264,7 @@ def list_signals(
     return SignalList(subject.robot, subject.run_id, len(frame), infos, len(matching), tuple(notes))
 
 
-def _info(frame: Frame, signal: Signal) -> SignalInfo:
+def _info(frame: Frame, signal: RegisteredSignal) -> SignalInfo:
     zones = frame.zones(signal.name)
     counts, is_usable = zones.value_count, bool(zones.value_count.any())
     if not is_usable and signal.is_number:  # all beyond 1e100, or null

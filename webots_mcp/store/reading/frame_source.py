@@ -16,9 +16,9 @@ from webots_mcp.store.chunks import (
     STATE_COLUMNS,
     STATE_IDS,
     WALL_TIMES,
+    ChunkProgress,
     DamagedChunkError,
     Decoded,
-    Reached,
     StateColumns,
     Statistics,
     decoded_of,
@@ -353,7 +353,7 @@ def rows_in_no_chunk(
     connection: sqlite3.Connection,
     run_id: int,
     span: tuple[float, float],
-    at: Reached,
+    at: ChunkProgress,
     deadline: Deadline,
 ) -> Read:
     """Rows of a run that are in no chunk, in order: all in [start, end), and maybe newer ones.
@@ -385,7 +385,7 @@ def rows_in_no_chunk(
         return _cached_rows(connection, run_id, key, place, deadline)
 
 
-def has_few_new_rows(connection: sqlite3.Connection, run_id: int, at: Reached) -> bool:
+def has_few_new_rows(connection: sqlite3.Connection, run_id: int, at: ChunkProgress) -> bool:
     """Whether a run has so few rows after those in chunks that they are cached."""
     asked = (run_id, at.end_s, at.last_state_id, MOST_ROWS_CACHED + 1)
     return bool(connection.execute(_FEWER_THAN, asked).fetchone()[0] <= MOST_ROWS_CACHED)

@@ -32,7 +32,7 @@ from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, Zones, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, kept_parts
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import RegisteredSignal
 
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
 _SAMPLE_ROWS: Final = 2000
@@ -44,7 +44,7 @@ _FIRST_ROWS_BACK: Final = 1024  # that are looked at before a row, then each tim
 _MORE_BACK: Final = 4
 
 
-def reads_values(frame: Frame, signal: Signal) -> bool:
+def reads_values(frame: Frame, signal: RegisteredSignal) -> bool:
     """Whether every value is looked at: of few rows, and where turns of an angle are counted."""
     if len(frame) <= FULL_ROWS or signal.turn is None:
         return len(frame) <= FULL_ROWS
@@ -58,7 +58,7 @@ def reads_values(frame: Frame, signal: Signal) -> bool:
     return bool(span > signal.turn / 2 or largest_step > signal.turn / 4)
 
 
-def summary_of(frame: Frame, signal: Signal, kept: Frame | None = None) -> Summary:
+def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None) -> Summary:
     """Counts, extremes, mean and deviation of all rows; those of an angle are circular as well.
 
     Args:
@@ -162,7 +162,7 @@ class Buckets:
     edges: Indexes
 
 
-class Cells(NamedTuple):
+class BucketFigures(NamedTuple):
     """What a signal comes to in each bucket; NaN where it has no usable number there.
 
     Attributes:
@@ -218,7 +218,9 @@ def _round_steps(at_least_s: float) -> Iterator[float]:
             yield nice * 10**exponent if exponent >= 0 else nice / 10**-exponent
 
 
-def cells_of(frame: Frame, signal: Signal, buckets: Buckets, kept: Frame | None) -> Cells:
+def cells_of(
+    frame: Frame, signal: RegisteredSignal, buckets: Buckets, kept: Frame | None
+) -> BucketFigures:
     """What a signal comes to in each bucket.
 
     Args:
@@ -247,7 +249,7 @@ class _Parts(NamedTuple):
     last: Array
 
 
-def _parts(frame: Frame, signal: Signal, buckets: Buckets) -> _Parts:
+def _parts(frame: Frame, signal: RegisteredSignal, buckets: Buckets) -> _Parts:
     """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
     name = signal.name
     if len(frame) <= FULL_ROWS or signal.turn is not None:
@@ -283,13 +285,13 @@ def _of_rows(start: int, numbers: Array) -> _Parts:
     return _Parts(rows + start, np.ones(len(rows), np.intp), held, held, held, held)
 
 
-def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> Cells:
+def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> BucketFigures:
     cells = len(edges) - 1
     places = np.searchsorted(edges, parts.first_row, "right") - 1
     starts = np.flatnonzero(np.diff(places, prepend=-1))
     if not len(starts):
         nothing = (np.full(cells, np.nan) for _ in range(4))
-        return Cells(np.zeros(cells, np.intp), *nothing)
+        return BucketFigures(np.zeros(cells, np.intp), *nothing)
     filled = places[starts]
 
     def spread(figures: Array) -> Array:
@@ -308,7 +310,7 @@ def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> Cells:
     count_of: Indexes = np.zeros(cells, np.intp)
     count_of[filled] = counts
     last = parts.last[np.append(starts[1:], len(places)) - 1]
-    return Cells(count_of, spread(low), spread(high), spread(mean), spread(last))
+    return BucketFigures(count_of, spread(low), spread(high), spread(mean), spread(last))
 
 
 def _circular_means(
@@ -337,7 +339,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Changes:
+class ChangePoints:
     """The change points of signals in a segment.
 
     Attributes:
@@ -361,7 +363,7 @@ class Changes:
         """How far before `end_s` the values are known."""
         return end_s if self.unread_from_s is None else min(end_s, self.unread_from_s)
 
-    def cut(self, unread_from_s: float | None) -> Changes:
+    def cut(self, unread_from_s: float | None) -> ChangePoints:
         """Those of them that were read up to there, for an answer that ends there."""
         if unread_from_s is None or self.read_to_s(unread_from_s) < unread_from_s:
             return self
@@ -376,12 +378,12 @@ class Changes:
 def change_points(
     connection: sqlite3.Connection,
     segment: Segment,
-    signals: Sequence[Signal],
+    signals: Sequence[RegisteredSignal],
     deadline: Deadline,
     *,
     frame: Frame | None = None,
     since: bool = True,
-) -> Changes:
+) -> ChangePoints:
     """The change points of signals in a segment, at any length of it.
 
     Args:
@@ -417,14 +419,14 @@ def change_points(
     if not segment.full_rate:
         _splice_kept(connection, segment, signals, deadline, points)
     if frame.cut_at_s is None:
-        return Changes(segment, points, frozenset(since_before), unread=frame.unread)
+        return ChangePoints(segment, points, frozenset(since_before), unread=frame.unread)
     unread_s = max(segment.start_s, frame.cut_at_s)
     found = {name: _until(each, unread_s) for name, each in points.items()}
-    return Changes(segment, found, frozenset(since_before), unread_s, frame.unread)
+    return ChangePoints(segment, found, frozenset(since_before), unread_s, frame.unread)
 
 
 def _in_force(
-    before: Frame, signal: Signal, at_begin: Point | None, *, since: bool
+    before: Frame, signal: RegisteredSignal, at_begin: Point | None, *, since: bool
 ) -> Point | None:
     """The point of the value in force when a segment begins; None where it is not found.
 
@@ -445,13 +447,13 @@ def _in_force(
     return at_begin if row == rows else Point(float(before.times[row]), at_begin.value)
 
 
-def _is_hidden(before: Frame, signal: Signal, time_s: float) -> bool:
+def _is_hidden(before: Frame, signal: RegisteredSignal, time_s: float) -> bool:
     """Whether the row before a time is one whose value could not be read."""
     row = int(before.places([time_s])[0])
     return row > 0 and not before.rows(row - 1, row).was_read(signal.name).all()
 
 
-def _first_alike(frame: Frame, signal: Signal, value: str | bool | None) -> int:
+def _first_alike(frame: Frame, signal: RegisteredSignal, value: str | bool | None) -> int:
     """The first of the last rows that all have this value; the number of rows if none has it."""
     stop, rows = len(frame), _FIRST_ROWS_BACK
     while stop > 0:
@@ -464,7 +466,7 @@ def _first_alike(frame: Frame, signal: Signal, value: str | bool | None) -> int:
     return 0
 
 
-def _points_in(frame: Frame, signal: Signal) -> list[Point]:
+def _points_in(frame: Frame, signal: RegisteredSignal) -> list[Point]:
     """The first value of a frame, and each that is unlike the one before."""
     values, codes = _valued(frame, signal)
     read = frame.was_read(signal.name)
@@ -474,7 +476,7 @@ def _points_in(frame: Frame, signal: Signal) -> list[Point]:
     return [Point(time_s, values[code]) for time_s, code in at]
 
 
-def _valued(frame: Frame, signal: Signal) -> tuple[list[str | bool | None], Indexes]:
+def _valued(frame: Frame, signal: RegisteredSignal) -> tuple[list[str | bool | None], Indexes]:
     """The values of a signal as its kind has them, and of each row which one it has."""
     codes, labels = frame.coded(signal.name)
     of_label = [_value(signal, label) for label in labels]
@@ -483,7 +485,7 @@ def _valued(frame: Frame, signal: Signal) -> tuple[list[str | bool | None], Inde
     return values, np.array([places[value] for value in of_label], np.intp)[codes]
 
 
-def _value(signal: Signal, label: Value) -> str | bool | None:
+def _value(signal: RegisteredSignal, label: Value) -> str | bool | None:
     if signal.kind == "bool":
         return None if label is None else label in (1, True)
     if signal.is_number and isinstance(label, str):
@@ -494,7 +496,7 @@ def _value(signal: Signal, label: Value) -> str | bool | None:
 def _splice_kept(
     connection: sqlite3.Connection,
     segment: Segment,
-    signals: Sequence[Signal],
+    signals: Sequence[RegisteredSignal],
     deadline: Deadline,
     points: dict[str, list[Point]],
 ) -> None:

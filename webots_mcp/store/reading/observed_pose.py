@@ -18,7 +18,7 @@ from webots_mcp.contract import OBSERVER, WORLD_EVENT
 from webots_mcp.signals.naming import OBSERVED, WORLD, find_position
 from webots_mcp.signals.register import kind_of, unit_of
 from webots_mcp.store.chunks import IS_ABSENT, IS_NUMBER, Decoded, StateColumns, signals_in
-from webots_mcp.store.signals import Signal, registered, seen_with, with_roles
+from webots_mcp.store.signals import RegisteredSignal, registered, seen_with, with_roles
 
 Derived = Mapping[str, Callable[[Array], Decoded]]
 """Signals that no row of a run holds, by name: their values at some simulation times."""
@@ -105,9 +105,9 @@ def _has_position(connection: sqlite3.Connection, run_id: int, columns: StateCol
 def with_observed_pose(
     connection: sqlite3.Connection,
     robot_id: int,
-    known: dict[str, Signal],
+    known: dict[str, RegisteredSignal],
     runs: Iterable[tuple[int, StateColumns]],
-) -> dict[str, Signal]:
+) -> dict[str, RegisteredSignal]:
     """Add the pose by an observer to what is known of a robot, where a run has only that.
 
     Args:
@@ -122,9 +122,9 @@ def with_observed_pose(
     return with_roles({**known, **added})
 
 
-def _signal(robot_id: int, name: str) -> Signal:
+def _signal(robot_id: int, name: str) -> RegisteredSignal:
     kind = kind_of(name, 0.5, ends_pose=False)
-    return Signal(None, robot_id, name, kind, unit_of(name, kind), "", None)
+    return RegisteredSignal(None, robot_id, name, kind, unit_of(name, kind), "", None)
 
 
 def _name_of(part: str) -> str:

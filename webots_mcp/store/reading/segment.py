@@ -16,8 +16,8 @@ from typing import Concatenate, Final, NamedTuple, ParamSpec, TypeVar
 
 from webots_mcp.database.connection import keep_deadline
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.store.robots import Robot, resolve_robot, robot_name
-from webots_mcp.store.run_rows import Run, current_run, fetch_run
+from webots_mcp.store.robots import RobotRecord, resolve_robot, robot_name
+from webots_mcp.store.run_rows import RunRecord, current_run, fetch_run
 
 _DECIMALS: Final = 3
 HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is left
@@ -190,7 +190,7 @@ def in_one_snapshot(
 # is about single states (extremes, changes, conditions) takes in both.
 
 
-class KeptStretch(NamedTuple):
+class FullRateSegment(NamedTuple):
     """From when to when, and why; `wall_time_s` is when it was asked for."""
 
     start_s: float
@@ -206,19 +206,21 @@ class KeptStretch(NamedTuple):
 
 def kept_stretches(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
-) -> list[KeptStretch]:
+) -> list[FullRateSegment]:
     """The stretches that touch [start_s, end_s) of a run, in order, as far as they are written."""
     rows = connection.execute(_STRETCHES, (run_id, start_s, end_s, MOST_STRETCHES)).fetchall()
-    return [_as_written(connection, run_id, KeptStretch(*row)) for row in reversed(rows)]
+    return [_as_written(connection, run_id, FullRateSegment(*row)) for row in reversed(rows)]
 
 
-def newest_kept(connection: sqlite3.Connection, run_id: int) -> KeptStretch | None:
+def newest_kept(connection: sqlite3.Connection, run_id: int) -> FullRateSegment | None:
     """The stretch of a run that begins last."""
     row = connection.execute(_STRETCHES, (run_id, -math.inf, math.inf, 1)).fetchone()
-    return row and _as_written(connection, run_id, KeptStretch(*row))
+    return row and _as_written(connection, run_id, FullRateSegment(*row))
 
 
-def _as_written(connection: sqlite3.Connection, run_id: int, stretch: KeptStretch) -> KeptStretch:
+def _as_written(
+    connection: sqlite3.Connection, run_id: int, stretch: FullRateSegment
+) -> FullRateSegment:
     """A controller that is killed leaves a stretch whose first rows are there, and not the last."""
     values = {"run": run_id, "start": stretch.start_s, "end": stretch.end_s}
     (until_s,) = connection.execute(_WRITTEN, values).fetchone() or (None,)
@@ -230,7 +232,7 @@ def _as_written(connection: sqlite3.Connection, run_id: int, stretch: KeptStretc
 
 def kept_parts(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
-) -> list[KeptStretch]:
+) -> list[FullRateSegment]:
     """Of those the ones that have rows of their own."""
     found = kept_stretches(connection, run_id, start_s, end_s)
     spans = [(each, (each.start_s, each.after_s)) for each in found]  # the last row is in it
@@ -276,7 +278,7 @@ class Subject:
 
 def choose(
     connection: sqlite3.Connection, robot: str | None, run_id: int | None, now_s: float
-) -> tuple[Robot, Run | None]:
+) -> tuple[RobotRecord, RunRecord | None]:
     """The run that was named, or the newest run of the robot that was named or is the only one.
 
     Without a run the robot's controller has never recorded.
@@ -294,7 +296,7 @@ def choose(
     return chosen, current_run(connection, chosen.id)
 
 
-def require_run(robot: Robot, run: Run | None) -> Run:
+def require_run(robot: RobotRecord, run: RunRecord | None) -> RunRecord:
     """The run.
 
     Raises:

@@ -1,0 +1,288 @@
+"""The page in a real Chromium: what it shows, what it survives, what its buttons do."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.plugins.page.conftest import LINE, NAME, Server, write_story
+from tests.waiting import wait_for
+from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.connection import connect
+
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+from playwright.sync_api import Page, expect
+from playwright.sync_api import TimeoutError as TooLateError
+
+pytestmark = pytest.mark.slow
+PATIENCE_MS = 120_000
+FIGURES = "[...document.querySelectorAll('.figure')].map(each => each.figure?.data)"
+CURVE = f"name => ({FIGURES})[0]?.curves?.find(each => each.name === name)"
+MODE = f"() => ({FIGURES})[0]?.lanes?.[0]?.held.map(each => each[0])"
+VIEW = "() => document.getElementById('signal-figure').figure?.frames[0].x"
+
+
+class Tab:
+    """A page that is open, and all that it asked for."""
+
+    def __init__(self, page: Page, server: Server) -> None:
+        self.page = page
+        self.asked: list[str] = []
+        self.errors: list[str] = []
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("request", lambda request: self.asked.append(request.url))
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.goto(server.url)
+
+    def column(self, curve: str, column: str) -> list[Any]:
+        self.page.wait_for_function(CURVE, arg=curve)
+        return self.page.evaluate(CURVE, curve)[column]
+
+    def until(self, curve: str, from_s: float, to_s: float) -> None:
+        """Wait until a curve is drawn from so early to so late."""
+        times = f"([name, from, to]) => {{ const t = ({CURVE})(name)?.t; return t"
+        reaches = f"{times} && t[0] <= from && t.at(-1) >= to }}"
+        self.page.wait_for_function(reaches, arg=[curve, from_s, to_s])
+
+    def view(self) -> tuple[float, float]:
+        """The time that the figure was drawn of."""
+        start, end = self.page.evaluate(VIEW)
+        return start, end
+
+    def point(self, share: float = 0.5, y: float = 60.0) -> None:
+        """Move the pointer over the signals."""
+        box = self.page.locator("#signal-figure > svg").bounding_box()
+        assert box is not None
+        self.page.mouse.move(box["x"] + share * box["width"], box["y"] + y)
+
+    def says(self, text: str) -> None:
+        expect(self.page.get_by_text(text).first).to_be_visible(timeout=PATIENCE_MS)
+
+    def choose(self, title: str, option: str) -> None:
+        """Choose the option that begins so."""
+        select = self.page.get_by_label(title, exact=True)
+        found = select.locator("option", has_text=re.compile(f"^{re.escape(option)}"))
+        expect(found).to_have_count(1, timeout=PATIENCE_MS)
+        select.select_option(value=found.get_attribute("value"))  # its light may change meanwhile
+
+
+@pytest.fixture
+def opened(chromium: Any) -> Iterator[Callable[[Server], Tab]]:
+    """Open the page of a server in a tab of its own."""
+    contexts: list[Any] = []
+
+    def start(server: Server) -> Tab:
+        contexts.append(chromium.new_context(viewport={"width": 1280, "height": 800}))
+        return Tab(contexts[-1].new_page(), server)
+
+    yield start
+    for context in contexts:
+        context.close()
+
+
+def test_it_shows_the_values_of_the_database_and_asks_nobody_else(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 1, 119)
+    places = tab.column("pose.0", "high")
+    assert max(places) == pytest.approx(12.8, abs=0.1)
+    assert tab.page.evaluate(MODE) == ["cruise", "back_up", "avoid", "cruise"]
+    tab.says("this is an earlier run; it ended by reset")
+    assert {url.split("/")[2] for url in tab.asked} == {f"127.0.0.1:{told.port}"}
+    assert tab.page.get_by_role("button", name="Pause").count() == 0
+    assert tab.errors == []
+
+
+def test_two_runs_lie_over_each_other_from_their_starts(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("over it", "run 2 ")
+    tab.choose("time", "all")
+    for run in (2, 1):
+        tab.until(f"pose.0, run {run}", 1, 29)
+
+
+def test_a_zoom_reads_what_it_shows_and_the_address_brings_the_view_back(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 1, 119)
+    apart = difference_s(tab.column("pose.0", "t"))
+
+    def zoomed() -> bool:  # a figure that is drawn anew meanwhile hears no wheel
+        tab.point()
+        tab.page.keyboard.down("Control")
+        for _ in range(6):
+            tab.page.mouse.wheel(0, -300)
+        tab.page.keyboard.up("Control")
+        near = f"() => {{ const x = ({VIEW})(); return x && x[1] - x[0] < 60 }}"
+        with suppress(TooLateError):
+            return bool(tab.page.wait_for_function(near, timeout=10_000))
+        return False
+
+    wait_for(zoomed)
+    wait_for(lambda: difference_s(tab.column("pose.0", "t")) < apart / 2)
+    wait_for(lambda: tab.view() == pytest.approx(tab.page.evaluate("wanted.view"), abs=0.01))
+    before = tab.view()
+    tab.page.reload()
+    tab.page.wait_for_function(VIEW)
+    assert tab.view() == pytest.approx(before)
+
+
+def difference_s(times: list[float]) -> float:
+    return times[1] - times[0]
+
+
+def test_a_signal_is_found_by_typing_and_moved_to_another_panel(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.column("pose.0", "t")
+    tab.page.get_by_label("find a signal").fill("BATT")
+    tab.page.get_by_label("battery_v").check()
+    tab.column("battery_v", "t")
+    panels = f"() => ({FIGURES})[0].panels"
+    assert ["battery_v"] in tab.page.evaluate(panels)
+    tab.page.locator('[data-hides="curve battery_v"]').hover()
+    tab.page.mouse.down()
+    tab.point(y=60)
+    tab.page.mouse.up()
+    tab.page.wait_for_function(f"() => ({panels})()[0].includes('battery_v')")
+    assert tab.page.locator("body").inner_text().count("battery_v") > 0
+
+
+def test_the_values_of_all_are_told_at_the_pointer_and_in_a_replay(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 1, 119)
+    tab.point()
+    shown = tab.page.locator("#signal-figure .told")
+    for name in ("pose.0 ", "pose.1 ", "mode "):
+        expect(shown).to_contain_text(name, timeout=PATIENCE_MS)
+    tab.page.get_by_label("replay at").fill("20")
+    expect(shown).to_contain_text("20.000 s", timeout=PATIENCE_MS)
+    expect(tab.page.locator("#way-figure .overlay circle")).to_have_count(1)
+    assert "at=20" in tab.page.url
+
+
+def test_all_robots_stand_on_one_map_and_a_narrow_window_holds_the_page(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.page.set_viewport_size({"width": 390, "height": 844})
+    tab.choose("robot", "rover")
+    tab.page.get_by_label("all robots").check()
+    tracks = "() => document.getElementById('way-figure').figure?.data.tracks.map(t => t.name)"
+    tab.page.wait_for_function(f"() => String(({tracks})()) === 'rover'")
+    tab.says("still: no position was found")
+    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_of_a_run_without_rows_it_says_so_and_stays_with_it(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "still")
+    tab.choose("run", "run 5 ")
+    tab.says("run 5 of robot 'still' has no state row yet")
+    tab.says("this is an earlier run; it ended by an unknown cause")
+    assert tab.errors == []
+
+
+def test_what_was_recorded_is_text_and_nothing_else(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", NAME)
+    tab.says(LINE)
+    tab.page.get_by_label(NAME, exact=True).check()
+    lanes = f"name => ({FIGURES})[0]?.lanes?.some(each => each.name === name)"
+    tab.page.wait_for_function(lanes, arg=NAME)
+    assert tab.page.evaluate("window.hacked") is None
+    assert tab.errors == []
+
+
+def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
+    opened: Callable[[Server], Tab], driven: Server
+) -> None:
+    tab = opened(driven)
+    tab.says("running")
+    # A chosen one: those shown unasked change as the robot goes on.
+    tab.page.get_by_label("pose.y", exact=True).first.check()
+    reached = tab.column("pose.y", "t")[-1]
+    tab.until("pose.y", reached, reached + 1)
+    tab.page.get_by_role("button", name="Pause").click()
+    tab.says("pause: done")
+    tab.says("paused")
+    stands = newest(driven, "SELECT max(sim_time_s) FROM state")
+    tab.page.get_by_role("button", name="Step").click()
+    tab.says("step: done")
+    assert newest(driven, "SELECT max(sim_time_s) FROM state") > stands
+    speed = tab.page.get_by_label("speed [rad/s] (0 to 10)")
+    speed.fill("7")
+    speed.press("Enter")
+    tab.says("speed = 7: done")
+    assert newest(driven, "SELECT value FROM parameter_value ORDER BY id DESC") == "7.0"
+    speed.fill("70")  # and while it is typed, a look brings the value that somebody else set
+    tab.page.evaluate("ask('steer', {robot: 'rover'}, {name: 'speed', value: 6})")
+    for _ in range(3):
+        tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
+    assert speed.input_value() == "70"
+    speed.press("Enter")
+    tab.says("a number from 0 up to 10, not 70")
+    tab.page.get_by_role("button", name="Reset").click()
+    tab.says("run 2, simulation time")
+    tab.page.get_by_role("button", name="Resume").click()
+    tab.says("running")
+    tab.page.wait_for_function(f"() => ({FIGURES})[0]?.curves?.[0].t.at(-1) < {reached}")
+    assert tab.errors == []
+
+
+def newest(server: Server, query: str) -> Any:
+    with closing(connect(server.data_dir / DATABASE_NAME, "reader")) as connection:
+        return connection.execute(query).fetchone()[0]
+
+
+def test_it_survives_a_purge_a_database_that_goes_away_and_a_server_that_stops(
+    opened: Callable[[Server], Tab], serve: Callable[..., Server], tmp_path: Path
+) -> None:
+    server = serve(tmp_path)
+    tab = opened(server)
+    tab.says("no controller with an MCPBridge has recorded there yet")
+    write_story(tmp_path)
+    tab.choose("robot", "rover")
+    tab.column("pose.0", "mean")
+    with closing(connect(tmp_path / DATABASE_NAME, "writer")) as connection:
+        connection.execute("DELETE FROM state WHERE run_id = 3 AND sim_time_s < 30")
+    tab.choose("time", "all")
+    tab.column("pose.0", "mean")
+    moved = shutil.move(tmp_path / DATABASE_NAME, tmp_path / "away.db")
+    tab.says("no database at")
+    shutil.move(moved, tmp_path / DATABASE_NAME)
+    tab.says("run 3, simulation time")
+    assert tab.errors == []
+    said = server.stop()
+    assert "Traceback" not in said, said
+    tab.says("connection was lost")

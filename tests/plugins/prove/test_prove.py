@@ -1,0 +1,198 @@
+"""`webots-mcp prove` on programs in the place of Webots: good ones, wrong ones, dead ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from getpass import getuser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.simulator.webots_program import put_on_path
+from webots_mcp.contract import host_name
+from webots_mcp.plugins.prove.bench import Bench, run_check
+from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED, check_launch
+from webots_mcp.simulator.instances import HOME_VARIABLE
+
+posix = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")
+DOCS = Path(__file__).parents[3] / "docs"
+Prove = Callable[..., "tuple[int, dict[str, Any]]"]
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """The folder of a Webots."""
+    put_on_path(tmp_path / "webots")
+    (tmp_path / "webots/resources").mkdir()
+    (tmp_path / "webots/resources/version.txt").write_text("R2025a\n", "utf-8")
+    return tmp_path / "webots"
+
+
+@pytest.fixture
+def prove(home: Path, monkeypatch: pytest.MonkeyPatch) -> Prove:
+    """Run some checks, or all; returns the exit code, and what was printed for programs."""
+    monkeypatch.setenv("DISPLAY", ":99")
+
+    def run(*only: str, patience_s: int = 60) -> tuple[int, dict[str, Any]]:
+        command = [sys.executable, "-m", "webots_mcp", "prove", "--json", "--webots", str(home)]
+        command += ["--patience", str(patience_s)]
+        command += [word for name in only for word in ("--only", name)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.stdout, done.stderr
+        return done.returncode, json.loads(done.stdout)
+
+    return run
+
+
+def outcomes(found: dict[str, Any]) -> dict[str, str]:
+    return {each["check"]: each["outcome"] for each in found["checks"]}
+
+
+def seen(found: dict[str, Any], check: str) -> str:
+    return next(str(each["seen"]) for each in found["checks"] if each["check"] == check)
+
+
+@posix
+@pytest.mark.slow
+def test_a_webots_that_is_as_its_sources_say_is_as_expected_in_all(prove: Prove) -> None:
+    code, found = prove()
+    others = [each for each in found["checks"] if each["outcome"] == "otherwise"]
+    assert (code, others) == (0, [])
+    assert {n for n, outcome in outcomes(found).items() if outcome == "not tried"} == {*NOT_TRIED}
+    assert [*outcomes(found)] == [*CHECKS, *NOT_TRIED]
+
+
+@posix
+def test_what_is_sent_names_the_versions_and_no_place_user_or_machine(
+    prove: Prove, home: Path
+) -> None:
+    code, found = prove("installed", "steps", "breakpoint", "put back", "hang")
+    assert (code, found["counts"]["as expected"]) == (0, 5)
+    assert found["webots"] == "R2025a"
+    assert {"webots_mcp", "system", "machine", "python"} <= found.keys()
+    assert "rover.py" in seen(found, "hang")
+    text = json.dumps(found)
+    for name in (str(home.parent), str(Path.home()), sys.prefix, host_name(), getuser()):
+        assert not re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text), name
+
+
+@posix
+def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_still(
+    prove: Prove, home: Path
+) -> None:
+    program = home / "webots"
+    good = program.read_text("utf-8")
+    obeying_always_and_ending_with_0 = (
+        "from tests.simulator import program\nlisten = program._listen\n"
+        "program._listen = lambda port, *, streams: listen(port + 1, streams=True)\n"
+        "main(sys.argv[1:])\n"
+    )
+    program.write_text(
+        good.replace("sys.exit(main(sys.argv[1:]))", obeying_always_and_ending_with_0), "utf-8"
+    )
+    code, found = prove("options", "no orders", "quit", "steps")
+    assert code == 1
+    assert outcomes(found) == {
+        "options": "otherwise", "no orders": "otherwise", "quit": "otherwise",
+        "steps": "as expected",
+    }  # fmt: skip
+    assert "paused by client" in seen(found, "no orders")
+    assert seen(found, "quit") == "exit code 0, not 7"
+    assert all(
+        each["works still"] and each["expected"]
+        for each in found["checks"]
+        if each["outcome"] == "otherwise"
+    )
+
+
+@posix
+def test_a_webots_that_never_runs_a_controller_costs_one_start_and_not_one_for_each_check(
+    prove: Prove, home: Path
+) -> None:
+    says_a_place = "#!/bin/sh\necho '/opt/somebody/webots-bin: no Qt' >&2\nexec sleep 600\n"
+    (home / "webots").write_text(says_a_place, "utf-8")
+    code, found = prove("launch", "options", "layout", "reload", patience_s=2)
+    assert code == 1
+    assert [*outcomes(found).values()] == ["otherwise", "not tried", "not tried", "not tried"]
+    said = seen(found, "launch")
+    assert "does not listen" in said
+    assert "its console has: webots-bin: no Qt" in said
+    assert "without a bridge: speaker (" in said, "an observer records"
+
+
+@posix
+def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(HOME_VARIABLE, str(home))
+    monkeypatch.setenv("DISPLAY", ":99")
+    bench, free, late = Bench(tmp_path / "project", patience_s=60), threading.Event(), list[str]()
+
+    def check_stuck(bench: Bench) -> None:
+        """It never ends; otherwise it would; otherwise nothing."""
+        bench.patience_s = 0  # which ends with a check
+        webots = bench.webots()
+        free.wait()
+        late.append(f"Webots ended: {webots.is_over}")
+        bench.row()
+
+    try:
+        found = run_check(check_launch, bench)
+        assert found["outcome"] == "as expected", found
+        bench.patience_s = 1
+        found = run_check(check_stuck, bench, limit_s=0.5)
+        assert (found["outcome"], found["seen"]) == ("otherwise", "it hung for 0.5 s")
+        stuck = bench.user
+        bench.patience_s = 60
+        assert run_check(check_launch, bench)["outcome"] == "as expected"
+        free.set()
+        stuck.join()
+        assert late == ["Webots ended: True"]
+    finally:
+        bench.end()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--only", "flying"], "--only 'flying' is none of installed, "),
+        (["--patience", "nan"], "'nan' is no whole number"),
+        (["--webots", "nowhere"], "nowhere is neither the folder nor the program of a Webots"),
+    ],
+)
+def test_what_is_not_there_is_refused_before_anything_starts(
+    options: list[str], said: str, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "webots_mcp", "prove", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+def test_each_statement_of_the_docs_names_its_check_and_each_check_a_statement() -> None:
+    named = set[str]()
+    is_statement = False
+    for line in (DOCS / "webots.md").read_text("utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if not line.startswith("|") or set(line) <= set("|-"):
+            is_statement = is_statement and line.startswith("|")
+        elif cells[0] == "known from sources":
+            is_statement = cells[-1] == "check"
+            assert is_statement, line
+        elif is_statement:
+            checks = re.findall("`(.+?)`", cells[2])
+            assert checks, line
+            named.update(checks)
+    assert named == {*CHECKS, *NOT_TRIED}
+
+
+def test_each_check_says_what_is_expected_and_what_works_still() -> None:
+    for name, check in CHECKS.items():
+        assert (check.__doc__ or "").count("; otherwise ") == 1, name

@@ -1,0 +1,249 @@
+"""What a report says, and what it never does."""
+
+from __future__ import annotations
+
+import math
+import re
+import sqlite3
+from base64 import b64decode
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from tests.plugins.report.conftest import Shown
+from tests.recordings.rows import Recorded
+from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
+from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.plugins.report.making import Report, make_report
+from webots_mcp.plugins.report.words import cut, length, number
+
+EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
+
+
+def test_it_tells_what_ran_as_it_was_recorded(page: Shown, recording: sqlite3.Connection) -> None:
+    (sha256, versions) = recording.execute(
+        "SELECT controller_sha256, json_extract(versions, '$.python') FROM session WHERE id = 1"
+    ).fetchone()
+    assert "Run 1 of rover" in page.text
+    assert "Run 2 of rover" in page.text
+    assert sha256 is None or sha256 in page.text
+    assert versions in page.text
+
+
+def test_durations_and_cut_texts_are_told_in_words() -> None:
+    told = [length(duration_s) for duration_s in (119.5, 120.0, 7199.0, 7500.0)]
+    assert told == ["120 s", "2 min 0 s", "119 min 59 s", "2 h 5 min"]
+    assert cut("abcde", 5) == "abcde"
+    assert cut("abcdef", 5) == "abcde … (6 characters)"
+
+
+def test_it_tells_events_with_the_seconds_around_them(page: Shown) -> None:
+    gap = page.text.index("gap at 11.968 s, for 3.04 s")
+    around = page.text[gap : page.text.index("Events", gap)]
+    assert "mode: cruise → back_up" in around
+    assert "grasp(): failed" in page.text
+    assert "the gripper is not mounted" in page.text
+
+
+def test_it_tells_for_how_long_each_mode_was_there(page: Shown) -> None:
+    modes = page.text[page.text.index("Time per value of mode") :]
+    assert re.match(r"Time per value of mode cruise [\d.]+ s, [\d.]+ % ", modes)
+
+
+def test_it_compares_two_runs_as_compare_runs_does(
+    page: Shown, recording: sqlite3.Connection
+) -> None:
+    found = compare_runs(recording, [1, 2])
+    (distance,) = (each for each in found.measures if each.name == "distance_m")
+    one, other = distance.spread
+    assert one is not None
+    assert other is not None
+    assert f"distance_m {one.median:.4g} {other.median:.4g}" in page.text
+    assert all(note in page.text for note in found.notes)
+
+
+def test_its_pictures_are_inside(page: Shown, recording: sqlite3.Connection) -> None:
+    (count,) = recording.execute("SELECT count(*) FROM image").fetchone()
+    sources = [value for tag, name, value in page.attributes if (tag, name) == ("img", "src")]
+    assert len(sources) == count > 0
+    assert all(source.startswith("data:image/") for source in sources)
+
+
+def test_it_refers_to_nothing_outside(both: Report, page: Shown) -> None:
+    links = [
+        value
+        for tag, name, value in page.attributes
+        if name in ("src", "href", "srcset", "action", "data", "poster") and tag != "a"
+    ]
+    assert all(link.startswith("data:") for link in links)
+    anchors = [value for tag, name, value in page.attributes if (tag, name) == ("a", "href")]
+    assert anchors
+    assert all(anchor.startswith("#") for anchor in anchors)
+    assert not re.search(r"url\(|@import", " ".join(page.styles))
+    (policy,) = (value for _, _, value in page.attributes if value.startswith("default-src"))
+    assert "http" not in policy
+
+
+def test_every_link_leads_to_a_place_in_the_page(page: Shown) -> None:
+    places = {value for _, name, value in page.attributes if name == "id"}
+    anchors = {value[1:] for tag, name, value in page.attributes if (tag, name) == ("a", "href")}
+    assert anchors <= places
+
+
+def test_it_says_how_large_it_is(both: Report, page: Shown) -> None:
+    assert f"It takes {len(both.html) / 1e6:.2f} MB of at most 10 MB" in page.text
+
+
+def test_what_was_recorded_is_shown_and_never_run(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot(f"rover {EVIL}", controller=f"/c/{EVIL}.py")
+    for step in range(50):
+        mode = EVIL if step > 25 else "drive"
+        robot.state(step * 0.1, {EVIL: step, "mode": mode, "pose": [step * 0.1, 0.0, 0.0]})
+    robot.log(1.0, EVIL, "error")
+    robot.event(2.0, "noticed_it", EVIL, {"why": EVIL})
+    report = make_report(recorded.connection, [robot.run_id], tmp_path)
+    recorded.close()
+    shown = Shown(report.html)
+    assert shown.text.count("window.harmed") >= 4
+    assert not [each for each in shown.attributes if each[1].startswith("on")]
+    assert b"<script>window" not in report.html
+    assert b"<img src=x" not in report.html
+
+
+def test_it_stays_as_small_as_was_asked_and_tells_what_is_not_in_it(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    for step in range(120):
+        robot.state(step * 0.1, {f"s{i}": (step * (i + 1)) % 7 for i in range(30)})
+        robot.log(step * 0.1, f"line {step} " + "<" * 3_000)
+    report = make_report(recorded.connection, [robot.run_id], tmp_path, max_mb=2)
+    recorded.close()
+    assert len(report.html) <= 2_000_000
+    assert any(re.match(r"\d+ of the log lines of run 1", each) for each in report.left_out)
+    assert any("of 30 numeric signals" in each for each in report.left_out)
+    text = Shown(report.html).text
+    assert all(each in text for each in report.left_out)
+    assert "line 119" in text, "the newest lines stay"
+
+
+def _hunter_and_runner(folder: Path, beside: Mapping[str, str]) -> tuple[Recorded, list[int]]:
+    """A run of each, with a number of its own and what both publish beside it."""
+    recorded = Recorded(folder / "webots.db")
+    run_ids: list[int] = []
+    for name in ("hunter", "runner"):
+        robot = recorded.robot(name)
+        run_ids.append(robot.run_id)
+        for step in range(20):
+            robot.state(step * 0.1, {f"{name}_m": step, **beside})
+    return recorded, run_ids
+
+
+def test_runs_of_two_robots_that_have_nothing_in_common_are_told_side_by_side(
+    tmp_path: Path,
+) -> None:
+    recorded, run_ids = _hunter_and_runner(tmp_path, {})
+    report = make_report(recorded.connection, run_ids, tmp_path, names=["hunter_m"])
+    recorded.close()
+    assert "the signals of both runs: none that was asked for is in both" in report.left_out
+    assert "Run 1 of hunter and Run 2 of runner" in report.title
+
+
+def test_runs_that_share_only_texts_are_told_to_share_no_numbers(tmp_path: Path) -> None:
+    recorded, run_ids = _hunter_and_runner(tmp_path, {"mode": "a"})
+    report = make_report(recorded.connection, run_ids, tmp_path)
+    recorded.close()
+    assert "the signals of both runs: they share no numeric signals" in report.left_out
+
+
+def test_of_a_run_without_rows_it_tells_what_there_is(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    robot.log(0.0, "ModuleNotFoundError: No module named 'cv2'", "error")
+    report = make_report(recorded.connection, [robot.run_id], tmp_path)
+    recorded.close()
+    text = Shown(report.html).text
+    assert "No module named 'cv2'" in text
+    assert "no state row" in text or "nothing" in text
+    assert "figures" not in report.holds
+
+
+def test_pictures_whose_files_are_gone_are_counted(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    robot.state(0.0, {"x": 1})
+    robot.state(1.0, {"x": 2})
+    robot.image(0.5, "camera/gone.png")
+    robot.image(0.6, "../outside.png")
+    report = make_report(recorded.connection, [robot.run_id], tmp_path)
+    recorded.close()
+    assert "2 of the pictures of run 1 (2 files cannot be read)" in report.left_out
+
+
+def test_pictures_are_scaled_down_and_thinned_evenly_where_they_have_no_room(
+    tmp_path: Path,
+) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    for step in range(20):
+        robot.state(step, {"x": step})
+        file = tmp_path / f"{step}.png"
+        Image.effect_noise((900, 700), 80).save(file)
+        robot.image(step, file.name)
+    report = make_report(recorded.connection, [robot.run_id], tmp_path, max_mb=2)
+    recorded.close()
+    shown = Shown(report.html)
+    sources = [value for tag, name, value in shown.attributes if (tag, name) == ("img", "src")]
+    assert 0 < len(sources) == report.holds["pictures"] < 20
+    assert len(report.html) <= 2_000_000
+    assert f"{20 - len(sources)} of the pictures of run 1" in report.left_out
+    sizes = {Image.open(BytesIO(b64decode(each.partition(",")[2]))).size for each in sources}
+    assert sizes == {(640, 498)}
+
+
+@pytest.mark.parametrize(
+    ("run_ids", "options", "error", "says"),
+    [
+        ([], {}, InvalidInputError, "one run or two, not 0"),
+        ([1, 2, 3], {}, InvalidInputError, "one run or two, not 3"),
+        ([1, 1], {}, InvalidInputError, "named twice"),
+        ([7], {}, UnknownRunError, "no run 7"),
+        ([1], {"max_mb": 1}, InvalidInputError, "from 2 to 100"),
+        ([1], {"max_mb": float("nan")}, InvalidInputError, "from 2 to 100"),
+        ([1], {"names": ["nosuch"]}, UnknownSignalError, "nosuch"),
+    ],
+)
+def test_what_cannot_be_reported_is_refused(
+    recording: sqlite3.Connection,
+    tmp_path: Path,
+    run_ids: list[int],
+    options: dict[str, Any],
+    error: type[Exception],
+    says: str,
+) -> None:
+    with pytest.raises(error, match=says):
+        make_report(recording, run_ids, tmp_path, **options)
+
+
+@pytest.mark.parametrize(
+    ("value", "span", "told"),
+    [(-4.857e-17, 0.64, "0"), (-4.857e-17, 0.0, "-4.857e-17"), (1e308, math.inf, "1e+308")],
+)
+def test_what_is_nothing_beside_the_span_of_its_signal_is_0(
+    value: float, span: float, told: str
+) -> None:
+    assert number(value, span) == told
+
+
+def test_a_number_that_cancelled_itself_out_is_told_as_0(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    for step in range(50):
+        robot.state(step * 0.1, {"x": step * 0.013 or -4.857e-17})
+    text = Shown(make_report(recorded.connection, [robot.run_id], tmp_path).html).text
+    recorded.close()
+    assert "e-17" not in text

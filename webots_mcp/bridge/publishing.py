@@ -1,0 +1,176 @@
+"""Records the states that a controller publishes.
+
+Each call is counted, tested against breakpoints and the goal of a run, and recorded or held.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from itertools import islice
+from typing import Any, Final, cast
+
+from webots_mcp.bridge.breakpoints import Breakpoints, Watch
+from webots_mcp.bridge.commands import Reloads
+from webots_mcp.bridge.devices import DeviceReader
+from webots_mcp.bridge.encoding import MAX_KEY_CHARACTERS, encode, key_text
+from webots_mcp.bridge.error_report import cut
+from webots_mcp.bridge.journal import Heartbeat, Journal
+from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.simulation import Clock
+from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.signals.register import SignalNames, StateChanges
+
+_BYTES_OF_A_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
+
+
+class Publisher:
+    """Handles each call of `publish` and `auto_publish`.
+
+    Args:
+        begin_run: Called where simulation time has gone back since the last call.
+
+    Attributes:
+        recorded: Recorded calls.
+        total_s: The time that they took.
+        longest_s: The longest of them.
+        devices: Reads the devices for `auto_publish`.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        heartbeat: Heartbeat,
+        throttle: Throttle,
+        breakpoints: Breakpoints,
+        watch: Watch,
+        keeper: Keeper,
+        devices: DeviceReader,
+        reloads: Reloads,
+        begin_run: Callable[[], None],
+    ) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._heartbeat = heartbeat
+        self._throttle = throttle
+        self._breakpoints = breakpoints
+        self._watch = watch
+        self._keeper = keeper
+        self._reloads = reloads
+        self._begin_run = begin_run
+        self._changes = StateChanges()
+        self._names = SignalNames()
+        recorder.new_database_entries.append(self._names.begin_anew)
+        self.devices = devices
+        self._run = clock.run
+        self._own_bytes = 0  # that a state of the devices takes in memory, about
+        self.recorded = 0
+        self.total_s = self.longest_s = 0.0
+
+    def publish(self, state: Mapping[Any, Any], force: bool, own_bytes: int = 0) -> None:
+        """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
+        if self._clock.update():
+            self._begin_run()
+        wanted, hit, keeper, breakpoints = force, None, self._keeper, self._breakpoints
+        # Tested here, since even an empty call would slow down every `publish`.
+        if breakpoints.armed or breakpoints.run is not self._clock.run:
+            hit = breakpoints.evaluate(state)
+            wanted |= breakpoints.reaches  # the past, asked of rows, is the same
+        if self._watch.asks_states:
+            wanted = self._watch.evaluate(state) or wanted
+        if self._throttle.admits(wanted or hit or self._heartbeat.loop):
+            self._record(state)
+        elif keeper.fills:
+            keeper.add(state, own_bytes)
+        if keeper.frames.cameras:
+            self._take_camera_frames(at_once=bool(hit))
+        if hit:
+            breakpoints.act(hit, state)  # after recording: a pause must show the state of the hit
+        if keeper.busy:
+            keeper.go_on()
+
+    def publish_devices(
+        self, extra: Mapping[Any, Any], include_time: bool, force: bool = False
+    ) -> dict[Any, Any] | None:
+        """Record the devices' values; they are read if this call is due.
+
+        Where breakpoints are armed or a run has a goal, they are read in every call; for the ring
+        buffer as often as the limit on the time for reading allows.
+
+        Returns:
+            The state; None where the devices were not read.
+        """
+        state = None
+        if self._clock.update():
+            self._begin_run()
+        keeper, throttle = self._keeper, self._throttle
+        due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
+        if due or self._breakpoints.ask_states() or self._watch.asks_states:
+            state = self._read(extra, include_time)
+            # What the devices say is made anew each time: nothing else can change it.
+            self.publish(state, force, own_bytes=0 if extra else self._own_bytes)
+            return state
+        if throttle.admits(force or self._heartbeat.loop is not None):
+            state = self._read(extra, include_time)
+            self._record(state)
+        elif keeper.fills:
+            keeper.leave_out(self.devices.why)
+        if keeper.frames.cameras:
+            self._take_camera_frames(at_once=False)
+        if keeper.busy:
+            keeper.go_on()
+        return state
+
+    def unread(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
+        """A state without the devices."""
+        return ({"time": self._clock.sim_time_s} if include_time else {}) | _finite(extra)
+
+    def _take_camera_frames(self, *, at_once: bool) -> None:
+        """Hold due camera frames with the states; at a hit take one of each camera."""
+        keeper = self._keeper
+        if at_once or keeper.frames.is_due(self._clock.sim_time_s):
+            keeper.take_camera_frames(at_once=at_once)
+
+    def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
+        return self.devices.read() | self.unread(extra, include_time)
+
+    def _record(self, state: Mapping[Any, Any]) -> None:
+        started_s = time.perf_counter()
+        self._reloads.fire()
+        encoded = encode(state)
+        if not encoded.text.startswith("{"):
+            raise TypeError(f"publish() takes a dict, got {type(state).__name__}")
+        self._journal.state(encoded)
+        if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+            self._record_changes(state)
+        self._own_bytes = _BYTES_OF_A_CHARACTER * len(encoded.text)
+        self._names.register(state, encoded.text, self._recorder.enter_signals)
+        self._heartbeat.beat_if_due()
+        self._count(time.perf_counter() - started_s)
+
+    def _count(self, duration_s: float) -> None:
+        self.recorded += 1
+        self.total_s += duration_s
+        if duration_s > self.longest_s:
+            self.longest_s = duration_s
+
+    def _record_changes(self, state: Mapping[Any, Any]) -> None:
+        if self._clock.run is not self._run:
+            self._run = self._clock.run
+            self._changes.forget()
+        for name, before, after in self._changes.compare(state):
+            shown = cut(key_text(name), MAX_KEY_CHARACTERS)
+            self._journal.event("change", {"from": before, "to": after}, shown)
+
+
+def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
+    """A mapping as a dict of `len` items: the iterator of a user's own mapping may be endless."""
+    if extra.__class__ is dict:
+        return cast("dict[Any, Any]", extra)
+    if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise TypeError(f"a state must be a dict, got {type(extra).__name__}")
+    return dict(islice(extra.items(), len(extra)))

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from webots_mcp.cli.options import Json, Parameter
-from webots_mcp.cli.terminal import answer_lines, print_json, rewrite
+from webots_mcp.cli.streams import rewrite
+from webots_mcp.cli.terminal import answer_lines, print_json
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, host_name
 from webots_mcp.database.connection import connect
 from webots_mcp.database.files import full_path, whole_file

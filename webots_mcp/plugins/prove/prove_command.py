@@ -50,7 +50,7 @@ def prove(
     """
     from webots_mcp.contract import VERSION
     from webots_mcp.plugins.prove.checks import CHECKS
-    from webots_mcp.simulator.instances import find_webots
+    from webots_mcp.simulator.installations import find_webots
     from webots_mcp.simulator.starting import Start
 
     for name in only or ():
@@ -104,7 +104,7 @@ def _choose(path: Path) -> None:
     Raises:
         CommandRefusedError: It is no Webots.
     """
-    from webots_mcp.simulator.instances import HOME_VARIABLE, installations
+    from webots_mcp.simulator.installations import HOME_VARIABLE, installations
 
     path = path.resolve()
     for home in (path, *path.parents[:4]):

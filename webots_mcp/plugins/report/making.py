@@ -23,7 +23,8 @@ from webots_mcp.plugins.report.embedded_pictures import EmbeddedPictures, pictur
 from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
 from webots_mcp.plugins.report.run_comparison import RunComparison, compare_two_runs
 from webots_mcp.plugins.report.words import clock, counted, size
-from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
+from webots_mcp.questions.arguments import AnyNames, RobotName, RunIds
+from webots_mcp.questions.declaring import DESTROYS, question
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.segment import in_one_snapshot

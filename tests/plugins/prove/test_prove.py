@@ -90,7 +90,7 @@ def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_st
     program = home / "webots"
     good = program.read_text("utf-8")
     obeying_always_and_ending_with_0 = (
-        "from tests.simulator import program\nlisten = program._listen\n"
+        "from tests.simulator import webots_program as program\nlisten = program._listen\n"
         "program._listen = lambda port, *, streams: listen(port + 1, streams=True)\n"
         "main(sys.argv[1:])\n"
     )

@@ -93,6 +93,7 @@ def test_the_header_is_compiled_as_the_workflow_does(case: dict[str, str], tmp_p
     subprocess.run([program], input=b"say\n", env=environment, check=True)
 
 
+@pytest.mark.slow
 @posix
 def test_the_file_for_users_drives_checks_and_reports(
     webots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

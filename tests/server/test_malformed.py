@@ -41,6 +41,7 @@ def test_every_table_is_tried(base: Path) -> None:
     assert names - KEPT_BY_OTHERS == set(TABLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", TABLES)
 async def test_a_wrong_value_anywhere_leaves_every_tool_with_an_answer(
     base: Path, tmp_path: Path, table: str

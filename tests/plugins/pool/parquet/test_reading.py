@@ -1,4 +1,4 @@
-"""A pool of fifty recordings, asked by SQL, answers as the tools do of each recording."""
+"""A pool of thirty recordings, asked by SQL, answers as the tools do of each recording."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.runs import list_runs
 from webots_mcp.store.sql import FOLDER
 
+pytestmark = pytest.mark.slow
 COUNTS = "SELECT recording_uuid, count(*) FROM state GROUP BY recording_uuid"
 MEANS = """
     SELECT recording_uuid, avg(CAST(data ->> '$.front_m' AS DOUBLE)) FROM state

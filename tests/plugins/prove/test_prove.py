@@ -69,6 +69,7 @@ def test_a_webots_that_is_as_its_sources_say_is_as_expected_in_all(prove: Prove)
     assert [*outcomes(found)] == [*CHECKS, *NOT_TRIED]
 
 
+@pytest.mark.slow
 @posix
 def test_what_is_sent_names_the_versions_and_no_place_user_or_machine(
     prove: Prove, home: Path
@@ -83,6 +84,7 @@ def test_what_is_sent_names_the_versions_and_no_place_user_or_machine(
         assert not re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text), name
 
 
+@pytest.mark.slow
 @posix
 def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_still(
     prove: Prove, home: Path
@@ -112,6 +114,7 @@ def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_st
     )
 
 
+@pytest.mark.slow
 @posix
 def test_a_webots_that_never_runs_a_controller_costs_one_start_and_not_one_for_each_check(
     prove: Prove, home: Path
@@ -127,6 +130,7 @@ def test_a_webots_that_never_runs_a_controller_costs_one_start_and_not_one_for_e
     assert "without a bridge: speaker (" in said, "an observer records"
 
 
+@pytest.mark.slow
 @posix
 def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

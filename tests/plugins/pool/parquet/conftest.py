@@ -19,7 +19,7 @@ from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import RecordingAccess
 
-RECORDINGS: Final = 50
+RECORDINGS: Final = 30
 STARTED_S: Final = 1_700_000_000.0  # 2023-11-14, 22:13 in UTC: later recordings begin the next day
 
 

@@ -99,6 +99,6 @@ def answers(bench: Bench) -> Iterator[str]:
 _READ: Final = """\
 Each question is asked of three recordings of which the accepted answers are stored (`python -m
 tests.golden`), in its usual form and in others. An answer has at most {budget} tokens by design,
-and up to {large} where `limit` or `max_points` asks for more, which the longest ones are. With
+and up to {large} where `limit` or `max_points` asks for more. With
 `serve --tools core` the list has {tools} tools and {tokens} tokens. Tokens are counted by a rule
 of this package (`tokens_in`); each model has its own tokenizer, which was not asked."""

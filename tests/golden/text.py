@@ -20,7 +20,7 @@ _ASKED_NOW: Final = re.compile(
 )
 # What the clock of the machine that recorded tells: only where it was a real one.
 _RECORDED_THEN: Final = re.compile(
-    r"(^|_)(wall|utc|pace|factor|started|ended|created|claimed|finished|waiting|running|commit)(_|$)"
+    r"(^|_)(wall|utc|pace|factor|started|ended|created|claimed|finished|waiting|running|commit|polls)(_|$)"
     r"|^(since|until|when|clock|longest_step_s|rows_per_s|own_ms|step_wait_ms)$"
 )
 _UUID: Final = re.compile(r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b")

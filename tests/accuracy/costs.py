@@ -18,7 +18,8 @@ from tests.golden.asking import TOOLS, ask_tools
 from tests.golden.recordings import RECORDINGS
 from tests.golden.stored import drawn
 from tests.tool_list import counts_of
-from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
+from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
+from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.location import MemoryDatabase
 from webots_mcp.server.mcp_server import create_server
 

@@ -15,7 +15,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.database.maintenance import LEASE_S, Maintainer
-from webots_mcp.questions.robot_state import webots_list_robots
+from webots_mcp.questions.list_robots import webots_list_robots
 from webots_mcp.setup.doctor import diagnose, subject_of
 from webots_mcp.setup.doctor.recording_checks import database as checked_database
 from webots_mcp.store.recording import RecordingAccess

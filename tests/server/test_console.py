@@ -26,8 +26,8 @@ from tests.simulator.conftest import (
 from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.simulator import console
-from webots_mcp.simulator.console import belongs
 from webots_mcp.simulator.instances import instances
+from webots_mcp.simulator.own_webots import belongs
 from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = pytest.mark.anyio

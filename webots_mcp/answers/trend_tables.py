@@ -4,22 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from webots_mcp.answers.budget import (
-    compact_json,
-    cut_for_a_model,
-    figure,
-    fitting,
-    is_for_a_person,
-    seconds,
-    short_name,
-    shown,
-    some,
-    table,
-    tokens_of,
-)
+from webots_mcp.answers.budget import figure, fitting, seconds, short_name, shown, some, table
 from webots_mcp.answers.models import (
     RunTrendTables,
 )
+from webots_mcp.answers.shortening import compact_json, cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend
 
 TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from webots_mcp.cli.options import (
     Json,
     Parameter,
-    Range,
+    TimeRangeOptions,
     Where,
     make_chunks_first,
     refuse_options,
@@ -28,21 +28,14 @@ from webots_mcp.cli.options import (
     value_of,
     whole_number,
 )
-from webots_mcp.cli.terminal import (
-    Typed,
-    as_typed,
-    line_of_progress,
-    print_answer,
-    running,
-    show_progress,
-    speak_of,
-    text_of,
-    value_name,
-    wait,
-)
+from webots_mcp.cli.streams import line_of_progress, show_progress, wait
+from webots_mcp.cli.terminal import print_answer, text_of
+from webots_mcp.cli.wording import Typed, as_typed, running, speak_of, value_name
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.questions.declaring import FOR_A_PERSON, SCOPE, Caller, Question, Reply, faults_of
+from webots_mcp.questions.arguments import FOR_A_PERSON, SCOPE
+from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.faults import faults_of
 from webots_mcp.store.recording import RecordingAccess
 
 # How options are called whose argument has another name in all questions.
@@ -92,7 +85,7 @@ def command_of(question: Question) -> Callable[..., None]:
 
     def run(
         *positional: Any,
-        span: Range | None = None,
+        span: TimeRangeOptions | None = None,
         recorded: Where | None = None,
         json: bool = False,
         follow: bool = False,
@@ -113,7 +106,11 @@ def command_of(question: Question) -> Callable[..., None]:
     parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
     if in_range:
-        parameters.append(inspect.Parameter("span", keyword, default=Range(), annotation=Range))
+        parameters.append(
+            inspect.Parameter(
+                "span", keyword, default=TimeRangeOptions(), annotation=TimeRangeOptions
+            )
+        )
     if question.follows:
         parameters.append(inspect.Parameter("follow", keyword, default=False, annotation=_FOLLOW))
     parameters += [
@@ -186,7 +183,7 @@ def _caller(question: Question, recording: RecordingAccess) -> Generator[Caller 
     if not question.has_caller:
         yield None
         return
-    from webots_mcp.steering.routes import Companions, Launcher
+    from webots_mcp.steering.launcher import Companions, Launcher
     from webots_mcp.steering.trial_worker import TrialWorkers
 
     companions = Companions(TrialWorkers(recording), Launcher(recording))

@@ -116,7 +116,7 @@ def _compile(recorded: Where) -> None:
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     """The answer with commands in the place of calls, and what passed in one line."""
     from webots_mcp.cli.asking import OPTIONS
-    from webots_mcp.cli.terminal import commands_by_tool
+    from webots_mcp.cli.wording import commands_by_tool
 
     def typed(cell: Any) -> Any:
         called = re.fullmatch(r"webots_(\w+)\(.*\)", str(cell))

@@ -126,7 +126,6 @@ def _no_constant(name: str) -> float:
 # -- which recording, which part of it, and how it is opened --
 
 _Given = ParamSpec("_Given")
-
 Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
 Robot: TypeAlias = Annotated[
     str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
@@ -245,7 +244,7 @@ class ToWebots(Waiting):
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Range:
+class TimeRangeOptions:
     """Which run of which robot, and which stretch of it: the options that commands share."""
 
     robot: Robot = None
@@ -317,7 +316,7 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
 
 def make_chunks_first(recording: RecordingAccess) -> None:
     """Put into chunks what no server has, so that a question of any length is answered."""
-    from webots_mcp.cli.terminal import shown_progress
+    from webots_mcp.cli.streams import shown_progress
     from webots_mcp.store.chunk_making import make_missing_chunks
 
     with shown_progress("making chunks of what was recorded") as progress:
@@ -345,7 +344,7 @@ def _name_of(name: str) -> str:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Limits:
+class RetentionOptions:
     """How much is kept of what, as it was typed; by the names of `Retention`."""
 
     state: Annotated[str | None, _option("state", "Keep so much of recorded states ({}).")] = None

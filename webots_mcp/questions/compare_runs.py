@@ -14,24 +14,21 @@ from pydantic import Field
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
-    WHOLE,
     answer_about,
     condensed,
-    cut_for_a_model,
     figure,
     figures,
     fitting,
     header_of_only,
-    is_for_a_person,
     notes_of,
     room_tokens,
     seconds,
     short_name,
-    shorten,
     shown,
     without_empty,
 )
-from webots_mcp.answers.models import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
+from webots_mcp.answers.models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
+from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
 from webots_mcp.judging.checks.finding import Finding
@@ -45,9 +42,7 @@ from webots_mcp.judging.comparison import (
 from webots_mcp.judging.detection.kinds import EventOptions, both_of
 from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
 from webots_mcp.judging.run_measures import Measure
-from webots_mcp.questions.declaring import (
-    READS,
-    SETS,
+from webots_mcp.questions.arguments import (
     AnyNames,
     Cursor,
     Limit,
@@ -59,8 +54,8 @@ from webots_mcp.questions.declaring import (
     ShownLimit,
     TrialSetId,
     Value,
-    question,
 )
+from webots_mcp.questions.declaring import READS, SETS, question
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
@@ -376,7 +371,7 @@ def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None]
     return [None if each is None else figures([each.low, each.high]) for each in spreads]
 
 
-def _groups(found: Comparison) -> Table | None:
+def _groups(found: Comparison) -> AnswerTable | None:
     robots = {run.robot for group in found.groups for run in group.runs}
     rows = [_group_row(group, told_robot=len(robots) > 1) for group in found.groups]
     return condensed(GROUP_COLUMNS, rows)

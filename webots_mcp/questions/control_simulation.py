@@ -9,28 +9,21 @@ import anyio
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.answers.budget import cut_text
 from webots_mcp.answers.models import CommandAnswer, RunAnswer
+from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.questions.declaring import (
-    CHANGES,
-    DESTROYS,
-    MAX_WAIT_S,
-    Caller,
-    RobotName,
-    TimeoutS,
-    Value,
-    WaitS,
-    merged,
-    question,
-)
+from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName, TimeoutS, Value, WaitS
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, merged, question
 from webots_mcp.questions.show_pictures import show_end
-from webots_mcp.simulator.launch import Launch, SessionStart, require_world
+from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, require_world
 from webots_mcp.simulator.orders import Order
 from webots_mcp.simulator.starting import Mode, Start, free_port
-from webots_mcp.steering.dispatch import ACTION, Dispatcher, require_possible
-from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.launcher import project_of
+from webots_mcp.steering.routes import Attempt
+from webots_mcp.steering.run_command import ACTION, require_possible
+from webots_mcp.steering.world_request import WorldRequest
 from webots_mcp.store.recording import RecordingAccess
 
 Port = Annotated[
@@ -38,7 +31,6 @@ Port = Annotated[
     Field(description="Of a Webots of another project."),
 ]
 Force = Annotated[bool, Field(description="Press Webots' keys where nothing else works.")]
-
 _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
 _USUAL_WAIT_S: Final[dict[Order, float]] = {"reload": _RELOAD_WAIT_S, "step": MAX_WAIT_S}
@@ -190,7 +182,7 @@ def _request(
     return WorldRequest(recording, dispatcher, robot, timeout_wall_s, caller.companions.webots)
 
 
-async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStart | None:
+async def _wait(launched: WebotsLaunch, caller: Caller, until_s: float) -> SessionStart | None:
     """Until a controller records; None where the time was over first.
 
     Raises:
@@ -198,7 +190,7 @@ async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStar
     """
     begun_s = time.monotonic()
     while True:
-        is_over = launched.webots.is_over  # before the look: what came last is seen
+        is_over = launched.webots.is_over  # checked first, so that rows of its last moment are read
         first = await to_thread.run_sync(launched.first_record)
         if first is not None or time.monotonic() > until_s:
             return first
@@ -213,7 +205,7 @@ async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStar
 
 
 def _answer(
-    recording: RecordingAccess, launched: Launch, first: SessionStart | None, started_s: float
+    recording: RecordingAccess, launched: WebotsLaunch, first: SessionStart | None, started_s: float
 ) -> CommandAnswer:
     header: dict[str, Any] = {}
     if first is not None:
@@ -231,7 +223,7 @@ def _answer(
     )
 
 
-def _then(launched: Launch) -> str:
+def _then(launched: WebotsLaunch) -> str:
     """How a start in pause goes on."""
     if launched.start.mode != "pause":
         return ""
@@ -240,7 +232,7 @@ def _then(launched: Launch) -> str:
     return f". {by_us if launched.start.streams else alone}"
 
 
-def _described(launched: Launch) -> dict[str, Any]:
+def _described(launched: WebotsLaunch) -> dict[str, Any]:
     address = launched.webots.address
     return {
         "world": str(launched.world),

@@ -11,17 +11,8 @@ from pydantic import Field, WithJsonSchema
 from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
-from webots_mcp.questions.declaring import (
-    CHANGES,
-    DESTROYS,
-    READS,
-    AnyNames,
-    Caller,
-    Cursor,
-    RobotName,
-    merged,
-    question,
-)
+from webots_mcp.questions.arguments import AnyNames, Cursor, RobotName
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, merged, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.robots import find_holder, list_robots

@@ -9,21 +9,13 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from webots_mcp.answers.budget import cut_text, fitting, is_for_a_person, wall_clock
-from webots_mcp.answers.models import LogsAnswer, Table
+from webots_mcp.answers.budget import fitting, wall_clock
+from webots_mcp.answers.models import AnswerTable, LogsAnswer
+from webots_mcp.answers.shortening import cut_text, is_for_a_person
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
-from webots_mcp.questions.declaring import (
-    READS,
-    Cursor,
-    EndS,
-    LastS,
-    RobotName,
-    RunId,
-    StartS,
-    TimeOfDay,
-    question,
-)
+from webots_mcp.questions.arguments import Cursor, EndS, LastS, RobotName, RunId, StartS, TimeOfDay
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.simulator.console import console_state
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
@@ -130,12 +122,12 @@ def _row(line: LogLine) -> dict[str, object]:
     }
 
 
-def _table(lines: list[LogLine], *, time_of_day: bool) -> Table:
+def _table(lines: list[LogLine], *, time_of_day: bool) -> AnswerTable:
     columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
     if time_of_day:
         columns.insert(columns.index("sim_time_s") + 1, "time")
     rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]
-    return Table(columns=columns, rows=[[row[name] for name in columns] for row in rows])
+    return AnswerTable(columns=columns, rows=[[row[name] for name in columns] for row in rows])
 
 
 def _answer(

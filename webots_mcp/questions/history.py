@@ -20,25 +20,24 @@ from webots_mcp.answers.budget import (
     short_name,
     shown,
     some,
-    tokens_of,
     without_empty,
 )
 from webots_mcp.answers.models import (
+    AnswerPart,
     ChangeSeries,
     HistoryAnswer,
     NumberSeries,
-    Part,
     RowColumns,
     RunSeries,
     RunTrendTables,
     SignalsAnswer,
     TrendsAnswer,
 )
+from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.trends import trends
-from webots_mcp.questions.declaring import (
-    READS,
+from webots_mcp.questions.arguments import (
     AnyNames,
     Cursor,
     Limit,
@@ -47,9 +46,8 @@ from webots_mcp.questions.declaring import (
     RobotName,
     RunId,
     ShownLimit,
-    merged,
-    question,
 )
+from webots_mcp.questions.declaring import READS, merged, question
 from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
@@ -225,7 +223,7 @@ def _likely_points(
     return max(1, room // (_CELL_TOKENS * max(numbers, 1)))
 
 
-def _told(part: Part) -> dict[str, Any]:
+def _told(part: AnswerPart) -> dict[str, Any]:
     return part.model_dump(mode="json", exclude_none=True)
 
 

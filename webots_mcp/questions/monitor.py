@@ -28,7 +28,8 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection.events import asked_kinds, search_events
 from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.trends import RunTrends, trends
-from webots_mcp.questions.declaring import MAX_WAIT_S, READS, Caller, RobotName, question
+from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName
+from webots_mcp.questions.declaring import READS, Caller, question
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
@@ -40,7 +41,6 @@ _ROWS_TOKENS: Final = 1_300
 _EVENTS_SHARE: Final = 0.45  # of them
 _TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
-
 _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 
@@ -163,7 +163,7 @@ def _of_earlier(told: Sequence[RunTrends]) -> list[str]:
     return [f"the trends of run {earlier}: webots_get_trends(run_id)"] if earlier else []
 
 
-def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:
+def _in_window(event: Event, window: WatchedWindow, wall_start_s: float) -> bool:
     """Whether it began in the window, or had begun before and lasted into it."""
     starts = (each.start_s for each in window.rows.segments if each.run_id == event.run_id)
     lasted = event.start_s < min(starts, default=math.inf) <= event.end_s
@@ -196,7 +196,7 @@ def _why_nothing(view: RobotView) -> str:
 
 
 @dataclass(frozen=True)
-class Window:
+class WatchedWindow:
     """The recording since a moment.
 
     Attributes:
@@ -209,7 +209,7 @@ class Window:
     around: TimeRange
 
 
-def window_from(view: RobotView, wall_start_s: float) -> Window:
+def window_from(view: RobotView, wall_start_s: float) -> WatchedWindow:
     """The window of a robot from that wall time (Unix) on."""
     found = find_range(view.connection, Scope(since_wall_time=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
@@ -218,7 +218,7 @@ def window_from(view: RobotView, wall_start_s: float) -> Window:
         for segment in found.segments or [_standing(view, wall_start_s)]
     ]
     around[-1] = replace(around[-1], end_s=math.inf)
-    return Window(found, replace(found, segments=tuple(around)))
+    return WatchedWindow(found, replace(found, segments=tuple(around)))
 
 
 def _from_row_before(connection: sqlite3.Connection, segment: Segment) -> float:

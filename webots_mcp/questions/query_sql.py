@@ -13,18 +13,12 @@ from anyio import to_thread
 from anyio.lowlevel import RunVar
 from pydantic import Field
 
-from webots_mcp.answers.budget import (
-    LONGEST_NAME,
-    cut_for_a_model,
-    fitting,
-    header_of_only,
-    is_for_a_person,
-    room_tokens,
-    tokens_of,
-)
-from webots_mcp.answers.models import SqlAnswer, Table
+from webots_mcp.answers.budget import LONGEST_NAME, fitting, header_of_only, room_tokens
+from webots_mcp.answers.models import AnswerTable, SqlAnswer
+from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.declaring import READS, ShownLimit, question
+from webots_mcp.questions.arguments import ShownLimit
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.sql import (
@@ -98,7 +92,7 @@ async def webots_query_sql(
     less = _LESS.format(deleted) if deleted and _OF_STATES.search(sql) else None
     return SqlAnswer(
         **header,
-        result=Table(columns=columns, rows=rows),
+        result=AnswerTable(columns=columns, rows=rows),
         truncated=_truncated(found, len(rows), longest),
         hint="; ".join(filter(None, (less, wide or _none(rows)))) or None,
     )

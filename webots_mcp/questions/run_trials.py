@@ -16,7 +16,6 @@ from pydantic import BeforeValidator, Field, WithJsonSchema
 from webots_mcp.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.answers.budget import (
     condensed,
-    cut_text,
     figure,
     figures,
     fitting,
@@ -25,25 +24,19 @@ from webots_mcp.answers.budget import (
     shown,
 )
 from webots_mcp.answers.models import TrialsAnswer
+from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
+from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
 from webots_mcp.questions.compare_runs import webots_list_runs
-from webots_mcp.questions.declaring import (
-    DESTROYS,
-    READS,
-    Caller,
-    RobotName,
-    TimeoutS,
-    TrialSetId,
-    merged,
-    question,
-)
-from webots_mcp.questions.send_command import settable
+from webots_mcp.questions.declaring import DESTROYS, READS, Caller, merged, question
+from webots_mcp.questions.parameters import settable
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.parameter import require_known
-from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
+from webots_mcp.steering.run_command import ACTION, known_names, require_possible
+from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
 from webots_mcp.store.parameters import (
@@ -70,7 +63,6 @@ _WAIT_S: Final = 60.0
 _TRIAL_S: Final = 300.0
 _LOOK_EVERY_S: Final = 0.05
 _REPORT_EVERY_S: Final = 1.0
-
 _Value = float | int | bool | str
 CANCELLED: Final = "it was cancelled"
 _TABLE_TOKENS: Final = 1_250

@@ -13,25 +13,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.answers.budget import compact_json, notes_of, seconds, some
+from webots_mcp.answers.budget import notes_of, seconds, some
 from webots_mcp.answers.models import CommandAnswer, RunAnswer, ShownPicture
+from webots_mcp.answers.shortening import compact_json
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
-from webots_mcp.questions.declaring import (
-    CHANGES,
-    READS,
+from webots_mcp.questions.arguments import (
     AnyNames,
-    Caller,
     RobotName,
     RunId,
     RunIds,
     Seconds,
     TimeoutS,
     TrialSetId,
-    question,
 )
+from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.reading.segment import just_after, kept_stretches

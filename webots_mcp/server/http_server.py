@@ -47,7 +47,7 @@ _FOREIGN: Final = "This server answers pages of its own host only.\n"
 _CLOSED: Final = "This server has no valid token: there 'webots-mcp token' says what is wrong.\n"
 
 
-class Place(NamedTuple):
+class Endpoint(NamedTuple):
     """Where a server listens.
 
     Attributes:
@@ -84,9 +84,9 @@ class Place(NamedTuple):
         )
 
 
-def place_of(
+def endpoint_of(
     text: str, allowed: Sequence[str] = (), certificate: Path | None = None, key: Path | None = None
-) -> Place:
+) -> Endpoint:
     """The place that `[HOST:]PORT` names; without a host 127.0.0.1.
 
     Raises:
@@ -95,12 +95,12 @@ def place_of(
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdecimal() and int(port) < 2**16):
         raise InvalidInputError(f"--http {text!r} is not [HOST:]PORT, such as 8000")
-    place = Place(host.strip("[]") or LOOPBACK[0], int(port), allowed, certificate, key)
+    place = Endpoint(host.strip("[]") or LOOPBACK[0], int(port), allowed, certificate, key)
     place.require_safe()
     return place
 
 
-def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) -> None:
+def serve_http(server: MCPServer, place: Endpoint, ready: Callable[[str], object]) -> None:
     """Serve until a signal; `ready` is called with the address as soon as clients may ask.
 
     Raises:
@@ -141,7 +141,7 @@ def _is_news(record: logging.LogRecord) -> bool:
     return not (record.exc_info and isinstance(record.exc_info[1], ClientDisconnect))
 
 
-def guarded_app(server: MCPServer, place: Place, most_sessions: int = MOST_SESSIONS) -> ASGIApp:
+def guarded_app(server: MCPServer, place: Endpoint, most_sessions: int = MOST_SESSIONS) -> ASGIApp:
     """The server as an application for requests that are addressed to it and have the token."""
     app = server.streamable_http_app(
         transport_security=_allowing(place),
@@ -151,7 +151,7 @@ def guarded_app(server: MCPServer, place: Place, most_sessions: int = MOST_SESSI
     return gate(SessionLimit(app, most_sessions), place)
 
 
-def _listening(place: Place) -> socket.socket:
+def _listening(place: Endpoint) -> socket.socket:
     family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
     try:
         return socket.create_server((place.host, place.port), family=family)
@@ -169,13 +169,13 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _names(place: Place) -> tuple[str, ...]:
+def _names(place: Endpoint) -> tuple[str, ...]:
     """The hosts that requests may be addressed to."""
     own = (place.host,) if _is_loopback(place.host) else ()  # such as 127.0.0.2
     return (*LOOPBACK, *own, *place.allowed)
 
 
-def _allowing(place: Place) -> TransportSecuritySettings:
+def _allowing(place: Endpoint) -> TransportSecuritySettings:
     """Requests for these names; pages of the same ones, as far as a browser sends any."""
     names = (*_names(place), *map(str.lower, place.allowed))  # as clients send it
     hosts = [spelled for name in names for spelled in (name, f"{name}:*")]
@@ -183,7 +183,7 @@ def _allowing(place: Place) -> TransportSecuritySettings:
     return TransportSecuritySettings(allowed_hosts=hosts, allowed_origins=origins)
 
 
-def gate(app: ASGIApp, place: Place) -> ASGIApp:
+def gate(app: ASGIApp, place: Endpoint) -> ASGIApp:
     """The application, for requests that are addressed to it and have the token.
 
     The SDK compares the beginning of Host and Origin only, so that both are read here first.

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.extras.requirements import checkout, quoted
-from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.installations import installations
 
 PROBE_TIMEOUT_S: Final = 30.0
 _PREFERENCE: Final = "pythonCommand"
@@ -179,7 +179,7 @@ def _of_registry() -> dict[str, str]:
     return found
 
 
-def look_into(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpreter:
+def probe_interpreter(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpreter:
     """Start the Python of a controller as Webots would, and import the bridge there."""
     by_rule = chosen(controller)
     settings = {"command": " ".join(by_rule.command), "chosen_by": by_rule.by}

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import PROJECT_DATA_FOLDER
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.installations import installations
 
 WAY_OUT: Final = (
     "keep the recording on a local disk of the side where Webots runs (--data-dir), and let the "

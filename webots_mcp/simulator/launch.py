@@ -13,7 +13,7 @@ from webots_mcp.database.connection import transaction
 from webots_mcp.database.files import full_path
 from webots_mcp.database.location import find_project, require_world_of
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
-from webots_mcp.simulator.console import as_row
+from webots_mcp.simulator.console_lines import as_row
 from webots_mcp.simulator.orders import WebotsAddress, WebotsLine, address_of
 from webots_mcp.simulator.project import controllers_in, has_bridge
 from webots_mcp.simulator.starting import LaunchedWebots, Show, Start
@@ -88,7 +88,7 @@ class SessionStart(NamedTuple):
     world: str | None
 
 
-class Launch:
+class WebotsLaunch:
     """A Webots that we have started, and what is recorded in it.
 
     Args:

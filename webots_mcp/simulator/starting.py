@@ -24,7 +24,8 @@ from typing import IO, TYPE_CHECKING, Final, Literal, NamedTuple
 from webots_mcp.database.liveness import process_alive
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator import program_keeper
-from webots_mcp.simulator.instances import DEFAULT_PORT, Instance, find_webots, instances
+from webots_mcp.simulator.installations import find_webots
+from webots_mcp.simulator.instances import DEFAULT_PORT, Instance, instances
 from webots_mcp.simulator.orders import WebotsAddress, WebotsLine
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 Mode = Literal["pause", "realtime", "fast"]
 Show = Callable[[WebotsLine], None]
-
 _HEADLESS: Final = ("--no-rendering", "--minimize")
 _LAST_PORT: Final = (1 << 16) - 1
 _HARD: Final = signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL

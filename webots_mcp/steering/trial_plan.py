@@ -38,7 +38,7 @@ _HOW_MANY: Final = "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or 
 
 
 @dataclass(frozen=True)
-class Range:
+class ParameterRange:
     """What may be tried of one parameter: the numbers of a range, or one of some choices.
 
     Attributes:
@@ -120,7 +120,7 @@ class TrialPlan:
     robot: str | None = None
     timeout_s: float = 300.0
     prune: str | None = None
-    ranges: dict[str, Range] = field(default_factory=dict[str, Range])
+    ranges: dict[str, ParameterRange] = field(default_factory=dict[str, ParameterRange])
     search: Search | None = None
     sets: int = 0
     seed: int = 0
@@ -268,7 +268,7 @@ def _require_tables(parameters: list[Any]) -> None:
         raise InvalidInputError("the same parameters are given twice: use repeats")
 
 
-def _read_ranges(tables: dict[str, Any]) -> dict[str, Range]:
+def _read_ranges(tables: dict[str, Any]) -> dict[str, ParameterRange]:
     """The ranges of `[ranges]` in a plan.
 
     Raises:
@@ -279,13 +279,13 @@ def _read_ranges(tables: dict[str, Any]) -> dict[str, Range]:
     return {name: _range_of(name, table) for name, table in tables.items()}
 
 
-def _range_of(name: str, table: Any) -> Range:
+def _range_of(name: str, table: Any) -> ParameterRange:
     try:
         if not isinstance(table, dict):
             raise InvalidInputError("write { low = 0.5, high = 10.0 } or { choices = [...] }")
         found = cast("dict[str, Any]", table)
         _require_kinds(found, _RANGE_KINDS)
-        return Range(**found)
+        return ParameterRange(**found)
     except InvalidInputError as error:
         raise InvalidInputError(f"[ranges] {name}: {error}") from error
 
@@ -306,7 +306,7 @@ def _require_kinds(table: dict[str, Any], kinds: Mapping[str, Any]) -> None:
             raise InvalidInputError(f"{key}={value!r} is a {type(value).__name__}")
 
 
-def _as_plain(ranges: dict[str, Range]) -> dict[str, Any]:
+def _as_plain(ranges: dict[str, ParameterRange]) -> dict[str, Any]:
     """In JSON's terms, without what is not given."""
     return {
         name: {key: value for key, value in asdict(each).items() if value not in (None, False)}

@@ -19,12 +19,9 @@ from typing import Any, Final
 from webots_mcp.database.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.judging.run_score import score_run
-from webots_mcp.steering.dispatch import (
-    ACTION,
-    BLOCK_NOTICED_S,
-    find_target,
-    withdraw_if_blocked,
-)
+from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, withdraw_if_blocked
+from webots_mcp.steering.run_command import ACTION
+from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, stored_plan
 from webots_mcp.store.parameters import (
     TrialRecord,

@@ -23,7 +23,7 @@ from tests.simulator.webots_server import WebotsServer
 from tests.waiting import wait_for
 from webots_mcp.contract import host_name
 from webots_mcp.database.liveness import holder_of
-from webots_mcp.simulator import console
+from webots_mcp.simulator import console, console_lines
 from webots_mcp.simulator.console import follow_console, job_of
 from webots_mcp.simulator.instances import Instance
 from webots_mcp.store.recording import RecordingAccess
@@ -111,7 +111,7 @@ def test_what_controllers_print_and_what_webots_says_become_rows_with_their_sour
 def test_of_what_was_said_before_it_is_told_that_nobody_knows_when(
     recorded: Recorded, follow: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(console, "MOST_OLD_LINES", 2)
+    monkeypatch.setattr(console_lines, "MOST_OLD_LINES", 2)
     with WebotsServer(streams=False) as server:
         begin_run(recorded, server.port)
         for each in range(5):

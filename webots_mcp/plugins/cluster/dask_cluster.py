@@ -32,7 +32,7 @@ from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.steering.trial_plan import WorldPlan
 from webots_mcp.steering.trial_run import (
-    Command,
+    CommandOfWorld,
     StoppedError,
     TrialAttempt,
     run_attempt,
@@ -80,7 +80,7 @@ class Needs:
     ship_to: str | None = None
 
     @property
-    def command(self) -> Command:
+    def command(self) -> CommandOfWorld:
         """Of the simulator."""
         return stand_in if self.is_stand_in else webots
 

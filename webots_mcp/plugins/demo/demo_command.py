@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from webots_mcp.cli.options import Json, Parameter
-from webots_mcp.cli.terminal import answer_lines, print_json, rewrite
+from webots_mcp.cli.streams import rewrite
+from webots_mcp.cli.terminal import answer_lines, print_json
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, host_name
 from webots_mcp.database.connection import connect
 from webots_mcp.database.files import full_path, whole_file
@@ -39,7 +40,6 @@ DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
 _START_TIMEOUT_S: Final = 30.0
 _ANSWER_LINES: Final = 24
 _ROWS: Final = 6  # of a table
-
 Turn = tuple[str, str, dict[str, Any]]
 # What a person would say, and the tool call that an assistant makes of it.
 CONVERSATION: Final[tuple[Turn, ...]] = (

@@ -29,7 +29,7 @@ from webots_mcp.judging.checks import check_run
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
-from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, compose_trajectory
+from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.making import obstacles_of
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
@@ -353,7 +353,7 @@ def _ranges(
 
 def _all_ways(connection: sqlite3.Connection) -> tuple[TrajectoryAxes, tuple[str, ...]]:
     """The ways of the newest runs of all robots on one map."""
-    tracks: list[Track] = []
+    tracks: list[PlottedPath] = []
     found: TrajectoryAxes | None = None
     notes: list[str] = []
     robots = without_observers(list_robots(connection, time.time()))

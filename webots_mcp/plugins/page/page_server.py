@@ -30,7 +30,7 @@ from webots_mcp.contract import VERSION
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
-from webots_mcp.questions.send_command import set_parameters
+from webots_mcp.questions.parameters import set_parameters
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.signals.parameter import Value
 from webots_mcp.simulator.orders import Order

@@ -11,14 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 from cyclopts.validators import Number
 
 from webots_mcp.cli.options import HERE, Count, Json, Parameter, Where
-from webots_mcp.cli.terminal import (
-    clock_text,
-    id_ranges,
-    print_json,
-    print_notes,
-    print_table,
-    shown_progress,
-)
+from webots_mcp.cli.streams import shown_progress
+from webots_mcp.cli.terminal import clock_text, id_ranges, print_json, print_notes, print_table
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plugins.pool.pool_contents import (
     Choice,

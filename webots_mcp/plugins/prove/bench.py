@@ -21,8 +21,8 @@ from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.questions.control_simulation import webots_simulation_control
 from webots_mcp.questions.declaring import Question
 from webots_mcp.questions.send_command import webots_send_command
-from webots_mcp.setup.project_edits import controller_change, python_change, with_observer
-from webots_mcp.simulator.launch import Launch
+from webots_mcp.setup.observer_edits import controller_change, python_change, with_observer
+from webots_mcp.simulator.launch import WebotsLaunch
 from webots_mcp.simulator.orders import WebotsAddress
 from webots_mcp.simulator.starting import LaunchedWebots, Mode, Start, free_port
 from webots_mcp.standin.in_process import DEFAULT_WORLD
@@ -100,7 +100,7 @@ class Bench:
         self.patience_s = patience_s
         self.where = Where(data_dir=folder / PROJECT_DATA_FOLDER)
         self.recording = self.where.recording(read_only=False)
-        self._launch: Launch | None = None
+        self._launch: WebotsLaunch | None = None
         self._never = set[tuple[bool, Mode | None]]()
         self._last_row = 0  # before Webots was started
 
@@ -126,7 +126,7 @@ class Bench:
         ((self._last_row,),) = self.rows(_LAST_ROW) or [(0,)]
         start = Start(self.world, mode, headless=True, streams=stream, port=port or free_port())
         environment = {DATA_DIR_VARIABLE: str(self.recording.data_dir)}
-        launch = self._launch = Launch(self.recording, start, environment, lambda line: None)
+        launch = self._launch = WebotsLaunch(self.recording, start, environment, lambda line: None)
         until_s = time.monotonic() + self.patience_s
         while mode != "pause" and not self.newest():
             if launch.webots.is_over or time.monotonic() > until_s:

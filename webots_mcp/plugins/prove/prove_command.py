@@ -51,7 +51,7 @@ def prove(
     from webots_mcp.contract import VERSION
     from webots_mcp.plugins.prove.bench import Bench, tried
     from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
-    from webots_mcp.simulator.instances import find_webots
+    from webots_mcp.simulator.installations import find_webots
     from webots_mcp.simulator.starting import Start
 
     for name in only or ():
@@ -94,7 +94,7 @@ def _choose(path: Path) -> None:
     Raises:
         CommandRefusedError: There is none.
     """
-    from webots_mcp.simulator.instances import HOME_VARIABLE, installations
+    from webots_mcp.simulator.installations import HOME_VARIABLE, installations
 
     path = path.resolve()
     for home in (path, *path.parents[:4]):

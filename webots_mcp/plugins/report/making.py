@@ -28,7 +28,8 @@ from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, compose_trajectory
 from webots_mcp.plugins.report.chapter import Chapter, Moment, chapter_of
 from webots_mcp.plugins.report.words import Beside, beside, clock, counted, size, time_at
-from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
+from webots_mcp.questions.arguments import AnyNames, RobotName, RunIds
+from webots_mcp.questions.declaring import DESTROYS, question
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals

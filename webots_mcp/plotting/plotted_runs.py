@@ -1,28 +1,20 @@
-"""What a picture is about: the runs in its ranges, what was recorded in each, and its events."""
+"""The runs in a picture: what was recorded of each, and its events.
+
+Several runs in one picture each begin at time 0.
+"""
 
 from __future__ import annotations
 
-import math
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.events import Events, Found, drawn_kinds, find_events
 from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.detection.search import find_motion
-from webots_mcp.plotting.canvas import (
-    TEXT_PX,
-    Area,
-    Canvas,
-    Frame,
-    scaled,
-    short,
-    ticks,
-    width_of,
-    wrapped,
-)
+from webots_mcp.plotting.canvas import short
 from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.reading.catalogue import one_signal, signals_of
@@ -33,38 +25,14 @@ from webots_mcp.store.series import MOST_POINTS, History, RunHistory, query_hist
 from webots_mcp.store.signals import RegisteredSignal
 
 Known = dict[str, RegisteredSignal]
-
 MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze
 MOST_RUNS: Final = 10  # each with a colour and dashes of its own
-_SHOWN_PARAMETERS: Final = 3
 MOST_EVENTS: Final = 500
 MOST_LANES: Final = 5  # in one picture
-TITLE_PX: Final = 13.0
-LINE_PX: Final = 16.0  # from line to line
-_SWATCH_PX: Final = 26.0
-_GAP_PX: Final = 14.0
-_MOST_HEIGHT: Final = 0.25  # of the picture
-_BAR_PX: Final = 12.0
-_BAR_STEPS: Final = 64
-SCALE_PX: Final = 78.0  # what a scale of colours takes
-_STAR: Final = "M" + "L".join(
-    f"{r * math.sin(i * math.pi / 5):.2f} {-r * math.cos(i * math.pi / 5):.2f}"
-    for i, r in enumerate([1.2, 0.5] * 5)
-) + "Z"  # fmt: skip
-SHAPES: Final = {
-    "circle": "M-1 0A1 1 0 1 1 1 0A1 1 0 1 1-1 0Z",
-    "square": "M-.9-.9H.9V.9H-.9Z",
-    "diamond": "M0-1.2L.7 0 0 1.2-.7 0Z",
-    "cross": "M-1-.6L-.6-1 0-.4.6-1 1-.6.4 0 1 .6 .6 1 0 .4-.6 1-1 .6-.4 0Z",
-    "plus": "M-.35-1H.35V-.35H1V.35H.35V1H-.35V.35H-1V-.35H-.35Z",
-    "triangle": "M0-1.1L1 .8H-1Z",
-    "star": _STAR,
-    "arrow": "M1 0L-.9.9V-.9Z",
-}
 
 
 @dataclass(frozen=True)
-class Part:
+class PlottedRun:
     """One run of a picture.
 
     Attributes:
@@ -107,13 +75,13 @@ class Part:
         return (*self.range.notes, *unread)
 
 
-def parts_of(
+def plotted_runs(
     connection: sqlite3.Connection,
     ranges: Sequence[TimeRange],
     names: Sequence[str],
     points: int = MOST_POINTS,
     deadline_s: float = QUESTION_DEADLINE_S,
-) -> list[Part]:
+) -> list[PlottedRun]:
     """Read the signals of each run in the ranges; several runs begin at 0 each.
 
     Args:
@@ -134,7 +102,7 @@ def parts_of(
             f"the range holds {count} runs, and at most {MOST_RUNS} can be laid over each other: "
             "name them by their ids"
         )
-    parts: list[Part] = []
+    parts: list[PlottedRun] = []
     histories = _histories(connection, ranges, names, points, deadline_s)
     for each, history in zip(ranges, histories, strict=True):
         for segment, run in zip(each.segments, history.runs, strict=True):
@@ -146,11 +114,13 @@ def parts_of(
     return _named_by_parameters(connection, [part for part in parts if part.has_rows])
 
 
-def _named_by_parameters(connection: sqlite3.Connection, parts: list[Part]) -> list[Part]:
+def _named_by_parameters(
+    connection: sqlite3.Connection, parts: list[PlottedRun]
+) -> list[PlottedRun]:
     """Runs that differ in parameters are told apart by them: run 3 (kp 2)."""
     had = parameters_of(connection, [part.run.run_id for part in parts])
-    unlike = differing(list(had.values()))[:_SHOWN_PARAMETERS]
-    named: list[Part] = []
+    unlike = differing(list(had.values()))[:3]
+    named: list[PlottedRun] = []
     for part in parts:
         own = had[part.run.run_id]
         values = [f"{name} {short(str(own[name].described))}" for name in unlike if name in own]
@@ -185,16 +155,16 @@ def _histories(
 
 def _part(
     connection: sqlite3.Connection, time_range: TimeRange, run: RunHistory, overlaid: bool
-) -> Part:
+) -> PlottedRun:
     first_s, newest_s = recorded_bounds(connection, run.run_id) or (run.start_s, run.end_s)
     label = fetch_run(connection, run.run_id).label
     name = f"run {run.run_id}" + (f" “{short(label)}”" if label else "")
     start_s, end_s = max(run.start_s, first_s), min(run.end_s, newest_s)
     origin_s = first_s if overlaid else 0.0
-    return Part(time_range, name, run, start_s, end_s, origin_s)
+    return PlottedRun(time_range, name, run, start_s, end_s, origin_s)
 
 
-def title_of(parts: Sequence[Part]) -> str:
+def title_of(parts: Sequence[PlottedRun]) -> str:
     """Robots, runs and the stretch of time."""
     robots = " and ".join(dict.fromkeys(part.robot for part in parts))
     if len(parts) > 1:
@@ -207,7 +177,7 @@ def _seconds(time_s: float) -> str:
     return f"{time_s:.2f}".rstrip("0").rstrip(".")
 
 
-def range_notes(parts: Sequence[Part]) -> list[str]:
+def range_notes(parts: Sequence[PlottedRun]) -> list[str]:
     """Where a range reaches outside the recording, and what of it is not drawn."""
     notes = [note for part in parts for note in part.notes]
     notes += [f"{unread}: it took too long" for unread in unread_parts(parts)]
@@ -220,7 +190,7 @@ def range_notes(parts: Sequence[Part]) -> list[str]:
     ]
 
 
-def unread_parts(parts: Sequence[Part]) -> list[str]:
+def unread_parts(parts: Sequence[PlottedRun]) -> list[str]:
     """From where on not all of each run was read, of those of which not all was."""
     return [
         f"not all of {part.name} was read from {_seconds(unread.start_s)} s on"
@@ -261,7 +231,7 @@ def mode_signal(known: Known, wanted: str | None) -> str | None:
 
 def event_lanes(
     connection: sqlite3.Connection,
-    part: Part,
+    part: PlottedRun,
     names: Sequence[str],
     rows: int = MOST_LANES,
     known: Mapping[int, Found] | None = None,
@@ -309,19 +279,19 @@ def _not_looked_for(verdicts: Verdicts) -> list[str]:
     return [f"not looked for: {kinds}: {why}" for kinds, why in gaps.items()]
 
 
-def _lane(kind: str, found: Events, part: Part) -> Lane:
+def _lane(kind: str, found: Events, part: PlottedRun) -> Lane:
     events = sorted((e for e in found.events if e.kind == kind), key=lambda event: event.start_s)
     intervals = [_interval(event, part).moved(part.origin_s) for event in events]
     return Lane(kind, intervals, ())
 
 
-def _interval(event: Event, part: Part) -> Interval:
+def _interval(event: Event, part: PlottedRun) -> Interval:
     """Named by what it is about: the signal, the action, the level, or what the bridge noticed."""
     what = event.details.get("what") if event.kind == "bridge_event" else event.name
     return _within(Interval(str(what or ""), event.start_s, event.end_s), part)
 
 
-def _within(interval: Interval, part: Part) -> Interval:
+def _within(interval: Interval, part: PlottedRun) -> Interval:
     """What of an event is in the picture: it may have begun before, and gone on."""
     start_s = max(interval.start_s, min(part.start_s, interval.end_s))
     return Interval(interval.value, start_s, min(interval.end_s, max(part.end_s, start_s)))
@@ -329,7 +299,7 @@ def _within(interval: Interval, part: Part) -> Interval:
 
 def _found(
     connection: sqlite3.Connection,
-    part: Part,
+    part: PlottedRun,
     options: EventOptions,
     known: Mapping[int, Found],
     deadline_s: float = QUESTION_DEADLINE_S,
@@ -353,7 +323,7 @@ def _found(
 
 def stuck_mark(
     connection: sqlite3.Connection,
-    part: Part,
+    part: PlottedRun,
     position: tuple[str, str],
     deadline_s: float,
     known: Mapping[int, Found] | None = None,
@@ -369,195 +339,4 @@ def stuck_mark(
 # What surrounds axes: titles, ticks, marks, and a legend in as many rows as it needs.
 
 
-Sample: TypeAlias = "Callable[[Canvas, float, float], None]"
-
-
-class Entry(NamedTuple):
-    """A line of a legend.
-
-    Attributes:
-        draw: Draws its sample around a place; None without one.
-        hides: The name of the elements that a click on it hides in a page.
-    """
-
-    text: str
-    draw: Sample | None = None
-    hides: str = ""
-
-    @property
-    def width_px(self) -> float:
-        """With its sample."""
-        return width_of(self.text) + (_SWATCH_PX if self.draw else 0.0) + _GAP_PX
-
-
-def line_sample(colour: str, dash: str = "none", width: float = 1.6) -> Sample:
-    """Draws a stretch of a line."""
-
-    def draw(canvas: Canvas, x: float, y: float) -> None:
-        canvas.add("path", d=f"M{x - 10:g} {y:g}h20", stroke=colour, stroke_width=width,
-                   stroke_dasharray=dash)  # fmt: skip
-
-    return draw
-
-
-def area_sample(area: Area, opacity: float = 1.0) -> Sample:
-    """Draws an area."""
-
-    def draw(canvas: Canvas, x: float, y: float) -> None:
-        paint_area(canvas, area, (x - 10, y - 5, 20.0, 10.0), opacity)
-
-    return draw
-
-
-def paint_area(
-    canvas: Canvas, area: Area, box: tuple[float, float, float, float], opacity: float = 1.0
-) -> None:
-    """A rectangle (left, top, width, height) in the style of an area."""
-    left, top, width, height = box
-    place = {"x": left, "y": top, "width": width, "height": height}
-    opaque = {} if opacity == 1.0 else {"fill_opacity": opacity}
-    canvas.add("rect", **place, fill=area.colour, **opaque)
-    if area.dotted:
-        canvas.add("rect", **place, fill="url(#hatch-dots)", fill_opacity=opacity / 2)
-
-
-def hatch_sample(pattern: str) -> Sample:
-    """Draws a hatched area."""
-
-    def draw(canvas: Canvas, x: float, y: float) -> None:
-        canvas.add("rect", x=x - 10, y=y - 5, width=20, height=10, fill=f"url(#{pattern})")
-
-    return draw
-
-
-def rows_of(entries: Sequence[Entry], width_px: float, height_px: float) -> list[list[Entry]]:
-    """The entries in rows of that width, up to a quarter of the height; the rest are counted."""
-    most = max(1, int(_MOST_HEIGHT * height_px / LINE_PX))
-    rows: list[list[Entry]] = []
-    for index, entry in enumerate(entries):
-        if rows and sum(each.width_px for each in rows[-1]) + entry.width_px <= width_px:
-            rows[-1].append(entry)
-        elif len(rows) < most:
-            rows.append([entry])
-        else:
-            rows[-1][-1] = Entry(f"and {len(entries) - index + 1} more")
-            break
-    return rows
-
-
-def paint_rows(
-    canvas: Canvas, rows: Sequence[Sequence[Entry]], top: float, left: float | None = None
-) -> None:
-    """Rows of a legend from a height downwards: centred, or from the left."""
-    for row, entries in enumerate(rows):
-        width = sum(each.width_px for each in entries) - _GAP_PX
-        x = max(4.0, (canvas.width_px - width) / 2) if left is None else left
-        y = top + (row + 0.5) * LINE_PX
-        for entry in entries:
-            hides = {"data_hides": entry.hides} if entry.hides else {}
-            canvas.open(class_="entry", **hides)
-            if entry.draw:
-                entry.draw(canvas, x + 10, y)
-            canvas.text(x + (_SWATCH_PX if entry.draw else 0.0), y + 4, entry.text)
-            canvas.close()
-            x += entry.width_px
-
-
-def paint_title(canvas: Canvas, title: str) -> float:
-    """At the top left, in as many lines as it needs; returns how high it is."""
-    lines = wrapped(title, canvas.width_px - 16, TITLE_PX * 1.1)
-    for row, line in enumerate(lines):
-        canvas.text(8, TITLE_PX + 4 + row * LINE_PX, line, size=TITLE_PX, font_weight="bold")
-    return 10 + LINE_PX * len(lines)
-
-
-def paint_x_axis(
-    canvas: Canvas, frame: Frame, marks: Sequence[tuple[float, str]], label: Sequence[str] = ()
-) -> None:
-    """A line below the frame, with ticks, their labels, and what the axis is."""
-    canvas.open(class_="x-axis")
-    pen = {"stroke": canvas.look.faint, "stroke_width": 0.8}
-    canvas.add("path", d=f"M{frame.left:.1f} {frame.bottom:.1f}H{frame.right:.1f}", **pen)
-    canvas.open(class_="ticks")
-    for value, text in marks:
-        x = float(frame.px(value))
-        canvas.add("path", d=f"M{x:.1f} {frame.bottom:.1f}v4", **pen)
-        half = width_of(text) / 2
-        inside = min(max(x, half), canvas.width_px - half)
-        canvas.text(inside, frame.bottom + 16, text, anchor="middle")
-    canvas.close()
-    for row, line in enumerate(label):
-        y = frame.bottom + 33 + row * LINE_PX
-        canvas.text(frame.left + frame.width / 2, y, line, anchor="middle")
-    canvas.close()
-
-
-def paint_y_axis(canvas: Canvas, frame: Frame, marks: Sequence[tuple[float, str]]) -> None:
-    """A line at the left of the frame, with ticks, their labels, and lines through the frame."""
-    canvas.open(class_="y-axis")
-    faint = {"stroke": canvas.look.faint, "stroke_width": 0.8}
-    canvas.add("path", d=f"M{frame.left:.1f} {frame.top:.1f}V{frame.bottom:.1f}", **faint)
-    canvas.open(class_="ticks")
-    for value, text in marks:
-        y = float(frame.py(value))
-        canvas.add("path", d=f"M{frame.left:.1f} {y:.1f}h-4", **faint)
-        canvas.text(frame.left - 7, y + 4, text, anchor="end")
-    canvas.close()
-    canvas.close()
-
-
-def paint_grid(
-    canvas: Canvas, frame: Frame, x: Sequence[tuple[float, str]], y: Sequence[tuple[float, str]]
-) -> None:
-    """Light lines at the ticks."""
-    lines = [f"M{frame.px(value):.1f} {frame.top:.1f}V{frame.bottom:.1f}" for value, _ in x]
-    lines += [f"M{frame.left:.1f} {frame.py(value):.1f}H{frame.right:.1f}" for value, _ in y]
-    canvas.add("path", class_="grid", d="".join(lines), stroke=canvas.look.grid, stroke_width=0.7)
-
-
-def paint_y_label(canvas: Canvas, frame: Frame, label: str) -> None:
-    """What the vertical axis is, along it."""
-    x, y = TEXT_PX + 2, frame.top + frame.height / 2
-    canvas.text(0, 0, label, anchor="middle", transform=f"translate({x:g} {y:.1f}) rotate(-90)")
-
-
-def paint_scale(
-    canvas: Canvas, frame: Frame, scale: str, bounds: tuple[float, float], label: str
-) -> None:
-    """A scale of colours at the right of the frame, and what it means."""
-    left, height = frame.right + 12, frame.height / _BAR_STEPS
-    for step in range(_BAR_STEPS):
-        colour = scaled(step / (_BAR_STEPS - 1), scale)
-        y = frame.bottom - (step + 1) * height
-        canvas.add("rect", x=left, y=y, width=_BAR_PX, height=height + 0.5, fill=colour)
-    bar = Frame(left, frame.top, _BAR_PX, frame.height, (0, 1), bounds)
-    for value, text in ticks(*bounds, frame.height / 40):
-        canvas.text(left + _BAR_PX + 4, float(bar.py(value)) + 4, text)
-    x, y = canvas.width_px - 6, frame.top + frame.height / 2
-    canvas.text(0, 0, label, anchor="middle", transform=f"translate({x:g} {y:.1f}) rotate(-90)")
-
-
 # Marks --------------------------------------------------------------------------------------------
-
-
-def paint_mark(
-    canvas: Canvas, shape: str, place: tuple[float, float], size: float, *, degrees: float = 0.0,
-    **style: Any,
-) -> None:  # fmt: skip
-    """A mark at a place in pixels, so large from its middle; in a page it keeps its size."""
-    x, y = place
-    canvas.open(class_="at", data_x=x, data_y=y, transform=f"translate({x:.2f} {y:.2f})")
-    turned = f" rotate({degrees:.1f})" if degrees else ""
-    scaled_by = {"transform": f"scale({size:g}){turned}"}
-    width = style.pop("stroke_width", 0.0) / size
-    canvas.add("path", d=SHAPES[shape], stroke_width=f"{width:.3f}", **scaled_by, **style)
-    canvas.close()
-
-
-def mark_sample(shape: str, size: float, **style: Any) -> Sample:
-    """Draws a mark."""
-
-    def draw(canvas: Canvas, x: float, y: float) -> None:
-        paint_mark(canvas, shape, (x, y), size, **style)
-
-    return draw

@@ -1,8 +1,4 @@
-"""The recordings of which every question is asked, each made by a program, the same each time.
-
-What was recorded by the real bridge has the clock of the machine in it; what was written row by
-row has a clock of its own, whose times are part of the answers.
-"""
+"""Recordings that code has made, each the same each time, which questions are asked of."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from tests.recordings import bridge as rover_on_the_stand_in
 from tests.recordings.long import build as build_long
@@ -44,32 +40,12 @@ _TRIED: Final = (  # speed, gait, score; without a score it fell over
 )  # fmt: skip
 
 
-class Kind(NamedTuple):
-    """One recording.
-
-    Attributes:
-        draw: Fills a folder; the database in it is `webots.db`.
-        clock: Whether wall times are drawn too, and the same each time.
-        part: Start and end of a stretch to ask about, simulated seconds.
-        robot: Whose.
-        run_id: The run to ask about; None for the newest of the robot.
-        x: The signal of its position to ask a condition of.
-    """
-
-    draw: Callable[[Path], None]
-    clock: bool
-    part: tuple[float, float]
-    robot: str = "rover"
-    x: str = "pose.x"
-    run_id: int | None = None
-
-
 def draw_story(folder: Path) -> None:
     """Three runs of a rover, second by second as `tests.recordings.rover` tells."""
     with closing(connect(folder / "webots.db", "writer", create=True)) as connection:
         create_schema(connection)
         record_rover(connection)
-        _sum_up(connection)
+        sum_up(connection)
 
 
 def draw_rover(folder: Path) -> None:
@@ -77,7 +53,7 @@ def draw_rover(folder: Path) -> None:
     rover_on_the_stand_in.record(folder)
     with closing(connect(folder / "webots.db", "writer")) as connection:
         connection.execute(_COMMANDS_TOOK)
-        _sum_up(connection)
+        sum_up(connection)
 
 
 def draw_e_puck(folder: Path) -> None:
@@ -90,7 +66,7 @@ def draw_e_puck(folder: Path) -> None:
         e_puck.decide()
         e_puck.act()
     bridge.close()
-    _sum_up_file(folder)
+    sum_up_file(folder)
 
 
 def draw_tag(folder: Path) -> None:
@@ -117,7 +93,7 @@ def draw_tag(folder: Path) -> None:
             bridges[2].log(f"caught after {round_s:.1f} s")
     for bridge in bridges:
         bridge.close()
-    _sum_up_file(folder)
+    sum_up_file(folder)
 
 
 def draw_trials(folder: Path) -> None:
@@ -136,7 +112,7 @@ def draw_trials(folder: Path) -> None:
             failed = None if score is not None else "ValueError: it fell over"
             finish_trial(connection, trial, TrialResult(run_id, score, failed, "for_s", 10.0))
         connection.execute("UPDATE session SET ended_wall_time_s = 2e9, end_reason = 'finished'")
-        _sum_up(connection)
+        sum_up(connection)
 
 
 def _try(
@@ -163,7 +139,7 @@ def _try(
 def draw_long(folder: Path) -> None:
     """10,000 rows of 39 signals, five minutes."""
     build_long(folder / "webots.db", 10_000)
-    _sum_up_file(folder)
+    sum_up_file(folder)
 
 
 def draw_purged(folder: Path) -> None:
@@ -175,55 +151,7 @@ def draw_purged(folder: Path) -> None:
         prune(connection, folder, Retention(rows, *others, outlive=0), now_s=1.7e9, rest=False)
 
 
-def draw_hostile(folder: Path) -> None:
-    """Values and names that a bridge has to bear: what is not in JSON, what changes its kind."""
-    robot = InProcessSupervisor("rover")
-    bridge = MCPBridge(robot, throttle_interval=1, database=folder / "webots.db")
-    for step in range(400):
-        robot.step(16)
-        bridge.publish(_hostile_state(step))
-        if step % 100 == 0:
-            bridge.log(
-                "a line\nwith \x1b[31mcolour\x1b[0m, \u202etext backwards and \x00", "warning"
-            )
-    bridge.close()
-    _sum_up_file(folder)
-
-
-def _hostile_state(step: int) -> dict[str, Any]:
-    return {
-        "pose": {"x": step * 0.01, "y": 0.0},
-        "front": (math.nan, math.inf, -math.inf, 1.5)[step // 100],
-        "large": 10 ** (step % 400),
-        "beyond": 2**63 + step,
-        "kind": (1, "one", True, None)[step // 50 % 4],
-        "mode": "a\u202eb" if step < 200 else "\U0001f916" * 3,
-        "text": "x" * (step * 10),
-        "a.b": {"c.d": step, "": step % 2 == 0, "wheels.left.is": 1.0},
-        "list": [step, None, [math.nan, 0, 0]],
-        "bytes": b"\xff\x00",
-        "tiny": 5e-324,
-        "minus_zero": -0.0,
-        **({"rare": 1.0} if step % 97 == 0 else {}),
-    }
-
-
-def draw_kept(folder: Path) -> None:
-    """One call in ten recorded, and two stretches of which each call is a row."""
-    robot = InProcessSupervisor("rover")
-    bridge = MCPBridge(robot, throttle_interval=10, database=folder / "webots.db")
-    for step in range(1500):
-        robot.step(16)
-        spike = 5.0 if step in (403, 904) else 0.0
-        mode = "turn" if 400 <= step < 407 else "cruise"
-        bridge.publish({"pose": {"x": step * 0.002, "y": 0.0}, "ir": spike, "mode": mode})
-        if step in (410, 910):
-            bridge.keep(f"the spike at step {step}")
-    bridge.close()
-    _sum_up_file(folder)
-
-
-def _sum_up(connection: sqlite3.Connection) -> None:
+def sum_up(connection: sqlite3.Connection) -> None:
     for table in ("session", "run"):
         for (key,) in connection.execute(f"SELECT id FROM {table} WHERE uuid IS NULL").fetchall():
             connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
@@ -231,19 +159,18 @@ def _sum_up(connection: sqlite3.Connection) -> None:
         pass
 
 
-def _sum_up_file(folder: Path) -> None:
+def sum_up_file(folder: Path) -> None:
     with closing(connect(folder / "webots.db", "writer")) as connection:
-        _sum_up(connection)
+        sum_up(connection)
 
 
-KINDS: Final[dict[str, Kind]] = {
-    "story": Kind(draw_story, clock=True, part=(45.0, 65.0), x="pose.0", run_id=1),
-    "rover": Kind(draw_rover, clock=False, part=(5.0, 9.0), x="pose.0", run_id=1),
-    "e_puck": Kind(draw_e_puck, clock=False, part=(5.0, 15.0), robot="e-puck", x="odom.x_m"),
-    "tag": Kind(draw_tag, clock=False, part=(5.0, 15.0), robot="hunter"),
-    "trials": Kind(draw_trials, clock=False, part=(2.0, 6.0)),
-    "long": Kind(draw_long, clock=True, part=(150.0, 175.0), x="pose.0"),
-    "purged": Kind(draw_purged, clock=True, part=(480.0, 720.0), x="pose.0"),
-    "hostile": Kind(draw_hostile, clock=False, part=(1.0, 4.0)),
-    "kept": Kind(draw_kept, clock=False, part=(6.0, 8.0)),
+DRAWN: Final[dict[str, Callable[[Path], None]]] = {
+    "story": draw_story,
+    "rover": draw_rover,
+    "e_puck": draw_e_puck,
+    "tag": draw_tag,
+    "trials": draw_trials,
+    "long": draw_long,
+    "purged": draw_purged,
 }
+"""By name, what fills a folder with a recording; the database in it is `webots.db`."""

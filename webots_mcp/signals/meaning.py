@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal, get_args
 
-from webots_mcp.signals.naming import angle_unit, unit_in, words_of
+from webots_mcp.signals.naming import SOLIDS, WORLD, angle_unit, unit_in, words_of
 
 Quantity = Literal[
     "x", "y", "height", "heading", "roll", "pitch", "speed", "turn rate", "wheel speed",
@@ -29,6 +29,7 @@ QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
 ROLES: Final[tuple[Role, ...]] = get_args(Role)
 SOURCES: Final[tuple[Source, ...]] = get_args(Source)  # the strongest first
 FIRM: Final = frozenset[Source](("declared", "device", "named"))  # a failure may rest on these
+_OF_OTHERS: Final = (f"{WORLD}.", f"{SOLIDS}.")
 _REMEMBERED: Final = 4096  # names whose words are kept
 
 # -- the words of names ------------------------------------------------------------------------
@@ -194,6 +195,8 @@ def meaning_by_name(
         names: All names of the robot, of which partners are found.
     """
     base = (register_role or "").rstrip("0123456789")
+    if name.startswith(_OF_OTHERS):
+        return Meaning(why="an observer saw it: it is of a body, not of the robot's own devices")
     if base == "mode":
         return _named("mode", None, name, "its name is one of a mode")
     if kind == "bool":
@@ -307,7 +310,10 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
         return found
     if said & _JOINTS and said & {"position", "angle", *_TARGET, *_COMMAND}:
         return "joint position"
-    return None
+    if unit in ("rad/s", "deg/s"):
+        return "angular velocity"
+    # What a robot has in front is a distance: a wheel or a motor there says that it is one.
+    return "distance" if said & {"front", "rear"} and said <= _DIRECTIONS else None
 
 
 def _motion_in(
@@ -344,6 +350,9 @@ def _motion_in(
     return None
 
 
+_DIRECTIONS: Final = frozenset(
+    ("front", "rear", "left", "right", "center", "middle", "side", "sensor", "obstacle")
+)
 _DRIVING: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
 _NO_SPEED: Final = frozenset((
     "position", "angle", "tick", "distance", "torque", "force", "current", "power", "temperature",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, noise_of, np
@@ -58,7 +59,7 @@ def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, 
     if blocks < 2 * _LEAST_SIDE:
         return None
     edges = np.linspace(0, len(values), blocks + 1).astype(np.intp)
-    noises = np.array([noise_of(values[a:b]) for a, b in zip(edges, edges[1:], strict=False)])
+    noises = np.array([noise_of(values[a:b]) for a, b in pairwise(edges.tolist())])
     if noises.min() <= _ROUNDING * float(np.abs(values).max()):
         return None
     best: tuple[float, int] | None = None

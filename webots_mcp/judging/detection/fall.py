@@ -93,9 +93,9 @@ def tilt_of(
 def _signal(search: Search, quantity: Quantity) -> RegisteredSignal | None:
     """The first signal of that quantity that has values and is measured."""
     for name, meaning in search.meanings.items():
-        if meaning.quantity == quantity and meaning.is_sensed:
-            if search.whole.zones(name).value_count.any():
-                return search.known[name]
+        is_one = meaning.quantity == quantity and meaning.is_sensed
+        if is_one and search.whole.zones(name).value_count.any():
+            return search.known[name]
     return None
 
 

@@ -101,10 +101,13 @@ def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tupl
             rows = rows if len(times) == len(part) else EvenRows.of(times)
             if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
                 numbers = unwrap(numbers, signal.turn)
-            for swing in swings_in(rows, numbers, *asked):
-                yield signal.name, _course(swing, times, numbers)
-            for swing in find_fast_swings(rows, numbers, least):
-                yield signal.name, Course(swing, swing.amplitude, swing.amplitude)
+            found = [_course(swing, times, numbers) for swing in swings_in(rows, numbers, *asked)]
+            fast = (
+                Course(swing, swing.amplitude, swing.amplitude)
+                for swing in find_fast_swings(rows, numbers, least)
+                if not any(_overlap(swing, each.swing) for each in found)
+            )
+            yield from ((signal.name, each) for each in (*found, *fast))
 
 
 def _course(swing: Swing, times: Array, values: Array) -> Course:
@@ -117,6 +120,10 @@ def _course(swing: Swing, times: Array, values: Array) -> Course:
     if swing.end_s > times[part][-1]:  # it goes on after a gap
         return Course(swing, swing.amplitude, swing.amplitude)
     return course_of(swing, times[part], values[part])
+
+
+def _overlap(one: Swing, other: Swing) -> bool:
+    return one.start_s <= other.end_s and other.start_s <= one.end_s
 
 
 def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:

@@ -335,8 +335,8 @@ class ModeUses:
         self._known: dict[str, ModeUse] = {}
 
     def of(self, mode: str) -> ModeUse:
-        """What it did in a mode; runs are read until one of them shows that it moved."""
-        while not self._known.get(mode, ModeUse()).moving:
+        """What it did in a mode; runs are read until it moved in a few visits of it."""
+        while self._known.get(mode, ModeUse()).moving < LEAST_VISITS:
             if (frame := next(self._frames, None)) is None:
                 break
             self.is_cut |= frame.cut_at_s is not None

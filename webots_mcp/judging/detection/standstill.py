@@ -392,7 +392,7 @@ class Standings:
             return True
         code = int(np.argmax(np.bincount(self.modes[rows])))
         use = self._use(code)
-        if use.moving >= LEAST_VISITS and not use.standing:
+        if use.moving >= LEAST_VISITS and use.standing <= 1:  # this visit is one of them
             return True
         last = int(self._frame_rows[rows.stop - 1])
         later = self._all_modes[last + 1 : last + 2]

@@ -48,9 +48,9 @@ def pursuits_in(search: Search) -> list[Pursuit]:
     for measured, target in targets_in(there):
         zones = frame.zones(target)
         is_set = (zones.min < 0).any() or (zones.max > 0).any()
-        if is_set and there[measured].quantity not in _PLACES:
-            if HOLDING.isdisjoint(words_in(measured)):
-                found.append(Pursuit(known[measured], known[target]))
+        follows = there[measured].quantity not in _PLACES
+        if is_set and follows and HOLDING.isdisjoint(words_in(measured)):
+            found.append(Pursuit(known[measured], known[target]))
     return found
 
 
@@ -74,9 +74,10 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
         return
     cells = _cells_of(frame.times[there])
     values, aims = values[there][cells.order], aims[there][cells.order]
-    off = values - aims
+    low, high = _recent_range(frame.times[there], aims)
     if turn := measured.turn:
-        off = np.remainder(off + turn / 2, turn) - turn / 2
+        values = aims + np.remainder(values - aims + turn / 2, turn) - turn / 2
+    off = np.maximum(values - high, 0.0) - np.maximum(low - values, 0.0)
     error = cells.medians(off)
     noise = max(search.noise.of(measured.name), search.noise.of(target.name))
     margin = _ERRORS * _MEDIAN_ERROR * noise / np.sqrt(cells.counts)
@@ -87,7 +88,12 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
     nearer = np.abs(before) - np.abs(error)
     approaches = nearer > np.maximum(_NEARER_SHARE * np.abs(before), 2 * margin)
     approaches &= np.append(False, cells.follows)
-    for run in runs_of(is_off & ~approaches, cells.starts_s).spans():
+    runs = (
+        run
+        for sign in (-1, 1)
+        for run in runs_of(is_off & ~approaches & (np.sign(error) == sign), cells.starts_s).spans()
+    )
+    for run in sorted(runs, key=lambda each: each.start_s):
         start_s = float(cells.starts_s[run.start])
         end_s = float(cells.ends_s[run.stop - 1])
         if end_s - start_s < OFF_S:
@@ -103,6 +109,19 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
             off_by=round(middle, 6),
             off_percent=round(100 * abs(middle) / size, 1),
         )
+
+
+def _recent_range(times: Array, aims: Array) -> tuple[Array, Array]:
+    """The minimum and maximum of a target in the last 3 s, in which a follower may lag."""
+    first = np.searchsorted(times, times - OFF_S)
+    low, high = aims.copy(), aims.copy()
+    steps = np.flatnonzero(np.diff(aims)) + 1
+    if not len(steps):
+        return low, high
+    width = int(np.max(np.arange(len(times)) - first)) + 1
+    padded = [np.concatenate((np.full(width - 1, each), aims)) for each in (np.inf, -np.inf)]
+    windows = [np.lib.stride_tricks.sliding_window_view(each, width) for each in padded]
+    return windows[0].min(axis=1), windows[1].max(axis=1)
 
 
 class _Cells(NamedTuple):

@@ -26,7 +26,7 @@ from webots_mcp.bridge.error_report import ErrorReport, cut
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Identity, same_simulation
-from webots_mcp.bridge.scene import SceneNode, find_field
+from webots_mcp.bridge.scene_nodes import SceneNode, find_field
 from webots_mcp.bridge.simulation import Clock, LoopMeter, Simulation
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
 from webots_mcp.database.liveness import is_living

@@ -56,7 +56,7 @@ def convert(value: Any) -> object:
     if isinstance(value, _Pointer):
         raise UnsupportedError(value.type_name)
     if isinstance(value, (type, memoryview)):
-        raise UnsupportedError(type_name(value))
+        raise UnsupportedError(type_name(cast("object", value)))
     if (ctypes := _ctypes_of(value)) is not None:
         return _convert_c_data(ctypes, value)
     if type(value).__name__ in _WEBOTS_RECORDS:

@@ -169,7 +169,7 @@ def _is_followed_when_read(kind: Any) -> bool:
     return isinstance(code, str) and code in _C_ADDRESSES
 
 
-# -- all other types, by the attribute that tells them apart -----------------------------------
+# -- all other types, by the attribute that identifies them -----------------------------------
 
 _CONVERSIONS: Final[tuple[tuple[str, Callable[[Any], object]], ...]] = (
     ("tolist", lambda array: _convert_array(array)),  # numpy scalars and arrays, array.array

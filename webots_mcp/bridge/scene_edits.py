@@ -120,7 +120,7 @@ class SceneEdits:
         return len(self.fields) + len(self.removed) >= MOST_EDITS
 
     def begin_run(self) -> None:
-        """After a reset, undo what Webots has not undone and nobody else has changed."""
+        """After a reset, undo what Webots has not undone and nothing else has changed."""
         edits, self.fields, self.added = reversed(self.fields.values()), {}, set()
         outcomes = {edit.path: self._set_back(edit) for edit in edits}
         put_back = {"paths": [path for path, is_set in outcomes.items() if is_set]}

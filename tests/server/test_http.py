@@ -28,7 +28,7 @@ from tests.server.conftest import Driver, ask, fail
 from tests.waiting import until, wait_for
 from webots_mcp.cli import main
 from webots_mcp.server.access_token import access_token, new_token, token_file
-from webots_mcp.server.http_server import Place, guarded_app
+from webots_mcp.server.http_server import Endpoint, guarded_app
 from webots_mcp.server.mcp_server import create_server
 
 pytestmark = pytest.mark.anyio
@@ -407,7 +407,7 @@ async def test_at_the_limit_of_sessions_the_one_that_is_idle_for_longest_ends(
     tmp_path: Path, home: Path
 ) -> None:
     server = create_server(tmp_path / "webots.db", tmp_path)
-    app = guarded_app(server, Place("127.0.0.1", 80), most_sessions=3)
+    app = guarded_app(server, Endpoint("127.0.0.1", 80), most_sessions=3)
     headers = {"Authorization": f"Bearer {access_token()}", **_JSON}
     body = {"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": _INITIALIZE}
     ping = {"jsonrpc": "2.0", "id": 2, "method": "ping"}

@@ -37,7 +37,6 @@ _BESIDE_TOKENS: Final = ANSWER_TOKENS - BUDGET_TOKENS
 _HEADER_TOKENS: Final = 150  # with a hint
 _FOR_A_PERSON_TOKENS: Final = 10_000_000
 LONGEST_NAME: Final = 80
-_LONGEST_NOTE: Final = 300
 _MOST_NOTES: Final = 5
 MOST_RUNS: Final = 5  # of which one answer tells
 
@@ -176,7 +175,7 @@ def notes_of(notes: Sequence[str]) -> list[str] | None:
         return [*notes] or None
     left_out = len(notes) - _MOST_NOTES
     more = [f"and {left_out} more notes"] if left_out > 0 else []
-    return [cut_text(note, _LONGEST_NOTE) for note in notes[:_MOST_NOTES]] + more or None
+    return [cut_text(note, 300) for note in notes[:_MOST_NOTES]] + more or None
 
 
 def some(names: Sequence[str], most: int = 10) -> str:

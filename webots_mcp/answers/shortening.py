@@ -19,11 +19,6 @@ STATE_BUDGET_TOKENS: Final = 1_500
 # A rule, for the tokenizer of one model tells little about another's: a word of up to 12 letters,
 # three digits, or some signs together are one token, and so is any other character.
 _TOKEN: Final = re.compile(r" ?[A-Za-z]{1,12}|\d{1,3}| ?[!-/:-@\[-`{-~]{1,4}|\s{1,16}|.")
-_LONGEST_TOKEN: Final = 16  # characters
-_DIGITS: Final = 4
-_DECIMALS: Final = 3
-_DUST: Final = 1e-12
-_ODD_NUMBERS: Final = ("nan", "inf", "-inf")
 
 
 @dataclass(frozen=True)
@@ -117,7 +112,7 @@ def tokens_of(value: Any) -> int:
 def _fits(value: Any, budget_tokens: int) -> bool:
     """Whether it has no more tokens; of most values their length tells it, without a count."""
     text = compact_json(value)
-    if len(text) <= budget_tokens or len(text) > budget_tokens * _LONGEST_TOKEN:
+    if len(text) <= budget_tokens or len(text) > budget_tokens * 16:
         return len(text) <= budget_tokens
     return tokens_in(text) <= budget_tokens
 
@@ -128,9 +123,9 @@ def round_number(value: float) -> float:
     So a time of 1234.567 s and a position far from the origin keep what moves. What adding leaves
     of a sum, as 2.25e-16, is the 0 that it means.
     """
-    if abs(value) < _DUST:
+    if abs(value) < 1e-12:
         return 0.0
-    return round(value, _DECIMALS) if abs(value) >= 1 else float(f"{value:.{_DIGITS}g}")
+    return round(value, 3) if abs(value) >= 1 else float(f"{value:.4g}")
 
 
 def cut_text(text: str, longest: int) -> str:
@@ -189,7 +184,7 @@ class _Shortener:
     def _summary(self, items: list[Any], depth: int) -> dict[str, Any]:
         numbers = [item for item in items if _is_figure(item)]
         others = [item for item in items if not _is_figure(item)]
-        if all(item is None or item in _ODD_NUMBERS for item in others):
+        if all(item is None or item in ("nan", "inf", "-inf") for item in others):
             return {**self._statistics(items, numbers), **_counts(others)}
         first = [self.shorten(item, depth + 1) for item in items[: min(3, self._limits.items)]]
         return {"count": len(items), "first": first}

@@ -14,8 +14,6 @@ from collections.abc import Callable, Generator
 from types import FrameType
 from typing import Final, TypeAlias
 
-_GRACE_S: Final = 0.5  # for giving back the lease and for commands that nobody waits for any more
-_LONGEST_END_S: Final = 2.5  # of a command that cleans up; then it ends as it is
 _WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIGTERM"}
 Handler: TypeAlias = Callable[[int, "FrameType | None"], None]
 
@@ -38,7 +36,7 @@ def ending_by_signals(*, is_process: bool) -> Generator[None]:
 
     def end(number: int, frame: FrameType | None) -> None:
         if number == signal.SIGTERM and not late:
-            late.append(threading.Timer(_LONGEST_END_S, _exit, [number]))
+            late.append(threading.Timer(2.5, _exit, [number]))
             late[0].daemon = True
             late[0].start()
         _interrupt(number, frame)
@@ -85,7 +83,7 @@ def ending_in_time() -> Generator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         # A task that the interrupt meets in the middle is no defect that anybody has to read of.
         logging.getLogger("asyncio").disabled = True
-        late = threading.Timer(_GRACE_S, _exit, [number])
+        late = threading.Timer(0.5, _exit, [number])
         late.daemon = True
         late.start()
         _interrupt(number, frame)

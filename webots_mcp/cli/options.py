@@ -46,10 +46,6 @@ else:  # cyclopts 4, the last for Python 3.10: options have no words for their v
 
 _TOO_LARGE: Final = 2**63  # for SQLite, and no id that it has given
 _NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
-# Not owed to a value in a row: reading past invalid rows would not help.
-_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
-_MAKING_CHUNKS_S: Final = 300.0  # a million rows of 40 values take 100 s
-_BACK: Final = "default"
 _RUNS: Final = "outlive"
 
 
@@ -299,7 +295,9 @@ def past_wrong_values(run: Callable[[], None]) -> None:
     try:
         return run()
     except Exception as error:
-        if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
+        if isinstance(error, (WebotsMCPError, OSError, ImportError)) and not isinstance(
+            error, MalformedRowError
+        ):
             raise
     past_invalid_rows(run)
 
@@ -320,7 +318,8 @@ def make_chunks_first(recording: RecordingAccess) -> None:
     from webots_mcp.store.chunk_making import make_missing_chunks
 
     with shown_progress("making chunks of what was recorded") as progress:
-        left = make_missing_chunks(recording, progress, limit_s=_MAKING_CHUNKS_S)
+        # A million rows of 40 values take 100 s.
+        left = make_missing_chunks(recording, progress, limit_s=300.0)
     if left:
         print(f"webots-mcp: {left}", file=sys.stderr)
 
@@ -386,7 +385,7 @@ class RetentionOptions:
 
 
 def _value(name: str, text: str) -> Limit | float | None:
-    if text == _BACK:
+    if text == "default":
         return None
     try:
         if name == _RUNS:

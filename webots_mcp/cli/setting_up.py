@@ -24,13 +24,11 @@ if TYPE_CHECKING:
     from webots_mcp.setup.file_change import FileChange
     from webots_mcp.simulator.project import ProjectController
 
-_WRONG: Final = 1  # the exit code
 _NO_CONTROLLER: Final = (
     "there is no controller in controllers/. Once there is one, run this again. An extern "
     "controller or a ROS 2 driver records with these two lines: 'from webots_mcp import MCPBridge' "
     "and, where it has made its robot, 'bridge = MCPBridge.attach(robot)'"
 )
-_LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
 
 
 @Parameter(name="*")
@@ -517,7 +515,7 @@ def doctor(
         print_json({"checks": [_facts(each) for each in checked]})
     else:
         _print_checks(checked)
-    return _WRONG if any(each.finding.verdict == "wrong" for each in checked) else 0
+    return 1 if any(each.finding.verdict == "wrong" for each in checked) else 0
 
 
 def _examined(recorded: Where) -> Examined:
@@ -555,7 +553,7 @@ def _print_folded(head: str, text: str) -> None:
     width = terminal_width(sys.stdout)
     lines = textwrap.wrap(
         printable(as_typed(text)),
-        max(width - len(head), _LEAST_COLUMN),
+        max(width - len(head), 30),
         break_long_words=False,
         break_on_hyphens=False,
     )

@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
 _WEBOTS: Final = ToWebots()
-_RANK_EVERY_S: Final = 1.0
-_WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
 _WHERE: Final = Where()
 
 
@@ -473,14 +471,15 @@ class _TrialProgress:
         """That a trial is over, and what came of it."""
         self._over += 1
         came = text_of(result.score) if result.status == "done" else result.error
-        came = f"{_WORDS[result.status]} {came}"
+        word = {"done": "score", "failed": "failed:", "pruned": "pruned:"}[result.status]
+        came = f"{word} {came}"
         said = f"{self._over}/{self._of}  "
         if trial.values:
             said += f"{text_of(trial.values)}: {came}"
         else:  # the same again, which no score ranks
             said += "over" if result.status == "done" else came
         print(said, file=sys.stderr, flush=True)
-        is_due = time.monotonic() >= self._ranked_s + _RANK_EVERY_S
+        is_due = time.monotonic() >= self._ranked_s + 1.0
         if trial.values and is_due and self._over < self._of:
             self._tell_leader()
             self._ranked_s = time.monotonic()

@@ -18,7 +18,6 @@ from typing import Any, Final, TextIO, cast
 
 from webots_mcp.signals.naming import spelled_out
 
-_INTERVAL_S: Final = 0.1  # between two states of the line of progress
 _PLAIN_INTERVAL_S: Final = 3.0  # between two lines where no line can be rewritten
 
 
@@ -108,7 +107,7 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
             return
         text = f"{doing}: {100 * done // max(of, 1)} %"
         if is_terminal:
-            next_s = time.monotonic() + _INTERVAL_S
+            next_s = time.monotonic() + 0.1
             rewrite(sys.stderr, text)
         else:
             next_s = time.monotonic() + _PLAIN_INTERVAL_S

@@ -13,17 +13,35 @@ import sys
 import textwrap
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, TextIO, cast
 
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.signals.naming import spelled_out
 
-_PARAGRAPH: Final = 100  # characters of a line of text, where the terminal has more
-_SHORT: Final = 48
-_INDENT: Final = "  "
-_ENDLESS: Final = 100_000
-_GAP: Final = 2  # between columns
-_LONGEST_WORD: Final = 24  # that no column folds, such as a time
+
+@dataclass(frozen=True)
+class TextLayout:
+    """The layout of answers, in characters.
+
+    Attributes:
+        paragraph: Width of a line of text where the terminal has more.
+        short: Length up to which members share a paragraph.
+        indent: Indentation of what belongs to the line above.
+        endless: Width where nobody reads: no line is folded.
+        gap: Gap between columns.
+        word: Length up to which no column folds a word, such as a time.
+    """
+
+    paragraph: int = 100
+    short: int = 48
+    indent: str = "  "
+    endless: int = 100_000
+    gap: int = 2
+    word: int = 24
+
+
+_LAYOUT: Final = TextLayout()
 _HEAD: Final = {
     "robot": "{}",
     "run_id": "run {}",
@@ -32,9 +50,7 @@ _HEAD: Final = {
     "age_s": "{} s old",
 }
 _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
-_CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
 _AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
-_OF_TABLE: Final = ("columns", "rows", "in_every_row")
 _NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
 
 
@@ -45,7 +61,7 @@ def print_answer(answer: Mapping[str, Any]) -> None:
 
 
 def answer_lines(
-    answer: Mapping[str, Any], *, width: int = _PARAGRAPH, most_rows: int | None = None
+    answer: Mapping[str, Any], *, width: int = _LAYOUT.paragraph, most_rows: int | None = None
 ) -> Iterator[str]:
     """Whom and when the answer is about in one line, then part by part what it says.
 
@@ -57,7 +73,7 @@ def answer_lines(
     layout = _Layout(width, most_rows, is_of_command="outcome" in answer)
     head = [text.format(text_of(answer[name])) for name, text in _HEAD.items() if name in answer]
     if head:
-        yield from textwrap.wrap(", ".join(head), width, subsequent_indent=_INDENT)
+        yield from textwrap.wrap(", ".join(head), width, subsequent_indent=_LAYOUT.indent)
     apart = (*_HEAD, *_NOTES)
     yield from layout.members({k: v for k, v in answer.items() if k not in apart})
     for name in _NOTES:
@@ -67,12 +83,14 @@ def answer_lines(
             yield from note_lines(f"left out: {text}" if name == "left_out" else text, width)
 
 
-def note_lines(text: str, width: int = _PARAGRAPH) -> list[str]:
+def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:
     """What there is to know about an answer, whole."""
     lines = textwrap.wrap(
-        f"note: {printable(as_typed(text))}", min(width, _PARAGRAPH), subsequent_indent=_INDENT
+        f"note: {printable(as_typed(text))}",
+        min(width, _LAYOUT.paragraph),
+        subsequent_indent=_LAYOUT.indent,
     )
-    return lines if width < _ENDLESS else [" ".join(map(str.strip, lines))]
+    return lines if width < _LAYOUT.endless else [" ".join(map(str.strip, lines))]
 
 
 def print_notes(notes: Iterable[str], file: TextIO | None = None) -> None:
@@ -89,7 +107,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 
 def table_lines(
-    columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int = _ENDLESS
+    columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int = _LAYOUT.endless
 ) -> Iterator[str]:
     """The lines of a table that is no wider than so many characters; what is longer is folded.
 
@@ -102,14 +120,14 @@ def table_lines(
     kept = [i for i in range(len(columns)) if any(row[i] is not None for row in rows)]
     headers = {index: printable(columns[index]) for index in kept}
     words = {i: [word for row in rows for word in text_of(row[i]).split()] for i in kept}
-    if sum(_longest([headers[i], *words[i]]) + _GAP for i in kept) > width:
+    if sum(_longest([headers[i], *words[i]]) + _LAYOUT.gap for i in kept) > width:
         headers = {index: header.replace("_", "_\n") for index, header in headers.items()}
     least = {i: _longest([*headers[i].split(), *words[i]]) for i in kept}
     full = {i: max(len(headers[i]), *(len(text_of(row[i])) for row in rows), 1) for i in kept}
-    if sum(least.values()) + _GAP * len(kept) > width:
+    if sum(least.values()) + _LAYOUT.gap * len(kept) > width:
         return (line for row in rows for line in _row_in_words(columns, row, width))
-    widths = _shared_out(width - _GAP * len(kept), least, full)
-    table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0), show_edge=False)
+    widths = _shared_out(width - _LAYOUT.gap * len(kept), least, full)
+    table = Table(box=None, pad_edge=False, padding=(0, _LAYOUT.gap, 0, 0), show_edge=False)
     for index in kept:
         numbers = all(isinstance(row[index], (int, float, type(None))) for row in rows)
         table.add_column(
@@ -120,7 +138,7 @@ def table_lines(
         )
     for row in rows:
         table.add_row(*(Text(text_of(row[index])) for index in kept))
-    wide = sum(widths.values()) + _GAP * len(kept)
+    wide = sum(widths.values()) + _LAYOUT.gap * len(kept)
     console = Console(width=wide, color_system=None, highlight=False, markup=False, emoji=False)
     with console.capture() as captured:
         console.print(table)
@@ -137,7 +155,7 @@ def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> lis
     return textwrap.wrap(
         ", ".join(named),
         width,
-        subsequent_indent=_INDENT,
+        subsequent_indent=_LAYOUT.indent,
         break_long_words=False,
         break_on_hyphens=False,
     )
@@ -159,7 +177,7 @@ def _shared_out(room: int, least: Mapping[int, int], full: Mapping[int, int]) ->
 
 
 def _longest(words: Iterable[str]) -> int:
-    return min(max(map(len, words), default=1), _LONGEST_WORD)
+    return min(max(map(len, words), default=1), _LAYOUT.word)
 
 
 def text_of(value: Any) -> str:
@@ -203,7 +221,7 @@ def print_json(found: Any) -> None:
 
 def terminal_width(stream: TextIO) -> int:
     """The characters of a line; no limit where nobody looks at it."""
-    return shutil.get_terminal_size().columns if stream.isatty() else _ENDLESS
+    return shutil.get_terminal_size().columns if stream.isatty() else _LAYOUT.endless
 
 
 def _number_text(value: float) -> str:
@@ -218,7 +236,7 @@ class _Layout:
 
     def __init__(self, width: int, most_rows: int | None, *, is_of_command: bool) -> None:
         self._width = width
-        self._paragraph = min(width, _PARAGRAPH)
+        self._paragraph = min(width, _LAYOUT.paragraph)
         self._most_rows = most_rows
         self._is_of_command = is_of_command
 
@@ -227,7 +245,7 @@ class _Layout:
         short = list[str]()
         for name, value in members.items():
             line = "" if _has_members(value) else f"{name} {text_of(value)}"
-            if 0 < len(line) <= _SHORT:
+            if 0 < len(line) <= _LAYOUT.short:
                 short.append(line)
                 continue
             yield from self._wrapped(short)
@@ -256,7 +274,7 @@ class _Layout:
                 part = part | {
                     "rows": [["NULL" if v is None else v for v in row] for row in part["rows"]]
                 }
-            yield from (_INDENT + line for line in self._inside(part))
+            yield from (_LAYOUT.indent + line for line in self._inside(part))
 
     def _inside(self, part: Mapping[str, Any]) -> Iterator[str]:
         if {"columns", "rows"} <= part.keys():
@@ -267,7 +285,9 @@ class _Layout:
 
     def _table_with_rest(self, part: Mapping[str, Any]) -> Iterator[str]:
         yield from self._table(part)
-        yield from self.members({k: v for k, v in part.items() if k not in _OF_TABLE})
+        yield from self.members(
+            {k: v for k, v in part.items() if k not in ("columns", "rows", "in_every_row")}
+        )
 
     def _table(self, table: Mapping[str, Any]) -> Iterator[str]:
         rows = table["rows"]
@@ -275,13 +295,13 @@ class _Layout:
         if shared:
             yield from self._wrapped(f"{name} {text_of(value)}" for name, value in shared.items())
         yield from table_lines(
-            table["columns"], rows[: self._most_rows], self._width - len(_INDENT)
+            table["columns"], rows[: self._most_rows], self._width - len(_LAYOUT.indent)
         )
         if self._most_rows is not None and len(rows) > self._most_rows:
             yield f"... and {len(rows) - self._most_rows} more"
 
     def _wrapped(self, texts: Iterable[str]) -> list[str]:
-        return textwrap.wrap(", ".join(texts), self._paragraph, subsequent_indent=_INDENT)
+        return textwrap.wrap(", ".join(texts), self._paragraph, subsequent_indent=_LAYOUT.indent)
 
 
 def _without_lists(
@@ -293,7 +313,8 @@ def _without_lists(
         if isinstance(value, dict):
             members = cast("dict[str, Any]", value)
             is_series = any(isinstance(members.get(each), list) for each in _TIMES)
-            inner = (*path, *([] if name in _CALLED_ALIKE else [name]))
+            # What they hold has names of its own.
+            inner = (*path, *([] if name in ("numbers", "signals") else [name]))
             left = members if is_series else _without_lists(members, length, inner, columns)
             if left:
                 rest[name] = left

@@ -5,7 +5,6 @@ The controller evaluates each condition at every call of `publish`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Final
 
 from anyio import to_thread
@@ -42,8 +41,6 @@ _NOT_ASKED: Final = (
     "no controller of this robot runs to ask any: those that its code had set ended with it, those "
     "of webots_breakpoint stay and are armed when it starts again"
 )
-_ARMING_WAIT_S: Final = 5.0
-_NO_PARAMS: Final[Mapping[str, Any]] = {}
 _LONGEST_CONDITION: Final = 300
 
 
@@ -75,7 +72,7 @@ async def webots_breakpoint(
     """
     parsed = parse_condition(condition)
     if action != "log":  # what the bridge does at a hit is not asked for again
-        await to_thread.run_sync(permit, recording, action, _NO_PARAMS)
+        await to_thread.run_sync(permit, recording, action, dict[str, Any]())
     name, number, notes = await to_thread.run_sync(
         _store, recording, robot, parsed, action, after_hits, caller.client
     )
@@ -168,7 +165,7 @@ async def _arm(
     """Let the controller read its breakpoints again; its reply, or why there is none."""
     dispatcher = Dispatcher(recording, caller.report)
     try:
-        answer = await dispatcher.ask(robot, "arm_breakpoints", _ARMING_WAIT_S)
+        answer = await dispatcher.ask(robot, "arm_breakpoints", 5.0)
     except CommandRefusedError as refused:
         return {}, f"{refused}. A controller of this robot reads them when it starts"
     if answer.outcome != "done":

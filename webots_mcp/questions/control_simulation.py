@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, cast
 
 import anyio
@@ -31,14 +32,30 @@ Port = Annotated[
     Field(description="Of a Webots of another project."),
 ]
 Force = Annotated[bool, Field(description="Press Webots' keys where nothing else works.")]
-_WAIT_S: Final = 10.0
-_RELOAD_WAIT_S: Final = 30.0
-_USUAL_WAIT_S: Final[dict[Order, float]] = {"reload": _RELOAD_WAIT_S, "step": MAX_WAIT_S}
-_STARTING_S: Final = 60.0  # Webots downloads what it has not cached
-_WORLD_WAIT_S: Final = 30.0
-_LOOK_EVERY_S: Final = 0.2
-_LONGEST_LINE: Final = 200
-_RUN_WAIT_S: Final = 60.0
+
+
+@dataclass(frozen=True)
+class ControlTimes:
+    """How long questions wait unless told otherwise, in seconds of wall time.
+
+    Attributes:
+        command_s: For a command.
+        reload_s: For a reload.
+        start_s: For Webots to start: it downloads what it has not cached.
+        world_s: For another world, or for the end of Webots.
+        run_s: For a run.
+        poll_s: Between two checks whether a controller records.
+    """
+
+    command_s: float = 10.0
+    reload_s: float = 30.0
+    start_s: float = 60.0
+    world_s: float = 30.0
+    run_s: float = 60.0
+    poll_s: float = 0.2
+
+
+_TIMES: Final = ControlTimes()
 
 
 @question("Control the simulation", DESTROYS, core=True)
@@ -68,7 +85,9 @@ async def webots_simulation_control(
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
     steps = steps or 1
     params = {"steps": steps} if command == "step" else {}
-    waiting_s = timeout_wall_s or _USUAL_WAIT_S.get(command, _WAIT_S)
+    waiting_s = timeout_wall_s or {"reload": _TIMES.reload_s, "step": MAX_WAIT_S}.get(
+        command, _TIMES.command_s
+    )
     dispatcher = Dispatcher(recording, caller.report)
     attempt = Attempt(recording, dispatcher, robot, waiting_s, command, params, force, port)
     return await attempt.steer()
@@ -80,7 +99,7 @@ async def webots_world_reload(
     caller: Caller,
     force: Force = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _RELOAD_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.reload_s,
 ) -> CommandAnswer:
     """Load world and code anew, as webots_simulation_control("reload")."""
     dispatcher = Dispatcher(recording, caller.report)
@@ -93,7 +112,7 @@ async def webots_world_reset(
     caller: Caller,
     force: Force = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.command_s,
 ) -> CommandAnswer:
     """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
     dispatcher = Dispatcher(recording, caller.report)
@@ -105,7 +124,7 @@ async def webots_reset_controller_state(
     recording: RecordingAccess,
     caller: Caller,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.command_s,
 ) -> CommandAnswer:
     """Put the controller's own variables back; world and time go on as they are.
 
@@ -130,7 +149,7 @@ async def webots_launch_world(
     stream: Annotated[
         bool, Field(description="Obey without a controller; opens the project to the net.")
     ] = False,
-    timeout_wall_s: TimeoutS = _STARTING_S,
+    timeout_wall_s: TimeoutS = _TIMES.start_s,
 ) -> CommandAnswer:
     """Start Webots and wait until the first controller records, or say why none does.
 
@@ -153,7 +172,7 @@ async def webots_load_world(
     world: World,
     caller: Caller,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WORLD_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.world_s,
 ) -> CommandAnswer:
     """Open another world in the running Webots; all controllers end.
 
@@ -169,7 +188,7 @@ async def webots_quit(
     recording: RecordingAccess,
     caller: Caller,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WORLD_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.world_s,
 ) -> CommandAnswer:
     """End Webots: the one of webots_launch_world; another only by a robot that is a Supervisor."""
     return await _request(recording, caller, robot, timeout_wall_s).quit()
@@ -199,9 +218,9 @@ async def _wait(launched: WebotsLaunch, caller: Caller, until_s: float) -> Sessi
             await to_thread.run_sync(launched.record_last_words)
             raise CommandRefusedError(await to_thread.run_sync(launched.silence))
         lines = launched.webots.lines
-        said = cut_text(lines[-1].text, _LONGEST_LINE) if lines else "Webots starts"
+        said = cut_text(lines[-1].text, 200) if lines else "Webots starts"
         await caller.report(time.monotonic() - begun_s, until_s - begun_s, said)
-        await anyio.sleep(_LOOK_EVERY_S)
+        await anyio.sleep(_TIMES.poll_s)
 
 
 def _answer(
@@ -276,7 +295,7 @@ async def webots_run(
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
     picture: Annotated[bool, Field(description="Show the end as a screenshot too.")] = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _RUN_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.run_s,
 ) -> RunAnswer:
     """Let the simulation run until a condition holds or a simulated time is over, then pause it.
 

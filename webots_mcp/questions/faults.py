@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     pass
 
 
-_MOST_FAULTS: Final = 3
 _LONGEST_VALUE: Final = 80
 _AS_DECLARED: Final[Mapping[str, str]] = MappingProxyType({})
 
@@ -37,7 +36,7 @@ def faults_of(error: ValidationError, typed: Mapping[str, str] = _AS_DECLARED) -
         typed: How the arguments are called where they were typed, if not by their names.
     """
     faults = {str(each["loc"][0]): _fault(each, typed) for each in reversed(error.errors())}
-    return "; ".join(list(faults.values())[:_MOST_FAULTS])
+    return "; ".join(list(faults.values())[:3])
 
 
 def _fault(error: ErrorDetails, typed: Mapping[str, str]) -> str:

@@ -34,16 +34,10 @@ from webots_mcp.store.robots import list_robots
 
 _COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
-_LONGEST_MESSAGE: Final = 500
-_BUDGET_TOKENS: Final = 1_500
 _ANY_LINE: Final = LogFilter(None, LogWindow(-math.inf, math.inf), "", "debug")
 _BELOW_LEVEL: Final = (
     "no robot has recorded yet, and no line of Webots' console has the level {} or above: these "
     "have a lower one"
-)
-_NONE_MATCHES: Final = (
-    "no robot has recorded yet, and no line of Webots' console matches: leave out the level, the "
-    "text and the source to see all of its lines"
 )
 _NO_RUN_YET: Final = (
     "lines without a run_id came from Webots' console before a run began: a controller that never "
@@ -99,7 +93,14 @@ def webots_get_logs(
             # What a controller prints as it fails has no level of its own.
             any_level = replace(asked, lowest_level=_ANY_LINE.lowest_level)
             shown = waiting or waiting_lines(connection, any_level, lines)
-        hint = _BELOW_LEVEL.format(lowest) if shown else _NONE_MATCHES
+        hint = (
+            _BELOW_LEVEL.format(lowest)
+            if shown
+            else (
+                "no robot has recorded yet, and no line of Webots' console matches: leave out the "
+                "level, the text and the source to see all of its lines"
+            )
+        )
         return LogsAnswer(
             lines=_table(_newest_fitting(shown), time_of_day=time_of_day) if shown else None,
             matching=len(waiting),
@@ -117,7 +118,7 @@ def _row(line: LogLine) -> dict[str, object]:
         "id": line.id,
         "sim_time_s": None if line.sim_time_s is None else round(line.sim_time_s, 3),
         "level": line.level,
-        "message": message if is_for_a_person() else cut_text(message, _LONGEST_MESSAGE),
+        "message": message if is_for_a_person() else cut_text(message, 500),
         "run_id": line.run_id,
     }
 
@@ -159,7 +160,7 @@ def _newest_fitting(lines: list[LogLine]) -> list[LogLine]:
     if is_for_a_person():
         return lines
     rows = [[*_row(line).values()] for line in reversed(lines)]
-    return lines[len(lines) - len(fitting(rows, _BUDGET_TOKENS)) :]
+    return lines[len(lines) - len(fitting(rows, 1_500)) :]
 
 
 def _hint(asked: LogFilter, matching: int, shown: int) -> str | None:

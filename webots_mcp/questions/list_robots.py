@@ -8,6 +8,7 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.answers.budget import (
@@ -60,17 +61,34 @@ from webots_mcp.store.run_rows import (
     real_time_factor,
 )
 
-_SHOWN_ROBOTS: Final = 50
-_SHOWN_IN_WORLD: Final = 40
+
+@dataclass(frozen=True)
+class RobotListSizes:
+    """How much of robots and world an answer shows.
+
+    Attributes:
+        robots: Robots.
+        bodies: Bodies in the world.
+        devices_tokens: Budget of the devices.
+        others_tokens: Budget of the other robots.
+        name_characters: Characters of a name.
+        error_characters: Characters of the last error.
+    """
+
+    robots: int = 50
+    bodies: int = 40
+    devices_tokens: int = 300
+    others_tokens: int = 200
+    name_characters: int = 100
+    error_characters: int = 300
+
+
+_SIZES: Final = RobotListSizes()
 _TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
 _PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
-_DEVICES_TOKENS: Final = 300
-_COMPANIONS_TOKENS: Final = 200
-_LONGEST_NAME: Final = 100
 _RECORDER_COLUMNS: Final = (
     "row_count", "why", "pace", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
 )  # fmt: skip
-_LONGEST_ERROR: Final = 300
 BY_OBSERVER: Final = "the observer, from customData: it has no bridge and takes no commands"
 _ROBOT_COLUMNS: Final = (
     "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
@@ -123,7 +141,7 @@ def webots_get_world_info(
         run = view.require_run()
         session = fetch_session(view.connection, run.session_id)
         others = _companions(view)
-        shown = others if is_for_a_person() else fitting(others, _COMPANIONS_TOKENS)
+        shown = others if is_for_a_person() else fitting(others, _SIZES.others_tokens)
         more = f"{len(others) - len(shown)} more robots beside it: webots_list_robots"
         answer = WorldAnswer(
             **view.header(),
@@ -172,7 +190,7 @@ def _recorder(view: RobotView) -> dict[str, Any]:
         "waiting_in": None,
         **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped if session else 0,
-        "last_error": error and cut_for_a_model(error, _LONGEST_ERROR),
+        "last_error": error and cut_for_a_model(error, _SIZES.error_characters),
     }
 
 
@@ -181,7 +199,7 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
     if world is None:
         return {}
     bodies = [*world.told.get("robots", ()), *world.told.get("solids", ())]
-    shown = [body | world.places.get(body["key"], {}) for body in bodies[:_SHOWN_IN_WORLD]]
+    shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
     used = [
         column
         for column in (*_TOLD_IN_WORLD, *_PLACE)
@@ -202,7 +220,7 @@ def _in_world(body: dict[str, Any], columns: list[str]) -> list[Any]:
     return [
         round_number(value)
         if isinstance(value, float)
-        else cut_text(value, _LONGEST_NAME)
+        else cut_text(value, _SIZES.name_characters)
         if isinstance(value, str)
         else value
         for value in values
@@ -222,7 +240,7 @@ def _retention(recording: RecordingAccess, connection: sqlite3.Connection) -> di
 def _liveliest(robots: list[Any]) -> list[Any]:
     """Those seen last, where there are too many to show; the latest first."""
     latest = sorted(robots, key=lambda robot: (robot.live, robot.last_seen_wall_time_s))
-    return latest[::-1][:_SHOWN_ROBOTS]
+    return latest[::-1][: _SIZES.robots]
 
 
 def _fitting(views: list[RobotView]) -> list[RobotView]:
@@ -236,7 +254,7 @@ def _row(view: RobotView) -> list[Any]:
     runs = count_runs(view.connection, view.robot.id)
     newest = [header[name] for name in ("status", "run_id", "sim_time_s", "age_s")]
     actions = len(session.actions) if session else 0
-    name = cut_text(view.robot.name, _LONGEST_NAME)
+    name = cut_text(view.robot.name, _SIZES.name_characters)
     return [name, view.robot.kind, view.robot.live, *newest, runs, actions]
 
 
@@ -275,7 +293,7 @@ def _controller(view: RobotView, session: SessionRecord | None) -> dict[str, Any
 
 
 def _devices(devices: dict[str, str]) -> dict[str, str] | None:
-    return shorten(devices, _DEVICES_TOKENS).value or None
+    return shorten(devices, _SIZES.devices_tokens).value or None
 
 
 def _companions(view: RobotView) -> list[list[str]]:

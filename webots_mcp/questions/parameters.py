@@ -41,11 +41,6 @@ from webots_mcp.store.recording import RecordingAccess, RobotView
 
 SET_WAIT_S: Final = 10.0
 _ACTION: Final = "set_parameters"
-_MOST_NEAR: Final = 5
-_NONE: Final = (
-    'this run has none: declare one in the controller with kp = bridge.parameter("kp", 2.0, '
-    "low=0.0, high=10.0) and read kp.value in its loop"
-)
 When = Literal["now", "reset"]
 
 
@@ -85,7 +80,12 @@ def settable(recording: RecordingAccess, robot: str | None) -> dict[str, Declare
 
 
 def _none(view: RobotView) -> str:
-    return _NONE if view.session is None or view.session.has_bridge else NO_BRIDGE
+    if view.session is not None and not view.session.has_bridge:
+        return NO_BRIDGE
+    return (
+        'this run has none: declare one in the controller with kp = bridge.parameter("kp", 2.0, '
+        "low=0.0, high=10.0) and read kp.value in its loop"
+    )
 
 
 @question("Get the parameters", READS, quotes=True)
@@ -163,7 +163,7 @@ def _meant(patterns: list[str] | None, known: list[str]) -> set[str]:
     for pattern in patterns or ():
         found = {name for name in known if fnmatchcase(name, pattern)}
         if not found:
-            near = ", ".join(nearest_first(pattern, known)[:_MOST_NEAR]) or "none"
+            near = ", ".join(nearest_first(pattern, known)[:5]) or "none"
             raise InvalidInputError(f"no parameter {pattern!r:.80}; the nearest are: {near}")
         meant |= found
     return meant

@@ -6,6 +6,7 @@ The newest events and the health of the recorder belong to the full state.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
@@ -55,22 +56,33 @@ from webots_mcp.store.run_rows import (
     select,
 )
 
-_PUBLISH: Final = (
-    "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
-    "controller's loop every 5th is by default (throttle_interval), or each one with force=True"
-)
-_EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND row_count > 0"
-_PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
-_EVENTS: Final = 10
-_EVENTS_TOKENS: Final = 250
-_PAGE: Final = 500  # members, items or characters where it was not said how many
-_SHOWN_NAMES: Final = 6
-_MARGIN_TOKENS: Final = 200  # for hints
-_SHOWN_REPLACED: Final = 20
-_NULL: Final = "the value at this path is null"  # which an answer leaves out
-_SHOWN_DEVICES: Final = 30
-_ERROR_CHARACTERS: Final = 300
 
+@dataclass(frozen=True)
+class StateSizes:
+    """How much of a state an answer shows.
+
+    Attributes:
+        events: Events.
+        events_tokens: Budget of the events.
+        page: Members, items or characters of a page, unless a limit is given.
+        names: Names in a hint.
+        margin_tokens: Budget that is kept for hints.
+        replaced: Replaced values.
+        devices: Devices that the state does not name.
+        error_characters: Characters of an error or a reason.
+    """
+
+    events: int = 10
+    events_tokens: int = 250
+    page: int = 500
+    names: int = 6
+    margin_tokens: int = 200
+    replaced: int = 20
+    devices: int = 30
+    error_characters: int = 300
+
+
+_SIZES: Final = StateSizes()
 PagePath = Annotated[
     str,
     Field(max_length=1000, description="Dotted path, as sensors.lidar."),
@@ -117,8 +129,8 @@ def webots_get_sensors(
         sensors = sensor_part(state, view.robot.devices)
         unnamed = unnamed_devices(state, view.robot.devices)
         missing = [f"{name} ({kind})" for name, kind in unnamed.items()]
-        replaced, not_named = _replaced_in(view.state, sensors), some(missing, _SHOWN_DEVICES)
-        left_tokens = ANSWER_TOKENS - _MARGIN_TOKENS - tokens_of([replaced, not_named])
+        replaced, not_named = _replaced_in(view.state, sensors), some(missing, _SIZES.devices)
+        left_tokens = ANSWER_TOKENS - _SIZES.margin_tokens - tokens_of([replaced, not_named])
         short = shorten(sensors, min(STATE_BUDGET_TOKENS, left_tokens))
         return SensorsAnswer(
             **view.header(),
@@ -158,8 +170,10 @@ def webots_get_full_state(
         told = {
             name: each.model_dump() if name == "events" else each for name, each in beside.items()
         }
-        left_tokens = most_tokens - _MARGIN_TOKENS - tokens_of(told)
-        return FullStateAnswer(**_page(part, path, offset, limit or _PAGE, left_tokens), **beside)
+        left_tokens = most_tokens - _SIZES.margin_tokens - tokens_of(told)
+        return FullStateAnswer(
+            **_page(part, path, offset, limit or _SIZES.page, left_tokens), **beside
+        )
 
 
 def _with_observed_pose(view: RobotView, state: StateRecord) -> dict[str, Any]:
@@ -176,15 +190,24 @@ def _with_observed_pose(view: RobotView, state: StateRecord) -> dict[str, Any]:
 def _nothing_yet(view: RobotView) -> str:
     """A robot that published before a reset will publish again."""
     run_id = view.run.id if view.run else 0
-    (purged_rows,) = view.connection.execute(_PURGED, (run_id,)).fetchone() or (0,)
+    (purged_rows,) = view.connection.execute(
+        "SELECT purged_rows FROM run WHERE id = ?", (run_id,)
+    ).fetchone() or (0,)
     if purged_rows:
         return (
             f"the newest states of this run are gone: retention has deleted {purged_rows}; for "
             "their values, as far as chunks hold them, webots_get_trends or webots_query_history"
         )
-    earlier = view.connection.execute(_EARLIER, (view.robot.id, run_id)).fetchone()[0]
+    earlier = view.connection.execute(
+        "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND row_count > 0",
+        (view.robot.id, run_id),
+    ).fetchone()[0]
     if earlier is None:
-        return _PUBLISH
+        return (
+            "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
+            "controller's loop every 5th is by default (throttle_interval), or each one with "
+            "force=True"
+        )
     return (
         f"nothing was recorded in this run yet, but in an earlier one (run_id={earlier}): ask "
         "again when the controller has published"
@@ -194,7 +217,11 @@ def _nothing_yet(view: RobotView) -> str:
 def _page(part: Any, path: str, offset: int, limit: int, budget_tokens: int) -> dict[str, Any]:
     """What fits of a value; of an object, an array or a text from `offset` on."""
     if not isinstance(part, (dict, list, str)):
-        return {"path": path, "state": part, "hint": _NULL if part is None else None}
+        return {  # an answer leaves out a null, so the hint names it
+            "path": path,
+            "state": part,
+            "hint": "the value at this path is null" if part is None else None,
+        }
     whole = cast("dict[str, Any] | list[Any] | str", part)
     hints, rule = list[str](), None
     if isinstance(whole, str):
@@ -207,13 +234,13 @@ def _page(part: Any, path: str, offset: int, limit: int, budget_tokens: int) -> 
         cut = {str(name): short.rule for name, short in shown.items() if short.rule}
         if cut:
             rule = next(iter(cut.values()))
-            hints.append(f"path=... shows these in pages: {some([*cut], _SHOWN_NAMES)}")
+            hints.append(f"path=... shows these in pages: {some([*cut], _SIZES.names)}")
         page = page if named else [*page.values()]
     end = offset + len(page)
     if end < len(whole) and isinstance(whole, dict):
         left_out = [*whole][end:]
         hints.append(
-            f"not shown: {some(left_out, _SHOWN_NAMES)}; ask with offset={end}, with path=... for "
+            f"not shown: {some(left_out, _SIZES.names)}; ask with offset={end}, with path=... for "
             f"one, or with limit for up to {LARGE_ANSWER_TOKENS:,} tokens"
         )
     return {
@@ -272,12 +299,12 @@ def _longest_that_fits(sizes: Collection[int], budget: int) -> int:
 
 def _events(view: RobotView) -> AnswerTable:
     """The newest events that fit, the oldest of them first."""
-    events = newest_events(view.connection, view.require_run().id, _EVENTS)
+    events = newest_events(view.connection, view.require_run().id, _SIZES.events)
     rows = [
         [round(event.sim_time_s, 3), event.kind, event.name, detailed(event.details())]
         for event in reversed(events)
     ]
-    shown = fitting(rows, _EVENTS_TOKENS)[::-1]
+    shown = fitting(rows, _SIZES.events_tokens)[::-1]
     return AnswerTable(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
 
 
@@ -288,7 +315,7 @@ def _health(view: RobotView) -> dict[str, Any] | None:
         session = fetch_session(view.connection, view.run.session_id)
     if session is None:
         return None
-    error = cut_text(session.last_error, _ERROR_CHARACTERS) if session.last_error else None
+    error = cut_text(session.last_error, _SIZES.error_characters) if session.last_error else None
     return {
         "rows_recorded": view.run.row_count if view.run else 0,
         **({"kept_at_full_rate": kept} if (kept := _kept(view)) else {}),
@@ -313,7 +340,7 @@ def _kept(view: RobotView) -> str | None:
     span = f"{newest.start_s:.3f}-{newest.end_s:.3f} s"
     if newest.end_s > view.run.last_sim_time_s:
         span = f"{newest.start_s:.3f} s on, until {newest.end_s:.3f} s"
-    return f"{span}: {cut_text(newest.reason, _ERROR_CHARACTERS)}"
+    return f"{span}: {cut_text(newest.reason, _SIZES.error_characters)}"
 
 
 def _replaced_in(state: StateRecord, part: dict[str, Any]) -> dict[str, str] | None:
@@ -328,7 +355,7 @@ def _replaced_in(state: StateRecord, part: dict[str, Any]) -> dict[str, str] | N
 
 def _some_replaced(replaced: Mapping[str, str]) -> dict[str, str] | None:
     """The first of them, and how many more there are; None without any."""
-    shown = dict(list(replaced.items())[:_SHOWN_REPLACED])
+    shown = dict(list(replaced.items())[: _SIZES.replaced])
     if more := len(replaced) - len(shown):
         shown["…"] = f"{more} more: webots_query_sql has all in column replaced of table state"
     return shown or None

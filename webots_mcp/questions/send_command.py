@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
 from pydantic import Field
@@ -34,14 +35,31 @@ COMMAND_COLUMNS: Final = (
     "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
 )  # fmt: skip
 _WAIT_S: Final = 10.0
-_ACTIONS_TOKENS: Final = 500
-_DOCSTRINGS: Final = (2_000, 400, 200, 100, 50, 25)  # characters of each
+
+
+@dataclass(frozen=True)
+class CommandListSizes:
+    """How much of actions and commands an answer shows.
+
+    Attributes:
+        actions_tokens: Budget of the actions.
+        commands_tokens: Budget of the commands.
+        error_characters: Characters of an error.
+        docstring_characters: Characters of each docstring: the first length with which all actions
+            fit.
+    """
+
+    actions_tokens: int = 500
+    commands_tokens: int = 1_100
+    error_characters: int = 200
+    docstring_characters: tuple[int, ...] = (2_000, 400, 200, 100, 50, 25)
+
+
+_SIZES: Final = CommandListSizes()
 _MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
     'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, 201, 200) '
     "FROM session, json_each(actions) WHERE session.id = {} AND key = 'NAME'\") has more of one"
 )
-_COMMANDS_TOKENS: Final = 1_100
-_LONGEST_TEXT: Final = 200
 NO_BRIDGE: Final = "this robot has no bridge: it takes no commands, and has no parameters"
 
 
@@ -122,13 +140,13 @@ def _command_row(command: Command, now_s: float) -> list[Any]:
         round(now_s - command.created_wall_time_s, 1),
         took_s,
         shown_result(command, DETAIL_BUDGET_TOKENS),
-        cut_text(command.error, _LONGEST_TEXT) if command.error else None,
+        cut_text(command.error, _SIZES.error_characters) if command.error else None,
     ]
 
 
 def _answer(view: RobotView, commands: list[Command], limit: int) -> CommandsAnswer:
     rows = [_command_row(command, view.now_s) for command in commands]
-    rows = fitting(rows, _COMMANDS_TOKENS)
+    rows = fitting(rows, _SIZES.commands_tokens)
     more = len(rows) < len(commands) or len(commands) == limit
     actions = view.session.actions if view.session else {}
     shown = _shown_actions(actions)
@@ -154,9 +172,9 @@ def _shown_actions(actions: Mapping[str, str]) -> dict[str, str]:
     """
     if is_for_a_person():
         return dict(actions)
-    for longest in _DOCSTRINGS:
+    for longest in _SIZES.docstring_characters:
         shown = {name: cut_text(text, longest) for name, text in actions.items()}
-        if tokens_of(shown) <= _ACTIONS_TOKENS:
+        if tokens_of(shown) <= _SIZES.actions_tokens:
             return shown
     named = [(short_name(name) or "", "…" if text else "") for name, text in actions.items()]
-    return dict(fitting(named, _ACTIONS_TOKENS))
+    return dict(fitting(named, _SIZES.actions_tokens))

@@ -19,7 +19,6 @@ _WORDS: Final = (
     "bumper", "distance", "range", "radar", "sonar", "light", "altimeter", "camera", "odometry",
     "battery", "force", "contact", "scan",
 )  # fmt: skip
-_MOST_ITEMS: Final = 64  # of an array, each of which may be a device
 _HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 _WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
@@ -60,7 +59,8 @@ def _paths(value: Any, path: str = "") -> Iterator[str]:
         for key, member in cast("dict[str, Any]", value).items():
             yield from _paths(member, f"{path}.{key}")
     elif isinstance(value, list):
-        for index, item in enumerate(cast("list[Any]", value)[:_MOST_ITEMS]):
+        # Each item of an array may be a device.
+        for index, item in enumerate(cast("list[Any]", value)[:64]):
             yield from _paths(item, f"{path}.{index}")
 
 

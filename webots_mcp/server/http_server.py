@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 PATH: Final = "/mcp"
-_GRACE_S: Final = 1  # for answers under way when the server ends
-_IDLE_S: Final = 86_400.0  # people come back to a conversation after hours
 _STRANGER: Final = (
     "This server answers requests with the header 'Authorization: Bearer TOKEN' only; "
     "'webots-mcp token' shows the token to the user who started the server.\n"
@@ -120,7 +118,7 @@ def serve_http(server: MCPServer, place: Endpoint, ready: Callable[[str], object
             lifespan="on",
             server_header=False,
             proxy_headers=False,
-            timeout_graceful_shutdown=_GRACE_S,
+            timeout_graceful_shutdown=1,  # for answers under way when the server ends
             ssl_certfile=place.certificate,
             ssl_keyfile=place.key,
         )
@@ -145,7 +143,7 @@ def guarded_app(server: MCPServer, place: Endpoint, most_sessions: int = MOST_SE
     """The server as an application for requests that are addressed to it and have the token."""
     app = server.streamable_http_app(
         transport_security=_allowing(place),
-        session_idle_timeout=_IDLE_S,
+        session_idle_timeout=86_400.0,  # people come back to a conversation after hours
         max_sessions=most_sessions,
     )
     return gate(SessionLimit(app, most_sessions), place)

@@ -41,7 +41,6 @@ from webots_mcp.store.requests import Requester
 
 _WRAPPER: Final = "params"
 _FORMAT: Final = "response_format"
-_FORMATS: Final = (None, "json", "markdown")
 _UNSAID: Final = (
     "title", "anyOf", "maxLength", "minLength", "maxProperties", "minProperties", "maxItems",
 )  # fmt: skip
@@ -52,13 +51,6 @@ _USUAL: Final[Mapping[str, tuple[Any, ...]]] = {  # what a model takes for grant
     "minItems": (1,),
     "additionalProperties": (True, {}),
 }
-_NOBODY_ASKS_FOR: Final = 1_000
-_BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
-_LONGEST_DEFECT: Final = 200
-_BOXES: Final = ("params", "parameters", "values", "arguments", "args")  # of names and values
-_LONGEST_ARGUMENT: Final = 60  # characters of one in a call that is shown shortened
-_LONGEST_CALL: Final = 300  # characters of a call that is shown as an example
-_LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
 _log = logging.getLogger(__name__)
 
 
@@ -96,14 +88,15 @@ def _answering(question: Question) -> Callable[..., Any]:
             return _as_result(await question.ask(recording, arguments, caller))
         except WebotsMCPError as error:
             rows = f" (left out: {'; '.join(error.left_out)})" if error.left_out else ""
-            raise ToolError(f"{cut_text(str(error), _LONGEST_ERROR)}{rows}") from error
+            # It may repeat what the model itself has sent.
+            raise ToolError(f"{cut_text(str(error), 4_000)}{rows}") from error
         except (MCPError, ToolError):
             raise
         except Exception as error:
             _log.exception("%s failed", question.name)
             raise ToolError(
                 "a defect of webots-mcp, or rows that it did not write "
-                f"({type(error).__name__}: {str(error)[:_LONGEST_DEFECT]}); ask for another range "
+                f"({type(error).__name__}: {str(error)[:200]}); ask for another range "
                 "or by another tool, and report what the server wrote to stderr"
             ) from error
 
@@ -127,7 +120,7 @@ def _as_result(reply: Reply) -> CallToolResult:
     content = [_block(each) for each in reply.shown]
     if reply.data is None:
         return CallToolResult(content=content)
-    bad = reply.data.get("outcome") in _BAD_ENDS
+    bad = reply.data.get("outcome") in ("failed", "expired", "cancelled", "lost")
     return CallToolResult(content=content, structured_content=reply.data, is_error=bad)
 
 
@@ -196,10 +189,8 @@ class CheckedTool(Tool):
         lacking = {each: "..." for each in required if each != inside and each not in own}
         given = {name: compact_json(value) for name, value in own.items()}
         whole = lacking | given | {inside: compact_json(values)}
-        if sum(map(len, whole.values())) > _LONGEST_CALL:
-            short = {
-                n: value if len(value) <= _LONGEST_ARGUMENT else "..." for n, value in given.items()
-            }
+        if sum(map(len, whole.values())) > 300:
+            short = {n: value if len(value) <= 60 else "..." for n, value in given.items()}
             whole = lacking | short | {inside: "{...}"}
         return f"{self.name}({', '.join(f'{name}={value}' for name, value in whole.items())})"
 
@@ -207,7 +198,11 @@ class CheckedTool(Tool):
 def _unboxed(values: dict[str, Any]) -> dict[str, Any]:
     """Names of the controller with their values, also where another tool's argument held them."""
     (name, value), *others = values.items()
-    is_box = not others and name in _BOXES and isinstance(value, dict)
+    is_box = (
+        not others
+        and name in ("params", "parameters", "values", "arguments", "args")
+        and isinstance(value, dict)
+    )
     return cast("dict[str, Any]", value) if is_box else values
 
 
@@ -232,7 +227,7 @@ def _slim(schema: dict[str, Any]) -> dict[str, Any]:
 
 def _is_absurd(key: str, value: Any) -> bool:
     """Whether it is a bound beyond what anybody asks for."""
-    return key == "maximum" and value >= _NOBODY_ASKS_FOR
+    return key == "maximum" and value >= 1_000
 
 
 def _unwrapped(
@@ -253,7 +248,7 @@ def _unwrapped(
 
 def _without_format(arguments: dict[str, Any]) -> dict[str, Any]:
     asked = arguments.get(_FORMAT)
-    if asked not in _FORMATS:
+    if asked not in (None, "json", "markdown"):
         raise ToolError(f"{_FORMAT} must be 'json' or 'markdown', not {shown_value(asked)}")
     return {name: value for name, value in arguments.items() if name != _FORMAT}
 

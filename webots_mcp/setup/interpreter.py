@@ -22,7 +22,6 @@ from webots_mcp.simulator.installations import installations
 
 PROBE_TIMEOUT_S: Final = 30.0
 _PREFERENCE: Final = "pythonCommand"
-_SECTION: Final = re.compile(r"\s*\[(.*)\]\s*")
 # For any Python 3. -B leaves no compiled files behind in a folder that is only looked at.
 _PROBE: Final = """
 import json, os, sys
@@ -107,7 +106,7 @@ def _runtime_command(file: Path) -> str | None:
 def _ini_value(text: str, sections: tuple[str, ...], key: str) -> str | None:
     section = ""
     for line in text.splitlines():
-        if found := _SECTION.fullmatch(line.partition(";")[0]):
+        if found := re.fullmatch(r"\s*\[(.*)\]\s*", line.partition(";")[0]):
             section = found[1].strip()
             continue
         name, _, value = line.partition("=")

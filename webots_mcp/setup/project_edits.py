@@ -28,9 +28,7 @@ _ROBOTS: Final = {
         "CSVSupervisorEnv", "EmitterReceiverRobot", "CSVRobot",
     ),
 }  # fmt: skip
-_PLAIN: Final = "Robot"  # the class without a supervisor's calls
 _MOST_MODULES: Final = 50
-_LINES: Final = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n|\Z)")
 _ADDED: Final = re.compile(
     rb"\s*(?:from webots_mcp import MCPBridge|MCPBridge\.attach\([^()]+\))\s*"
 )
@@ -118,7 +116,7 @@ def is_plain_robot(controller: Path) -> bool:
         files += [each for each in _imported(module, file, controller) if each not in files]
         del files[_MOST_MODULES:]
         made |= _classes_used(list(ast.walk(module)))
-    return made == {_PLAIN}
+    return made == {"Robot"}  # the class without a supervisor's calls
 
 
 def _classes_used(nodes: list[ast.AST]) -> set[str]:
@@ -400,7 +398,7 @@ def _dotted(node: ast.AST) -> str | None:
 
 def _split(source: bytes) -> list[bytes]:
     """Lines as Python counts them, with their ends."""
-    return [line for line in _LINES.findall(source) if line]
+    return [line for line in re.findall(rb"[^\r\n]*(?:\r\n|\r|\n|\Z)", source) if line]
 
 
 def _insert(lines: list[bytes], after: int, line: bytes) -> None:

@@ -19,7 +19,6 @@ _BEGIN: Final = "<!-- webots-mcp: its lines begin here -->"
 _END: Final = "<!-- webots-mcp {}: updated by 'webots-mcp init --skills' until you change it -->\n"
 _OURS: Final = r"(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->(?:\r?\n)?{}"
 _KEPT: Final = "it is kept, as you wrote or changed it: remove {} to get that of this version"
-_PAGE: Final = re.compile(r"---\nname: (\S+)\ndescription: (.+?\.) ")
 
 
 class ManagedText(NamedTuple):
@@ -68,7 +67,7 @@ def managed_texts(project: Path) -> Iterator[ManagedText]:
         text = page.read_text("utf-8")
         place = Path(".claude", "skills", page.parent.name, page.name)
         yield ManagedText(project / place, text, is_whole=True)
-        if named := _PAGE.match(text):
+        if named := re.match(r"---\nname: (\S+)\ndescription: (.+?\.) ", text):
             lines.append(f"- `{place.as_posix()}`: {named[2]}\n")
     head = (
         "## Webots\n\nThe MCP server `webots` and the command `webots-mcp` read what the robots of "

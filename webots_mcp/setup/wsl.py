@@ -27,7 +27,6 @@ WAY_OUT: Final = (
 )
 _PROC_VERSION: Final = Path("/proc/version")
 _DRIVE: Final = re.compile(r"[A-Za-z]:\\")
-_PATIENCE_S: Final = 30  # PowerShell takes seconds to start the first time
 
 
 class Windows(NamedTuple):
@@ -123,7 +122,12 @@ def windows_server(project: Path) -> tuple[list[str] | None, str | None]:
 def _answer(*command: str) -> str:
     try:
         ended = subprocess.run(
-            command, capture_output=True, timeout=_PATIENCE_S, check=True, stdin=subprocess.DEVNULL
+            # PowerShell takes seconds to start the first time.
+            command,
+            capture_output=True,
+            timeout=30,
+            check=True,
+            stdin=subprocess.DEVNULL,
         )
     except (OSError, subprocess.SubprocessError) as error:
         raise CommandRefusedError(

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.contract import host_name
@@ -36,21 +37,40 @@ from webots_mcp.simulator.own_webots import own_webots
 from webots_mcp.store.logs import ConsoleRows, Said
 from webots_mcp.store.recording import Job, RecordingAccess
 
-_CONNECTING_S: Final = 2.0
-_LOOK_S: Final = 0.25
-# A line waits so long for what a bridge records of it, and for the run that a controller begins.
-_HOLD_S: Final = 0.7
-_SHORTEST_PAUSE_S: Final = 0.5
-_LONGEST_PAUSE_S: Final = 8.0
-_RENEW_S: Final = 5.0
-_WAITING_LOOK_S: Final = 2.0
-_YOUNG_S: Final = 5.0  # a Webots that has just started has printed nothing old
-_MOST_HELD: Final = 5_000  # while the database is locked
-_LAST_WRITING_S: Final = 3.0
-_FIRST_LOOK_S: Final = 1.0  # a server that has just started has answers to give
-_LOOK_EVERY_S: Final = 5.0
-_NOBODY: Final = "no Webots of this recording runs on this machine, so no console is followed"
-_UNSURE: Final = "; it was started without --stream: if no lines appear, start it with --stream"
+
+@dataclass(frozen=True)
+class ConsoleTimes:
+    """Times of following a console, in seconds of wall time.
+
+    Attributes:
+        connecting_s: For a connection.
+        receive_s: For the next message.
+        hold_s: How long a line waits for what a bridge records of it, and for the run that a
+            controller begins.
+        min_pause_s: Shortest pause after a failure.
+        max_pause_s: Longest pause after a failure.
+        renew_s: Between two checks of the lease.
+        waiting_s: Between two checks whether lines that wait for a run can be recorded.
+        young_s: Age up to which a Webots has printed nothing before it was followed.
+        last_write_s: For the last lines of a stand-in.
+        first_search_s: Before the first search: a server that has just started has answers to give.
+        search_s: Between two searches for a running Webots.
+    """
+
+    connecting_s: float = 2.0
+    receive_s: float = 0.25
+    hold_s: float = 0.7
+    min_pause_s: float = 0.5
+    max_pause_s: float = 8.0
+    renew_s: float = 5.0
+    waiting_s: float = 2.0
+    young_s: float = 5.0
+    last_write_s: float = 3.0
+    first_search_s: float = 1.0
+    search_s: float = 5.0
+
+
+_TIMES: Final = ConsoleTimes()
 _JOB: Final = "console of "
 
 
@@ -92,7 +112,7 @@ class _RecordingThread(threading.Thread):
         """Keep lines until their time comes, and no more of them than is wise."""
         now_s = time.monotonic()
         self._held.extend((now_s, line) for line in lines)
-        while len(self._held) > _MOST_HELD:
+        while len(self._held) > 5_000:  # while the database is locked
             self._held.popleft()
             self._lost += 1
 
@@ -149,9 +169,9 @@ class ConsoleFollower(_RecordingThread):
                 self.problem = str(error)
             if not self.instance.runs:
                 return
-            lasted = time.monotonic() - began_s > _LONGEST_PAUSE_S
-            longer_s = _SHORTEST_PAUSE_S if lasted else 2 * pause_s
-            pause_s = min(max(longer_s, _SHORTEST_PAUSE_S), _LONGEST_PAUSE_S)
+            lasted = time.monotonic() - began_s > _TIMES.max_pause_s
+            longer_s = _TIMES.min_pause_s if lasted else 2 * pause_s
+            pause_s = min(max(longer_s, _TIMES.min_pause_s), _TIMES.max_pause_s)
 
     def let_go(self) -> None:
         """Have it end soon."""
@@ -180,9 +200,9 @@ class ConsoleFollower(_RecordingThread):
     def _follow(self, job: Job) -> None:
         """Until it is to end, or Webots hangs up; what has come is recorded in any case."""
         age_s = time.time() - self.instance.started_wall_time_s
-        lines = ConsoleLines(old=self._was_connected or age_s > _YOUNG_S)
+        lines = ConsoleLines(old=self._was_connected or age_s > _TIMES.young_s)
         try:
-            with connected(self.instance.address, _CONNECTING_S) as stream:
+            with connected(self.instance.address, _TIMES.connecting_s) as stream:
                 begin_console(stream)
                 self.problem, self._was_connected = None, True
                 self._listen(job, stream, lines)
@@ -194,20 +214,20 @@ class ConsoleFollower(_RecordingThread):
     def _listen(self, job: Job, stream: Stream, lines: ConsoleLines) -> None:
         renew_s = look_s = 0.0
         while not self._ending.is_set():
-            message = stream.receive(time.monotonic() + _LOOK_S)
+            message = stream.receive(time.monotonic() + _TIMES.receive_s)
             self._hold(lines.idle())
             if message is not None:
                 self._hold(lines.take(message))
             now_s = time.monotonic()
             with self._keeping_on():
                 if now_s > renew_s:
-                    renew_s = now_s + _RENEW_S
+                    renew_s = now_s + _TIMES.renew_s
                     job.require_held()
                 if self._rows.waits and now_s > look_s:
-                    look_s = now_s + _WAITING_LOOK_S
+                    look_s = now_s + _TIMES.waiting_s
                     self._write_waiting(job, self._rows)
-                if self._held and self._held[0][0] < now_s - _HOLD_S:
-                    self._write_held(job, self._rows, now_s - _HOLD_S)
+                if self._held and self._held[0][0] < now_s - _TIMES.hold_s:
+                    self._write_held(job, self._rows, now_s - _TIMES.hold_s)
 
 
 class StandInConsole(_RecordingThread):
@@ -232,7 +252,7 @@ class StandInConsole(_RecordingThread):
     def __exit__(self, *_: object) -> None:
         self._ending.set()
         if self.is_alive():
-            self.join(timeout=_LAST_WRITING_S)
+            self.join(timeout=_TIMES.last_write_s)
 
     def begin(self, port: int) -> None:
         """Begin to record: controllers know the simulation by this port."""
@@ -253,17 +273,17 @@ class StandInConsole(_RecordingThread):
             with self._recording.writer() as connection:
                 take(connection, lease)
             renew_s = look_s = time.monotonic()
-            while not self._ending.wait(_LOOK_S):
+            while not self._ending.wait(_TIMES.receive_s):
                 now_s = time.monotonic()
                 self._note_idle()
                 with self._keeping_on():
-                    if now_s > renew_s + _RENEW_S:
+                    if now_s > renew_s + _TIMES.renew_s:
                         renew_s = now_s
                         job.require_held()
-                    if rows.waits and now_s > look_s + _WAITING_LOOK_S:
+                    if rows.waits and now_s > look_s + _TIMES.waiting_s:
                         look_s = now_s
                         self._write_waiting(job, rows)
-                    self._write_held(job, rows, now_s - _HOLD_S)
+                    self._write_held(job, rows, now_s - _TIMES.hold_s)
             self._note_idle(at_the_end=True)
             self._write_held(job, rows, came_by_s=math.inf)
             with self._recording.writer() as connection:
@@ -292,9 +312,9 @@ class ConsoleWatch(threading.Thread):
 
     def run(self) -> None:
         """Search until stopped; whatever goes wrong ends one search, never the thread."""
-        pause_s = _FIRST_LOOK_S
+        pause_s = _TIMES.first_search_s
         while not self._ending.wait(pause_s):
-            pause_s = _LOOK_EVERY_S
+            pause_s = _TIMES.search_s
             try:
                 self.follow_new()
             except Exception as error:  # noqa: BLE001  (it is reported)
@@ -346,13 +366,20 @@ def console_state(recording: RecordingAccess, connection: sqlite3.Connection) ->
         for name in held_jobs(connection, _JOB)
         if name not in recorded
     ]
-    return "; ".join(states) or _NOBODY
+    return (
+        "; ".join(states)
+        or "no Webots of this recording runs on this machine, so no console is followed"
+    )
 
 
 def _state(instance: Instance, recording: RecordingAccess, connection: sqlite3.Connection) -> str:
     console = f"the console of Webots at port {instance.port}"
     if holder_of(connection, job_of(instance)) is not None:
-        unsure = "" if instance.streams else _UNSURE
+        unsure = (
+            ""
+            if instance.streams
+            else "; it was started without --stream: if no lines appear, start it with --stream"
+        )
         return f"{console} is followed{unsure}"
     try:
         with connected(instance.address, ANSWER_S):

@@ -35,7 +35,6 @@ _PROGRAM_FOLDERS: Final[dict[str, tuple[str, ...]]] = {
 }
 _RESOURCES: Final = {"darwin": ("Contents/Resources", "Contents/resources", "resources")}
 _LIBRARIES: Final = {"darwin": ("Contents/lib", "lib")}
-_VERSION: Final = re.compile(r"R\d{4}[a-z]\w*(?:[ -]\w+)*")
 
 
 @dataclass(frozen=True)
@@ -142,6 +141,6 @@ def _version(home: Path, platform: str) -> str | None:
             text = (home / folder / "version.txt").read_text("utf-8", "replace")
         except OSError:
             continue
-        found = _VERSION.search(text)
+        found = re.search(r"R\d{4}[a-z]\w*(?:[ -]\w+)*", text)
         return found.group() if found else text.strip() or None
     return None

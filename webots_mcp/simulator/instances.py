@@ -21,7 +21,6 @@ DEFAULT_PORT: Final = 1234
 PORTS_TRIED: Final = 11  # Webots takes the next one where a port is taken, ten times
 # `webots` is a script that starts `webots-bin`, on Windows `webots` and `webotsw` start it.
 _PROGRAMS: Final = ("webots", "webots-bin", "webotsw")
-_INTERPRETERS: Final = ("sh", "bash", "dash", "zsh", "python")
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def _arguments(command_line: Sequence[str]) -> list[str] | None:
         name = PurePath(word.replace("\\", "/")).name.lower().removesuffix(".exe")
         if name in _PROGRAMS:
             return list(command_line[at + 1 :])
-        if not name.startswith(_INTERPRETERS):
+        if not name.startswith(("sh", "bash", "dash", "zsh", "python")):
             return None
     return None
 

@@ -18,13 +18,6 @@ if TYPE_CHECKING:
     pass
 from webots_mcp.simulator.orders import Order
 
-_PRESSING_TIMEOUT_S: Final = 10.0
-_ON_MACOS: Final = (
-    "allow the program that runs this under System Settings, Privacy & Security, Accessibility"
-)
-_ON_WINDOWS: Final = (
-    "it needs exactly one window of Webots, and Windows' leave to bring it to the front"
-)
 _TITLE: Final = "Webots R20"  # "<world> (<project>) - Webots R2023b"
 
 
@@ -67,9 +60,17 @@ def press(order: Order, pid: int | None, platform: str = sys.platform) -> None:
         if platform == "linux":
             _press_in_x11(key, pid)
         elif platform == "darwin":
-            _run(macos_command(key, pid), _ON_MACOS)
+            _run(
+                macos_command(key, pid),
+                "allow the program that runs this under System Settings, Privacy & Security, "
+                "Accessibility",
+            )
         elif platform == "win32":
-            _run(windows_command(key, pid), _ON_WINDOWS)
+            _run(
+                windows_command(key, pid),
+                "it needs exactly one window of Webots, and Windows' leave to bring it to the "
+                "front",
+            )
         else:
             raise CommandRefusedError(f"no way to press keys on {platform!r} is known")
     except CommandRefusedError as error:
@@ -153,7 +154,7 @@ def _attempt(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
             capture_output=True,
             text=True,
             stdin=subprocess.DEVNULL,
-            timeout=_PRESSING_TIMEOUT_S,
+            timeout=10.0,
         )
     except FileNotFoundError as error:
         install = " (apt install xdotool)" if command[0] == "xdotool" else ""

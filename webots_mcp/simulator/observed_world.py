@@ -20,15 +20,33 @@ from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.signals.naming import SEEN_SPEED, SOLIDS, WORLD
 
 DIGITS: Final = 6
-_MOVED_M: Final = 0.001
-_TURNED_RAD: Final = 0.01
-_NO_WORD: Final = re.compile(r"\W")
-_LONGEST_WORD: Final = 60  # characters
+
+
+@dataclass(frozen=True)
+class WalkLimits:
+    """When the tree is walked, and when a body counts as moved.
+
+    Attributes:
+        moved_m: Distance from which on a body has moved, in metres.
+        turned_rad: Angle from which on it has turned, in radians.
+        stale_m: Distance between tracked and current position from which on tracking is not
+            trusted, in metres.
+        walk_s: Wall time of one piece of a walk.
+        rest_s: Wall time between two walks.
+        word_characters: Characters of the name of a body in signals.
+    """
+
+    moved_m: float = 0.001
+    turned_rad: float = 0.01
+    stale_m: float = 0.01
+    walk_s: float = 0.004
+    rest_s: float = 5.0
+    word_characters: int = 60
+
+
+_LIMITS: Final = WalkLimits()
 MOST_ROBOTS: Final = 200
 MOST_SOLIDS: Final = 100
-_WALK_S: Final = 0.004  # of wall time in one look
-_REST_S: Final = 5.0  # of wall time between two walks
-_STALE_M: Final = 0.01
 Seen: TypeAlias = "dict[str, dict[str, dict[str, float | None]]]"
 
 
@@ -53,7 +71,7 @@ class BodyPose(NamedTuple):
     def is_elsewhere(self, other: BodyPose) -> bool:
         """Whether a body has moved or turned between the two."""
         turned = abs(math.remainder(self.heading_rad - other.heading_rad, math.tau))
-        return self.distance_m([*other[1:4]]) > _MOVED_M or turned > _TURNED_RAD
+        return self.distance_m([*other[1:4]]) > _LIMITS.moved_m or turned > _LIMITS.turned_rad
 
 
 @dataclass
@@ -168,7 +186,10 @@ def word_of(name: str, taken: Collection[str]) -> str:
 
     Conditions and positions can name it without quotes. A number is appended to one that is taken.
     """
-    word = _NO_WORD.sub("_", unicodedata.normalize("NFKC", name))[:_LONGEST_WORD] or "robot"
+    word = (
+        re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))[: _LIMITS.word_characters]
+        or "robot"
+    )
     if word[0].isdigit() or keyword.iskeyword(word):
         word = f"_{word}"
     number, free = 2, word
@@ -226,13 +247,13 @@ class ObservedWorld:
         """Walk on, or begin to walk where it is time to."""
         if self._walk is None and self._is_due():
             self._walk = self._survey()
-        until_s = time.monotonic() + _WALK_S
+        until_s = time.monotonic() + _LIMITS.walk_s
         for _ in self._walk or ():
             if time.monotonic() > until_s:
                 return
         if self._walk is not None:
             self._walk, self._is_walked = None, True
-            self._next_walk_s = time.monotonic() + _REST_S
+            self._next_walk_s = time.monotonic() + _LIMITS.rest_s
 
     def begin_run(self) -> None:
         """The world was reset: look at everything again."""
@@ -357,7 +378,7 @@ def _is_stale(body: ObservedBody, before: BodyPose | None) -> bool:
         return False
     if place[1:] != before[1:]:
         return False
-    return place.distance_m(body.scene.node.getPosition()) > _STALE_M
+    return place.distance_m(body.scene.node.getPosition()) > _LIMITS.stale_m
 
 
 def _proto_id_around(scene: SceneNode) -> int | None:

@@ -30,16 +30,7 @@ from webots_mcp.simulator.observed_world import DIGITS, ObservedBody, ObservedWo
 
 PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
 LONGEST_PERIOD_MS: Final = 60_000
-_ROUND_S: Final = 0.01  # of wall time
-_END_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP")
 _GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to come round
-_TRIAL_S: Final = 1.0  # of wall time in which time ought to have moved
-_RECORD_AGAIN_S: Final = 3600.0  # of wall time: old events are purged
-_MOST_CONTACTS: Final = 30
-_NO_RIGHTS: Final = (
-    "the observer needs a robot with 'supervisor TRUE': {!r} is none. 'webots-mcp init --observer "
-    "WORLD' adds one to a copy of a world"
-)
 
 
 def checked_period(period_ms: int) -> int:
@@ -88,13 +79,13 @@ class StepPace:
         now_s = float(self._robot.getTime())
         if now_s != self._time_s:
             self._time_s, self._tells_time = now_s, True
-        time.sleep(_ROUND_S)
+        time.sleep(0.01)
         return answer != -1
 
     def _has_stood(self) -> bool:
         if self._robot.simulationGetMode() == self._robot.SIMULATION_MODE_PAUSE:
             self._stood_since_s = time.monotonic()
-        return time.monotonic() - self._stood_since_s > _TRIAL_S
+        return time.monotonic() - self._stood_since_s > 1.0
 
     def _try_step(self) -> bool:
         """Make one step; where time advances by more, `step(0)` is no longer trusted to show it."""
@@ -197,7 +188,7 @@ class EndSignals:
         if threading.current_thread() is threading.main_thread():
             reader, writer = self._sockets
             writer.setblocking(False)
-            names = (name for name in _END_SIGNALS if hasattr(signal, name))
+            names = (name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
             for number in (getattr(signal, name) for name in names):
                 self._before[number] = signal.signal(number, self._receive)
                 if hasattr(signal, "siginterrupt"):  # Webots' library takes EINTR for an error
@@ -239,7 +230,11 @@ class Observer:
 
     def __init__(self, robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:
         if not robot.getSupervisor():
-            raise CommandRefusedError(_NO_RIGHTS.format(str(robot.getName())))
+            raise CommandRefusedError(
+                "the observer needs a robot with 'supervisor TRUE': "
+                f"{str(robot.getName())!r} is none. 'webots-mcp init --observer WORLD' adds one to "
+                "a copy of a world"
+            )
         basic_ms = float(robot.getBasicTimeStep())
         self._period_ms = max(int(math.ceil(period_ms / basic_ms) * basic_ms), 1)
         self._robot = robot
@@ -287,7 +282,7 @@ class Observer:
             self.bridge.record_event(MODE_EVENT, {"mode": self.bridge.mode_name})
         self.world.go_on()
         if self.world.is_new or is_due:
-            self._record_again_s = time.monotonic() + _RECORD_AGAIN_S
+            self._record_again_s = time.monotonic() + 3600.0  # old events are purged
             self.bridge.record_event(WORLD_EVENT, self.world.describe())
 
     def _warn(self, text: str) -> None:
@@ -322,7 +317,7 @@ def _standing(node: Any, robot: Any) -> dict[str, Any]:
     try:
         contacts = node.getContactPoints(True)
         return {
-            "contacts": [_contact(contact, robot) for contact in contacts[:_MOST_CONTACTS]],
+            "contacts": [_contact(contact, robot) for contact in contacts[:30]],
             "contacts_in_all": len(contacts),
             "center_of_mass_m": [round(float(value), DIGITS) for value in node.getCenterOfMass()],
             "is_balanced": bool(node.getStaticBalance()),

@@ -24,11 +24,6 @@ Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 MAX_MESSAGE_BYTES: Final = 4 << 20
 ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
 _CLOSING_S: Final = 0.2
-_LOOK_S: Final = 0.02  # whether the ping was answered
-# A robot of this name need not exist: asking for a window begins the logs for this client.
-_BEGIN_CONSOLE: Final = "robot:" + json.dumps(
-    {"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":")
-)
 # What is sent, and how what comes back begins. The time in ms is a limit; negative: none.
 _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "pause": ("pause", ("pause",)),  # "paused by client", and "pause: <ms>" to the others
@@ -39,8 +34,6 @@ _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "reload": ("reload", ("delete world", "loading:", "world:", "scene load completed")),
 }
 _SAID_TO_ALL: Final = ("stdout:", "stderr:", "robot")  # also without --stream
-_LONGEST_WORDS: Final = 200
-_LONGEST_OTHER: Final = 60
 RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
 
 
@@ -209,12 +202,12 @@ def _give(
         pong = stream.ping()
         is_alive = False
         while (now_s := time.monotonic()) < until_s:
-            message = stream.receive(min(until_s, now_s + _LOOK_S))
-            line = message.text.partition("\n")[0][:_LONGEST_WORDS] if message else ""
+            message = stream.receive(min(until_s, now_s + 0.02))
+            line = message.text.partition("\n")[0][:200] if message else ""
             if message and line.startswith(answers):
                 return OrderReply(line, is_alive=True)
             if message and not line.startswith(_SAID_TO_ALL):
-                other = other or line[:_LONGEST_OTHER]
+                other = other or line[:60]
             if pong.is_set() and not is_alive:
                 is_alive = True
                 if not late:
@@ -243,7 +236,10 @@ def why_not_obeyed(address: WebotsAddress, reply: OrderReply) -> str:
 
 def begin_console(stream: Stream) -> None:
     """Have Webots send its console to all its clients, from the first line not sent yet."""
-    stream.send(_BEGIN_CONSOLE)
+    stream.send(
+        "robot:"
+        + json.dumps({"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":"))
+    )
 
 
 def console_lines(text: str) -> Iterator[WebotsLine]:

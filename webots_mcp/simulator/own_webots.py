@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from typing import Final
 
 from webots_mcp.database.files import full_path
 from webots_mcp.database.location import find_project
@@ -19,8 +18,6 @@ from webots_mcp.errors import (
 from webots_mcp.simulator.instances import Instance, instances
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.robots import list_robots
-
-_WORLD: Final = "SELECT EXISTS (SELECT 1 FROM run WHERE world = ?)"
 
 
 def own_webots(recording: RecordingAccess) -> list[Instance]:
@@ -61,7 +58,11 @@ def _is_in_project(instance: Instance, recording: RecordingAccess) -> bool:
 def _has_known_world(instance: Instance, connection: sqlite3.Connection) -> bool:
     if instance.world is None:
         return False
-    return bool(connection.execute(_WORLD, (str(instance.world.resolve()),)).fetchone()[0])
+    return bool(
+        connection.execute(
+            "SELECT EXISTS (SELECT 1 FROM run WHERE world = ?)", (str(instance.world.resolve()),)
+        ).fetchone()[0]
+    )
 
 
 def _has_live_session(instance: Instance, connection: sqlite3.Connection) -> bool:

@@ -20,10 +20,7 @@ from webots_mcp.signals.naming import harmless_first
 
 Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000
-_MOST_SEED: Final = 2**63
-_STEPS_TOLERANCE: Final = 1e-9
 _GRID: Final = "grid"
-_REQUIRED: Final = ("world", "score")
 _NUMBER: Final = (int, float)
 _RANGE_KINDS: Final[dict[str, Any]] = {
     "low": _NUMBER, "high": _NUMBER, "step": _NUMBER, "log": bool, "choices": list,
@@ -87,7 +84,7 @@ class ParameterRange:
         if self.log and not (self.is_whole and step == 1):
             raise InvalidInputError("log and step go together only as whole numbers with step = 1")
         steps = round((high - low) / step)
-        if steps < 1 or not math.isclose(low + steps * step, high, rel_tol=_STEPS_TOLERANCE):
+        if steps < 1 or not math.isclose(low + steps * step, high, rel_tol=1e-9):
             raise InvalidInputError(f"high={high} must be a number of steps={step} above low={low}")
 
 
@@ -159,7 +156,7 @@ class TrialPlan:
             )
         if self.sets < 1:
             raise InvalidInputError("sets is missing: how many sets are to be searched for?")
-        if not 0 <= self.seed < _MOST_SEED:
+        if not 0 <= self.seed < (2**63):
             raise InvalidInputError(f"seed={self.seed} must be 0 or more, and less than 2**63")
 
     @property
@@ -230,7 +227,7 @@ def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Worl
     if _GRID in found:
         found = found | {"parameters": combinations(found[_GRID], "[grid] ")}
     found = {name: value for name, value in found.items() if name != _GRID}
-    for name in _REQUIRED:
+    for name in ("world", "score"):
         if name not in found:
             raise InvalidInputError(f"{name} is missing")
     if "ranges" in found:

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     pass
 
 CONSOLE: Final = "simulator.log"
-_LOOK_EVERY_S: Final = 0.05
 CommandOfWorld = Callable[[str], CommandLine]
 
 
@@ -199,7 +198,7 @@ def _watched(
             last = simulator.last_line() if watch.run_id is None else ""
             text = f" (its simulator printed last: {last})" if last else ""
             return None, f"it took longer than {timeout_s:g} s of wall time{text}"
-        if attempt.stopping.wait(_LOOK_EVERY_S):
+        if attempt.stopping.wait(0.05):
             raise StoppedError
         ended = _ended(recording, watch)
         if ended is not None:

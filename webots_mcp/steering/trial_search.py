@@ -10,7 +10,7 @@ import random
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from webots_mcp.errors import (
     InvalidInputError,
@@ -23,10 +23,6 @@ from webots_mcp.store.parameters import (
 
 if TYPE_CHECKING:
     import optuna
-
-
-_STATES: Final = {"done": "COMPLETE", "failed": "FAIL", "pruned": "PRUNED"}
-_UNDER_WAY: Final = "RUNNING"
 
 
 def require_optuna() -> None:
@@ -63,7 +59,9 @@ def _suggested(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any]
     )
     distributions = {name: _distribution(each) for name, each in plan.ranges.items()}
     for trial in trials:
-        state = optuna.trial.TrialState[_STATES.get(trial.status, _UNDER_WAY)]
+        state = optuna.trial.TrialState[
+            {"done": "COMPLETE", "failed": "FAIL", "pruned": "PRUNED"}.get(trial.status, "RUNNING")
+        ]
         study.add_trial(
             optuna.trial.create_trial(
                 state=state, value=trial.score, params=trial.values, distributions=distributions

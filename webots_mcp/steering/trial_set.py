@@ -49,8 +49,6 @@ if TYPE_CHECKING:
 from webots_mcp.steering.trial_run import Simulators, StoppedError, TrialAttempt, recorded_result
 
 FOLDER: Final = "trials"
-_MOST_THREADS: Final = 1000  # each waits for one trial
-_PATIENCE_S: Final = 0.5  # between two checks whether the caller wants to stop
 TrialReport = Callable[[TrialRecord, TrialResult], object]
 
 
@@ -126,7 +124,7 @@ def _run_left(set_run: SetRun, set_id: int, report: TrialReport) -> None:
             shutil.rmtree(set_run.folder(trial), ignore_errors=True)
     left = deque(trial for trial in trials if not trial.is_over)
     running: dict[Future[TrialResult], TrialRecord] = {}
-    pool = ThreadPoolExecutor(_MOST_THREADS)
+    pool = ThreadPoolExecutor(1000)  # each waits for one trial
     try:
         while True:
             _require_wanted(set_run, set_id)
@@ -137,7 +135,7 @@ def _run_left(set_run: SetRun, set_id: int, report: TrialReport) -> None:
                 running[pool.submit(run_trial, set_run, trial)] = trial
             if not running:
                 return
-            for future in wait(running, _PATIENCE_S, FIRST_COMPLETED).done:
+            for future in wait(running, 0.5, FIRST_COMPLETED).done:
                 report(running.pop(future), future.result())
     finally:
         set_run.stopping.set()

@@ -21,15 +21,6 @@ if TYPE_CHECKING:
 
 
 _SAME_TIME_S: Final = 1e-6
-_ROBOTS: Final = "SELECT id, name FROM robot ORDER BY id"
-_FIRST_RUN: Final = "SELECT id, started_sim_time_s FROM run WHERE robot_id = ? ORDER BY id LIMIT 1"
-_NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
-_ROWS: Final = "SELECT id, sim_time_s, data FROM state WHERE run_id = ? AND id > ? ORDER BY id"
-_START_VALUES: Final = (
-    "SELECT name, value FROM parameter_value WHERE run_id = ? AND id IN "
-    "(SELECT min(id) FROM parameter_value WHERE run_id = ? GROUP BY name)"
-)
-_DECLARED: Final = "SELECT name, low, high, choices FROM parameter WHERE robot_id = ?"
 Ending: TypeAlias = Literal["for_s", "until", "prune"]
 
 
@@ -66,10 +57,15 @@ class TrialWatch:
         """
         if self.run_id is None and not self._find_run(connection):
             return None
-        self.reached_s = connection.execute(_NEWEST, (self.run_id,)).fetchone()[0]
+        self.reached_s = connection.execute(
+            "SELECT max(sim_time_s) FROM state WHERE run_id = ?", (self.run_id,)
+        ).fetchone()[0]
         if not self._evaluators:
             return self._by_time(self.reached_s)
-        for row_id, sim_time_s, data in connection.execute(_ROWS, (self.run_id, self._last_id)):
+        for row_id, sim_time_s, data in connection.execute(
+            "SELECT id, sim_time_s, data FROM state WHERE run_id = ? AND id > ? ORDER BY id",
+            (self.run_id, self._last_id),
+        ):
             self._last_id = row_id
             if (end := self._by_time(sim_time_s)) and sim_time_s > end.sim_time_s + _SAME_TIME_S:
                 return end
@@ -91,8 +87,22 @@ class TrialWatch:
         """
         if self.run_id is None:
             return
-        taken = dict(connection.execute(_START_VALUES, (self.run_id, self.run_id)).fetchall())
-        declared = {row[0]: row[1:] for row in connection.execute(_DECLARED, (self.robot_id,))}
+        taken = dict(
+            connection.execute(
+                (
+                    "SELECT name, value FROM parameter_value WHERE run_id = ? AND id IN "
+                    "(SELECT min(id) FROM parameter_value WHERE run_id = ? GROUP BY name)"
+                ),
+                (self.run_id, self.run_id),
+            ).fetchall()
+        )
+        declared = {
+            row[0]: row[1:]
+            for row in connection.execute(
+                "SELECT name, low, high, choices FROM parameter WHERE robot_id = ?",
+                (self.robot_id,),
+            )
+        }
         for name, value in wanted.items():
             if name not in taken:
                 known = ", ".join(sorted(declared)) or "none"
@@ -114,14 +124,17 @@ class TrialWatch:
         return End(end_s, "for_s") if sim_time_s >= end_s - _SAME_TIME_S else None
 
     def _find_run(self, connection: sqlite3.Connection) -> bool:
-        robots = connection.execute(_ROBOTS).fetchall()
+        robots = connection.execute("SELECT id, name FROM robot ORDER BY id").fetchall()
         wanted = self._plan.robot
         chosen = [row for row in robots if wanted in (None, row[1])]
         if wanted is None and len(robots) > 1:
             names = ", ".join(name for _, name in robots)
             raise InvalidInputError(f"several robots record ({names}): name one as robot = '...'")
         for robot_id, _ in chosen:
-            row = connection.execute(_FIRST_RUN, (robot_id,)).fetchone()
+            row = connection.execute(
+                "SELECT id, started_sim_time_s FROM run WHERE robot_id = ? ORDER BY id LIMIT 1",
+                (robot_id,),
+            ).fetchone()
             if row is not None:
                 self.robot_id = robot_id
                 self.run_id, self._started_s = row

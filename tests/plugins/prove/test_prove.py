@@ -17,7 +17,7 @@ import pytest
 
 from tests.simulator.webots_program import put_on_path
 from webots_mcp.contract import host_name
-from webots_mcp.plugins.prove.bench import Bench, tried
+from webots_mcp.plugins.prove.bench import Bench, run_check
 from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED, check_launch
 from webots_mcp.simulator.installations import HOME_VARIABLE
 
@@ -92,7 +92,7 @@ def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_st
     program = home / "webots"
     good = program.read_text("utf-8")
     obeying_always_and_ending_with_0 = (
-        "from tests.simulator import program\nlisten = program._listen\n"
+        "from tests.simulator import webots_program as program\nlisten = program._listen\n"
         "program._listen = lambda port, *, streams: listen(port + 1, streams=True)\n"
         "main(sys.argv[1:])\n"
     )
@@ -148,14 +148,14 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
         bench.row()
 
     try:
-        found = tried(check_launch, bench)
+        found = run_check(check_launch, bench)
         assert found["outcome"] == "as expected", found
         bench.patience_s = 1
-        found = tried(check_stuck, bench, limit_s=0.5)
+        found = run_check(check_stuck, bench, limit_s=0.5)
         assert (found["outcome"], found["seen"]) == ("otherwise", "it hung for 0.5 s")
         stuck = bench.user
         bench.patience_s = 60
-        assert tried(check_launch, bench)["outcome"] == "as expected"
+        assert run_check(check_launch, bench)["outcome"] == "as expected"
         free.set()
         stuck.join()
         assert late == ["Webots ended: True"]

@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,8 @@ def messages(recorded: Recorded, source: str | None = None) -> list[str]:
 @pytest.fixture(autouse=True)
 def at_short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody else records these lines, and nothing has to be spared."""
-    for interval in ("_HOLD_S", "_LOOK_S", "_SHORTEST_PAUSE_S"):
-        monkeypatch.setattr(console, interval, 0.05)
+    short = replace(console._TIMES, hold_s=0.05, receive_s=0.05, min_pause_s=0.05)
+    monkeypatch.setattr(console, "_TIMES", short)
 
 
 @pytest.fixture
@@ -207,7 +208,7 @@ def test_who_does_not_answer_is_named_and_asked_again(
     greeting: bytes,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(console, "_CONNECTING_S", 0.3)
+    monkeypatch.setattr(console, "_TIMES", replace(console._TIMES, connecting_s=0.3))
     callers: list[socket.socket] = []
     with socket.create_server(("127.0.0.1", 0)) as door:
 

@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 Verdict = Literal["ok", "warning", "wrong", "not checked"]
 _WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not checked", "ok")
 PAGE: Final = "docs/troubleshooting.md"
-_RECOVER: Final = (
-    "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
-)
 # From the controller's machine to the client; within a module the order is that of its functions.
 _IN_ORDER: Final = (
     "machine_checks", "recording_checks", "controller_checks", "simulation_check", "webots_checks",
@@ -222,7 +219,11 @@ def _run_check(check: Check, subject: Examined) -> Diagnosis:
         return unclear(f"the Python package {error.name!r} is missing")
     except Exception as error:  # noqa: BLE001  (it is reported)
         if is_damage(error):
-            return wrong(f"the database is damaged: {text_of(error)}", _RECOVER)
+            fix = (
+                "stop what records there, save rows with 'sqlite3 FILE .recover', and move the "
+                "file away"
+            )
+            return wrong(f"the database is damaged: {text_of(error)}", fix)
         return unclear(f"{type(error).__name__}: {error}")
 
 

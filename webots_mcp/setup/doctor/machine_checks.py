@@ -12,6 +12,7 @@ import sqlite3
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import DATA_DIR_VARIABLE
@@ -30,12 +31,29 @@ from webots_mcp.setup.doctor import (
 )
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 
-_OLDEST_PYTHON: Final = (3, 10)
-_NEWEST_PYTHON: Final = (3, 13)  # that it was tried with
-# Two connections that write or checkpoint at once could damage a file before these versions
-# (sqlite.org/wal.html, "The WAL-reset bug"); the two older branches were mended as well.
-_WAL_RESET_MENDED: Final = (3, 51, 3)
-_WAL_RESET_MENDED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
+
+@dataclass(frozen=True)
+class MachineLimits:
+    """What a machine must have.
+
+    Attributes:
+        oldest_python: Oldest Python.
+        newest_python: Newest Python with which this was tried.
+        wal_reset_fixed: SQLite without the WAL-reset bug (sqlite.org/wal.html): before it, two
+            connections that write or checkpoint at once could damage a file.
+        full_bytes: Free space below which a disk counts as full.
+        low_bytes: Free space below which there is a warning.
+    """
+
+    oldest_python: tuple[int, int] = (3, 10)
+    newest_python: tuple[int, int] = (3, 13)
+    wal_reset_fixed: tuple[int, int, int] = (3, 51, 3)
+    full_bytes: int = 50_000_000
+    low_bytes: int = 1_000_000_000
+
+
+_LIMITS: Final = MachineLimits()
+_WAL_RESET_FIXED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
 # Names of file systems as the operating systems have them; in none does SQLite share memory.
 _NETWORK: Final = (
     "nfs", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afpfs", "webdav", "ncpfs", "afs", "ceph",
@@ -44,8 +62,6 @@ _NETWORK: Final = (
 _SHARED_WITH_HOST: Final = ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs")
 _WINDOWS_FROM_WSL: Final = ("9p", "drvfs")
 _WSL_FROM_WINDOWS: Final = ("//wsl$/", "//wsl.localhost/")
-_FULL_BYTES: Final = 50_000_000
-_LOW_BYTES: Final = 1_000_000_000
 _IN_MEMORY: Final = "the recording is in memory"
 _LOCAL: Final = (
     f"record in a folder of this machine's own disk: {DATA_DIR_VARIABLE}, --data-dir, or "
@@ -57,9 +73,9 @@ _LOCAL: Final = (
 def python(_: Examined) -> Iterator[Diagnosis]:
     """The Python that runs this; `Recording now` has that of the controllers."""
     seen = f"{platform.python_version()} at {sys.executable}"
-    if sys.version_info[:2] < _OLDEST_PYTHON:
+    if sys.version_info[:2] < _LIMITS.oldest_python:
         yield wrong(seen, "use Python 3.10 or newer")
-    elif sys.version_info[:2] > _NEWEST_PYTHON:
+    elif sys.version_info[:2] > _LIMITS.newest_python:
         yield warning(f"{seen}: newer than what this was tried with", "use Python 3.13")
     else:
         yield ok(seen)
@@ -85,8 +101,8 @@ def judge_sqlite(version: tuple[int, ...]) -> Diagnosis:
     if version < OLDEST_SQLITE:
         fix = "use a Python with a newer one (python.org, conda and Debian 12 have it)"
         return wrong(f"{seen} is too old: 3.38 is needed", fix)
-    mended = _WAL_RESET_MENDED_IN_BRANCH.get((version[0], version[1]))
-    if version < _WAL_RESET_MENDED and (mended is None or version[2] < mended):
+    mended = _WAL_RESET_FIXED_IN_BRANCH.get((version[0], version[1]))
+    if version < _LIMITS.wal_reset_fixed and (mended is None or version[2] < mended):
         seen += (
             ", which has the WAL-reset bug: webots-mcp checkpoints so that it cannot strike; let "
             "no other program write to the file while a robot records"
@@ -196,7 +212,7 @@ def free_space(subject: Examined) -> Iterator[Diagnosis]:
     free = shutil.disk_usage(folder).free
     seen = f"{free / 1e9:.1f} GB free"
     fix = "make room: 'webots-mcp prune --dry-run' lists what could be deleted"
-    if free < _FULL_BYTES:
+    if free < _LIMITS.full_bytes:
         yield wrong(f"{seen}: the disk is full", fix)
     else:
-        yield warning(seen, fix) if free < _LOW_BYTES else ok(seen)
+        yield warning(seen, fix) if free < _LIMITS.low_bytes else ok(seen)

@@ -46,17 +46,7 @@ _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "
     "MCPBridge.attach(robot), which does, before anything takes or replaces robot.step"
 )
-_READ_FASTER: Final = (
-    "give the observer's Robot node 'synchronization TRUE' and the robot's step in ms as "
-    "controllerArgs, or let the robot write less often"
-)
-_LONG_AT_WORK_S: Final = 30.0
 _NOT_POLLED_S: Final = 5.0
-_UNFINISHED: Final = (
-    "SELECT id, robot_id, action, status, session_id, created_wall_time_s, expires_wall_time_s, "
-    "coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
-    "WHERE status IN ('pending', 'claimed') ORDER BY id"
-)
 
 
 @check("Database", well="in memory")
@@ -139,7 +129,11 @@ def rows(subject: Examined) -> Iterator[Diagnosis]:
             fix = "see free space and the folder's rights; what was dropped is lost"
             yield wrong(seen, fix) if view.robot.live else warning(seen, fix)
         elif view.robot.kind == CUSTOM_DATA and view.robot.live and error and "(seq)" in error:
-            yield warning(error[:200], _READ_FASTER)
+            yield warning(
+                error[:200],
+                "give the observer's Robot node 'synchronization TRUE' and the robot's step in ms "
+                "as controllerArgs, or let the robot write less often",
+            )
         elif waiting.get("rows_waiting"):
             yield warning(
                 f"{waiting['rows_waiting']} rows of {name} wait in {waiting['waiting_in']}{why}",
@@ -194,7 +188,14 @@ class _Unfinished(NamedTuple):
 @check("Commands", needs_recording=True)
 def commands(subject: Examined) -> Iterator[Diagnosis]:
     """What waits for a controller, and for how long."""
-    unfinished = [_Unfinished(*row) for row in subject.opened.execute(_UNFINISHED)]
+    unfinished = [
+        _Unfinished(*row)
+        for row in subject.opened.execute(
+            "SELECT id, robot_id, action, status, session_id, created_wall_time_s, "
+            "expires_wall_time_s, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
+            "WHERE status IN ('pending', 'claimed') ORDER BY id"
+        )
+    ]
     by_robot = {view.robot.id: view for view in subject.views}
     for each in unfinished:
         judge = _claimed if each.status == "claimed" else _pending
@@ -222,7 +223,7 @@ def _claimed(command: _Unfinished, view: RobotView) -> Iterator[Diagnosis]:
     if session is None or not session.is_alive(view.now_s):
         seen = f"{_named(command, view)} was claimed by a controller that is gone: it is lost"
         yield warning(seen, "ask again; a server that may write settles it")
-    elif at_work_s >= _LONG_AT_WORK_S:
+    elif at_work_s >= 30.0:
         inside = handler_at_work(view.connection, session, view.now_s)
         seen = inside or f"{_named(command, view)} is under way since {ago(at_work_s)}"
         yield warning(seen, "wait for it, or send cancel_run; a handler must return soon")

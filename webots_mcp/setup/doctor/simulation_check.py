@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -36,15 +37,29 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 
-_WATCHED_S: Final = 0.3
-_LOOKS: Final = 6
-_MOST_WATCHED: Final = 5  # simulations, one after the other
-_MOST_NAMED: Final = 5  # controllers
-_BUSY: Final = 0.5  # of a processor; a controller that waits for its next step needs none
-_EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
-_OF_CONTROLLERS: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_INSTANCE_PATH")
-_LARGEST_WORLD_BYTES: Final = 50_000_000
-_ENDED_BADLY: Final = ("crashed", "reload")
+@dataclass(frozen=True)
+class WatchLimits:
+    """How processes of a simulation are watched.
+
+    Attributes:
+        watched_s: Wall time for which they are watched.
+        samples: Samples in that time.
+        simulations: Simulations that are watched, one after the other.
+        named: Controllers that are named.
+        busy_share: Share of a processor from which on a process computes: one that waits for its
+            next step needs none.
+        world_bytes: Size of a world file that is searched for extern robots.
+    """
+
+    watched_s: float = 0.3
+    samples: int = 6
+    simulations: int = 5
+    named: int = 5
+    busy_share: float = 0.5
+    world_bytes: int = 50_000_000
+
+
+_LIMITS: Final = WatchLimits()
 _SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
 _MEND_LINE: Final = f"mend that line; else {_SEE_PAGE}"
 _PRESS_PLAY: Final = "press play in Webots"
@@ -64,7 +79,7 @@ def simulation(subject: Examined) -> Iterator[Diagnosis]:
             watched.setdefault(view.session.instance, view)
         else:
             yield _judged(view)
-    for view in list(watched.values())[:_MOST_WATCHED]:
+    for view in list(watched.values())[: _LIMITS.simulations]:
         yield _narrowed(subject, view)
 
 
@@ -88,7 +103,7 @@ def _judged(view: RobotView) -> Diagnosis:
     if view.session is None or not view.robot.live:
         if status.why == UNSEEN:
             return warning(seen, _SEE_PAGE)
-        if view.session and (view.session.end_reason or "crashed") in _ENDED_BADLY:
+        if view.session and (view.session.end_reason or "crashed") in ("crashed", "reload"):
             return wrong(seen, "see 'webots-mcp logs --level error', mend the controller and start "
                          "it again")  # fmt: skip
         return ok(seen)
@@ -201,15 +216,17 @@ def _started_for(instance: str) -> dict[int, int]:
     for process in psutil.process_iter():
         with suppress(psutil.Error, OSError):  # another user's, or one that has just ended
             environment, parent = process.environ(), process.ppid()
-            is_controller = not environment.keys().isdisjoint(_OF_CONTROLLERS)
+            is_controller = not environment.keys().isdisjoint(
+                ("WEBOTS_CONTROLLER_URL", "WEBOTS_INSTANCE_PATH")
+            )
             if is_controller and instance_of(environment, parent) == instance:
                 found[process.pid] = parent
     return {pid: parent for pid, parent in found.items() if pid not in own}
 
 
 def _listed(pids: list[int]) -> str:
-    more = f" and {len(pids) - _MOST_NAMED} more" if len(pids) > _MOST_NAMED else ""
-    return ", ".join(map(_named, pids[:_MOST_NAMED])) + more
+    more = f" and {len(pids) - _LIMITS.named} more" if len(pids) > _LIMITS.named else ""
+    return ", ".join(map(_named, pids[: _LIMITS.named])) + more
 
 
 def _named(pid: int) -> str:
@@ -226,13 +243,13 @@ def _computing(pids: set[int]) -> list[int]:
     """
     before_s = {pid: _processor_s(pid) for pid in sorted(pids)}
     waited = set[int]()
-    for _ in range(_LOOKS):
-        time.sleep(_WATCHED_S / _LOOKS)
+    for _ in range(_LIMITS.samples):
+        time.sleep(_LIMITS.watched_s / _LIMITS.samples)
         waited |= {pid for pid in pids if not _wants_processor(pid)}
     return [
         pid
         for pid, used_s in before_s.items()
-        if pid not in waited or _processor_s(pid) - used_s > _BUSY * _WATCHED_S
+        if pid not in waited or _processor_s(pid) - used_s > _LIMITS.busy_share * _LIMITS.watched_s
     ]
 
 
@@ -260,8 +277,14 @@ def _missing_externs(
     world = Path(named) if named else None
     count = 0
     with suppress(OSError):
-        if world is not None and world.stat().st_size <= _LARGEST_WORLD_BYTES:
-            count = len(_EXTERN.findall(world.read_text("utf-8", "replace")))
+        if world is not None and world.stat().st_size <= _LIMITS.world_bytes:
+            count = len(
+                re.findall(
+                    r'^\s*controller\s+"<extern>"',
+                    world.read_text("utf-8", "replace"),
+                    re.MULTILINE,
+                )
+            )
     alive = [session, *companions(view.connection, session, view.now_s)]
     here = sum(each.extern for each in alive)
     if world is None or count <= here:

@@ -44,15 +44,9 @@ if TYPE_CHECKING:
     from typing import TextIO
 
 
-_ANSWER_S: Final = 3  # for a server that runs to answer
-_PLACES: Final = ("--data-dir", "--database")
 _INIT: Final = "run 'webots-mcp init' in the project"
 _TIMEOUT_S: Final = 30.0
 _SHOWN_CHARACTERS: Final = 300
-_FIX: Final = (
-    "run the same command in a shell, see what it prints, and install webots-mcp again where a "
-    "package is missing or broken"
-)
 
 
 @check("Webots")
@@ -158,7 +152,7 @@ def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Diagnosis:
 def _over_http(name: str, url: str) -> Diagnosis:
     """Whether a server asks for the token there; it is not sent, as anybody may have written it."""
     try:
-        with urlopen(url, timeout=_ANSWER_S) as answer:
+        with urlopen(url, timeout=3) as answer:
             status: int = answer.status
     except HTTPError as error:
         status = error.code
@@ -175,7 +169,7 @@ def _other_place(subject: Examined, arguments: list[str]) -> str | None:
     """The recording that the arguments name, if it is another one."""
     words = [part for word in arguments for part in word.split("=", 1)]
     for option, value in pairwise(words):
-        if option in _PLACES and "$" not in value:
+        if option in ("--data-dir", "--database") and "$" not in value:
             ours = subject.recording.data_dir if option == "--data-dir" else subject.file
             meant = subject.project / (in_wsl(value) if is_wsl() else value)
             same = ours is not None and meant.resolve() == ours.resolve()
@@ -200,7 +194,11 @@ def server(subject: Examined) -> Iterator[Diagnosis]:
             complaints.seek(0)
             wrote = complaints.read().strip().splitlines()
             last = f"; it wrote: {wrote[-1][:_SHOWN_CHARACTERS]}" if wrote else ""
-            yield wrong(f"'{' '.join(line)}' did not answer: {_why(error)}{last}", _FIX)
+            yield wrong(
+                f"'{' '.join(line)}' did not answer: {_why(error)}{last}",
+                "run the same command in a shell, see what it prints, and install webots-mcp again "
+                "where a package is missing or broken",
+            )
             return
     started = f"started over stdio, {tools} tools that only read"  # by --read-only
     if refused:

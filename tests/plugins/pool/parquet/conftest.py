@@ -15,7 +15,7 @@ from tests.plugins.pool.parquet import bucket
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.pool_contents import open_pool
-from webots_mcp.plugins.pool.shipping import Order, Report, ship
+from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import RecordingAccess
 
@@ -63,6 +63,8 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Many:
     url = bucket.empty()  # a disk would have to be waited for a thousand times
     for database in databases:
         recording = RecordingAccess(database, database.parent, read_only=True)
-        ship(Order(recording, partial(open_pool, url, ships=True), full=True), Report())
+        ship(
+            ShippingJob(recording, partial(open_pool, url, ships=True), full=True), ShippingReport()
+        )
     bucket.copy_to(folder / "pool")
     return Many(folder / "pool", tuple(databases))

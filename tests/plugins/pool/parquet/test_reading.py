@@ -22,9 +22,9 @@ from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.trends import trends
 from webots_mcp.plugins.pool import duckdb_statement as asking
-from webots_mcp.plugins.pool.parquet_files import Storage
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_contents import pooled_runs
+from webots_mcp.plugins.pool.storage import Storage
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.runs import list_runs
 from webots_mcp.store.sql import FOLDER

@@ -73,7 +73,7 @@ def read_devices(robot: Any, failed: Failed) -> dict[str, object]:
     groups: dict[str, dict[str, object]] = {"sensors": sensors}
     gps = unit = None  # the first enabled ones
     for name, device in devices.items():
-        cls: type[Any] = type(device)
+        cls: type[Any] = device.__class__
         rule = _RULES_OF_CLASSES.get(cls, ...)
         if rule is ...:
             rule = _remember_rule(cls)

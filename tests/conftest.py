@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import os
+import shutil
 import signal
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -26,6 +29,28 @@ from tests.recordings.fixtures import (
 from webots_mcp.database.connection import connect
 
 __all__ = ["database", "empty", "looked_at", "recorded", "rover", "rover_recordings"]
+
+pytest_plugins = ["tests.progress"]
+
+# Hundreds of processes import the package: none of them compiles it anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+# Recordings of tests need not outlast the machine: in memory, no commit waits for a disk.
+_MEMORY = Path("/dev/shm")
+_MEMORY_BYTES = 4_000_000_000  # all tests at once take a tenth of it
+if _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free > _MEMORY_BYTES:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
+
+# The longest of the slow files begin first, so that no process is left with one at the end.
+_LONGEST = (
+    "tests/judging/detection/test_detected.py",
+    "tests/benchmarks/test_benchmarks.py",
+    "tests/plugins/pool/parquet/test_reading.py",
+    "tests/plugins/cluster/test_cluster.py",
+    "tests/steering/trials/test_killed.py",
+    "tests/bridge/test_interrupts.py",
+)
 
 # The same examples each time, so that a red run was made red by the change that it tests;
 # `pytest --hypothesis-profile=explore` looks for new ones. No machine is too slow for them.
@@ -52,11 +77,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Slow tests run last, or not at all: what fails quickly is seen quickly."""
     slow = [item for item in items if item.get_closest_marker("slow")]
+    slow.sort(key=_begins)
     fast = [item for item in items if not item.get_closest_marker("slow")]
     if config.getoption("--fast"):
         config.hook.pytest_deselected(items=slow)
         slow = []
     items[:] = [*fast, *slow]
+
+
+def _begins(item: pytest.Item) -> int:
+    file = item.nodeid.partition("::")[0]
+    return _LONGEST.index(file) if file in _LONGEST else len(_LONGEST)
 
 
 def pytest_collection_finish() -> None:

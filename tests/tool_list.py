@@ -1,6 +1,6 @@
 """How much of a model's context the list of the tools takes; `./run check` prints it.
 
-Tokens are counted by the rule of `webots_mcp.answers.budget.tokens_in`. Where the package
+Tokens are counted by the rule of `webots_mcp.answers.shortening.tokens_in`. Where the package
 `tdqs` is installed, its `tdqs lint` judges the list as well.
 """
 
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import anyio
 from mcp.types import Tool
 
-from webots_mcp.answers.budget import tokens_in
+from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.location import MemoryDatabase
 from webots_mcp.server.mcp_server import create_server
 

@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from webots_mcp.answers.budget import GLANCE, WHOLE, Limits, shorten, tokens_in, tokens_of
+from webots_mcp.answers.shortening import (
+    GLANCE,
+    WHOLE,
+    ShorteningLimits,
+    shorten,
+    tokens_in,
+    tokens_of,
+)
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -83,7 +90,7 @@ def test_a_cut_text_says_how_long_it_was() -> None:
 
 
 def test_names_that_would_be_the_same_when_cut_stay_whole() -> None:
-    level = (Limits(items=2, text=8, keys=9, depth=2),)
+    level = (ShorteningLimits(items=2, text=8, keys=9, depth=2),)
     short = shorten({"sensor_left": 1, "sensor_last": 2}, 100, level)
     assert short.value == {"sensor_l… [11 characters]": 1, "sensor_last": 2}
 

@@ -15,7 +15,7 @@ from mcp.types import ImageContent, TextContent, Tool
 
 from tests.benchmarks.core import Bench, Line, Target, benchmark
 from tests.benchmarks.processes import environment
-from webots_mcp.answers.budget import tokens_in
+from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.database.connection import connect
 from webots_mcp.server.mcp_server import create_server

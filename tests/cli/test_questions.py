@@ -15,7 +15,7 @@ from tests.cli.conftest import Cli, line_with
 from tests.recordings.rows import Recorded
 from tests.server.story import copy_of
 from webots_mcp.cli import app_for, described, names
-from webots_mcp.cli.terminal import as_typed, commands_by_tool
+from webots_mcp.cli.wording import as_typed, commands_by_tool
 
 # What is typed about a recording of three runs, and what lines of the answer hold, as patterns.
 ANSWERED = [

@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.cli import main
-from webots_mcp.cli.terminal import rewrite, shown_progress, spelling_out
+from webots_mcp.cli.streams import rewrite, shown_progress, spelling_out
 
 # Sets the title of the terminal, clears it in one character (C1), and turns what follows round.
 HOSTILE = "a\x1b]0;owned\x07\x9b2J\u202egnp.exe\u2066\u200f"
@@ -110,7 +110,7 @@ def test_where_no_terminal_is_long_work_says_how_far_it_is_by_a_line_every_few_s
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now_s = 0.0
-    monkeypatch.setattr("webots_mcp.cli.terminal.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("webots_mcp.cli.streams.time.monotonic", lambda: now_s)
     with shown_progress("making chunks") as progress:
         for done in range(32):  # for 8 s
             progress(done, 32)

@@ -22,7 +22,7 @@ from webots_mcp.cli import described, names
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.database.connection import OLDEST_SQLITE, SCHEMA_FILE
 from webots_mcp.judging.detection.events import kind_names
-from webots_mcp.questions.declaring import MAX_WAIT_S
+from webots_mcp.questions.arguments import MAX_WAIT_S
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.client_entries import claude_desktop, clients_of, is_ours
 
@@ -32,7 +32,6 @@ INSTALLED = Path(webots_mcp.__file__).parents[1]
 PAGES = sorted([CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", CHECKOUT / "CONTRIBUTING.md",
                 CHECKOUT / "SECURITY.md",
                 *DOCS.glob("*.md"), *CHECKOUT.glob("examples/*/README.md")])  # fmt: skip
-
 WORDS = {2.0: "two", 8: "eight"}
 
 

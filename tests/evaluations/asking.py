@@ -20,7 +20,7 @@ from mcp.types import CallToolResult
 
 from tests.evaluations.scenario import Fact, Scenario
 from tests.evaluations.subjects import subject
-from webots_mcp.answers.budget import tokens_in
+from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.server.mcp_server import create_server
 
 CHECKOUT: Final = Path(__file__).parents[2]

@@ -15,25 +15,11 @@ from hypothesis import strategies as st
 from tests.plotting.conftest import Record, whole
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.plotting.canvas import (
-    MERGED,
-    MOST_PANELS,
-    MOST_VALUES,
-    OTHER_VALUES,
-    Sheet,
-    area_styles,
-)
-from webots_mcp.plotting.curves import (
-    MOST_CURVES,
-    Curve,
-    Path,
-    Place,
-    by_scale,
-    by_signal,
-    headings,
-    thinned,
-)
+from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
+from webots_mcp.plotting.colours import MERGED, MOST_VALUES, OTHER_VALUES, area_styles
+from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
 from webots_mcp.plotting.intervals import Interval, at_resolution
+from webots_mcp.plotting.robot_path import PathPoint, RobotPath, headings, thinned
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.store.chunk_making import chunk_whole_run
@@ -201,12 +187,12 @@ def test_values_have_styles_of_their_own_as_long_as_there_are_any(values: list[s
 
 
 PLACES = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=60).map(
-    lambda points: [Place(float(index), x, y) for index, (x, y) in enumerate(points)]
+    lambda points: [PathPoint(float(index), x, y) for index, (x, y) in enumerate(points)]
 )
 
 
 @given(PLACES)
-def test_a_thinned_path_keeps_its_ends_and_its_shape(places: list[Place]) -> None:
+def test_a_thinned_path_keeps_its_ends_and_its_shape(places: list[PathPoint]) -> None:
     kept = thinned(places)
     assert (kept[0], kept[-1]) == (places[0], places[-1])
     size = max(max(p[i] for p in places) - min(p[i] for p in places) for i in (1, 2))
@@ -215,8 +201,10 @@ def test_a_thinned_path_keeps_its_ends_and_its_shape(places: list[Place]) -> Non
 
 
 @given(PLACES, st.frozensets(st.integers(1, 59)))
-def test_the_pieces_of_a_path_are_all_of_it(places: list[Place], breaks: frozenset[int]) -> None:
-    path = Path(places, None, frozenset(index for index in breaks if index < len(places)))
+def test_the_pieces_of_a_path_are_all_of_it(
+    places: list[PathPoint], breaks: frozenset[int]
+) -> None:
+    path = RobotPath(places, None, frozenset(index for index in breaks if index < len(places)))
     assert [place for piece in path.pieces() for place in piece] == places
 
 
@@ -234,7 +222,7 @@ def test_the_path_of_a_run_is_that_of_its_own_position(record: Record) -> None:
     connection = record(lambda t: next(published, {"gps": {"x": t, "y": 0}}), 100, 100)
     assert all(chunk_whole_run(connection, run_id) for run_id in (1, 2))
     axes, _ = compose_trajectory(connection, [whole(connection, 2)])
-    assert axes.tracks[0].path.places[-1] == Place(9.9, 9.9, 0)
+    assert axes.tracks[0].path.places[-1] == PathPoint(9.9, 9.9, 0)
 
 
 def test_trouble_is_marked_where_it_was(rover: sqlite3.Connection) -> None:
@@ -253,10 +241,10 @@ def test_trouble_is_marked_where_it_was(rover: sqlite3.Connection) -> None:
 
 def test_arrows_point_the_way_that_was_taken() -> None:
     square = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0)]
-    path = Path([Place(i, *place) for i, place in enumerate(square)], None, frozenset())
+    path = RobotPath([PathPoint(i, *place) for i, place in enumerate(square)], None, frozenset())
     found = headings(path, 4)
     assert [heading.degrees for heading in found] == pytest.approx([0, 90, 180, -90])
-    assert headings(Path([Place(0, 1, 1)], None, frozenset()), 4) == []
+    assert headings(RobotPath([PathPoint(0, 1, 1)], None, frozenset()), 4) == []
 
 
 def moded(time_s: float) -> dict[str, object]:

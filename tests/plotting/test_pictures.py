@@ -28,16 +28,16 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.plotting import PlotKind, plot
-from webots_mcp.plotting.canvas import DASHES, LINES, Canvas, Picture, Sheet, image_format_of
+from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, image_format_of
+from webots_mcp.plotting.colours import DASHES, LINES
 from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.signals import compose_signals, paint_signals, plot_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
-from webots_mcp.questions.declaring import RunIds
+from webots_mcp.questions.arguments import RunIds
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Ask = dict[str, Any]
-
 QUESTIONS: dict[str, Ask] = {
     "one signal": {"signals": ["sensors.front"]},
     "several scales": {"signals": ["pose", "heading", "target", "battery_v", "sensors"]},
@@ -52,13 +52,13 @@ QUESTIONS: dict[str, Ask] = {
 }
 
 
-def ask(connection: sqlite3.Connection, **question: Any) -> Picture:
+def ask(connection: sqlite3.Connection, **question: Any) -> PlotImage:
     question.setdefault("run_ids", [1])
     asked = {each.name: question.pop(each.name, None) for each in fields(Scope)}
     return plot(connection, **question, scope=Scope(**asked))
 
 
-def words(picture: Picture) -> set[str]:
+def words(picture: PlotImage) -> set[str]:
     """The texts in an SVG."""
     root = ElementTree.fromstring(picture.data)
     texts = root.iter("{http://www.w3.org/2000/svg}text")

@@ -16,18 +16,17 @@ from tests.recordings.long import build
 from tests.recordings.rows import Recorded
 from tests.server.conftest import text_of
 from tests.server.story import client_on
-from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
+from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
+from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.connection import connect
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import MergedQuestion
 
 pytestmark = pytest.mark.anyio
-
 RICH_TOKENS: Final = 1_500
 ROWS: Final = 5_000
 LONG_RUN: Final = 2
 MORE_SIGNALS: Final = 30  # to the 39 of the long recording
-
 DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_list_robots", {}),
     ("webots_diagnose", {}),

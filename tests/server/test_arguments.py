@@ -18,7 +18,7 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, Driver, ask, fail, text_of
 from webots_mcp import MemoryDatabase
 from webots_mcp.questions import all_questions
-from webots_mcp.server.mcp_server import tool_of
+from webots_mcp.server.tools import tool_of
 from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = pytest.mark.anyio

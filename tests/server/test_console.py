@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ from tests.simulator.conftest import (
 from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.simulator import console
-from webots_mcp.simulator.console import belongs
 from webots_mcp.simulator.instances import instances
+from webots_mcp.simulator.own_webots import belongs
 from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = pytest.mark.anyio
@@ -41,8 +42,8 @@ import nothing_of_that_name
 @pytest.fixture(autouse=True)
 def looked_for_often(monkeypatch: pytest.MonkeyPatch) -> None:
     """A Webots that starts is followed at once, not five seconds later."""
-    monkeypatch.setattr(console, "_FIRST_LOOK_S", 0.2)
-    monkeypatch.setattr(console, "_LOOK_EVERY_S", 0.5)
+    often = replace(console._TIMES, first_search_s=0.2, search_s=0.5)
+    monkeypatch.setattr(console, "_TIMES", often)
 
 
 Lines = list[list[Any]]

@@ -26,10 +26,9 @@ from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.setup.file_change import apply
-from webots_mcp.setup.project_edits import controller_change, with_observer
+from webots_mcp.setup.observer_edits import controller_change, with_observer
 
 pytestmark = pytest.mark.anyio
-
 PLAIN = CONTROLLER.replace("Supervisor", "Robot")
 Begin = Callable[..., Client]
 

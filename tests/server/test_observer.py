@@ -22,12 +22,11 @@ from tests.simulator.conftest import (
 from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.file_change import apply
-from webots_mcp.setup.project_edits import controller_change, with_observer
+from webots_mcp.setup.observer_edits import controller_change, with_observer
 from webots_mcp.simulator.instances import instances
 from webots_mcp.simulator.orders import give_order
 
 pytestmark = pytest.mark.anyio
-
 DRIVES = """
 from math import inf
 from controller import Robot
@@ -46,7 +45,6 @@ HANGS = (
         pass
 """
 )
-
 RESETS = (
     CONTROLLER
     + """

@@ -24,8 +24,9 @@ from tests.server.conftest import (
 from tests.server.story import rows_of
 from tests.waiting import until
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.steering.dispatch import Dispatcher, require_possible
+from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import CLAIMING_S
+from webots_mcp.steering.run_command import require_possible
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
 

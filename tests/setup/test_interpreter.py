@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.extras.requirements import checkout, quoted
-from webots_mcp.setup.interpreter import chosen, look_into
+from webots_mcp.setup.interpreter import chosen, probe_interpreter
 
 
 @pytest.fixture(autouse=True)
@@ -89,7 +89,7 @@ def test_macos_keeps_them_in_a_property_list(controller: Path, home: Path) -> No
 
 def test_a_python_with_the_bridge_says_its_version(controller: Path) -> None:
     runtime(controller, sys.executable)
-    found = look_into(controller)
+    found = probe_interpreter(controller)
     assert (found.error, found.fix) == (None, None)
     assert found.bridge
     assert found.executable == sys.executable
@@ -99,7 +99,7 @@ def test_a_python_with_the_bridge_says_its_version(controller: Path) -> None:
 
 def test_one_without_it_gets_the_line_that_mends_it_quoted(controller: Path, bare: Path) -> None:
     runtime(controller, str(bare))
-    found = look_into(controller)
+    found = probe_interpreter(controller)
     assert found.bridge is None
     assert "webots_mcp" in (found.error or "")
     line = (found.fix or "").partition("   (")[0]
@@ -114,7 +114,7 @@ def test_one_without_it_gets_the_line_that_mends_it_quoted(controller: Path, bar
 def test_a_controllers_own_file_that_hides_the_package_is_seen(controller: Path) -> None:
     runtime(controller, sys.executable)
     controller.with_name("webots_mcp.py").write_text("raise RuntimeError('mine')\n")
-    assert look_into(controller).error == "RuntimeError: mine"
+    assert probe_interpreter(controller).error == "RuntimeError: mine"
 
 
 ENDLESS = "exec sleep 600"
@@ -137,7 +137,7 @@ def test_what_is_no_python_that_works_is_named_with_what_mends_it(
     file.write_text(f"#!/bin/sh\n{program}\n")
     file.chmod(0o755)
     runtime(controller, str(file) if program else "/no/such/python")
-    found = look_into(controller, timeout_s=0.2 if program == ENDLESS else 60)
+    found = probe_interpreter(controller, timeout_s=0.2 if program == ENDLESS else 60)
     assert error in (found.error or "")
     assert fix in (found.fix or "")
 
@@ -149,7 +149,7 @@ def test_the_environment_of_this_shell_does_not_count(
     assert link.exists()
     monkeypatch.setenv("VIRTUAL_ENV", str(bare.parent.parent))
     monkeypatch.setenv("PATH", f"{bare.parent}{os.pathsep}{os.environ['PATH']}")
-    assert look_into(controller).executable != str(link)
+    assert probe_interpreter(controller).executable != str(link)
 
 
 def test_lines_are_quoted_for_the_shell_of_the_system() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.setup.project_edits import (
+from webots_mcp.setup.observer_edits import (
     copy_of,
     has_observer,
     undo,

@@ -21,11 +21,11 @@ from mcp import Client, StdioServerParameters
 import webots_mcp
 from tests.waiting import wait_for
 from webots_mcp import __version__
-from webots_mcp.answers.budget import tokens_in
+from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.contract import bundled
 from webots_mcp.setup.client_entries import is_ours
 from webots_mcp.setup.file_change import apply
-from webots_mcp.setup.skills import PLUGIN, Part, parts_of, skill_files
+from webots_mcp.setup.skills import PLUGIN, ManagedText, managed_texts, skill_files
 
 pytestmark = pytest.mark.anyio
 CHECKOUT: Final = Path(__file__).parents[2]
@@ -189,7 +189,7 @@ def test_the_plugin_starts_our_server_and_has_the_version_of_the_package() -> No
 def update(project: Path) -> dict[str, str | None]:
     """What `init --skills` does; the notes by file."""
     notes = dict[str, str | None]()
-    for part in parts_of(project):
+    for part in managed_texts(project):
         change, note = part.plan()
         notes[part.file.relative_to(project).as_posix()] = note
         if change.is_needed:
@@ -197,7 +197,7 @@ def update(project: Path) -> dict[str, str | None]:
     return notes
 
 
-def newer(part: Part) -> Part:
+def newer(part: ManagedText) -> ManagedText:
     return part._replace(text=f"{part.text}One more line.\n")
 
 
@@ -208,7 +208,7 @@ def test_a_newer_version_replaces_what_is_unchanged_and_keeps_what_is_not(
     agents = tmp_path / "AGENTS.md"
     agents.write_text(f"# Mine{end}Do as I say.{end}", "utf-8", newline="")
     assert set(update(tmp_path).values()) == {None}
-    parts = list(parts_of(tmp_path))
+    parts = list(managed_texts(tmp_path))
     for part in parts:  # as Git may write it on Windows
         text = part.file.read_text("utf-8")
         part.file.write_text(text, "utf-8", newline=end)

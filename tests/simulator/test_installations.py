@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.simulator import instances as module
-from webots_mcp.simulator.instances import find_webots, installations
+from webots_mcp.simulator import installations as module
+from webots_mcp.simulator.installations import find_webots, installations
 from webots_mcp.steering.trial_run import webots
 
 LAYOUTS = {

@@ -14,7 +14,8 @@ from typing import get_args
 import pytest
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.simulator.orders import KEYS, Order, macos_command, press, windows_command
+from webots_mcp.simulator.key_presses import KEYS, macos_command, press, windows_command
+from webots_mcp.simulator.orders import Order
 
 NEEDED = ("Xvfb", "xdotool", "xev")
 MISSING = [program for program in NEEDED if shutil.which(program) is None]

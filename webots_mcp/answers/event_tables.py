@@ -11,11 +11,11 @@ from webots_mcp.answers.budget import (
     seconds,
     short_name,
     shown,
-    tokens_of,
     wall_clock,
     without_empty,
 )
-from webots_mcp.answers.models import KindVerdicts, Table
+from webots_mcp.answers.models import AnswerTable, KindVerdicts
+from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.judging.detection.events import (
     Events,
     Found,
@@ -31,7 +31,7 @@ _GROUP_BUDGET_TOKENS: Final = 200
 
 def fitting_events(
     found: Found, limit: int, budget_tokens: int, view: RobotView, *, time_of_day: bool = False
-) -> tuple[Events, Table | None]:
+) -> tuple[Events, AnswerTable | None]:
     """At most `limit` of what was found, and as much of it as fits the budget."""
     while True:
         told = found.told(view.connection, limit)
@@ -67,7 +67,7 @@ def not_shown_of(told: Events) -> dict[str, str] | None:
 
 def events_table(
     events: Sequence[Event], view: RobotView, *, time_of_day: bool = False
-) -> Table | None:
+) -> AnswerTable | None:
     """Events as rows under `EVENT_COLUMNS`, and the values around them.
 
     With the time of day, where it is asked for, at which each began.

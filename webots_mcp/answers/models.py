@@ -25,13 +25,13 @@ def said(text: str) -> Any:
     return Field(default=None, description=text)
 
 
-class Part(BaseModel):
+class AnswerPart(BaseModel):
     """A part of an answer."""
 
     model_config = ConfigDict(defer_build=True)  # most processes use one kind of answer
 
 
-class Table(Part):
+class AnswerTable(AnswerPart):
     """Rows under column names; a name says its unit."""
 
     columns: list[str]
@@ -39,7 +39,7 @@ class Table(Part):
     in_every_row: dict[str, Any] | None = said("Columns with the same value in all rows.")
 
 
-class Answer(Part):
+class Answer(AnswerPart):
     """The header of every answer: about what, as of when, and whether time is moving."""
 
     robot: str | None = None
@@ -90,7 +90,7 @@ class FullStateAnswer(Answer):
     next_offset: int | None = said("Ask again with this offset for more.")
     shortened: str | None = None
     replaced: dict[str, str] | None = None
-    events: Table | None = None
+    events: AnswerTable | None = None
     recorder: dict[str, Any] | None = said(
         "Rows waiting and dropped, last kept stretch, error, controller."
     )
@@ -103,7 +103,7 @@ class WorldAnswer(Answer):
     title: str | None = None
     basic_time_step_ms: float | None = None
     observer: str | None = said("Its signals world.KEY.x_m and solid.KEY.x_m are places.")
-    in_world: Table | None = said("What the observer sees: robots, and solids with a DEF.")
+    in_world: AnswerTable | None = said("What the observer sees: robots, and solids with a DEF.")
     real_time_factor: float | None = said(
         "Simulation time per wall time over the last seconds recorded."
     )
@@ -112,7 +112,7 @@ class WorldAnswer(Answer):
     runs_recorded: int | None = None
     controller: dict[str, Any] | None = None
     devices: dict[str, str] | None = None
-    other_robots: Table | None = said("Other robots in the same simulation.")
+    other_robots: AnswerTable | None = said("Other robots in the same simulation.")
     database: str | None = None
     retention: dict[str, Any] | None = said("How much is kept, set by whom; size of the database.")
     data_dir: str | None = None
@@ -121,7 +121,9 @@ class WorldAnswer(Answer):
 class RobotsAnswer(Answer):
     """All robots ever seen."""
 
-    robots: Table | None = said("rows_waiting, rows_dropped, last_error: where there are any.")
+    robots: AnswerTable | None = said(
+        "rows_waiting, rows_dropped, last_error: where there are any."
+    )
     database: str | None = None
     retention: dict[str, Any] | None = None
 
@@ -138,7 +140,7 @@ class DiagnosisAnswer(Answer):
 class LogsAnswer(Answer):
     """Log lines, oldest first."""
 
-    lines: Table | None = None
+    lines: AnswerTable | None = None
     matching: int | None = said("How many lines match (with a cursor: how many older ones).")
     cursor: int | None = said("Ask again with this cursor for older lines.")
 
@@ -160,14 +162,14 @@ class CommandAnswer(Answer):
 class ParametersAnswer(Answer):
     """The parameters of a run."""
 
-    parameters: Table | None = None
+    parameters: AnswerTable | None = None
     total: int | None = None
 
 
 class CommandsAnswer(Answer):
     """Commands, newest first, and what can be asked for."""
 
-    commands: Table | None = None
+    commands: AnswerTable | None = None
     cursor: int | None = said("Ask again with this cursor for older ones.")
     actions: dict[str, Any] | None = said("The controller's own actions with their docstrings.")
     built_in: list[str] | None = None
@@ -186,7 +188,7 @@ class BreakpointAnswer(Answer):
 class BreakpointsAnswer(Answer):
     """The breakpoints of a robot."""
 
-    breakpoints: Table | None = None
+    breakpoints: AnswerTable | None = None
 
 
 class NotedAnswer(Answer):
@@ -198,12 +200,12 @@ class NotedAnswer(Answer):
 class SignalsAnswer(NotedAnswer):
     """The signals of a run."""
 
-    signals: Table | None = said("missing: rows of the run without a value of it.")
+    signals: AnswerTable | None = said("missing: rows of the run without a value of it.")
     total: int | None = said("How many match.")
     cursor: int | None = said("Ask again with this cursor for more.")
 
 
-class NumberSeries(Part):
+class NumberSeries(AnswerPart):
     """A numeric signal: one item per bucket in each list, null where it has no value."""
 
     unit: str | None = None
@@ -223,7 +225,7 @@ class NumberSeries(Part):
     )
 
 
-class ChangeSeries(Part):
+class ChangeSeries(AnswerPart):
     """A text or boolean signal: its values, each with the time from which on it had it."""
 
     since_s: list[float | None] = Field(
@@ -234,7 +236,7 @@ class ChangeSeries(Part):
     time_by_value_s: dict[str, float]
 
 
-class RunSeries(Part):
+class RunSeries(AnswerPart):
     """The part of an answer that is about one run."""
 
     run_id: int
@@ -253,7 +255,7 @@ class RunSeries(Part):
     )
 
 
-class RowColumns(Part):
+class RowColumns(AnswerPart):
     """Rows as they were recorded, as columns."""
 
     run_id: list[int] | None = said("Where it is not the header's.")
@@ -270,7 +272,7 @@ class HistoryAnswer(NotedAnswer):
     cursor: int | None = said("With raw: ask again with this cursor for the next rows.")
 
 
-class RunTrendTables(Part):
+class RunTrendTables(AnswerPart):
     """The trends of one run."""
 
     run_id: int
@@ -278,8 +280,8 @@ class RunTrendTables(Part):
     end_s: float | None
     row_count: int
     resolution_s: float | None = said("Shapes and slopes come from means over this many seconds.")
-    numbers: Table | None = said("What changed most is first.")
-    states: Table | None = said("Text and flags that changed.")
+    numbers: AnswerTable | None = said("What changed most is first.")
+    states: AnswerTable | None = said("Text and flags that changed.")
     constant: str | None = said("What never changed, with its value.")
     without_value: str | None = said("Signals without a value in the range.")
     not_shown: str | None = said("Of those that changed.")
@@ -294,7 +296,7 @@ class TrendsAnswer(NotedAnswer):
     runs: list[RunTrendTables] | None = None
 
 
-class KindVerdicts(Part):
+class KindVerdicts(AnswerPart):
     """What became of each kind that was asked for."""
 
     found: dict[str, int] | None = said("How many there are in the range, shown or not.")
@@ -308,7 +310,9 @@ class KindVerdicts(Part):
 class EventsAnswer(NotedAnswer):
     """What happened in a range, in order of time."""
 
-    events: Table | None = said("Columns with @ hold that signal's value when the event began.")
+    events: AnswerTable | None = said(
+        "Columns with @ hold that signal's value when the event began."
+    )
     verdicts: KindVerdicts | None = None
     not_shown: dict[str, str] | None = said(
         "How many of each kind there are beside these, and when they began."
@@ -320,14 +324,16 @@ class CheckAnswer(NotedAnswer):
     """Whether a run is well."""
 
     outcome: str | None = said("The worst: fail, not looked at, warn or pass.")
-    checks: Table | None = said("Those that did not pass; more: the call that shows it in full.")
+    checks: AnswerTable | None = said(
+        "Those that did not pass; more: the call that shows it in full."
+    )
     passed: list[str] | None = None
 
 
 class TimelineAnswer(NotedAnswer):
     """A page of what happened, in order of time."""
 
-    events: Table | None = None
+    events: AnswerTable | None = None
     verdicts: KindVerdicts | None = None
     cursor: str | None = said("Ask again with this cursor for later ones.")
 
@@ -339,7 +345,9 @@ class MonitorAnswer(NotedAnswer):
     row_count: int | None = said("States recorded in the window.")
     movement: dict[str, Any] | None = None
     trends: list[RunTrendTables] | None = said("More than one: time went back in between.")
-    events: Table | None = said("Columns with @ hold that signal's value when the event began.")
+    events: AnswerTable | None = said(
+        "Columns with @ hold that signal's value when the event began."
+    )
     verdicts: KindVerdicts | None = None
     not_shown: dict[str, str] | None = said(
         "How many of each kind there are beside these, and when they began."
@@ -356,7 +364,7 @@ class TrialsAnswer(NotedAnswer):
     pruned: int | None = said("Ended early, as the plan says.")
     failed: int | None = None
     score: str | None = None
-    ranked: Table | None = said(
+    ranked: AnswerTable | None = said(
         "The best first; score is the mean, range least and greatest of repeats."
     )
     noise: float | None = said("Standard deviation of the scores of like trials.")
@@ -380,23 +388,23 @@ class RunAnswer(CommandAnswer):
     shortened: str | None = None
     movement: dict[str, Any] | None = None
     trends: RunTrendTables | None = None
-    events: Table | None = None
+    events: AnswerTable | None = None
     not_shown: dict[str, str] | None = None
-    rows: Table | None = said("The last rows, of its signals.")
+    rows: AnswerTable | None = said("The last rows, of its signals.")
     picture: dict[str, Any] | None = None
 
 
 class SqlAnswer(Answer):
     """What a SELECT returned."""
 
-    result: Table | None = None
+    result: AnswerTable | None = None
     truncated: str | None = said("Why rows or parts are missing.")
 
 
 class RunsAnswer(Answer):
     """Runs, the newest first."""
 
-    runs: Table | None = None
+    runs: AnswerTable | None = None
     run: dict[str, Any] | None = said("The one that was annotated.")
     total: int | None = None
     cursor: int | None = said("Ask again with this cursor for older ones.")
@@ -408,13 +416,13 @@ class ComparisonAnswer(NotedAnswer):
     verdict: str | None = said("With first_difference: where the two part.")
     unlike: dict[str, list[Any]] | None = said("What was not the same of them to begin with.")
     compared: dict[str, Any] | None = said("Rows that both have at the same simulation time.")
-    parted: Table | None = said("In the order in which they part; beyond_s: the tolerance.")
+    parted: AnswerTable | None = said("In the order in which they part; beyond_s: the tolerance.")
     growth: dict[str, Any] | None = said("Largest difference of the signal that parts most.")
-    groups: Table | None = None
+    groups: AnswerTable | None = None
     compared_s: float | None = said(
         "All figures are about the first seconds of each run, this many."
     )
-    measures: Table | None = said(
+    measures: AnswerTable | None = said(
         "Each run as a whole: median over the runs of each group, and their range. "
         "Of each group but the first: different; null where it cannot be told, then runs_wanted: "
         "this many runs of each would tell, if they went on like these. interval: of the "
@@ -423,7 +431,7 @@ class ComparisonAnswer(NotedAnswer):
     unknown: dict[str, str] | None = said(
         "Figures that are null, or not of everything: why; what to do."
     )
-    differences: Table | None = said(
+    differences: AnswerTable | None = said(
         "Signals, most different first; lists are in the order of the groups. Of each "
         "group but the first (a list where there are several): effect, how far the mean is from "
         "the first group's, in standard deviations (0.8 is large, null: unequal constants), "

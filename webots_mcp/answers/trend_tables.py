@@ -2,42 +2,50 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.answers.budget import (
-    compact_json,
-    cut_for_a_model,
-    figure,
-    fitting,
-    is_for_a_person,
-    seconds,
-    short_name,
-    shown,
-    some,
-    table,
-    tokens_of,
-)
+from webots_mcp.answers.budget import figure, fitting, seconds, short_name, shown, some, table
 from webots_mcp.answers.models import (
     RunTrendTables,
 )
+from webots_mcp.answers.shortening import compact_json, cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend
 
 TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
 STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")
 MOST_SIGNALS: Final = 500
-_STATES_SHARE: Final = 0.25  # of the budget, at most
-_LONGEST_SAYING: Final = 200
+
+
+@dataclass(frozen=True)
+class TrendSizes:
+    """How much of the trends of a run is shown.
+
+    Attributes:
+        states_share: Maximum share of the budget for texts and flags.
+        text_characters: Characters of the description of a trend.
+        values: Values of a text or flag with their time.
+        constants: Signals that never changed.
+    """
+
+    states_share: float = 0.25
+    text_characters: int = 200
+    values: int = 6
+    constants: int = 20
+
+
+_SIZES: Final = TrendSizes()
 EMPTY: Final = '""'  # a name without a character
-_SHOWN_VALUES: Final = 6
-_SHOWN_CONSTANTS: Final = 20
 
 
 def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTables:
     """The trends of a run as tables that fit the budget."""
     changed = [state for state in run.states if state.changes]
-    states = fitting([_state_row(state) for state in changed], int(budget_tokens * _STATES_SHARE))
+    states = fitting(
+        [_state_row(state) for state in changed], int(budget_tokens * _SIZES.states_share)
+    )
     moving = _moving(run)
-    constant, without_value = some(_constants(run), _SHOWN_CONSTANTS), some(run.without_value)
+    constant, without_value = some(_constants(run), _SIZES.constants), some(run.without_value)
     left_tokens = budget_tokens - tokens_of([states, constant, without_value])
     rows = fitting([_trend_row(trend) for trend in moving[:limit]], left_tokens)
     return RunTrendTables(
@@ -77,7 +85,7 @@ def _trend_row(trend: Trend) -> list[Any]:
     """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
     return [
         short_name(trend.name),
-        cut_for_a_model(trend.says, _LONGEST_SAYING),
+        cut_for_a_model(trend.says, _SIZES.text_characters),
         figure(trend.summary.last),
         figure(trend.mean),
         figure(trend.deviation),
@@ -87,7 +95,7 @@ def _trend_row(trend: Trend) -> list[Any]:
 def _state_row(state: StateTrend) -> list[Any]:
     """A text or a flag as a row under `STATE_COLUMNS`."""
     longest_first = [*state.time_by_value_s.items()]
-    most = len(longest_first) if is_for_a_person() else _SHOWN_VALUES
+    most = len(longest_first) if is_for_a_person() else _SIZES.values
     times = {shown(value): round(duration_s, 3) for value, duration_s in longest_first[:most]}
     if rest := longest_first[most:]:
         times[f"… {len(rest)} more values"] = round(sum(duration_s for _, duration_s in rest), 3)

@@ -18,22 +18,16 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.cli.terminal import (
-    Typed,
-    as_typed,
-    ended_by,
-    ending_by_signals,
-    speak_of,
-    spelling_out,
-    value_name,
-)
+from webots_mcp.cli.ending import ended_by, ending_by_signals
+from webots_mcp.cli.streams import spelling_out
+from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
 from webots_mcp.errors import InvalidInputError, NotAllowedError, WebotsMCPError
 from webots_mcp.signals.naming import is_destructive, spelled_out
 
 if TYPE_CHECKING:
     from cyclopts import App, Argument, CycloptsError
 
-    from webots_mcp.cli.commands import Command
+    from webots_mcp.cli.commands import CommandEntry
 
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 _OFFER: Final = re.compile(r' Did you mean "?([^\s"?]+)"?\?')
@@ -220,7 +214,7 @@ def app_for(argv: Sequence[str]) -> App:
     return app
 
 
-def _function_of(command: Command) -> Callable[..., Any]:
+def _function_of(command: CommandEntry) -> Callable[..., Any]:
     """Its function, with the parameters that are its options."""
     found = command.declared()
     if inspect.isfunction(found):
@@ -230,20 +224,20 @@ def _function_of(command: Command) -> Callable[..., Any]:
     return command_of(found)
 
 
-class Described(NamedTuple):
+class CommandHelp(NamedTuple):
     """A command as its help describes it; arguments by how they are typed."""
 
     text: str
     arguments: dict[str, str]
 
 
-def described() -> dict[str, Described]:
+def described() -> dict[str, CommandHelp]:
     """Every command by its name."""
     from webots_mcp.cli.commands import COMMANDS
 
     app = app_for([])
     return {
-        name: Described(
+        name: CommandHelp(
             inspect.getdoc(_function_of(command)) or "",
             {
                 _typed(each): each.parameter.help or ""

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from webots_mcp.cli.options import (
     Json,
     Parameter,
-    Range,
+    TimeRangeOptions,
     Where,
     make_chunks_first,
     refuse_options,
@@ -28,21 +28,14 @@ from webots_mcp.cli.options import (
     value_of,
     whole_number,
 )
-from webots_mcp.cli.terminal import (
-    Typed,
-    as_typed,
-    line_of_progress,
-    print_answer,
-    running,
-    show_progress,
-    speak_of,
-    text_of,
-    value_name,
-    wait,
-)
+from webots_mcp.cli.streams import line_of_progress, show_progress, wait
+from webots_mcp.cli.terminal import print_answer, text_of
+from webots_mcp.cli.wording import Typed, as_typed, running, speak_of, value_name
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.questions.declaring import FOR_A_PERSON, SCOPE, Caller, Question, Reply, faults_of
+from webots_mcp.questions.arguments import FOR_A_PERSON, SCOPE
+from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.faults import faults_of
 from webots_mcp.store.recording import RecordingAccess
 
 # How options are called whose argument has another name in all questions.
@@ -70,16 +63,13 @@ _VALUE_NAMES: Final = {
 }  # fmt: skip
 # What a person does not give, where a model's client would soon give up waiting.
 _DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_wall_s": 600.0})
-_OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # that choose among signals
 _FOLLOW: Final = Annotated[
     bool,
     Parameter(
         "--follow", help="Go on with what comes, until Ctrl-C. As JSON each row is an object."
     ),
 ]
-_LOOK_EVERY_S: Final = 0.5
 _FLOOD: Final = "more than {} rows came at once: --before {} shows those that were left out"
-_NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
 _UNDER_WAY: Final = (
     "the controller is still busy with it and goes on: do not send it again, but go on waiting "
     "with\n\n    {}\n"
@@ -92,7 +82,7 @@ def command_of(question: Question) -> Callable[..., None]:
 
     def run(
         *positional: Any,
-        span: Range | None = None,
+        span: TimeRangeOptions | None = None,
         recorded: Where | None = None,
         json: bool = False,
         follow: bool = False,
@@ -113,7 +103,11 @@ def command_of(question: Question) -> Callable[..., None]:
     parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
     if in_range:
-        parameters.append(inspect.Parameter("span", keyword, default=Range(), annotation=Range))
+        parameters.append(
+            inspect.Parameter(
+                "span", keyword, default=TimeRangeOptions(), annotation=TimeRangeOptions
+            )
+        )
     if question.follows:
         parameters.append(inspect.Parameter("follow", keyword, default=False, annotation=_FOLLOW))
     parameters += [
@@ -174,7 +168,9 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
     asks_controllers = question.has_caller  # which takes a row in the queue, also to read
     recording = where.recording(read_only=question.effect.reads and not asks_controllers)
     valid = _valid(question, given, recording)
-    if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
+    if not (frozenset({"signals", "pattern"})).isdisjoint(
+        each.name for each in question.parameters
+    ):
         make_chunks_first(recording)
     with line_of_progress(), _caller(question, recording) as caller:
         return anyio.run(question.ask, recording, valid, caller)
@@ -186,7 +182,7 @@ def _caller(question: Question, recording: RecordingAccess) -> Generator[Caller 
     if not question.has_caller:
         yield None
         return
-    from webots_mcp.steering.routes import Companions, Launcher
+    from webots_mcp.steering.launcher import Companions, Launcher
     from webots_mcp.steering.trial_worker import TrialWorkers
 
     companions = Companions(TrialWorkers(recording), Launcher(recording))
@@ -244,7 +240,7 @@ def show(question: Question, reply: Reply, where: Where, *, as_json: bool) -> No
     if data is None:
         return print(*(each for each in reply.shown if isinstance(each, str)), sep="\n")
     _require_recorded(data)
-    if data.get("outcome") in _NOT_DONE:
+    if data.get("outcome") in ("failed", "expired", "cancelled", "lost", "claimed"):
         refused = CommandRefusedError(_not_done(question, data, where))
         refused.answer = {name: value for name, value in data.items() if name != "hint"}
         raise refused
@@ -304,7 +300,7 @@ def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json:
     again = given | {question.follows: most} | {"robot": data.get("robot") or given.get("robot")}
     is_live = where.may_change()
     while is_live:
-        wait(_LOOK_EVERY_S)
+        wait(0.5)
         rows = _rows_in(ask(question, again, where).data or {}, question.follows)
         came = new.of(rows)
         if came and len(came) == most:

@@ -16,10 +16,10 @@ from webots_mcp.cli.options import (
     Count,
     Id,
     Json,
-    Limits,
     Parameter,
-    Range,
+    RetentionOptions,
     Robot,
+    TimeRangeOptions,
     Where,
     make_chunks_first,
     only_reading,
@@ -28,16 +28,8 @@ from webots_mcp.cli.options import (
     refuse_options,
     whole_number,
 )
-from webots_mcp.cli.terminal import (
-    binary_stdout,
-    id_ranges,
-    print_json,
-    print_notes,
-    print_table,
-    printable,
-    shown_progress,
-    wait,
-)
+from webots_mcp.cli.streams import binary_stdout, shown_progress, wait
+from webots_mcp.cli.terminal import id_ranges, print_json, print_notes, print_table, printable
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.plugins import export_formats
@@ -47,7 +39,7 @@ from webots_mcp.store.purge import Purged
 if TYPE_CHECKING:
     import sqlite3
 
-    from webots_mcp.plotting.canvas import Picture
+    from webots_mcp.plotting.canvas import PlotImage
     from webots_mcp.store.logs import FollowedLine
     from webots_mcp.store.reading.ranges import TimeRange
     from webots_mcp.store.recording import RecordingAccess
@@ -58,9 +50,9 @@ if TYPE_CHECKING:
 else:
     _Format = Literal[("csv", "jsonl", *(each.name for each in export_formats()), "zip")]
 
-_ALL: Final = Range()
+_ALL: Final = TimeRangeOptions()
 _STDOUT: Final = Path("-")
-_UNLIMITED: Final = Limits()
+_UNLIMITED: Final = RetentionOptions()
 
 
 class _Written(NamedTuple):
@@ -103,7 +95,7 @@ def export(
             help="The trials of that set instead, one row each, with score, rank and spread.",
         ),
     ] = None,
-    part: Range = _ALL,
+    part: TimeRangeOptions = _ALL,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
@@ -160,7 +152,7 @@ def _require_for_stdout(form: str, *, as_json: bool) -> None:
 
 def _export_table(
     recorded: Where,
-    part: Range,
+    part: TimeRangeOptions,
     trial_set: int | None,
     file: Path | None,
     form: str,
@@ -185,7 +177,7 @@ def _export_table(
     return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(notes))
 
 
-def _export_for_viewers(recorded: Where, part: Range, file: Path, form: str) -> _Written:
+def _export_for_viewers(recorded: Where, part: TimeRangeOptions, file: Path, form: str) -> _Written:
     from webots_mcp.store.export import export_for_viewers
 
     data_dir = recorded.recording().data_dir
@@ -208,7 +200,7 @@ def _notes_of(wanted: TimeRange) -> list[str]:
     return [note.removesuffix(USE_EVERY_ROW) for note in wanted.notes]
 
 
-def _export_bundle(recorded: Where, part: Range, file: Path) -> _Written:
+def _export_bundle(recorded: Where, part: TimeRangeOptions, file: Path) -> _Written:
     from webots_mcp.store.reading.ranges import Scope, find_subject
 
     scope, recording = part.scope(), recorded.recording()
@@ -308,7 +300,7 @@ def _taken_in(found: dict[str, Any]) -> str:
 def prune(
     *,
     dry_run: Annotated[bool, Parameter("--dry-run", help="Only tell what would go.")] = False,
-    limits: Limits = _UNLIMITED,
+    limits: RetentionOptions = _UNLIMITED,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
@@ -328,7 +320,7 @@ def prune(
 
     asked = limits.asked()
 
-    def look() -> None:
+    def preview() -> None:
         with recorded.reader() as connection:
             wanted, sizes = plan(connection, in_force(connection, asked)), file_sizes(connection)
         disk = _on_disk(wanted, sizes)
@@ -338,7 +330,7 @@ def prune(
         _print_disk(disk)
 
     if dry_run:
-        return past_wrong_values(look)
+        return past_wrong_values(preview)
     with recorded.writer("prune", asked) as (recording, connection):
         set_limits(connection, asked, "prune")
         retention = in_force(connection)
@@ -355,7 +347,7 @@ def prune(
 def retain(
     *run_ids: Annotated[Id, Parameter("RUN", help="As 'webots-mcp runs' lists them.")],
     release: Annotated[bool, Parameter("--release", help="Let retention have them again.")] = False,
-    limits: Limits = _UNLIMITED,
+    limits: RetentionOptions = _UNLIMITED,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
@@ -552,7 +544,7 @@ def plot(
     ] = None,
     width_px: Annotated[Count, Parameter("--width", help="Pixels (900).")] = 900,
     height_px: Annotated[Count, Parameter("--height", help="Pixels (500).")] = 500,
-    span: Range | None = None,
+    span: TimeRangeOptions | None = None,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
@@ -570,7 +562,7 @@ def plot(
                 connection,
                 "trajectory" if trajectory else "signals",
                 [*signals, *behind_runs],
-                scope=(span or Range()).scope(),
+                scope=(span or TimeRangeOptions()).scope(),
                 run_ids=ids,
                 trial_set=trial_set,
                 width_px=width_px,
@@ -587,7 +579,7 @@ def _is_id(text: str) -> bool:
     return text.isascii() and text.isdecimal()
 
 
-def write_picture(file: Path, picture: Picture, *, as_json: bool = False) -> None:
+def write_picture(file: Path, picture: PlotImage, *, as_json: bool = False) -> None:
     """Write a picture as a file of its owner alone, and say what it shows.
 
     Raises:

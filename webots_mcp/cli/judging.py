@@ -47,12 +47,6 @@ _ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
     "not applicable": ("skipped", "skipped"),
 }
 _WAITING: Final = Waiting()
-_FRAME: Final = re.compile(r"(.*) \((.*):(\d+)\)$")
-_OURS: Final = str(Path(__file__).parents[1])
-_SHOWN: Final = 12
-_IN_STEP: Final = ("waiting in step()", None)
-_BRIDGE: Final = ("in the bridge", None)
-_OTHER: Final = ("in no file of the controller", None)
 _NOT_PERMITTED: Final = (
     "py-spy may not look into process {}: allow it with 'sudo sysctl kernel.yama.ptrace_scope=0' "
     "on Linux, with --cap-add SYS_PTRACE for a container, or ask as root (macOS)"
@@ -116,7 +110,7 @@ def _compile(recorded: Where) -> None:
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     """The answer with commands in the place of calls, and what passed in one line."""
     from webots_mcp.cli.asking import OPTIONS
-    from webots_mcp.cli.terminal import commands_by_tool
+    from webots_mcp.cli.wording import commands_by_tool
 
     def typed(cell: Any) -> Any:
         called = re.fullmatch(r"webots_(\w+)\(.*\)", str(cell))
@@ -350,7 +344,7 @@ def profile(
         samples[_place_of(stack, own)] += count
     total = samples.total()
     columns = ("share", "line", "function", "samples")
-    rows = [[f"{n / total:.1%}", *place, n] for place, n in samples.most_common(_SHOWN)]
+    rows = [[f"{n / total:.1%}", *place, n] for place, n in samples.most_common(12)]
     if json:
         found = {"robot": name, "seconds": seconds, "samples": total}
         return print_json(found | {"columns": columns, "rows": rows})
@@ -386,11 +380,17 @@ def _place_of(stack: str, own: str) -> tuple[str, str | None]:
     """The innermost line of the controller's own files, and its function."""
     in_bridge = False
     for each in reversed(stack.split(";")):
-        function, file, line = found.groups() if (found := _FRAME.match(each)) else ("", "", "")
+        function, file, line = (
+            found.groups() if (found := re.match(r"(.*) \((.*):(\d+)\)$", each)) else ("", "", "")
+        )
         is_own = file.startswith(own) and not INSTALLED.search(file)
         if function.rpartition(".")[2] in STEPPING and not is_own:
-            return _IN_STEP
+            return ("waiting in step()", None)
         if is_own:
-            return _BRIDGE if in_bridge else (f"{Path(file).name}:{line}", f"{function}()")
-        in_bridge = in_bridge or file.startswith(_OURS)
-    return _OTHER
+            return (
+                ("in the bridge", None)
+                if in_bridge
+                else (f"{Path(file).name}:{line}", f"{function}()")
+            )
+        in_bridge = in_bridge or file.startswith(str(Path(__file__).parents[1]))
+    return ("in no file of the controller", None)

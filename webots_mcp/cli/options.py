@@ -46,10 +46,6 @@ else:  # cyclopts 4, the last for Python 3.10: options have no words for their v
 
 _TOO_LARGE: Final = 2**63  # for SQLite, and no id that it has given
 _NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
-# Not owed to a value in a row: reading past invalid rows would not help.
-_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
-_MAKING_CHUNKS_S: Final = 300.0  # a million rows of 40 values take 100 s
-_BACK: Final = "default"
 _RUNS: Final = "outlive"
 
 
@@ -126,7 +122,6 @@ def _no_constant(name: str) -> float:
 # -- which recording, which part of it, and how it is opened --
 
 _Given = ParamSpec("_Given")
-
 Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
 Robot: TypeAlias = Annotated[
     str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
@@ -245,7 +240,7 @@ class ToWebots(Waiting):
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Range:
+class TimeRangeOptions:
     """Which run of which robot, and which stretch of it: the options that commands share."""
 
     robot: Robot = None
@@ -300,7 +295,9 @@ def past_wrong_values(run: Callable[[], None]) -> None:
     try:
         return run()
     except Exception as error:
-        if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
+        if isinstance(error, (WebotsMCPError, OSError, ImportError)) and not isinstance(
+            error, MalformedRowError
+        ):
             raise
     past_invalid_rows(run)
 
@@ -317,11 +314,12 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
 
 def make_chunks_first(recording: RecordingAccess) -> None:
     """Put into chunks what no server has, so that a question of any length is answered."""
-    from webots_mcp.cli.terminal import shown_progress
+    from webots_mcp.cli.streams import shown_progress
     from webots_mcp.store.chunk_making import make_missing_chunks
 
     with shown_progress("making chunks of what was recorded") as progress:
-        left = make_missing_chunks(recording, progress, limit_s=_MAKING_CHUNKS_S)
+        # A million rows of 40 values take 100 s.
+        left = make_missing_chunks(recording, progress, limit_s=300.0)
     if left:
         print(f"webots-mcp: {left}", file=sys.stderr)
 
@@ -345,7 +343,7 @@ def _name_of(name: str) -> str:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Limits:
+class RetentionOptions:
     """How much is kept of what, as it was typed; by the names of `Retention`."""
 
     state: Annotated[str | None, _option("state", "Keep so much of recorded states ({}).")] = None
@@ -387,7 +385,7 @@ class Limits:
 
 
 def _value(name: str, text: str) -> Limit | float | None:
-    if text == _BACK:
+    if text == "default":
         return None
     try:
         if name == _RUNS:

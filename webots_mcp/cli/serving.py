@@ -16,20 +16,29 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from cyclopts.validators import Number
 
-from webots_mcp.cli.options import HERE, DataDir, Json, Limits, Parameter, Where, whole_number
-from webots_mcp.cli.terminal import ending_in_time, print_json
+from webots_mcp.cli.ending import ending_in_time
+from webots_mcp.cli.options import (
+    HERE,
+    DataDir,
+    Json,
+    Parameter,
+    RetentionOptions,
+    Where,
+    whole_number,
+)
+from webots_mcp.cli.terminal import print_json
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.extras.plugins import stand_in_simulator
 
 if TYPE_CHECKING:
     from webots_mcp.database.location import Database
-    from webots_mcp.simulator.launch import Launch, SessionStart
+    from webots_mcp.simulator.launch import SessionStart, WebotsLaunch
     from webots_mcp.simulator.orders import WebotsLine
     from webots_mcp.store.recording import RecordingAccess
     from webots_mcp.store.retention import Asked
 
-_AS_BEFORE: Final = Limits()
+_AS_BEFORE: Final = RetentionOptions()
 _URL: Final = "WEBOTS_CONTROLLER_URL"
 _LOOK_EVERY_S: Final = 0.2
 _EXTERN_HERE: Final = "--robot NAME=FILE runs one"
@@ -82,7 +91,7 @@ def serve(
     tls_key: Annotated[
         Path | None, Parameter("--tls-key", help="With --http: the certificate's key, in PEM.")
     ] = None,
-    limits: Limits = _AS_BEFORE,
+    limits: RetentionOptions = _AS_BEFORE,
     recorded: Where = HERE,
 ) -> None:
     """Serve a recording to an MCP client over stdin and stdout, or to many over HTTP.
@@ -110,9 +119,9 @@ def serve(
     asked = limits.asked()
     place = None
     if http is not None:
-        from webots_mcp.server.http_server import place_of
+        from webots_mcp.server.http_server import endpoint_of
 
-        place = place_of(http, allow_host, tls_cert, tls_key)
+        place = endpoint_of(http, allow_host, tls_cert, tls_key)
     elif allow_host or tls_cert or tls_key:
         raise InvalidInputError("--allow-host, --tls-cert and --tls-key are for --http")
     elif sys.stdin.isatty():
@@ -270,7 +279,8 @@ def _connect_to(url: str | None, robot: str) -> str:
     Raises:
         CommandRefusedError: There is no such library.
     """
-    from webots_mcp.simulator.instances import DEFAULT_PORT, HOME_VARIABLE, installations
+    from webots_mcp.simulator.installations import HOME_VARIABLE, installations
+    from webots_mcp.simulator.instances import DEFAULT_PORT
 
     url = url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
     os.environ[_URL] = f"{url.rstrip('/')}/{robot}" if url.count("/") == 2 else url
@@ -353,7 +363,7 @@ def launch(
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
     from webots_mcp.simulator.console import StandInConsole
-    from webots_mcp.simulator.launch import Launch, newest_in, require_world
+    from webots_mcp.simulator.launch import WebotsLaunch, newest_in, require_world
     from webots_mcp.simulator.starting import Start, free_port
     from webots_mcp.store.policy import LAUNCH
     from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest, permit
@@ -380,7 +390,7 @@ def launch(
     start = Start(file, mode, headless, stream, port or free_port())
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
     console = _Console()
-    launched = Launch(recording, start, environment, console.show)
+    launched = WebotsLaunch(recording, start, environment, console.show)
     with _Recorder(launched, recording) as recorder:
         try:
             return _follow(launched, patience_s, console, recorder)
@@ -444,7 +454,9 @@ def _recording(data_dir: Path | None, project: Path) -> RecordingAccess:
     )
 
 
-def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _Recorder) -> int:
+def _follow(
+    launched: WebotsLaunch, patience_s: float, console: _Console, recorder: _Recorder
+) -> int:
     """Until Webots has ended; its exit code."""
     webots, first = launched.webots, None
     until_s = time.monotonic() + patience_s
@@ -463,7 +475,7 @@ def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _R
     return code
 
 
-def _announce_first(launched: Launch) -> SessionStart | None:
+def _announce_first(launched: WebotsLaunch) -> SessionStart | None:
     """Say which controller records first, once there is one."""
     first = launched.first_record()
     if first is not None:
@@ -495,7 +507,7 @@ class _Console:
 class _Recorder(ExitStack):
     """Records Webots' console, from when it listens."""
 
-    def __init__(self, launched: Launch, recording: RecordingAccess) -> None:
+    def __init__(self, launched: WebotsLaunch, recording: RecordingAccess) -> None:
         super().__init__()
         self._launched = launched
         self._recording = recording

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from webots_mcp.cli.options import HERE, Json, Parameter, Where
-from webots_mcp.cli.terminal import as_typed, print_json, print_notes, printable, terminal_width
+from webots_mcp.cli.terminal import print_json, print_notes, printable, terminal_width
+from webots_mcp.cli.wording import as_typed
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 
 if TYPE_CHECKING:
@@ -23,13 +24,11 @@ if TYPE_CHECKING:
     from webots_mcp.setup.file_change import FileChange
     from webots_mcp.simulator.project import ProjectController
 
-_WRONG: Final = 1  # the exit code
 _NO_CONTROLLER: Final = (
     "there is no controller in controllers/. Once there is one, run this again. An extern "
     "controller or a ROS 2 driver records with these two lines: 'from webots_mcp import MCPBridge' "
     "and, where it has made its robot, 'bridge = MCPBridge.attach(robot)'"
 )
-_LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
 
 
 @Parameter(name="*")
@@ -225,7 +224,7 @@ def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: W
 
 def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool) -> None:
     """Put the observer into a copy of a world, or into the world itself."""
-    from webots_mcp.setup.project_edits import controller_change, world_change
+    from webots_mcp.setup.observer_edits import controller_change, world_change
     from webots_mcp.simulator.project import project_of
 
     change = world_change(world, in_place=in_place, extern=extern)
@@ -244,10 +243,10 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
 
 def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
     """The Python that can run the observer, where the one that Webots takes cannot."""
-    from webots_mcp.setup.interpreter import look_into
-    from webots_mcp.setup.project_edits import python_change
+    from webots_mcp.setup.interpreter import probe_interpreter
+    from webots_mcp.setup.observer_edits import python_change
 
-    found = look_into(controller)
+    found = probe_interpreter(controller)
     if found.error is None:
         return []
     change = python_change(controller, sys.executable)
@@ -261,7 +260,7 @@ def _remove_observer(world: Path, writing: Writing) -> None:
     """Take the observer out of a world, or delete the copy that was made for it."""
     from webots_mcp.contract import CONTROLLER_FOLDER, WORLD_ENDING, WORLD_FOLDER
     from webots_mcp.database.location import find_project
-    from webots_mcp.setup.project_edits import undo, unused_controller
+    from webots_mcp.setup.observer_edits import undo, unused_controller
 
     change = undo(world)
     writing.require_yes(world)
@@ -311,7 +310,7 @@ def _make_ready(
     """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER, PROJECT_FILE
     from webots_mcp.setup import client_entries
-    from webots_mcp.setup.skills import parts_of
+    from webots_mcp.setup.skills import managed_texts
     from webots_mcp.setup.wsl import windows_server
     from webots_mcp.simulator.project import controllers_of, project_of
 
@@ -334,7 +333,7 @@ def _make_ready(
     for each in clients:
         planned = partial(client_entries.plan_entry, each, name, line)
         files += [{"client": each.name} | _written(each.file, writing, planned)]
-    files += [_written(e.file, writing, e.plan) for e in parts_of(project)] if skills else []
+    files += [_written(e.file, writing, e.plan) for e in managed_texts(project)] if skills else []
     controllers = [_described(found, project) for found in controllers_of(project)]
     hindrance = None if http or of_windows else client_entries.server_hindrance()
     notes = [note for note in (border, hindrance, expected) if note]
@@ -410,7 +409,7 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     """A controller, the lines that it needs, and the Python that it is started with."""
     from dataclasses import asdict
 
-    from webots_mcp.setup.interpreter import look_into
+    from webots_mcp.setup.interpreter import probe_interpreter
     from webots_mcp.setup.project_edits import (
         IMPORT,
         AlreadyPatchedError,
@@ -441,7 +440,7 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     if is_plain_robot(controller.file) and not has_observer(project):
         lacks = f"its robot {NO_SUPERVISOR}. {NO_POSITION_OF_ITS_OWN}"
         described["lacks"] = f"{lacks}: {offer_observer(project)}"
-    python = asdict(look_into(controller.file))
+    python = asdict(probe_interpreter(controller.file))
     known = {name: value for name, value in python.items() if value is not None}
     return described | {"python": known}
 
@@ -516,7 +515,7 @@ def doctor(
         print_json({"checks": [_facts(each) for each in checked]})
     else:
         _print_checks(checked)
-    return _WRONG if any(each.finding.verdict == "wrong" for each in checked) else 0
+    return 1 if any(each.finding.verdict == "wrong" for each in checked) else 0
 
 
 def _examined(recorded: Where) -> Examined:
@@ -554,7 +553,7 @@ def _print_folded(head: str, text: str) -> None:
     width = terminal_width(sys.stdout)
     lines = textwrap.wrap(
         printable(as_typed(text)),
-        max(width - len(head), _LEAST_COLUMN),
+        max(width - len(head), 30),
         break_long_words=False,
         break_on_hyphens=False,
     )

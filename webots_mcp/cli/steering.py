@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from webots_mcp.cli.data import write_picture
+from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.options import (
     HERE,
     Count,
@@ -29,14 +30,7 @@ from webots_mcp.cli.options import (
     Where,
     whole_number,
 )
-from webots_mcp.cli.terminal import (
-    clock_text,
-    ending_by_event,
-    print_json,
-    print_notes,
-    print_table,
-    text_of,
-)
+from webots_mcp.cli.terminal import clock_text, print_json, print_notes, print_table, text_of
 from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
@@ -51,8 +45,6 @@ if TYPE_CHECKING:
 _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
 _WEBOTS: Final = ToWebots()
-_RANK_EVERY_S: Final = 1.0
-_WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
 _WHERE: Final = Where()
 
 
@@ -118,7 +110,7 @@ def parameters(
 
         webots-mcp parameters kp=3.5 gait=trot
     """
-    from webots_mcp.questions.send_command import webots_get_parameters, webots_set_parameters
+    from webots_mcp.questions.parameters import webots_get_parameters, webots_set_parameters
 
     if from_reset and not settings:
         raise InvalidInputError("--from-reset needs what is set then: NAME=VALUE")
@@ -152,17 +144,17 @@ def breakpoint_(
 
     It is asked of every published state, stored, and armed again after a reset or reload.
     """
-    from webots_mcp.questions import send_command as questions
+    from webots_mcp.questions import breakpoints
 
     if condition is not None and breakpoint_id is not None:
         raise InvalidInputError("give a condition to set, or --remove ID, not both")
     if breakpoint_id is not None:
-        remove = questions.webots_remove_breakpoint
+        remove = breakpoints.webots_remove_breakpoint
         return _show(remove, asked, as_json=json, breakpoint_id=breakpoint_id)
     if condition is None:
-        return _show(questions.webots_list_breakpoints, asked, as_json=json)
+        return _show(breakpoints.webots_list_breakpoints, asked, as_json=json)
     given = {"condition": condition, "action": action, "after_hits": after_hits}
-    _show(questions.webots_breakpoint, asked, as_json=json, **given)
+    _show(breakpoints.webots_breakpoint, asked, as_json=json, **given)
 
 
 def field(
@@ -361,7 +353,8 @@ def trials(
 
 def run_plan(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) -> int:
     """Run what is left of the plan's set; returns its id."""
-    from webots_mcp.steering.trial_run import SetRun, require_optuna, run_trials
+    from webots_mcp.steering.trial_search import require_optuna
+    from webots_mcp.steering.trial_set import SetRun, run_trials
     from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
 
     if plan.search:
@@ -375,7 +368,7 @@ def run_plan(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions)
             ending_by_event(set_run.stopping),
         ):
             set_id = _set_of(recording, plan, options)
-            run_trials(set_run, set_id, _Progress(recording, set_id, plan).tell)
+            run_trials(set_run, set_id, _TrialProgress(recording, set_id, plan).tell)
     return set_id
 
 
@@ -458,7 +451,7 @@ def _text_of(plan: WorldPlan, options: TrialOptions) -> str:
     return json.dumps({"stand_in": options.stand_in, **json.loads(plan.text)}, sort_keys=True)
 
 
-class _Progress:
+class _TrialProgress:
     """A line on stderr for each trial that is over, and for each set that takes the lead."""
 
     def __init__(self, recording: RecordingAccess, set_id: int, plan: WorldPlan) -> None:
@@ -478,14 +471,15 @@ class _Progress:
         """That a trial is over, and what came of it."""
         self._over += 1
         came = text_of(result.score) if result.status == "done" else result.error
-        came = f"{_WORDS[result.status]} {came}"
+        word = {"done": "score", "failed": "failed:", "pruned": "pruned:"}[result.status]
+        came = f"{word} {came}"
         said = f"{self._over}/{self._of}  "
         if trial.values:
             said += f"{text_of(trial.values)}: {came}"
         else:  # the same again, which no score ranks
             said += "over" if result.status == "done" else came
         print(said, file=sys.stderr, flush=True)
-        is_due = time.monotonic() >= self._ranked_s + _RANK_EVERY_S
+        is_due = time.monotonic() >= self._ranked_s + 1.0
         if trial.values and is_due and self._over < self._of:
             self._tell_leader()
             self._ranked_s = time.monotonic()

@@ -9,19 +9,17 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.trends import trends
-from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, Picture, Sheet
+from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, PlotImage, Sheet
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
 from webots_mcp.plotting.trials import plot_trials
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
 PlotKind = Literal["signals", "trajectory"]
-
-_DEFAULT_SIGNALS: Final = 3
 
 
 def plot(
@@ -36,7 +34,7 @@ def plot(
     width_px: int = WIDTH_PX,
     height_px: int = HEIGHT_PX,
     image_format: ImageFormat = "png",
-) -> Picture:
+) -> PlotImage:
     """A picture of signals over a range of time, of the robot's way, or of trials.
 
     Args:
@@ -77,7 +75,7 @@ def plot(
 
 def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:
     """The three numbers that changed most, which are drawn where none is named."""
-    found = trends(connection, time_range, limit=_DEFAULT_SIGNALS).runs
+    found = trends(connection, time_range, limit=3).runs
     return [trend.name for run in found for trend in run.numbers] or ["*"]
 
 

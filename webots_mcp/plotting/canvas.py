@@ -1,52 +1,46 @@
-"""A sheet to draw on: pictures are painted as SVG, and become PNG without a browser."""
+"""Pictures are painted as SVG on a canvas, and become PNG without a browser.
+
+A sheet says how large a picture is, and how much is readable on it.
+"""
 
 from __future__ import annotations
 
 import io
-import math
 import tempfile
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, get_args
-from zlib import crc32
+from typing import Any, Final, Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.plotting.colours import LINES, ON_PAPER, Theme
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.series import MOST_POINTS
 
-# Colours that people with any kind of colour vision can tell apart.
-#
-# Lines and marks: M. Okabe, K. Ito, "Color Universal Design" (2008), without the yellow, which is
-# too light for a line on white. Areas: P. Tol, "Colour Schemes", SRON/EPS/TN/09-002 (2021), the
-# scheme "light", made for the background of labels.
+
+@dataclass(frozen=True)
+class SheetLayout:
+    """What the parts of a picture take in pixels, about.
+
+    Attributes:
+        beside_axis_px: What stands next to a horizontal axis.
+        panel_px: A panel that is still readable.
+        title_and_legend_px: Title, axis and legend.
+        bucket_px: A bucket: in fewer pixels the band of extremes would hide behind the line.
+        lanes: Maximum number of rows of modes and flags.
+    """
+
+    beside_axis_px: int = 200
+    panel_px: int = 110
+    title_and_legend_px: int = 150
+    bucket_px: int = 3
+    lanes: int = 4
 
 
-LINES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-DASHES: Final = ("none", "6 2", "2 1.6", "6 2 2 2")  # in pixels
-AREAS: Final = (
-    "#77AADD", "#EE8866", "#44BB99", "#EEDD88", "#FFAABB", "#AAAA00", "#99DDFF", "#BBCC33",
-)  # fmt: skip
-_FIRST_CHOICE: Final = 4  # of the areas; the others are each close to one of these
-OTHER_VALUES: Final = "others"  # the name that values share of which there are too many
-FAINT: Final = "#767676"  # the lightest grey that is readable as text on white
-INK: Final = "#333333"  # on areas, whatever the ground of the picture is
-# Scales of colour whose lightness grows evenly, at equal distances: matplotlib's viridis and
-# cividis, which are in the public domain.
-_VIRIDIS: Final = (
-    "#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80", "#5EC962", "#ADDC30",
-    "#FDE725",
-)  # fmt: skip
-_CIVIDIS: Final = (
-    "#00224E", "#123570", "#3B496C", "#575D6D", "#707173", "#8A8678", "#A59C74", "#C3B369",
-    "#FEE838",
-)  # fmt: skip
-SCALES: Final = {"time": _VIRIDIS, "score": _CIVIDIS}
-MOST_VALUES: Final = 2 * len(AREAS)
+_LAYOUT: Final = SheetLayout()
 MOST_PANELS: Final = 3
-MOST_LANES: Final = 4
 WIDTH_PX: Final = 900
 HEIGHT_PX: Final = 500
 LEAST_WIDTH_PX: Final = 400
@@ -54,20 +48,7 @@ LEAST_HEIGHT_PX: Final = 300
 MOST_PX: Final = 2000
 ROW_PX: Final = 17
 TEXT_PX: Final = 11.0  # the size of usual letters
-_BESIDE_PX: Final = 200  # what stands beside an axis, about
-_PANEL_PX: Final = 110
-_TITLE_AND_LEGEND_PX: Final = 150
-_BUCKET_PX: Final = 3  # in fewer pixels the band of extremes would hide behind the line
 _LONGEST_NAME: Final = 24
-_LEAST_SPAN: Final = 1e-11  # of the values: less is what rounding leaves of a constant
-_FLAT: Final = 0.05  # of a constant value is shown above and below it
-# Widths of letters in em, of the widest of the usual fonts, so that texts have room in all.
-_NARROW: Final = frozenset("ijlftr|.,:;'!()[]/\\ -")
-_BROAD: Final = frozenset("mwMW@%…")
-# The last one comes with Pillow, for a computer without any font.
-_FAMILIES: Final = "DejaVu Sans, Segoe UI, Helvetica Neue, Arial, Liberation Sans, Aileron"
-_UNSEEN: Final = ("Cc", "Cf", "Zs", "Zl", "Zp", "Mn", "Me")  # spaces, controls, marks on letters
-_NO_CHARACTER: Final = "\U0010ffff"  # no font has it
 _CELL_PX: Final = 24
 _SHOWN_TEXTS: Final = 3
 _HATCHES: Final = (
@@ -78,49 +59,11 @@ _HATCHES: Final = (
     '</pattern><pattern id="hatch-dots" width="6" height="6" patternUnits="userSpaceOnUse">'
     '<circle cx="3" cy="3" r="1" fill="#333333"/></pattern></defs>'
 )
-
-
-class Area(NamedTuple):
-    """How an area, or a stretch of a way, is filled."""
-
-    colour: str
-    dotted: bool
-
-
-MERGED: Final = Area("#DDDDDD", dotted=False)
-
-
-def area_styles(values: Iterable[str]) -> dict[str, Area]:
-    """A style for each value: eight colours, the same with dots, and grey from the 17th value on.
-
-    The colour hangs on the value's own text, so that "cruise" looks alike in every picture, unless
-    another value in the same one has taken it.
-    """
-    styles: dict[str, Area] = {}
-    for value in sorted(set(values)):
-        first = crc32(value.encode()) % _FIRST_CHOICE
-        order = (*AREAS[first:_FIRST_CHOICE], *AREAS[:first], *AREAS[_FIRST_CHOICE:])
-        styled = (Area(colour, dotted) for dotted in (False, True) for colour in order)
-        free = (style for style in styled if style not in styles.values())
-        styles[value] = MERGED if value == OTHER_VALUES else next(free, MERGED)
-    return styles
-
-
-def scaled(share: float, scale: str) -> str:
-    """The colour at a share, from 0 to 1, of a scale."""
-    stops = SCALES[scale]
-    place = min(max(share, 0.0), 1.0) * (len(stops) - 1)
-    index = min(int(place), len(stops) - 2)
-    low, high = (bytes.fromhex(stops[index + i][1:]) for i in (0, 1))
-    mixed = (round(a + (place - index) * (b - a)) for a, b in zip(low, high, strict=True))
-    return "#" + bytes(mixed).hex().upper()
-
-
 ImageFormat = Literal["png", "svg"]
 
 
 @dataclass(frozen=True)
-class Picture:
+class PlotImage:
     """A finished picture.
 
     Attributes:
@@ -171,12 +114,12 @@ class Sheet:
     @property
     def room(self) -> Room:
         """What is still readable on it."""
-        beside_panels_px = self.height_px - _TITLE_AND_LEGEND_PX
+        beside_panels_px = self.height_px - _LAYOUT.title_and_legend_px
         rows = beside_panels_px // (2 * ROW_PX)
         return Room(
-            points=min((self.width_px - _BESIDE_PX) // _BUCKET_PX, MOST_POINTS),
-            panels=max(1, min(MOST_PANELS, beside_panels_px // _PANEL_PX)),
-            lanes=min(MOST_LANES, rows),
+            points=min((self.width_px - _LAYOUT.beside_axis_px) // _LAYOUT.bucket_px, MOST_POINTS),
+            panels=max(1, min(MOST_PANELS, beside_panels_px // _LAYOUT.panel_px)),
+            lanes=min(_LAYOUT.lanes, rows),
             rows=rows,
         )
 
@@ -199,25 +142,11 @@ def image_format_of(file: Path) -> ImageFormat:
     raise InvalidInputError(f"{file.name!r} is not the name of a picture: end it in .png or .svg")
 
 
-@dataclass(frozen=True)
-class Look:
-    """The colours of what surrounds the data, as CSS; in a page they follow its style."""
-
-    ink: str = INK
-    faint: str = FAINT
-    grid: str = "#E3E3E3"
-    ground: str = "#FFFFFF"
-
-
-ON_PAPER: Final = Look()
-ON_A_PAGE: Final = Look("var(--ink)", "var(--faint)", "var(--grid)", "var(--ground)")
-
-
 class Canvas:
     """An SVG that is painted: elements over each other, in the order in which they are added."""
 
-    def __init__(self, width_px: float, height_px: float, look: Look = ON_PAPER) -> None:
-        self.width_px, self.height_px, self.look = width_px, height_px, look
+    def __init__(self, width_px: float, height_px: float, theme: Theme = ON_PAPER) -> None:
+        self.width_px, self.height_px, self.theme = width_px, height_px, theme
         self._parts: list[str] = []
         self._texts: list[str] = []
 
@@ -243,7 +172,7 @@ class Canvas:
         """
         text = spelled_out(text)
         self._texts.append(text)
-        place = {"x": x, "y": y, "font_size": size, "fill": colour or self.look.ink}
+        place = {"x": x, "y": y, "font_size": size, "fill": colour or self.theme.ink}
         place |= {"text_anchor": anchor} if anchor != "start" else {}
         written = _written(place | attributes)
         self._parts.append(f"<text{written}>{escape(text, quote=False)}</text>")
@@ -251,19 +180,22 @@ class Canvas:
     def svg(self) -> str:
         """The whole SVG."""
         width, height = f"{self.width_px:g}", f"{self.height_px:g}"
-        ground = f'<rect width="100%" height="100%" fill="{self.look.ground}"/>'
+        # Aileron comes with Pillow, for a computer without any font.
+        families = "DejaVu Sans, Segoe UI, Helvetica Neue, Arial, Liberation Sans, Aileron"
+        families += ", sans-serif"
+        ground = f'<rect width="100%" height="100%" fill="{self.theme.ground}"/>'
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
-            f'viewBox="0 0 {width} {height}" font-family="{_FAMILIES}, sans-serif">'
+            f'viewBox="0 0 {width} {height}" font-family="{families}">'
             f"{_HATCHES}{ground}{''.join(self._parts)}</svg>"
         )
 
-    def picture(self, image_format: ImageFormat, caption: str, notes: Sequence[str]) -> Picture:
+    def picture(self, image_format: ImageFormat, caption: str, notes: Sequence[str]) -> PlotImage:
         """The picture as a file; of a PNG a note says which texts no font here can show."""
         svg = self.svg()
         if image_format == "svg":
-            return Picture(svg.encode(), "image/svg+xml", caption, tuple(notes))
-        return Picture(_png(svg), "image/png", caption, (*notes, *_missing_fonts(self._texts)))
+            return PlotImage(svg.encode(), "image/svg+xml", caption, tuple(notes))
+        return PlotImage(_png(svg), "image/png", caption, (*notes, *_missing_fonts(self._texts)))
 
 
 def _written(attributes: dict[str, Any]) -> str:
@@ -304,7 +236,9 @@ def _missing_fonts(texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def _is_foreign(character: str) -> bool:
-    return not character.isascii() and unicodedata.category(character) not in _UNSEEN
+    """Return whether a font may lack a character: not ASCII, and no space, control or accent."""
+    unseen = ("Cc", "Cf", "Zs", "Zl", "Zp", "Mn", "Me")
+    return not character.isascii() and unicodedata.category(character) not in unseen
 
 
 def _boxed(characters: Sequence[str]) -> set[str]:
@@ -312,7 +246,7 @@ def _boxed(characters: Sequence[str]) -> set[str]:
     from PIL import Image
 
     cells = Canvas(_CELL_PX, _CELL_PX * (len(characters) + 1))
-    for row, character in enumerate([_NO_CHARACTER, *characters]):
+    for row, character in enumerate(["\U0010ffff", *characters]):  # no font has it
         cells.text(4, _CELL_PX * (row + 0.8), character)
     drawn = Image.open(io.BytesIO(_png(cells.svg()))).convert("L")
     rows = [drawn.crop((0, y, _CELL_PX, y + _CELL_PX)).tobytes()
@@ -329,11 +263,12 @@ def width_of(text: str, size: float = TEXT_PX) -> float:
 
 
 def _em(character: str) -> float:
+    """Return the width of a letter in the widest of the usual fonts, so that texts fit in all."""
     if unicodedata.category(character) in ("Mn", "Me", "Cf"):
         return 0.0
-    if character in _NARROW:
+    if character in "ijlftr|.,:;'!()[]/\\ -":
         return 0.4
-    if character in _BROAD or unicodedata.east_asian_width(character) in "WF":
+    if character in "mwMW@%…" or unicodedata.east_asian_width(character) in "WF":
         return 1.0
     return 0.72 if character.isupper() else 0.64
 
@@ -368,64 +303,3 @@ def wrapped(text: str, width_px: float, size: float = TEXT_PX, most: int = 4) ->
 
 
 # Axes ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Axes in pixels, and the range of values on each."""
-
-    left: float
-    top: float
-    width: float
-    height: float
-    x: tuple[float, float]
-    y: tuple[float, float]
-
-    @property
-    def right(self) -> float:
-        """In pixels."""
-        return self.left + self.width
-
-    @property
-    def bottom(self) -> float:
-        """In pixels."""
-        return self.top + self.height
-
-    def px(self, x: Any) -> Any:
-        """A value, or an array of values, of the horizontal axis in pixels."""
-        low, high = self.x
-        return self.left + self.width * ((x - low) / (high - low))
-
-    def py(self, y: Any) -> Any:
-        """The same of the vertical axis."""
-        low, high = self.y
-        return self.bottom - self.height * ((y - low) / (high - low))
-
-
-def axis_range(low: float, high: float, margin: float = 0.08) -> tuple[float, float]:
-    """The range of an axis for such values: what is constant but for rounding is a flat line."""
-    largest = max(abs(low), abs(high))
-    middle = low / 2 + high / 2
-    if high - low <= _LEAST_SPAN * largest:
-        half = _FLAT * largest or 1.0
-        return middle - half, middle + half
-    half = (0.5 + margin) * (high - low)
-    return middle - half, middle + half
-
-
-def ticks(low: float, high: float, most: float) -> list[tuple[float, str]]:
-    """Round values between two others, at most so many, with their labels."""
-    least = (high - low) / max(most, 1.0)
-    unit = 10.0 ** math.floor(math.log10(least))
-    step = next(unit * factor for factor in (1, 2, 5, 10) if unit * factor >= least * (1 - 1e-9))
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    values = [step * count for count in range(first, last + 1)]
-    return [(value, _label(value, step, max(abs(low), abs(high)))) for value in values]
-
-
-def _label(value: float, step: float, largest: float) -> str:
-    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    if largest < 1e6 and decimals <= 5:
-        return f"{value:.{decimals}f}" if value else "0"
-    digits = max(1, math.ceil(math.log10(largest / step) + 1e-9) + 1)
-    return f"{value:.{digits}g}" if value else "0"

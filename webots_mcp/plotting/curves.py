@@ -1,30 +1,21 @@
-"""Numeric signals as curves, broken where nothing was recorded, and which of them share a panel."""
+"""Numeric signals as curves, broken at gaps in the recording, and which of them share a panel.
+
+Signals of one unit and a similar scale share an axis.
+"""
 
 from __future__ import annotations
 
 import math
-import sqlite3
-from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate, pairwise
-from typing import Final, NamedTuple
+from itertools import pairwise
+from typing import Final
 
-from webots_mcp.analysis.arrays import np, rhythm_of
-from webots_mcp.analysis.summary import LARGEST
-from webots_mcp.plotting.parts import Part
-from webots_mcp.store.reading.frame import read_frame
-from webots_mcp.store.reading.segment import Deadline
+from webots_mcp.analysis.arrays import rhythm_of
 from webots_mcp.store.series import NumberColumns, RunHistory
-from webots_mcp.store.signals import RegisteredSignal
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum
-_BREAK: Point = (math.nan, math.nan, math.nan, math.nan)
 MOST_CURVES: Final = 5  # more bands on top of each other are mud
-_LEAST_SHARE: Final = 0.07  # of the axis; a curve that moves less would look flat
-MOST_PLACES: Final = 20_000  # of a way; a picture has a thousandth as many pixels
-_LEAP: Final = 10.0  # times the speed that 95 % of the steps keep to
-_FINENESS: Final = 1 / 2000  # of the larger side: what lies nearer is the same pixel
 
 
 @dataclass(frozen=True)
@@ -82,7 +73,7 @@ def _with_breaks(points: Sequence[Point], run: RunHistory, *, angle: bool) -> li
             before[0] - step_s <= gap.start_s and gap.end_s <= after[0] + step_s for gap in run.gaps
         )
         if silent or (angle and abs(after[1] - before[1]) > math.pi):
-            broken.append(_BREAK)
+            broken.append((math.nan, math.nan, math.nan, math.nan))
         broken.append(after)
     return broken
 
@@ -120,7 +111,8 @@ class Panel:
 
 def _is_visible(curve: Curve, height: float) -> bool:
     interval = curve.high - curve.low
-    return interval == 0 or interval >= _LEAST_SHARE * height
+    # A curve that moves within less than 7 % of the axis would look flat.
+    return interval == 0 or interval >= 0.07 * height
 
 
 def by_scale(curves: Iterable[Curve], most_panels: int) -> tuple[list[Panel], list[str]]:
@@ -178,124 +170,3 @@ def by_choice(
 
 
 # Where a robot went: the rows of a run as points in the plane, and where they stand out.
-
-
-class Place(NamedTuple):
-    """Where the robot was at a simulation time."""
-
-    time_s: float
-    x: float
-    y: float
-
-
-@dataclass(frozen=True)
-class Path:
-    """The places of one run, in order.
-
-    Attributes:
-        step_s: Simulated time between the places where not every row was read; else None.
-        breaks: Indexes of the places before which nothing was recorded, or to which it leapt.
-        is_whole: Whether it was read up to its end: the last place of one that was not is none.
-    """
-
-    places: Sequence[Place]
-    step_s: float | None
-    breaks: frozenset[int]
-    is_whole: bool = True
-
-    def pieces(self) -> Iterator[Sequence[Place]]:
-        """The parts between the breaks."""
-        edges = [0, *sorted(self.breaks), len(self.places)]
-        return (self.places[start:end] for start, end in pairwise(edges) if end > start)
-
-    def steps(self) -> list[tuple[Place, Place]]:
-        """From each place that can be seen to the next, within the pieces."""
-        return [step for piece in self.pieces() for step in pairwise(thinned(piece))]
-
-    def at(self, time_s: float) -> Place:
-        """The place at that time, or the first one."""
-        index = bisect_right(self.places, time_s, key=lambda place: place.time_s)
-        return self.places[max(0, index - 1)]
-
-    def between(self, start_s: float, end_s: float) -> Sequence[Place]:
-        """The places in [start_s, end_s), and the next one, so that pieces touch."""
-        start = bisect_right(self.places, start_s, key=lambda place: place.time_s)
-        end = bisect_right(self.places, end_s, key=lambda place: place.time_s)
-        return self.places[max(0, start - 1) : end + 1]
-
-
-def read_path(
-    connection: sqlite3.Connection,
-    part: Part,
-    x: RegisteredSignal,
-    y: RegisteredSignal,
-    deadline_s: float,
-) -> Path:
-    """The places of one run: of every row, or of every so many if the rows are many."""
-    (segment,) = part.range.segments
-    frame = read_frame(connection, segment, Deadline(deadline_s))
-    xs, ys = frame.numbers(x.name), frame.numbers(y.name)
-    rows = np.flatnonzero(np.maximum(np.abs(xs), np.abs(ys)) <= LARGEST)
-    every = max(1, math.ceil(len(rows) / MOST_PLACES))
-    shown = np.union1d(rows[::every], rows[-1:])
-    times = frame.times
-    places = [
-        Place(*place)
-        for place in zip(times[shown].tolist(), xs[shown].tolist(), ys[shown].tolist(), strict=True)
-    ]
-    step_s = None
-    if every > 1:
-        step_s = float(f"{float(np.median(np.diff(times[shown]))):.3g}")
-    return Path(places, step_s, frozenset(_breaks(places)), is_whole=frame.cut_at_s is None)
-
-
-def _breaks(places: Sequence[Place]) -> Iterator[int]:
-    pauses = {gap.start_s for gap in rhythm_of([place.time_s for place in places]).gaps}
-    speeds = [_speed(before, after) for before, after in pairwise(places)]
-    usual = sorted(speeds)[int(0.95 * len(speeds))] if speeds else 0.0
-    for index, speed in enumerate(speeds):
-        if places[index].time_s in pauses or speed > _LEAP * usual > 0:
-            yield index + 1
-
-
-def _speed(before: Place, after: Place) -> float:
-    passed_s = after.time_s - before.time_s
-    return math.dist(before[1:], after[1:]) / passed_s if passed_s > 0 else 0.0
-
-
-def extent(places: Sequence[Place]) -> float:
-    """The larger side of the box around the places."""
-    xs, ys = [place.x for place in places], [place.y for place in places]
-    return max(max(xs) - min(xs), max(ys) - min(ys)) if places else 0.0
-
-
-def thinned(places: Sequence[Place]) -> list[Place]:
-    """The places without those that would be painted on the same pixel as the one before."""
-    least = _FINENESS * extent(places)
-    kept = list(places[:1])
-    for place in places:
-        if math.dist(place[1:], kept[-1][1:]) > least:
-            kept.append(place)
-    return [*kept, places[-1]] if kept[-1:] != list(places[-1:]) else kept
-
-
-class Heading(NamedTuple):
-    """A place on the path, and the direction in which it goes on from there."""
-
-    x: float
-    y: float
-    degrees: float
-
-
-def headings(path: Path, count: int) -> list[Heading]:
-    """The direction at `count` places that are evenly spread over the length of the path."""
-    steps = path.steps()
-    reached = list(accumulate(math.dist(before[1:], after[1:]) for before, after in steps))
-    if not reached or reached[-1] == 0:
-        return []
-    found: list[Heading] = []
-    for number in range(count):
-        before, after = steps[bisect_right(reached, reached[-1] * (number + 0.5) / count)]
-        degrees = math.degrees(math.atan2(after.y - before.y, after.x - before.x))
-        found.append(Heading((before.x + after.x) / 2, (before.y + after.y) / 2, degrees))
-    return found

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from webots_mcp.analysis.arrays import Gap
-from webots_mcp.plotting.canvas import MOST_VALUES, OTHER_VALUES
+from webots_mcp.plotting.colours import MOST_VALUES, OTHER_VALUES
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.frame_summary import Point, spelled
 from webots_mcp.store.series import ChangeColumns, RunHistory

@@ -13,20 +13,37 @@ from dataclasses import dataclass
 from pathlib import Path as File
 from typing import Any, Final
 
-from webots_mcp.plotting.canvas import ON_A_PAGE, Frame, Room
-from webots_mcp.plotting.curves import Curve, thinned
+from webots_mcp.plotting.axes import AxesBox
+from webots_mcp.plotting.canvas import Room
+from webots_mcp.plotting.colours import ON_A_PAGE
+from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.intervals import Lane
+from webots_mcp.plotting.robot_path import thinned
 from webots_mcp.plotting.signals import SignalAxes, paint_signals
-from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, paint_trajectory
+from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, paint_trajectory
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.series import MOST_POINTS
 
 ROOM: Final = Room(points=MOST_POINTS, panels=8, lanes=8, rows=16)
 WIDTH_PX: Final = 900
-_PANEL_PX: Final = 150
-_ROW_PX: Final = 18
-_AROUND_PX: Final = 90
-_DIGITS: Final = 12  # of a value
+
+
+@dataclass(frozen=True)
+class FigureLayout:
+    """The height of a figure, in pixels.
+
+    Attributes:
+        panel_px: Each panel.
+        row_px: Each row of intervals.
+        around_px: Axis and legend.
+    """
+
+    panel_px: int = 150
+    row_px: int = 18
+    around_px: int = 90
+
+
+_LAYOUT: Final = FigureLayout()
 
 
 @dataclass(frozen=True)
@@ -61,7 +78,9 @@ def signals_figure(
     height_px: int | None = None,
 ) -> Figure:  # fmt: skip
     """Signals over time, as `compose_signals` gathers them; as high as it needs, or as given."""
-    needed_px = _AROUND_PX + _PANEL_PX * len(plot.panels) + _ROW_PX * len(plot.rows)
+    needed_px = (
+        _LAYOUT.around_px + _LAYOUT.panel_px * len(plot.panels) + _LAYOUT.row_px * len(plot.rows)
+    )
     canvas, frames = paint_signals(
         plot, width_px, max(height_px or 0, needed_px), ON_A_PAGE, titled=False
     )
@@ -93,7 +112,7 @@ def way_figure(
     return Figure(canvas.svg(), data, plot.title, tuple(notes))
 
 
-def _placed(frame: Frame) -> dict[str, Any]:
+def _placed(frame: AxesBox) -> dict[str, Any]:
     return {
         "left": frame.left, "top": frame.top, "width": frame.width, "height": frame.height,
         "x": list(frame.x), "y": list(frame.y),
@@ -113,7 +132,7 @@ def _curve(curve: Curve, frame: int, run: str | None) -> dict[str, Any]:
 
 
 def _numbers(values: Sequence[float]) -> list[float | None]:
-    return [float(f"{each:.{_DIGITS}g}") if math.isfinite(each) else None for each in values]
+    return [float(f"{each:.12g}") if math.isfinite(each) else None for each in values]
 
 
 def _lane(lane: Lane) -> dict[str, Any]:
@@ -121,7 +140,7 @@ def _lane(lane: Lane) -> dict[str, Any]:
     return {"name": spelled_out(lane.name), "held": held}
 
 
-def _track(track: Track) -> dict[str, Any]:
+def _track(track: PlottedPath) -> dict[str, Any]:
     places = thinned(track.path.places) if track.path.places else []
     columns = zip(*places, strict=True) if places else ((), (), ())
     named = zip(("t", "x", "y"), map(_numbers, columns), strict=True)

@@ -12,40 +12,28 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.judging.detection.events import Found
+from webots_mcp.plotting.axes import AxesBox, axis_range, ticks
 from webots_mcp.plotting.canvas import (
-    DASHES,
-    INK,
     LEAST_HEIGHT_PX,
-    LINES,
-    ON_PAPER,
     ROW_PX,
-    Area,
     Canvas,
-    Frame,
-    Look,
-    Picture,
+    PlotImage,
     Room,
     Sheet,
-    area_styles,
-    axis_range,
     fitted,
     short,
-    ticks,
     width_of,
     wrapped,
 )
+from webots_mcp.plotting.colours import DASHES, INK, LINES, ON_PAPER, Area, Theme, area_styles
 from webots_mcp.plotting.curves import Curve, Panel, by_choice, by_scale, by_signal, curve_of
 from webots_mcp.plotting.intervals import Interval, Lane, at_resolution, lane_of, merged_notes
-from webots_mcp.plotting.parts import (
+from webots_mcp.plotting.painting import (
     LINE_PX,
-    Entry,
-    Part,
+    LegendEntry,
     area_sample,
-    event_lanes,
     hatch_sample,
-    known_signals,
     line_sample,
-    mode_signal,
     paint_area,
     paint_grid,
     paint_mark,
@@ -53,9 +41,15 @@ from webots_mcp.plotting.parts import (
     paint_title,
     paint_x_axis,
     paint_y_axis,
-    parts_of,
-    range_notes,
     rows_of,
+)
+from webots_mcp.plotting.plotted_runs import (
+    PlottedRun,
+    event_lanes,
+    known_signals,
+    mode_signal,
+    plotted_runs,
+    range_notes,
     title_of,
     unread_parts,
 )
@@ -63,15 +57,34 @@ from webots_mcp.signals.naming import listed, spelled_out
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
-_EVENTS_SHARE: Final = 0.4  # of the time, whatever the curves take
-_SMALL_PX: Final = 9.5  # of the letters in rows of intervals
-_TICK_PX: Final = 70.0  # between the labels of the time axis, and
-_LEVEL_PX: Final = 20.0  # between those of the others, at least
-_RIGHT_PX: Final = 16.0
-_BELOW_PX: Final = 24.0  # the labels of the time axis
+
+@dataclass(frozen=True)
+class SignalLayout:
+    """The layout of signals over time.
+
+    Attributes:
+        small_text_px: Size of the letters in rows of intervals.
+        tick_px: Minimum distance between labels of the time axis.
+        level_px: Minimum distance between labels of the vertical axis.
+        right_px: Margin on the right.
+        time_labels_px: Height of the labels of the time axis.
+        band_opacity: Opacity of modes behind curves.
+        event_lines: Events that are marked by a line through the panels: more would be a curtain.
+        events_share: Share of the reading time that is kept for events, whatever the curves take.
+    """
+
+    small_text_px: float = 9.5
+    tick_px: float = 70.0
+    level_px: float = 20.0
+    right_px: float = 16.0
+    time_labels_px: float = 24.0
+    band_opacity: float = 0.35
+    event_lines: int = 30
+    events_share: float = 0.4
+
+
+_LAYOUT: Final = SignalLayout()
 _FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
-_BAND_OPACITY: Final = 0.35
-_LINES_THROUGH: Final = 30  # more instants would be a curtain
 
 
 def plot_signals(
@@ -81,7 +94,7 @@ def plot_signals(
     *,
     bands: str | None = None,
     sheet: Sheet | None = None,
-) -> Picture:
+) -> PlotImage:
     """Numbers as a mean line in a min-max band, a mode behind them, flags and events below.
 
     Signals whose units or scales do not fit one axis get panels of their own, at most three.
@@ -131,8 +144,10 @@ def compose_signals(
     room = room or Sheet().room
     deadline = Deadline(deadline_s)
     mode = mode_signal(known_signals(connection, ranges), bands)
-    curves_s = deadline_s * (1 - _EVENTS_SHARE) if events else deadline_s
-    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])], room.points, curves_s)
+    curves_s = deadline_s * (1 - _LAYOUT.events_share) if events else deadline_s
+    parts = plotted_runs(
+        connection, ranges, [*names, *([mode] if mode else [])], room.points, curves_s
+    )
     overlaid = len(parts) > 1
     curves = [curve for part in parts for curve in _curves(part)]
     if grouped and not overlaid:
@@ -149,7 +164,7 @@ def compose_signals(
         drawn = [name for panel in panels for name in panel.names] or names
         marked, event_notes = event_lanes(
             connection, parts[0], drawn, room.rows - len(below), found,
-            max(deadline.left_s, _EVENTS_SHARE * deadline_s),
+            max(deadline.left_s, _LAYOUT.events_share * deadline_s),
         )  # fmt: skip
     plot = SignalAxes(
         title=title_of(parts),
@@ -169,12 +184,14 @@ def compose_signals(
     return plot, (*notes, *event_notes)
 
 
-def _curves(part: Part) -> list[Curve]:
+def _curves(part: PlottedRun) -> list[Curve]:
     made = (curve_of(columns, part.run, part.origin_s) for columns in part.run.numbers)
     return [curve for curve in made if curve is not None]
 
 
-def _behind_and_below(parts: Sequence[Part], mode: str | None) -> tuple[Lane | None, list[Lane]]:
+def _behind_and_below(
+    parts: Sequence[PlottedRun], mode: str | None
+) -> tuple[Lane | None, list[Lane]]:
     """The mode of a single run stands behind the curves, all else in rows below."""
     overlaid = len(parts) > 1
     lanes = [lane for part in parts for lane in _lanes(part, overlaid)]
@@ -182,17 +199,17 @@ def _behind_and_below(parts: Sequence[Part], mode: str | None) -> tuple[Lane | N
     return behind, [lane for lane in lanes if lane is not behind]
 
 
-def _lanes(part: Part, overlaid: bool) -> list[Lane]:
+def _lanes(part: PlottedRun, overlaid: bool) -> list[Lane]:
     lanes = [lane_of(columns, part.run, part.end_s) for columns in part.run.changes]
     of_run = f", {part.name}" if overlaid else ""
     return [lane.moved(part.origin_s, lane.name + of_run) for lane in lanes if lane.intervals]
 
 
-def _gaps(part: Part) -> list[Interval]:
+def _gaps(part: PlottedRun) -> list[Interval]:
     return [Interval("", gap.start_s, gap.end_s).moved(part.origin_s) for gap in part.run.gaps]
 
 
-def _unread(part: Part) -> list[Interval]:
+def _unread(part: PlottedRun) -> list[Interval]:
     return [] if part.unread is None else [part.unread.moved(part.origin_s)]
 
 
@@ -201,13 +218,13 @@ def _height_of_rows(rows: int, sheet: Sheet) -> int:
     return min(sheet.height_px, max(LEAST_HEIGHT_PX, 130 + 50 * rows))
 
 
-def _x_range(parts: Sequence[Part]) -> tuple[float, float]:
+def _x_range(parts: Sequence[PlottedRun]) -> tuple[float, float]:
     start_s = min(part.start_s - part.origin_s for part in parts)
     end_s = max(part.end_s - part.origin_s for part in parts)
     return (start_s, end_s) if end_s > start_s else (start_s - 0.5, start_s + 0.5)
 
 
-def _x_label(parts: Sequence[Part]) -> str:
+def _x_label(parts: Sequence[PlottedRun]) -> str:
     clock = "simulation time [s]" if len(parts) == 1 else "time since the start of the run [s]"
     steps = {part.run.step_s for part in parts if part.run.numbers}
     if len(steps) != 1 or None in steps:
@@ -223,7 +240,7 @@ def _caption(plot: SignalAxes) -> str:
     return f"{plot.title}: {', '.join([*shown, *below])}{behind}{unread}"
 
 
-def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
+def _notes(parts: Sequence[PlottedRun], curves: Sequence[Curve]) -> list[str]:
     notes = range_notes(parts)
     drawn = {(curve.run_id, curve.name) for curve in curves}
     for part in parts:
@@ -254,7 +271,7 @@ def _left_out(names: Sequence[str], room: Room) -> str:
     return f"left out: {listed(dict.fromkeys(names))} ({why}); ask for them alone"
 
 
-def _nothing(parts: Sequence[Part]) -> str:
+def _nothing(parts: Sequence[PlottedRun]) -> str:
     notes = "; ".join(note for part in parts for note in part.notes)
     if unread := unread_parts(parts):
         return f"nothing to draw was read in time ({'; '.join(unread)}): ask for less time"
@@ -294,24 +311,24 @@ class SignalAxes:
 
 
 def paint_signals(
-    plot: SignalAxes, width_px: int, height_px: int, look: Look = ON_PAPER, *, titled: bool = True
-) -> tuple[Canvas, list[Frame]]:
+    plot: SignalAxes, width_px: int, height_px: int, theme: Theme = ON_PAPER, *, titled: bool = True
+) -> tuple[Canvas, list[AxesBox]]:
     """Paint it; the frames are those of the panels, and of the rows below them as the last."""
-    return _Painter(plot, width_px, height_px, look).paint(titled=titled)
+    return _SignalPainter(plot, width_px, height_px, theme).paint(titled=titled)
 
 
-class _Painter:
+class _SignalPainter:
     """Paints what shares a clock and the margins."""
 
-    def __init__(self, plot: SignalAxes, width_px: int, height_px: int, look: Look) -> None:
+    def __init__(self, plot: SignalAxes, width_px: int, height_px: int, theme: Theme) -> None:
         self._plot = plot
-        self._canvas = Canvas(width_px, height_px, look)
+        self._canvas = Canvas(width_px, height_px, theme)
         behind = plot.bands.values if plot.bands else ()
         values = [value for lane in plot.lanes for value in lane.values]
         # The same value has the same style in every row, and behind the panels.
         self._styles = area_styles([v for v in (*behind, *values) if v not in _FLAGS]) | _FLAGS
 
-    def paint(self, *, titled: bool) -> tuple[Canvas, list[Frame]]:
+    def paint(self, *, titled: bool) -> tuple[Canvas, list[AxesBox]]:
         plot, canvas = self._plot, self._canvas
         top = paint_title(canvas, plot.title) if titled else 6.0
         heads = [
@@ -325,21 +342,21 @@ class _Painter:
         ]
         left = self._left_px(scales)
         legend = rows_of(self._entries(left), canvas.width_px - 20, canvas.height_px)
-        below = _BELOW_PX + LINE_PX * (len(label) + len(legend)) + 4
+        below = _LAYOUT.time_labels_px + LINE_PX * (len(label) + len(legend)) + 4
         heads_px = sum(LINE_PX * len(rows) + 8 for rows in heads)
         room = max(20.0, canvas.height_px - top - below - heads_px)
         rows_px = self._rows_px(room)
         panel_px = (room - rows_px) / max(1, len(plot.panels))
-        frames: list[Frame] = []
-        width = canvas.width_px - left - _RIGHT_PX
+        frames: list[AxesBox] = []
+        width = canvas.width_px - left - _LAYOUT.right_px
         for panel, rows, scale in zip(plot.panels, heads, scales, strict=True):
             paint_rows(canvas, rows, top, left)
             top += LINE_PX * len(rows) + 2
-            frames.append(Frame(left, top, width, panel_px - 2, plot.x_range, scale))
+            frames.append(AxesBox(left, top, width, panel_px - 2, plot.x_range, scale))
             self._panel(panel, frames[-1])
             top += panel_px + 6
         if plot.rows:
-            frames.append(Frame(left, top, width, rows_px, plot.x_range, (len(plot.rows), 0.0)))
+            frames.append(AxesBox(left, top, width, rows_px, plot.x_range, (len(plot.rows), 0.0)))
             self._rows(frames[-1])
         marks = self._time_marks(frames[-1])
         for frame in frames[:-1]:
@@ -361,25 +378,27 @@ class _Painter:
             return room
         return min(len(self._plot.rows) * float(ROW_PX), room / 2)
 
-    def _time_marks(self, frame: Frame) -> list[tuple[float, str]]:
+    def _time_marks(self, frame: AxesBox) -> list[tuple[float, str]]:
         low, high = self._plot.x_range
-        room = max(_TICK_PX, 1.6 * max(width_of(text) for _, text in ticks(low, high, 8)))
+        room = max(_LAYOUT.tick_px, 1.6 * max(width_of(text) for _, text in ticks(low, high, 8)))
         return ticks(low, high, frame.width / room)
 
     # Panels ---------------------------------------------------------------------------------------
 
-    def _head(self, panel: Panel) -> list[Entry]:
+    def _head(self, panel: Panel) -> list[LegendEntry]:
         """What stands above a panel: the name of its signal, or each with a sample of its line."""
         unit = [f"[{panel.unit}]"] if panel.unit else []
         room = self._canvas.width_px - 90
         if len(panel.names) == 1:
             part = "" if self._plot.colour_by_run else self._part(panel.curves[0])
-            return [Entry(fitted(" ".join([panel.names[0], *unit]), room), None, part)]
+            return [LegendEntry(fitted(" ".join([panel.names[0], *unit]), room), None, part)]
         entries = [
-            Entry(_named(curve, panel), line_sample(*self._pen(panel, index)), self._part(curve))
+            LegendEntry(
+                _named(curve, panel), line_sample(*self._pen(panel, index)), self._part(curve)
+            )
             for index, curve in enumerate(panel.curves)
         ]
-        return [*entries, *map(Entry, unit)]
+        return [*entries, *map(LegendEntry, unit)]
 
     def _part(self, curve: Curve) -> str:
         """By which a page finds it: of several runs all curves of one are hidden together."""
@@ -391,26 +410,26 @@ class _Painter:
         runs = list(self._plot.colour_by_run)
         index = runs.index(panel.curves[index].run_id) if runs else index
         colour = LINES[index % len(LINES)]
-        return (self._canvas.look.ink if colour == "#000000" else colour), DASHES[index % 4]
+        return (self._canvas.theme.ink if colour == "#000000" else colour), DASHES[index % 4]
 
-    def _panel(self, panel: Panel, frame: Frame) -> None:
+    def _panel(self, panel: Panel, frame: AxesBox) -> None:
         canvas = self._canvas
-        levels = ticks(*frame.y, max(2.0, frame.height / _LEVEL_PX))
+        levels = ticks(*frame.y, max(2.0, frame.height / _LAYOUT.level_px))
         self._open(frame)
         self._ground(frame)
         paint_grid(canvas, frame, (), levels)
         for event in [each for lane in self._plot.events for each in lane.intervals][
-            :_LINES_THROUGH
+            : _LAYOUT.event_lines
         ]:
             x = float(frame.px(event.start_s))
-            pen = {"stroke": canvas.look.faint, "stroke_width": 0.6, "stroke_dasharray": "1 3"}
+            pen = {"stroke": canvas.theme.faint, "stroke_width": 0.6, "stroke_dasharray": "1 3"}
             canvas.add("path", d=f"M{x:.1f} {frame.top:.1f}V{frame.bottom:.1f}", **pen)
         for index, curve in enumerate(panel.curves):
             self._curve(frame, curve, *self._pen(panel, index), len(panel.curves))
         self._close()
         paint_y_axis(canvas, frame, levels)
 
-    def _open(self, frame: Frame) -> None:
+    def _open(self, frame: AxesBox) -> None:
         """Begin what is cut off at the frame, and scaled in a page that is zoomed."""
         box = {"x": frame.left, "y": frame.top, "width": frame.width, "height": frame.height}
         view = f"{frame.left:.2f} {frame.top:.2f} {frame.width:.2f} {frame.height:.2f}"
@@ -421,7 +440,7 @@ class _Painter:
         self._canvas.close()
         self._canvas.close("svg")
 
-    def _curve(self, frame: Frame, curve: Curve, colour: str, dash: str, count: int) -> None:
+    def _curve(self, frame: AxesBox, curve: Curve, colour: str, dash: str, count: int) -> None:
         canvas = self._canvas
         canvas.open(data_part=self._part(curve))
         rows: Any = np.array(curve.points, np.float64)
@@ -452,31 +471,31 @@ class _Painter:
                            stroke_width=4, stroke_linecap="round")  # fmt: skip
         canvas.close()
 
-    def _ground(self, frame: Frame) -> None:
+    def _ground(self, frame: AxesBox) -> None:
         """Modes and gaps, over the whole height behind the curves."""
         bands = self._plot.bands
         for each in _shown(bands.intervals, frame) if bands else ():
             box = (*self._stretch(frame, each), frame.height)
-            paint_area(self._canvas, self._styles[each.value], box, _BAND_OPACITY)
+            paint_area(self._canvas, self._styles[each.value], box, _LAYOUT.band_opacity)
         self._hatch(frame)
 
-    def _hatch(self, frame: Frame) -> None:
+    def _hatch(self, frame: AxesBox) -> None:
         """Where nothing was recorded, or read, whatever stands there in the last row's name."""
         canvas = self._canvas
         for stretches, name in ((self._plot.gaps, "gap"), (self._plot.unread, "unread")):
             for each in stretches:
                 left, top, width = self._stretch(frame, each)
-                for fill in (canvas.look.ground, f"url(#hatch-{name})"):
+                for fill in (canvas.theme.ground, f"url(#hatch-{name})"):
                     canvas.add("rect", x=left, y=top, width=width, height=frame.height, fill=fill)
 
-    def _stretch(self, frame: Frame, interval: Interval) -> tuple[float, float, float]:
+    def _stretch(self, frame: AxesBox, interval: Interval) -> tuple[float, float, float]:
         """Left, top and width."""
         left, right = float(frame.px(interval.start_s)), float(frame.px(interval.end_s))
         return left, frame.top, right - left
 
     # Rows -----------------------------------------------------------------------------------------
 
-    def _rows(self, frame: Frame) -> None:
+    def _rows(self, frame: AxesBox) -> None:
         canvas, plot = self._canvas, self._plot
         row_px = frame.height / len(plot.rows)
         self._open(frame)
@@ -502,14 +521,14 @@ class _Painter:
                 self._mark_events(frame, middle, lane)
             canvas.close()
 
-    def _name_states(self, frame: Frame, middle: float, lane: Lane) -> None:
+    def _name_states(self, frame: AxesBox, middle: float, lane: Lane) -> None:
         for each in lane.intervals:
             if _has_room(frame, each):
                 ink = "#FFFFFF" if self._styles[each.value].colour == INK else INK
                 x = float(frame.px((each.start_s + each.end_s) / 2))
                 self._name(short(each.value), x, middle, colour=ink, anchor="middle")
 
-    def _mark_events(self, frame: Frame, middle: float, lane: Lane) -> None:
+    def _mark_events(self, frame: AxesBox, middle: float, lane: Lane) -> None:
         """A mark at the start of each, its name where there is room."""
         ends = [*(each.start_s for each in lane.intervals[1:]), frame.x[1]]
         for each, end_s in zip(lane.intervals, ends, strict=True):
@@ -521,33 +540,33 @@ class _Painter:
     def _name(self, text: str, x: float, y: float, *, shift: float = 0.0, **style: Any) -> None:
         canvas = self._canvas
         canvas.open(class_="at", data_x=x, data_y=y, transform=f"translate({x:.1f} {y:.1f})")
-        canvas.text(shift, 3.5, text, size=_SMALL_PX, **style)
+        canvas.text(shift, 3.5, text, size=_LAYOUT.small_text_px, **style)
         canvas.close()
 
     # Legend ---------------------------------------------------------------------------------------
 
-    def _entries(self, left: float) -> list[Entry]:
+    def _entries(self, left: float) -> list[LegendEntry]:
         """What the legend below the axes has to tell."""
         plot = self._plot
-        entries: list[Entry] = []
+        entries: list[LegendEntry] = []
         for index, (run_id, name) in enumerate(plot.colour_by_run.items()):
             sample = line_sample(LINES[index % len(LINES)], DASHES[index % len(DASHES)])
             room = self._canvas.width_px - 80
-            entries.append(Entry(fitted(name, room), sample, f"run {run_id}"))
+            entries.append(LegendEntry(fitted(name, room), sample, f"run {run_id}"))
         if plot.gaps:
-            entries.append(Entry("nothing recorded", hatch_sample("hatch-gap")))
+            entries.append(LegendEntry("nothing recorded", hatch_sample("hatch-gap")))
         if plot.unread:
-            entries.append(Entry("not all was read", hatch_sample("hatch-unread")))
+            entries.append(LegendEntry("not all was read", hatch_sample("hatch-unread")))
         if plot.bands is not None and plot.panels:
-            entries.append(Entry(f"{short(plot.bands.name)}:"))
+            entries.append(LegendEntry(f"{short(plot.bands.name)}:"))
             entries += [
-                Entry(short(value), area_sample(self._styles[value], _BAND_OPACITY))
+                LegendEntry(short(value), area_sample(self._styles[value], _LAYOUT.band_opacity))
                 for value in plot.bands.values
             ]
-        width = self._canvas.width_px - left - _RIGHT_PX
-        frame = Frame(left, 0, width, 1, plot.x_range, (0, 1))
+        width = self._canvas.width_px - left - _LAYOUT.right_px
+        frame = AxesBox(left, 0, width, 1, plot.x_range, (0, 1))
         return entries + [
-            Entry(short(value), area_sample(self._styles[value]))
+            LegendEntry(short(value), area_sample(self._styles[value]))
             for value in _unnamed(plot.lanes, frame)
         ]
 
@@ -563,7 +582,7 @@ def line_through(x: Any, y: Any) -> str:
     return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _shown(intervals: Sequence[Interval], frame: Frame) -> Sequence[Interval]:
+def _shown(intervals: Sequence[Interval], frame: AxesBox) -> Sequence[Interval]:
     """The intervals that are drawn: one for each pixel where there are many more than pixels."""
     if len(intervals) <= 2 * frame.width:
         return intervals
@@ -571,12 +590,12 @@ def _shown(intervals: Sequence[Interval], frame: Frame) -> Sequence[Interval]:
     return at_resolution(intervals, (high - low) / frame.width)
 
 
-def _has_room(frame: Frame, interval: Interval) -> bool:
+def _has_room(frame: AxesBox, interval: Interval) -> bool:
     width = frame.width * (interval.end_s - interval.start_s) / (frame.x[1] - frame.x[0])
-    return width > 10 + width_of(short(interval.value), _SMALL_PX)
+    return width > 10 + width_of(short(interval.value), _LAYOUT.small_text_px)
 
 
-def _unnamed(lanes: Sequence[Lane], frame: Frame) -> list[str]:
+def _unnamed(lanes: Sequence[Lane], frame: AxesBox) -> list[str]:
     """Values in the rows below that no interval had room for."""
     intervals = [interval for lane in lanes for interval in lane.intervals]
     named = {interval.value for interval in intervals if _has_room(frame, interval)}

@@ -12,36 +12,16 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.events import Found
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
-from webots_mcp.plotting.canvas import (
-    DASHES,
-    INK,
-    LINES,
-    ON_PAPER,
-    Canvas,
-    Frame,
-    Look,
-    Picture,
-    Sheet,
-    area_styles,
-    axis_range,
-    fitted,
-    scaled,
-    short,
-    ticks,
-    width_of,
-)
-from webots_mcp.plotting.curves import Path, Place, extent, headings, read_path, thinned
+from webots_mcp.plotting.axes import AxesBox, axis_range, ticks
+from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, short, width_of
+from webots_mcp.plotting.colours import DASHES, INK, LINES, ON_PAPER, Theme, area_styles, scaled
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
-from webots_mcp.plotting.parts import (
+from webots_mcp.plotting.painting import (
     LINE_PX,
     SCALE_PX,
-    Entry,
-    Known,
-    Part,
-    known_signals,
+    LegendEntry,
     line_sample,
     mark_sample,
-    mode_signal,
     paint_grid,
     paint_mark,
     paint_rows,
@@ -50,11 +30,25 @@ from webots_mcp.plotting.parts import (
     paint_x_axis,
     paint_y_axis,
     paint_y_label,
-    parts_of,
-    range_notes,
     rows_of,
+)
+from webots_mcp.plotting.plotted_runs import (
+    Known,
+    PlottedRun,
+    known_signals,
+    mode_signal,
+    plotted_runs,
+    range_notes,
     stuck_mark,
     title_of,
+)
+from webots_mcp.plotting.robot_path import (
+    PathPoint,
+    RobotPath,
+    extent,
+    headings,
+    read_path,
+    thinned,
 )
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.signals.naming import listed, spelled_out
@@ -64,17 +58,35 @@ from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.signals import RegisteredSignal
 
-_FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
-_SIGNALS_SHARE: Final = 0.5  # of the time; the rest is for the way, and for when it was stuck
-_ARROWS: Final = 9
-_TICK_PX: Final = 50.0  # between ticks, at least
-_ON_THE_SPOT: Final = 0.03  # of the size of the whole way
-_LEAST_SIZE: Final = 0.02  # of the picture, in the unit of the position
-_MARGIN: Final = 0.06
-_COLOURS: Final = 64  # of a way that is coloured by time
-_MANY: Final = 10  # marks of a kind; more are drawn smaller
+
+@dataclass(frozen=True)
+class TrajectoryLayout:
+    """The layout of a path in the plane.
+
+    Attributes:
+        signals_share: Share of the reading time for signals; the rest is for the path and
+            standstills.
+        tick_px: Minimum distance between ticks.
+        spot_share: Share of the size of the path within which a mode counts as held on the spot.
+        min_size: Minimum side of the picture, in the unit of the position.
+        margin: Margin on each side, as a share of the size.
+        time_colours: Colours of a path that is coloured by time.
+        many_marks: Marks of a kind beyond which they are drawn smaller.
+        arrows: Arrows that show the direction.
+    """
+
+    signals_share: float = 0.5
+    tick_px: float = 50.0
+    spot_share: float = 0.03
+    min_size: float = 0.02
+    margin: float = 0.06
+    time_colours: int = 64
+    many_marks: int = 10
+    arrows: int = 9
+
+
+_LAYOUT: Final = TrajectoryLayout()
 _SHAPES: Final = ("circle", "cross", "plus", "triangle", "star")  # the first is around the others
-_OBSTACLE: Final = {"fill": "#B8B8B8", "fill_opacity": 0.55, "stroke_width": 0.8}
 
 
 def plot_trajectory(
@@ -84,7 +96,7 @@ def plot_trajectory(
     *,
     bands: str | None = None,
     sheet: Sheet | None = None,
-) -> Picture:
+) -> PlotImage:
     """The way of the robot in the plane, with start, end, direction, and where it got into trouble.
 
     Args:
@@ -128,8 +140,10 @@ def compose_trajectory(
     mode = mode_signal(known, bands)
     flags = _flags(known) if events else []
     names = [x.name, y.name, *([mode] if mode else []), *flags]
-    parts = parts_of(connection, ranges, names, deadline_s=_SIGNALS_SHARE * deadline.left_s)
-    tracks: list[Track] = []
+    parts = plotted_runs(
+        connection, ranges, names, deadline_s=_LAYOUT.signals_share * deadline.left_s
+    )
+    tracks: list[PlottedPath] = []
     unlooked: list[str] = []
     for part in parts:
         modes = _lane(part, mode) if len(parts) == 1 else None
@@ -139,7 +153,7 @@ def compose_trajectory(
             stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline.left_s, found)
             marks.insert(0, stuck)
             unlooked += notes
-        tracks.append(Track(part.name, path, modes, marks))
+        tracks.append(PlottedPath(part.name, path, modes, marks))
     if not any(track.path.places for track in tracks):
         if not all(track.path.is_whole for track in tracks):
             raise NothingRecordedError(
@@ -190,16 +204,17 @@ def _number(known: Known, name: str) -> RegisteredSignal:
 
 def _flags(known: Known) -> list[str]:
     flags = [name for name in known if known[name].kind == "bool"]
-    return [name for name in flags if any(flag in name.lower() for flag in _FLAGS)]
+    words = ("bumper", "collision", "collided", "contact", "touching", "stuck")
+    return [name for name in flags if any(word in name.lower() for word in words)]
 
 
-def _lane(part: Part, name: str | None) -> Lane | None:
+def _lane(part: PlottedRun, name: str | None) -> Lane | None:
     found = (columns for columns in part.run.changes if columns.name == name)
     lanes = (lane_of(columns, part.run, part.end_s) for columns in found)
     return next(lanes, None)
 
 
-def _flagged(part: Part, flag: str) -> Lane:
+def _flagged(part: PlottedRun, flag: str) -> Lane:
     lane = _lane(part, flag)
     intervals = lane.intervals if lane else ()
     return Lane(flag, [each for each in intervals if each.value == "true"], ())
@@ -211,7 +226,7 @@ def _label(signal: RegisteredSignal, usual_unit: str | None) -> str:
     return f"{signal.name} [{unit}]" if unit else signal.name
 
 
-def _notes(parts: Sequence[Part], tracks: Sequence[Track]) -> tuple[str, ...]:
+def _notes(parts: Sequence[PlottedRun], tracks: Sequence[PlottedPath]) -> tuple[str, ...]:
     notes = range_notes(parts)
     notes += merged_notes([track.modes for track in tracks if track.modes])
     notes += [
@@ -222,7 +237,7 @@ def _notes(parts: Sequence[Part], tracks: Sequence[Track]) -> tuple[str, ...]:
     return (*notes, *_cut(tracks))
 
 
-def _cut(tracks: Sequence[Track]) -> list[str]:
+def _cut(tracks: Sequence[PlottedPath]) -> list[str]:
     """Up to when a way was read that goes on."""
     return [
         f"the path of {track.name} is not read after {track.path.places[-1].time_s:g} s"
@@ -232,7 +247,7 @@ def _cut(tracks: Sequence[Track]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Track:
+class PlottedPath:
     """The way of one run.
 
     Attributes:
@@ -241,7 +256,7 @@ class Track:
     """
 
     name: str
-    path: Path
+    path: RobotPath
     modes: Lane | None
     marks: Sequence[Lane]
 
@@ -267,24 +282,26 @@ class TrajectoryAxes:
     title: str
     x_label: str
     y_label: str
-    tracks: Sequence[Track]
+    tracks: Sequence[PlottedPath]
     mode: str | None
 
     @property
-    def places(self) -> Sequence[Place]:
+    def places(self) -> Sequence[PathPoint]:
         """Of all tracks."""
         return [place for track in self.tracks for place in track.path.places]
 
 
 def paint_trajectory(
-    plot: TrajectoryAxes, width_px: int, height_px: int, look: Look = ON_PAPER, *,
+    plot: TrajectoryAxes, width_px: int, height_px: int, theme: Theme = ON_PAPER, *,
     obstacles: Sequence[Obstacle] = (), titled: bool = True,
-) -> tuple[Canvas, Frame]:  # fmt: skip
+) -> tuple[Canvas, AxesBox]:  # fmt: skip
     """Paint it, at the same scale on both axes."""
-    return _Painter(plot, Canvas(width_px, height_px, look), obstacles).paint(titled=titled)
+    return _TrajectoryPainter(plot, Canvas(width_px, height_px, theme), obstacles).paint(
+        titled=titled
+    )
 
 
-class _Painter:
+class _TrajectoryPainter:
     def __init__(self, plot: TrajectoryAxes, canvas: Canvas, obstacles: Sequence[Obstacle]) -> None:
         self._plot, self._canvas, self._standing = plot, canvas, obstacles
         self._alone = len(plot.tracks) == 1
@@ -292,7 +309,7 @@ class _Painter:
         self._modes = modes if plot.mode is not None else None
         self._styles = area_styles(modes.values) if modes else {}
 
-    def paint(self, *, titled: bool) -> tuple[Canvas, Frame]:
+    def paint(self, *, titled: bool) -> tuple[Canvas, AxesBox]:
         plot, canvas = self._plot, self._canvas
         top = paint_title(canvas, plot.title) if titled else 6.0
         legend = rows_of(self._entries(), canvas.width_px - 20, canvas.height_px)
@@ -325,11 +342,11 @@ class _Painter:
         paint_rows(canvas, legend, canvas.height_px - LINE_PX * len(legend) - 2)
         return canvas, frame
 
-    def _frame(self, top: float, below: float, right: float) -> Frame:
+    def _frame(self, top: float, below: float, right: float) -> AxesBox:
         """The same scale on both axes; a robot that stands still is not blown up."""
         canvas, places = self._canvas, self._plot.places
         low, high = ([pick(p[i] for p in places) for i in (1, 2)] for pick in (min, max))
-        sides = [max(b - a, _LEAST_SIZE) * (1 + 2 * _MARGIN)
+        sides = [max(b - a, _LAYOUT.min_size) * (1 + 2 * _LAYOUT.margin)
                  for a, b in zip(low, high, strict=True)]  # fmt: skip
         middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
         labels = [text for _, text in ticks(*axis_range(low[1], high[1]), 8)]
@@ -339,15 +356,15 @@ class _Painter:
         per_px = max(sides[0] / width, sides[1] / height)
         x, y = ((m - n * per_px / 2, m + n * per_px / 2)
                 for m, n in zip(middle, (width, height), strict=True))  # fmt: skip
-        return Frame(left, top, width, height, x, y)
+        return AxesBox(left, top, width, height, x, y)
 
     def _ink(self, index: int) -> str:
         """Of several ways each has a colour of its own."""
         if self._alone or LINES[index % len(LINES)] == "#000000":
-            return self._canvas.look.ink
+            return self._canvas.theme.ink
         return LINES[index % len(LINES)]
 
-    def _obstacles(self, frame: Frame) -> None:
+    def _obstacles(self, frame: AxesBox) -> None:
         """Outlines where sizes are known, squares elsewhere; a page tells their names."""
         for each in self._standing:
             x, y = float(frame.px(each.x)), float(frame.py(each.y))
@@ -355,15 +372,16 @@ class _Painter:
             if each.outline:
                 corners = np.array(each.outline)
                 d = line_through(frame.px(corners[:, 0]), frame.py(corners[:, 1])) + "Z"
-            named = {"stroke": self._canvas.look.faint, "data_name": spelled_out(each.name)}
-            self._canvas.add("path", d=d, **named, **_OBSTACLE)
+            named = {"stroke": self._canvas.theme.faint, "data_name": spelled_out(each.name)}
+            style = {"fill": "#B8B8B8", "fill_opacity": 0.55, "stroke_width": 0.8}
+            self._canvas.add("path", d=d, **named, **style)
 
-    def _way(self, frame: Frame, track: Track, index: int) -> None:
+    def _way(self, frame: AxesBox, track: PlottedPath, index: int) -> None:
         canvas, path = self._canvas, track.path
         canvas.open(data_part=f"track {index}")
         for at in path.breaks:  # where nothing was recorded, or it leapt: what follows what
             leap = [path.places[at - 1], path.places[at]]
-            self._line(frame, [leap], canvas.look.faint, 0.8, stroke_dasharray="1 2")
+            self._line(frame, [leap], canvas.theme.faint, 0.8, stroke_dasharray="1 2")
         if not self._alone:
             pen = {"stroke_dasharray": DASHES[index % len(DASHES)]}
             self._line(frame, path.pieces(), self._ink(index), 1.8, **pen)
@@ -373,12 +391,12 @@ class _Painter:
             self._by_time(frame, path)
         canvas.close()
 
-    def _by_mode(self, frame: Frame, path: Path, modes: Lane) -> None:
-        stretches: dict[str, list[Sequence[Place]]] = {value: [] for value in modes.values}
-        spot = _ON_THE_SPOT * extent(path.places)
-        spots: list[tuple[Place, str]] = []
+    def _by_mode(self, frame: AxesBox, path: RobotPath, modes: Lane) -> None:
+        stretches: dict[str, list[Sequence[PathPoint]]] = {value: [] for value in modes.values}
+        spot = _LAYOUT.spot_share * extent(path.places)
+        spots: list[tuple[PathPoint, str]] = []
         for piece in path.pieces():
-            part = Path(piece, None, frozenset())
+            part = RobotPath(piece, None, frozenset())
             begin_s, end_s = piece[0].time_s, piece[-1].time_s
             for interval in modes.intervals:
                 if interval.end_s < begin_s or end_s < interval.start_s:
@@ -388,26 +406,30 @@ class _Painter:
                 if len(held) > 1 and extent(held) < spot:
                     spots.append((held[-1], self._styles[interval.value].colour))
         # An edge, so that light colours are seen.
-        self._line(frame, path.pieces(), self._canvas.look.ink, 4.6)
+        self._line(frame, path.pieces(), self._canvas.theme.ink, 4.6)
         for value, held in stretches.items():
             self._line(frame, held, self._styles[value].colour, 3.2)
             if self._styles[value].dotted:
                 self._line(frame, held, INK, 1.4, stroke_dasharray="1.4 2.8", stroke_linecap="butt")
         for place, colour in spots:  # what happened on the spot, where a line has no length
-            self._line(frame, [[place, place]], self._canvas.look.ink, 7.0)
+            self._line(frame, [[place, place]], self._canvas.theme.ink, 7.0)
             self._line(frame, [[place, place]], colour, 5.4)
 
-    def _by_time(self, frame: Frame, path: Path) -> None:
+    def _by_time(self, frame: AxesBox, path: RobotPath) -> None:
         start_s, end_s = path.places[0].time_s, path.places[-1].time_s
         length_s = (end_s - start_s) or 1.0
-        stretches: list[list[Sequence[Place]]] = [[] for _ in range(_COLOURS)]
+        stretches: list[list[Sequence[PathPoint]]] = [[] for _ in range(_LAYOUT.time_colours)]
         for before, after in path.steps():
             share = (before.time_s - start_s) / length_s
-            stretches[min(_COLOURS - 1, int(share * _COLOURS))].append((before, after))
+            stretches[min(_LAYOUT.time_colours - 1, int(share * _LAYOUT.time_colours))].append(
+                (before, after)
+            )
         for number, steps in enumerate(stretches):
-            self._line(frame, steps, scaled(number / (_COLOURS - 1), "time"), 2.4)
+            self._line(frame, steps, scaled(number / (_LAYOUT.time_colours - 1), "time"), 2.4)
 
-    def _line(self, frame: Frame, stretches: Any, colour: str, width: float, **style: Any) -> None:
+    def _line(
+        self, frame: AxesBox, stretches: Any, colour: str, width: float, **style: Any
+    ) -> None:
         """One line, broken between the stretches."""
         drawn = [np.array(thinned(each))[:, 1:] for each in stretches if len(each) > 1]
         if drawn:
@@ -415,21 +437,23 @@ class _Painter:
             style = {"stroke_linecap": "round", "stroke_linejoin": "round"} | style
             self._canvas.add("path", d=d, fill="none", stroke=colour, stroke_width=width, **style)
 
-    def _marks(self, frame: Frame, track: Track, index: int) -> None:
+    def _marks(self, frame: AxesBox, track: PlottedPath, index: int) -> None:
         canvas, path, ink = self._canvas, track.path, self._ink(index)
         canvas.open(data_part=f"track {index}")
-        edge = {"stroke": canvas.look.ground, "stroke_width": 0.6}
-        for each in headings(path, _ARROWS):
+        edge = {"stroke": canvas.theme.ground, "stroke_width": 0.6}
+        for each in headings(path, _LAYOUT.arrows):
             at = (float(frame.px(each.x)), float(frame.py(each.y)))
             paint_mark(canvas, "arrow", at, 6.0, degrees=-each.degrees, fill=ink, **edge)
         first, last = path.places[0], path.places[-1]
         at = (float(frame.px(first.x)), float(frame.py(first.y)))
-        paint_mark(canvas, "circle", at, 5.0, fill=canvas.look.ground, stroke=ink, stroke_width=2.0)
+        paint_mark(
+            canvas, "circle", at, 5.0, fill=canvas.theme.ground, stroke=ink, stroke_width=2.0
+        )
         if path.is_whole:
             at = (float(frame.px(last.x)), float(frame.py(last.y)))
             paint_mark(canvas, "square", at, 6.5, fill=ink)
         for mark, shape in zip(track.marks, _SHAPES, strict=False):
-            size = 0.6 if len(mark.intervals) > _MANY else 1.0
+            size = 0.6 if len(mark.intervals) > _LAYOUT.many_marks else 1.0
             for interval in mark.intervals:
                 place = path.at(interval.start_s)
                 at = (float(frame.px(place.x)), float(frame.py(place.y)))
@@ -440,33 +464,33 @@ class _Painter:
         colour = LINES[1] if self._alone else self._ink(index)
         if shape == "circle":
             return {"fill": "none", "stroke": colour, "stroke_width": 2.6}
-        return {"fill": colour, "stroke": self._canvas.look.ground, "stroke_width": 0.8}
+        return {"fill": colour, "stroke": self._canvas.theme.ground, "stroke_width": 0.8}
 
-    def _entries(self) -> list[Entry]:
-        plot, ink, ground = self._plot, self._canvas.look.ink, self._canvas.look.ground
+    def _entries(self) -> list[LegendEntry]:
+        plot, ink, ground = self._plot, self._canvas.theme.ink, self._canvas.theme.ground
         start = mark_sample("circle", 5.0, fill=ground, stroke=ink, stroke_width=2.0)
-        entries = [Entry("start", start)]
+        entries = [LegendEntry("start", start)]
         if any(each.path.is_whole for each in plot.tracks if each.path.places):
-            entries.append(Entry("end", mark_sample("square", 6.5, fill=ink)))
+            entries.append(LegendEntry("end", mark_sample("square", 6.5, fill=ink)))
         if self._modes is not None:
-            entries.append(Entry(f"{short(self._modes.name)}:"))
+            entries.append(LegendEntry(f"{short(self._modes.name)}:"))
             for value in self._modes.values:
                 style = self._styles[value]
-                entries.append(Entry(short(value), _mode_sample(style.colour, style.dotted)))
+                entries.append(LegendEntry(short(value), _mode_sample(style.colour, style.dotted)))
         for index, track in enumerate(plot.tracks):
             if not track.path.places:
                 continue
             if not self._alone:
                 sample = line_sample(self._ink(index), DASHES[index % len(DASHES)], 2.0)
                 room = self._canvas.width_px - 80
-                entries.append(Entry(fitted(track.name, room), sample, f"track {index}"))
+                entries.append(LegendEntry(fitted(track.name, room), sample, f"track {index}"))
             whose = "" if self._alone else f", {track.name}"
             for mark, shape in zip(track.marks, _SHAPES, strict=False):
                 if mark.intervals:
                     size = min(9.0, _size(shape))
                     sample = mark_sample(shape, size, **self._style(shape, index))
                     text = f"{short(mark.name)}{whose} ({len(mark.intervals)})"
-                    entries.append(Entry(fitted(text, self._canvas.width_px - 80), sample))
+                    entries.append(LegendEntry(fitted(text, self._canvas.width_px - 80), sample))
         return entries
 
 
@@ -483,8 +507,8 @@ def _mode_sample(colour: str, dotted: bool) -> Any:
     return draw
 
 
-def _marks_of(frame: Frame) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
+def _marks_of(frame: AxesBox) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
     """Ticks of both axes, at the same distances."""
-    widest = max(width_of(text) for _, text in ticks(*frame.x, frame.width / _TICK_PX))
-    room = max(_TICK_PX, 1.4 * widest)
+    widest = max(width_of(text) for _, text in ticks(*frame.x, frame.width / _LAYOUT.tick_px))
+    room = max(_LAYOUT.tick_px, 1.4 * widest)
     return ticks(*frame.x, frame.width / room), ticks(*frame.y, frame.height / room)

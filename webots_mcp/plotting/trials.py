@@ -11,24 +11,13 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import np
 from webots_mcp.analysis.summary import Outcome, Ranked, rank
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.plotting.canvas import (
-    INK,
-    LINES,
-    Canvas,
-    Frame,
-    Picture,
-    Sheet,
-    axis_range,
-    fitted,
-    scaled,
-    short,
-    ticks,
-    width_of,
-)
-from webots_mcp.plotting.parts import (
+from webots_mcp.plotting.axes import AxesBox, axis_range, ticks
+from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, short, width_of
+from webots_mcp.plotting.colours import INK, LINES, scaled
+from webots_mcp.plotting.painting import (
     LINE_PX,
     SCALE_PX,
-    Entry,
+    LegendEntry,
     line_sample,
     mark_sample,
     paint_grid,
@@ -45,8 +34,6 @@ from webots_mcp.plotting.signals import line_through
 from webots_mcp.signals.naming import listed, nearest_first
 from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, trials_of
 
-_MOST_TOLD_CELLS: Final = 60  # more texts in a grid would not fit
-_DARK: Final = 0.5  # of the colour scale: on darker cells texts are white
 _BELOW_PX: Final = 42.0
 _RING: Final[dict[str, Any]] = {"fill": "none", "stroke": LINES[1], "stroke_width": 2.4}
 _DOT: Final[dict[str, Any]] = {"fill": INK}
@@ -60,7 +47,7 @@ def plot_trials(
     names: Sequence[str] = (),
     *,
     sheet: Sheet | None = None,
-) -> Picture:
+) -> PlotImage:
     """The scores of a trial set: each, their mean and their spread; the best is marked.
 
     Args:
@@ -154,17 +141,19 @@ def _paint_scores(canvas: Canvas, plot: TrialAxes, top: float) -> None:
     scored = [(place, each, each.score) for place, each in told if each.score is not None]
     failed = [place for place, each in told if each.failures]
     entries = [
-        Entry("mean, and least to greatest", _mean_sample),
-        Entry("one trial", mark_sample("circle", 2.2, **_DOT)),
+        LegendEntry("mean, and least to greatest", _mean_sample),
+        LegendEntry("one trial", mark_sample("circle", 2.2, **_DOT)),
     ]
-    entries += [Entry("best", mark_sample("circle", 8.0, **_RING))] if plot.best else []
-    entries += [Entry("with failures", mark_sample("cross", 5.0, **_FAILED))] if failed else []
+    entries += [LegendEntry("best", mark_sample("circle", 8.0, **_RING))] if plot.best else []
+    entries += (
+        [LegendEntry("with failures", mark_sample("cross", 5.0, **_FAILED))] if failed else []
+    )
     legend = rows_of(entries, canvas.width_px - 20, canvas.height_px)
     y = axis_range(min(s.low for *_, s in scored), max(s.high for *_, s in scored))
     x = axis_range(min(places.values()), max(places.values()), 0.05)
     left = 34 + max(width_of(text) for _, text in ticks(*y, 8))
     height = max(20.0, canvas.height_px - top - _BELOW_PX - LINE_PX * len(legend))
-    frame = Frame(left, top, canvas.width_px - left - 16, height, x, y)
+    frame = AxesBox(left, top, canvas.width_px - left - 16, height, x, y)
     marks = named or ticks(*x, frame.width / 80), ticks(*y, height / 40)
     paint_grid(canvas, frame, *marks)
     for place, _, score in scored:
@@ -205,7 +194,7 @@ def _paint_grid(canvas: Canvas, plot: TrialAxes, top: float) -> None:
     left = 34 + min(0.3 * canvas.width_px, max(24.0, *(width_of(_text(value)) for value in y)))
     width = canvas.width_px - left - SCALE_PX
     height = max(20.0, canvas.height_px - top - _BELOW_PX - LINE_PX)
-    frame = Frame(left, top, width, height, (-0.5, len(x) - 0.5), (-0.5, len(y) - 0.5))
+    frame = AxesBox(left, top, width, height, (-0.5, len(x) - 0.5), (-0.5, len(y) - 0.5))
     cell_px = width / len(x), height / len(y)
     # Seen where no trial has a score.
     canvas.add("rect", x=left, y=top, width=width, height=height, fill="#EEEEEE")
@@ -213,7 +202,8 @@ def _paint_grid(canvas: Canvas, plot: TrialAxes, top: float) -> None:
         column, row = x.index(each.parameters[first]), y.index(each.parameters[second])
         corner = left + column * cell_px[0], frame.bottom - (row + 1) * cell_px[1]
         share = (each.score.mean - bounds[0]) / (bounds[1] - bounds[0]) if each.score else None
-        _paint_cell(canvas, each, corner, cell_px, share, told=len(plot.sets) <= _MOST_TOLD_CELLS)
+        # More texts in a grid would not fit.
+        _paint_cell(canvas, each, corner, cell_px, share, told=len(plot.sets) <= 60)
         if each.parameters == plot.best:
             canvas.add("rect", x=corner[0] + 3, y=corner[1] + 3, width=cell_px[0] - 6,
                        height=cell_px[1] - 6, **_RING)  # fmt: skip
@@ -223,7 +213,7 @@ def _paint_grid(canvas: Canvas, plot: TrialAxes, top: float) -> None:
     paint_y_axis(canvas, frame, [(i, fitted(_text(v), left - 30)) for i, v in enumerate(y)])
     paint_y_label(canvas, frame, fitted(second, height))
     paint_scale(canvas, frame, "score", bounds, "mean score")
-    entry = Entry("best; cells: mean, spread", _frame_sample)
+    entry = LegendEntry("best; cells: mean, spread", _frame_sample)
     paint_rows(canvas, [[entry]], canvas.height_px - LINE_PX - 2)
 
 
@@ -243,7 +233,7 @@ def _paint_cell(
         low, mean, high = ranked.score.low, ranked.score.mean, ranked.score.high
         spread = [f"{low:.3g} to {high:.3g}"] if low != high else []
         lines = [f"{mean:.4g}", *spread, *lines]
-    ink = "#FFFFFF" if share is not None and share < _DARK else INK
+    ink = "#FFFFFF" if share is not None and share < 0.5 else INK  # white on dark cells
     for row, line in enumerate(lines if told else ()):
         y = corner[1] + size[1] / 2 + 4 + (row - (len(lines) - 1) / 2) * (LINE_PX - 3)
         canvas.text(corner[0] + size[0] / 2, y, line, colour=ink, anchor="middle")

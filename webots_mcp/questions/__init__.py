@@ -14,9 +14,9 @@ from webots_mcp.questions.declaring import Question
 
 # In the order in which clients list them; those of plugins follow.
 MODULES: Final = (
-    "robot_state", "show_pictures", "get_logs", "monitor", "history", "events",
-    "compare_runs", "query_sql", "control_simulation", "run_trials", "send_command",
-    "edit_scene",
+    "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor", "history",
+    "events", "compare_runs", "query_sql", "control_simulation", "run_trials", "breakpoints",
+    "send_command", "parameters", "edit_scene",
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import PurePath
 from typing import Annotated, Any, Final
@@ -14,24 +15,21 @@ from pydantic import Field
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
-    WHOLE,
     answer_about,
     condensed,
-    cut_for_a_model,
     figure,
     figures,
     fitting,
     header_of_only,
-    is_for_a_person,
     notes_of,
     room_tokens,
     seconds,
     short_name,
-    shorten,
     shown,
     without_empty,
 )
-from webots_mcp.answers.models import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
+from webots_mcp.answers.models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
+from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
 from webots_mcp.judging.checks.finding import Finding
@@ -45,9 +43,7 @@ from webots_mcp.judging.comparison import (
 from webots_mcp.judging.detection.kinds import EventOptions, both_of
 from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
 from webots_mcp.judging.run_measures import Measure
-from webots_mcp.questions.declaring import (
-    READS,
-    SETS,
+from webots_mcp.questions.arguments import (
     AnyNames,
     Cursor,
     Limit,
@@ -59,8 +55,8 @@ from webots_mcp.questions.declaring import (
     ShownLimit,
     TrialSetId,
     Value,
-    question,
 )
+from webots_mcp.questions.declaring import READS, SETS, question
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
@@ -82,19 +78,36 @@ DIFFERENCE_COLUMNS: Final = (
     "interval", "min", "max",
 )  # fmt: skip
 CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
-_CHECKED_FOR_A_PERSON_S: Final = 120.0
-_LONGEST_EVIDENCE: Final = 250
-_CHECK_BUDGET_TOKENS: Final = 1_400
-DEFAULT_DIFFERENCES: Final = 15
-_MOST_PARTED: Final = 10
-_LONGEST_VERDICT: Final = 600
-_SHOWN_HASH: Final = 10
-_MOST_ONLY_IN: Final = 10
-_OF_MEASURES: Final = (
-    0.75  # of the room beside groups and notes; the differing signals have the rest
-)
+
+
+@dataclass(frozen=True)
+class ComparisonSizes:
+    """How much of a comparison its answer shows.
+
+    Attributes:
+        differences: Signals that differ, unless a limit is given.
+        diverging: Signals in which two runs diverge, and properties in which they differ.
+        only_in: Signals that only some groups have.
+        verdict_characters: Characters of a verdict.
+        hash_characters: Characters of a hash.
+        measures_share: Share of the rows' budget for measures; the signals that differ have the
+            rest.
+        evidence_characters: Characters of the evidence of a check.
+        checks_tokens: Budget of the checks that did not pass.
+    """
+
+    differences: int = 15
+    diverging: int = 10
+    only_in: int = 10
+    verdict_characters: int = 600
+    hash_characters: int = 10
+    measures_share: float = 0.75
+    evidence_characters: int = 250
+    checks_tokens: int = 1_400
+
+
+_SIZES: Final = ComparisonSizes()
 _GOING_ON: Final = "going on"
-_TAKE_AWAY: Final = "-"
 
 
 @question(
@@ -230,7 +243,7 @@ def webots_annotate_run(
 
 def _change(text: str) -> str | None:
     """None leaves it as it is, an empty text takes it away."""
-    return "" if text == _TAKE_AWAY else text or None
+    return "" if text == "-" else text or None
 
 
 def _no_runs(parameters: dict[str, Any] | None) -> str:
@@ -263,8 +276,8 @@ def _run_row(run: RunInfo) -> list[Any]:
         run.purged_rows or None,
         shown(run.notable) or None,
         short_name(_file(run.controller)),
-        run.controller_sha256 and run.controller_sha256[:_SHOWN_HASH],
-        run.git_commit and run.git_commit[:_SHOWN_HASH],
+        run.controller_sha256 and run.controller_sha256[: _SIZES.hash_characters],
+        run.git_commit and run.git_commit[: _SIZES.hash_characters],
         short_name(_file(run.world)),
         shown(run.note),
     ]
@@ -284,14 +297,14 @@ def _file(path: str | None) -> str | None:
 
 def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     """Where two runs part, as an answer has it."""
-    notes, most = notes_of(found.notes), None if is_for_a_person() else _MOST_PARTED
+    notes, most = notes_of(found.notes), None if is_for_a_person() else _SIZES.diverging
     known = {short_name(n): shown([*pair]) for n, pair in list(found.unlike.items())[:most]}
-    names, parted = PartedSignal._fields[1:-1], found.parted[: limit or _MOST_PARTED]
+    names, parted = PartedSignal._fields[1:-1], found.parted[: limit or _SIZES.diverging]
     rows = [[short_name(each.signal), *map(_cell, names, each[1:-1])] for each in parted]
     rows = fitting(rows, room_tokens(limit, [known, notes]))
     left, worst = len(found.parted) - len(rows), found.worst
     return {
-        "verdict": cut_for_a_model(found.verdict, _LONGEST_VERDICT),
+        "verdict": cut_for_a_model(found.verdict, _SIZES.verdict_characters),
         "unlike": known or None,
         "compared": {"row_count": found.rows, "signal_count": found.signals,
                      "from_s": seconds(found.from_s), "until_s": seconds(found.until_s)},
@@ -323,14 +336,14 @@ def _compared(
         "options": options,
         "min_effect_sd": min_effect_sd,
     }
-    asked["limit"] = limit or DEFAULT_DIFFERENCES
+    asked["limit"] = limit or _SIZES.differences
     asked |= {"set_id": set_id or None, "robot": view.robot.name}
     found = compare_runs(view.connection, run_ids or None, **asked)
     differing = [each for each in found.differences if _differs(each)]
     groups, notes, only_in = _groups(found), notes_of(found.notes), list(found.only_in.items())
-    most = len(only_in) if is_for_a_person() else _MOST_ONLY_IN
+    most = len(only_in) if is_for_a_person() else _SIZES.only_in
     beside: list[Any] = [groups and groups.rows, found.unknown, notes]
-    of_measures = int(_OF_MEASURES * room_tokens(limit, beside))
+    of_measures = int(_SIZES.measures_share * room_tokens(limit, beside))
     measures = fitting(list(map(_measure_row, found.measures)), of_measures)
     beside.append(measures)
     rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
@@ -376,7 +389,7 @@ def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None]
     return [None if each is None else figures([each.low, each.high]) for each in spreads]
 
 
-def _groups(found: Comparison) -> Table | None:
+def _groups(found: Comparison) -> AnswerTable | None:
     robots = {run.robot for group in found.groups for run in group.runs}
     rows = [_group_row(group, told_robot=len(robots) > 1) for group in found.groups]
     return condensed(GROUP_COLUMNS, rows)
@@ -384,7 +397,9 @@ def _groups(found: Comparison) -> Table | None:
 
 def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
     labels = [short_name(run.label) for run in group.runs if run.label]
-    hashes = dict.fromkeys((run.controller_sha256 or "")[:_SHOWN_HASH] for run in group.runs)
+    hashes = dict.fromkeys(
+        (run.controller_sha256 or "")[: _SIZES.hash_characters] for run in group.runs
+    )
     driven_s = sum(run.wall_duration_s - run.held_s for run in group.runs)
     return [
         group.name,
@@ -442,7 +457,7 @@ def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: 
     hints += ["no numeric signal differs"] * (differing == 0)
     equal = 0 if more else found.total - differing
     hints += [f"mean and deviation of the other {equal} are equal"] * (equal > 0 and differing > 0)
-    hints += [f"{only_in + _MOST_ONLY_IN} signals are in some groups only"] * (only_in > 0)
+    hints += [f"{only_in + _SIZES.only_in} signals are in some groups only"] * (only_in > 0)
     return "; ".join(hints) or None
 
 
@@ -486,14 +501,14 @@ def _checked(
     view: RobotView, expected: Sequence[Expectation], project: Sequence[Expected] | None
 ) -> dict[str, Any]:
     """What became of the checks, the worst first; of those that passed the names."""
-    deadline_s = _CHECKED_FOR_A_PERSON_S if is_for_a_person() else CHECK_DEADLINE_S
+    deadline_s = 120.0 if is_for_a_person() else CHECK_DEADLINE_S
     run_id = view.require_run().id
     checked = check_run(
         view.connection, run_id, expect=expected, project=project, deadline_s=deadline_s
     )
     others = [each for each in checked.worst_first if each.outcome != "pass"]
     rows = fitting(
-        [_check_row(each) for each in others], None if is_for_a_person() else _CHECK_BUDGET_TOKENS
+        [_check_row(each) for each in others], None if is_for_a_person() else _SIZES.checks_tokens
     )
     left = Counter(each.outcome for each in others[len(rows) :])
     counts = ", ".join(f"{count} {outcome}" for outcome, count in left.items())
@@ -509,7 +524,7 @@ def _check_row(finding: Finding) -> list[Any]:
     return [
         finding.name,
         finding.outcome,
-        cut_for_a_model(finding.evidence, _LONGEST_EVIDENCE),
+        cut_for_a_model(finding.evidence, _SIZES.evidence_characters),
         seconds(finding.since_s),
         finding.often,
         finding.more or None,

@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, cast
 
 import anyio
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.answers.budget import cut_text
 from webots_mcp.answers.models import CommandAnswer, RunAnswer
+from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.questions.declaring import (
-    CHANGES,
-    DESTROYS,
-    MAX_WAIT_S,
-    Caller,
-    RobotName,
-    TimeoutS,
-    Value,
-    WaitS,
-    merged,
-    question,
-)
+from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName, TimeoutS, Value, WaitS
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, merged, question
 from webots_mcp.questions.show_pictures import show_end
-from webots_mcp.simulator.launch import Launch, SessionStart, require_world
+from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, require_world
 from webots_mcp.simulator.orders import Order
 from webots_mcp.simulator.starting import Mode, Start, free_port
-from webots_mcp.steering.dispatch import ACTION, Dispatcher, require_possible
-from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.launcher import project_of
+from webots_mcp.steering.routes import Attempt
+from webots_mcp.steering.run_command import ACTION, require_possible
+from webots_mcp.steering.world_request import WorldRequest
 from webots_mcp.store.recording import RecordingAccess
 
 Port = Annotated[
@@ -39,14 +33,29 @@ Port = Annotated[
 ]
 Force = Annotated[bool, Field(description="Press Webots' keys where nothing else works.")]
 
-_WAIT_S: Final = 10.0
-_RELOAD_WAIT_S: Final = 30.0
-_USUAL_WAIT_S: Final[dict[Order, float]] = {"reload": _RELOAD_WAIT_S, "step": MAX_WAIT_S}
-_STARTING_S: Final = 60.0  # Webots downloads what it has not cached
-_WORLD_WAIT_S: Final = 30.0
-_LOOK_EVERY_S: Final = 0.2
-_LONGEST_LINE: Final = 200
-_RUN_WAIT_S: Final = 60.0
+
+@dataclass(frozen=True)
+class ControlTimes:
+    """How long questions wait unless told otherwise, in seconds of wall time.
+
+    Attributes:
+        command_s: For a command.
+        reload_s: For a reload.
+        start_s: For Webots to start: it downloads what it has not cached.
+        world_s: For another world, or for the end of Webots.
+        run_s: For a run.
+        poll_s: Between two checks whether a controller records.
+    """
+
+    command_s: float = 10.0
+    reload_s: float = 30.0
+    start_s: float = 60.0
+    world_s: float = 30.0
+    run_s: float = 60.0
+    poll_s: float = 0.2
+
+
+_TIMES: Final = ControlTimes()
 
 
 @question("Control the simulation", DESTROYS, core=True)
@@ -76,7 +85,9 @@ async def webots_simulation_control(
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
     steps = steps or 1
     params = {"steps": steps} if command == "step" else {}
-    waiting_s = timeout_wall_s or _USUAL_WAIT_S.get(command, _WAIT_S)
+    waiting_s = timeout_wall_s or {"reload": _TIMES.reload_s, "step": MAX_WAIT_S}.get(
+        command, _TIMES.command_s
+    )
     dispatcher = Dispatcher(recording, caller.report)
     attempt = Attempt(recording, dispatcher, robot, waiting_s, command, params, force, port)
     return await attempt.steer()
@@ -88,7 +99,7 @@ async def webots_world_reload(
     caller: Caller,
     force: Force = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _RELOAD_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.reload_s,
 ) -> CommandAnswer:
     """Load world and code anew, as webots_simulation_control("reload")."""
     dispatcher = Dispatcher(recording, caller.report)
@@ -101,7 +112,7 @@ async def webots_world_reset(
     caller: Caller,
     force: Force = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.command_s,
 ) -> CommandAnswer:
     """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
     dispatcher = Dispatcher(recording, caller.report)
@@ -113,7 +124,7 @@ async def webots_reset_controller_state(
     recording: RecordingAccess,
     caller: Caller,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.command_s,
 ) -> CommandAnswer:
     """Put the controller's own variables back; world and time go on as they are.
 
@@ -138,7 +149,7 @@ async def webots_launch_world(
     stream: Annotated[
         bool, Field(description="Obey without a controller; opens the project to the net.")
     ] = False,
-    timeout_wall_s: TimeoutS = _STARTING_S,
+    timeout_wall_s: TimeoutS = _TIMES.start_s,
 ) -> CommandAnswer:
     """Start Webots and wait until the first controller records, or say why none does.
 
@@ -161,7 +172,7 @@ async def webots_load_world(
     world: World,
     caller: Caller,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WORLD_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.world_s,
 ) -> CommandAnswer:
     """Open another world in the running Webots; all controllers end.
 
@@ -177,7 +188,7 @@ async def webots_quit(
     recording: RecordingAccess,
     caller: Caller,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WORLD_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.world_s,
 ) -> CommandAnswer:
     """End Webots: the one of webots_launch_world; another only by a robot that is a Supervisor."""
     return await _request(recording, caller, robot, timeout_wall_s).quit()
@@ -190,7 +201,7 @@ def _request(
     return WorldRequest(recording, dispatcher, robot, timeout_wall_s, caller.companions.webots)
 
 
-async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStart | None:
+async def _wait(launched: WebotsLaunch, caller: Caller, until_s: float) -> SessionStart | None:
     """Until a controller records; None where the time was over first.
 
     Raises:
@@ -198,7 +209,7 @@ async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStar
     """
     begun_s = time.monotonic()
     while True:
-        is_over = launched.webots.is_over  # before the look: what came last is seen
+        is_over = launched.webots.is_over  # checked first, so that rows of its last moment are read
         first = await to_thread.run_sync(launched.first_record)
         if first is not None or time.monotonic() > until_s:
             return first
@@ -207,13 +218,13 @@ async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStar
             await to_thread.run_sync(launched.record_last_words)
             raise CommandRefusedError(await to_thread.run_sync(launched.silence))
         lines = launched.webots.lines
-        said = cut_text(lines[-1].text, _LONGEST_LINE) if lines else "Webots starts"
+        said = cut_text(lines[-1].text, 200) if lines else "Webots starts"
         await caller.report(time.monotonic() - begun_s, until_s - begun_s, said)
-        await anyio.sleep(_LOOK_EVERY_S)
+        await anyio.sleep(_TIMES.poll_s)
 
 
 def _answer(
-    recording: RecordingAccess, launched: Launch, first: SessionStart | None, started_s: float
+    recording: RecordingAccess, launched: WebotsLaunch, first: SessionStart | None, started_s: float
 ) -> CommandAnswer:
     header: dict[str, Any] = {}
     if first is not None:
@@ -231,7 +242,7 @@ def _answer(
     )
 
 
-def _then(launched: Launch) -> str:
+def _then(launched: WebotsLaunch) -> str:
     """How a start in pause goes on."""
     if launched.start.mode != "pause":
         return ""
@@ -240,7 +251,7 @@ def _then(launched: Launch) -> str:
     return f". {by_us if launched.start.streams else alone}"
 
 
-def _described(launched: Launch) -> dict[str, Any]:
+def _described(launched: WebotsLaunch) -> dict[str, Any]:
     address = launched.webots.address
     return {
         "world": str(launched.world),
@@ -284,7 +295,7 @@ async def webots_run(
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
     picture: Annotated[bool, Field(description="Show the end as a screenshot too.")] = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _RUN_WAIT_S,
+    timeout_wall_s: TimeoutS = _TIMES.run_s,
 ) -> RunAnswer:
     """Let the simulation run until a condition holds or a simulated time is over, then pause it.
 

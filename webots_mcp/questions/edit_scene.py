@@ -11,17 +11,8 @@ from pydantic import Field, WithJsonSchema
 from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
-from webots_mcp.questions.declaring import (
-    CHANGES,
-    DESTROYS,
-    READS,
-    AnyNames,
-    Caller,
-    Cursor,
-    RobotName,
-    merged,
-    question,
-)
+from webots_mcp.questions.arguments import AnyNames, Cursor, RobotName
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, merged, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.robots import find_holder, list_robots
@@ -34,9 +25,6 @@ Path = Annotated[
         "of a robot or solid, type, or number.",
     ),
 ]
-_Count = Annotated[int, Field(ge=1, le=24)]
-_Start = Annotated[int, Field(ge=0)]
-_WAIT_S: Final = 15.0  # of wall time
 _NO_SUPERVISOR: Final = (
     "no live controller can read the scene of {}: set the field 'supervisor' of a Robot node to "
     "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
@@ -61,7 +49,10 @@ async def webots_get_scene(
     recording: RecordingAccess,
     caller: Caller,
     path: Annotated[str | None, Field(description="Only in this node.")] = None,
-    depth: Annotated[_Count | None, Field(description="Levels; 2 unless types or names.")] = None,
+    depth: Annotated[
+        (Annotated[int, Field(ge=1, le=24)]) | None,
+        Field(description="Levels; 2 unless types or names."),
+    ] = None,
     types: AnyNames = None,
     names: AnyNames = None,
     fields: Annotated[
@@ -83,7 +74,9 @@ async def webots_get_field(
     recording: RecordingAccess,
     caller: Caller,
     path: Path,
-    start: Annotated[_Start | None, Field(description="From this entry or field on.")] = None,
+    start: Annotated[
+        (Annotated[int, Field(ge=0)]) | None, Field(description="From this entry or field on.")
+    ] = None,
     robot: RobotName = None,
 ) -> CommandAnswer:
     """The value of a field of the scene tree now, or of a node all its fields."""
@@ -157,7 +150,7 @@ async def _ask(
         )
     name = await to_thread.run_sync(_find_supervisor, recording, robot)
     given = {key: value for key, value in params.items() if value is not None}
-    return await Dispatcher(recording, caller.report).ask(name, action, _WAIT_S, given)
+    return await Dispatcher(recording, caller.report).ask(name, action, 15.0, given)
 
 
 def _find_supervisor(recording: RecordingAccess, robot: str | None) -> str:

@@ -6,15 +6,10 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
-from webots_mcp.answers.budget import (
-    answer_about,
-    notes_of,
-    range_in,
-    room_tokens,
-    tokens_of,
-)
+from webots_mcp.answers.budget import answer_about, notes_of, range_in, room_tokens
 from webots_mcp.answers.event_tables import events_table, fitting_events, not_shown_of, verdicts_of
 from webots_mcp.answers.models import EventsAnswer, TimelineAnswer
+from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection.events import (
     KINDS,
@@ -24,8 +19,7 @@ from webots_mcp.judging.detection.events import (
     timeline,
 )
 from webots_mcp.judging.detection.kinds import EventOptions, both_of
-from webots_mcp.questions.declaring import (
-    READS,
+from webots_mcp.questions.arguments import (
     AnyNames,
     LogLevel,
     Mode,
@@ -33,9 +27,8 @@ from webots_mcp.questions.declaring import (
     ShownLimit,
     TextCursor,
     TimeOfDay,
-    merged,
-    question,
 )
+from webots_mcp.questions.declaring import READS, merged, question
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
 

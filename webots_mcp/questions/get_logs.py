@@ -9,21 +9,13 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from webots_mcp.answers.budget import cut_text, fitting, is_for_a_person, wall_clock
-from webots_mcp.answers.models import LogsAnswer, Table
+from webots_mcp.answers.budget import fitting, wall_clock
+from webots_mcp.answers.models import AnswerTable, LogsAnswer
+from webots_mcp.answers.shortening import cut_text, is_for_a_person
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
-from webots_mcp.questions.declaring import (
-    READS,
-    Cursor,
-    EndS,
-    LastS,
-    RobotName,
-    RunId,
-    StartS,
-    TimeOfDay,
-    question,
-)
+from webots_mcp.questions.arguments import Cursor, EndS, LastS, RobotName, RunId, StartS, TimeOfDay
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.simulator.console import console_state
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
@@ -42,16 +34,10 @@ from webots_mcp.store.robots import list_robots
 
 _COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
-_LONGEST_MESSAGE: Final = 500
-_BUDGET_TOKENS: Final = 1_500
 _ANY_LINE: Final = LogFilter(None, LogWindow(-math.inf, math.inf), "", "debug")
 _BELOW_LEVEL: Final = (
     "no robot has recorded yet, and no line of Webots' console has the level {} or above: these "
     "have a lower one"
-)
-_NONE_MATCHES: Final = (
-    "no robot has recorded yet, and no line of Webots' console matches: leave out the level, the "
-    "text and the source to see all of its lines"
 )
 _NO_RUN_YET: Final = (
     "lines without a run_id came from Webots' console before a run began: a controller that never "
@@ -107,7 +93,14 @@ def webots_get_logs(
             # What a controller prints as it fails has no level of its own.
             any_level = replace(asked, lowest_level=_ANY_LINE.lowest_level)
             shown = waiting or waiting_lines(connection, any_level, lines)
-        hint = _BELOW_LEVEL.format(lowest) if shown else _NONE_MATCHES
+        hint = (
+            _BELOW_LEVEL.format(lowest)
+            if shown
+            else (
+                "no robot has recorded yet, and no line of Webots' console matches: leave out the "
+                "level, the text and the source to see all of its lines"
+            )
+        )
         return LogsAnswer(
             lines=_table(_newest_fitting(shown), time_of_day=time_of_day) if shown else None,
             matching=len(waiting),
@@ -125,17 +118,17 @@ def _row(line: LogLine) -> dict[str, object]:
         "id": line.id,
         "sim_time_s": None if line.sim_time_s is None else round(line.sim_time_s, 3),
         "level": line.level,
-        "message": message if is_for_a_person() else cut_text(message, _LONGEST_MESSAGE),
+        "message": message if is_for_a_person() else cut_text(message, 500),
         "run_id": line.run_id,
     }
 
 
-def _table(lines: list[LogLine], *, time_of_day: bool) -> Table:
+def _table(lines: list[LogLine], *, time_of_day: bool) -> AnswerTable:
     columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
     if time_of_day:
         columns.insert(columns.index("sim_time_s") + 1, "time")
     rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]
-    return Table(columns=columns, rows=[[row[name] for name in columns] for row in rows])
+    return AnswerTable(columns=columns, rows=[[row[name] for name in columns] for row in rows])
 
 
 def _answer(
@@ -167,7 +160,7 @@ def _newest_fitting(lines: list[LogLine]) -> list[LogLine]:
     if is_for_a_person():
         return lines
     rows = [[*_row(line).values()] for line in reversed(lines)]
-    return lines[len(lines) - len(fitting(rows, _BUDGET_TOKENS)) :]
+    return lines[len(lines) - len(fitting(rows, 1_500)) :]
 
 
 def _hint(asked: LogFilter, matching: int, shown: int) -> str | None:

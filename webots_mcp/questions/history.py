@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
 from pydantic import Field
@@ -20,25 +21,24 @@ from webots_mcp.answers.budget import (
     short_name,
     shown,
     some,
-    tokens_of,
     without_empty,
 )
 from webots_mcp.answers.models import (
+    AnswerPart,
     ChangeSeries,
     HistoryAnswer,
     NumberSeries,
-    Part,
     RowColumns,
     RunSeries,
     RunTrendTables,
     SignalsAnswer,
     TrendsAnswer,
 )
+from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.trends import trends
-from webots_mcp.questions.declaring import (
-    READS,
+from webots_mcp.questions.arguments import (
     AnyNames,
     Cursor,
     Limit,
@@ -47,9 +47,8 @@ from webots_mcp.questions.declaring import (
     RobotName,
     RunId,
     ShownLimit,
-    merged,
-    question,
 )
+from webots_mcp.questions.declaring import READS, merged, question
 from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
@@ -64,11 +63,26 @@ from webots_mcp.store.series import (
 )
 
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
-_SHOWN_GAPS: Final = 10
-_CELL_TOKENS: Final = 15  # of a bucket of a numeric signal: min, max, mean and last
-_SIGNAL_TOKENS: Final = 60  # of a signal, beside its buckets
-DEFAULT_LIMIT: Final = 20
-_ASK_FOR_OTHERS: Final = "signals=['...'] asks for others, limit for more"
+
+
+@dataclass(frozen=True)
+class HistorySizes:
+    """How much of a history its answer shows.
+
+    Attributes:
+        gaps: Recording gaps.
+        bucket_tokens: Budget of a bucket of a numeric signal: min, max, mean and last.
+        signal_tokens: Budget of a signal without its buckets.
+        trends: Signals with a trend, unless a limit is given.
+    """
+
+    gaps: int = 10
+    bucket_tokens: int = 15
+    signal_tokens: int = 60
+    trends: int = 20
+
+
+_SIZES: Final = HistorySizes()
 
 
 @question(
@@ -221,11 +235,11 @@ def _likely_points(
 ) -> int:
     signals = signals_of(view.connection, asked, names)
     numbers = sum(signal.is_number for signal in signals)
-    room = budget_tokens - _SIGNAL_TOKENS * len(signals) * len(asked.segments)
-    return max(1, room // (_CELL_TOKENS * max(numbers, 1)))
+    room = budget_tokens - _SIZES.signal_tokens * len(signals) * len(asked.segments)
+    return max(1, room // (_SIZES.bucket_tokens * max(numbers, 1)))
 
 
-def _told(part: Part) -> dict[str, Any]:
+def _told(part: AnswerPart) -> dict[str, Any]:
     return part.model_dump(mode="json", exclude_none=True)
 
 
@@ -264,10 +278,10 @@ def _run_series(run: RunHistory) -> RunSeries:
         or None,
         row_count=run.rows,
         recording_gaps=[
-            [seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]
+            [seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[: _SIZES.gaps]
         ]
         or None,
-        recording_gap_count=len(run.gaps) if len(run.gaps) > _SHOWN_GAPS else None,
+        recording_gap_count=len(run.gaps) if len(run.gaps) > _SIZES.gaps else None,
         rows_missing_from_s=seconds(run.cut_at_s),
     )
 
@@ -420,7 +434,7 @@ def _trends(
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
     budget_tokens = room_tokens(limit) // max(len(found.runs), 1)
     recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
-    runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget_tokens) for run in recorded]
+    runs = [trend_tables(run, limit or _SIZES.trends, budget_tokens) for run in recorded]
     return {
         "runs": runs or None,
         "notes": notes_of(found.notes),
@@ -431,7 +445,11 @@ def _trends(
 def _hint_of_trends(runs: Sequence[RunTrendTables]) -> str | None:
     if not runs:
         return "no row in that range: leave the range out, or see notes"
-    return _ASK_FOR_OTHERS if any(run.not_shown for run in runs) else None
+    return (
+        "signals=['...'] asks for others, limit for more"
+        if any(run.not_shown for run in runs)
+        else None
+    )
 
 
 TRENDS: Final = merged(

@@ -28,19 +28,35 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection.events import asked_kinds, search_events
 from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.trends import RunTrends, trends
-from webots_mcp.questions.declaring import MAX_WAIT_S, READS, Caller, RobotName, question
+from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName
+from webots_mcp.questions.declaring import READS, Caller, question
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 USUAL_DURATION_S: Final = 10.0
-_REPORT_INTERVAL_S: Final = 1.0
-_SHOWN_SIGNALS: Final = 12
-_SHOWN_EVENTS: Final = 30
-_ROWS_TOKENS: Final = 1_300
-_EVENTS_SHARE: Final = 0.45  # of them
-_TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
-_ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
 
+
+@dataclass(frozen=True)
+class MonitorSizes:
+    """How much of a watched window its answer shows.
+
+    Attributes:
+        signals: Signals with a trend, of each run.
+        events: Events.
+        rows_tokens: Budget of events and trends together.
+        events_share: Share of it for events.
+        runs: Runs with trends: the one before a reset, and the one after it.
+    """
+
+    signals: int = 12
+    events: int = 30
+    rows_tokens: int = 1_300
+    events_share: float = 0.45
+    runs: int = 2
+
+
+_SIZES: Final = MonitorSizes()
+_ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
 _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 
@@ -81,7 +97,7 @@ async def webots_monitor(
         return await to_thread.run_sync(look_back, recording, robot, lookback_wall_s)
     name, started_s, is_live = await to_thread.run_sync(_start, recording, robot)
     for second in range(1, math.ceil(duration_wall_s) + 1) if is_live else ():
-        await anyio.sleep(min(_REPORT_INTERVAL_S, duration_wall_s - second + 1))
+        await anyio.sleep(min(1.0, duration_wall_s - second + 1))
         doing = await to_thread.run_sync(_doing, recording, name)
         await caller.report(min(second, duration_wall_s), duration_wall_s, doing)
     return await to_thread.run_sync(_watched, recording, name, started_s)
@@ -126,7 +142,7 @@ def _found(view: RobotView, wall_start_s: float) -> dict[str, Any]:
     window = window_from(view, wall_start_s)
     recorded = bool(window.rows.segments)
     told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
-    newest = told[-_TOLD_RUNS:]
+    newest = told[-_SIZES.runs :]
     found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
@@ -134,14 +150,14 @@ def _found(view: RobotView, wall_start_s: float) -> dict[str, Any]:
     moved = movement(view, window.rows) if recorded else None
     notes = notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told)))))
     beside = [verdicts.model_dump(exclude_none=True), moved, notes]
-    room = room_tokens(beside=beside, usual_tokens=_ROWS_TOKENS)
-    shown, events = fitting_events(in_window, _SHOWN_EVENTS, int(room * _EVENTS_SHARE), view)
-    of_a_run = int(room * (1 - _EVENTS_SHARE)) // max(len(newest), 1)
+    room = room_tokens(beside=beside, usual_tokens=_SIZES.rows_tokens)
+    shown, events = fitting_events(in_window, _SIZES.events, int(room * _SIZES.events_share), view)
+    of_a_run = int(room * (1 - _SIZES.events_share)) // max(len(newest), 1)
     rows = sum(run.rows for run in told)
     return {
         "row_count": rows,
         "movement": moved,
-        "trends": [trend_tables(run, _SHOWN_SIGNALS, of_a_run) for run in newest] or None,
+        "trends": [trend_tables(run, _SIZES.signals, of_a_run) for run in newest] or None,
         "events": events,
         "verdicts": verdicts,
         "not_shown": not_shown_of(shown),
@@ -159,11 +175,11 @@ def _unlooked(verdicts: Verdicts) -> Verdicts:
 
 def _of_earlier(told: Sequence[RunTrends]) -> list[str]:
     """Where the trends of all runs but the newest are."""
-    earlier = ", ".join(str(run.run_id) for run in told[:-_TOLD_RUNS])
+    earlier = ", ".join(str(run.run_id) for run in told[: -_SIZES.runs])
     return [f"the trends of run {earlier}: webots_get_trends(run_id)"] if earlier else []
 
 
-def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:
+def _in_window(event: Event, window: WatchedWindow, wall_start_s: float) -> bool:
     """Whether it began in the window, or had begun before and lasted into it."""
     starts = (each.start_s for each in window.rows.segments if each.run_id == event.run_id)
     lasted = event.start_s < min(starts, default=math.inf) <= event.end_s
@@ -196,7 +212,7 @@ def _why_nothing(view: RobotView) -> str:
 
 
 @dataclass(frozen=True)
-class Window:
+class WatchedWindow:
     """The recording since a moment.
 
     Attributes:
@@ -209,7 +225,7 @@ class Window:
     around: TimeRange
 
 
-def window_from(view: RobotView, wall_start_s: float) -> Window:
+def window_from(view: RobotView, wall_start_s: float) -> WatchedWindow:
     """The window of a robot from that wall time (Unix) on."""
     found = find_range(view.connection, Scope(since_wall_time=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
@@ -218,7 +234,7 @@ def window_from(view: RobotView, wall_start_s: float) -> Window:
         for segment in found.segments or [_standing(view, wall_start_s)]
     ]
     around[-1] = replace(around[-1], end_s=math.inf)
-    return Window(found, replace(found, segments=tuple(around)))
+    return WatchedWindow(found, replace(found, segments=tuple(around)))
 
 
 def _from_row_before(connection: sqlite3.Connection, segment: Segment) -> float:

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
 import anyio
@@ -13,18 +14,12 @@ from anyio import to_thread
 from anyio.lowlevel import RunVar
 from pydantic import Field
 
-from webots_mcp.answers.budget import (
-    LONGEST_NAME,
-    cut_for_a_model,
-    fitting,
-    header_of_only,
-    is_for_a_person,
-    room_tokens,
-    tokens_of,
-)
-from webots_mcp.answers.models import SqlAnswer, Table
+from webots_mcp.answers.budget import LONGEST_NAME, fitting, header_of_only, room_tokens
+from webots_mcp.answers.models import AnswerTable, SqlAnswer
+from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.declaring import READS, ShownLimit, question
+from webots_mcp.questions.arguments import ShownLimit
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.sql import (
@@ -38,16 +33,33 @@ from webots_mcp.store.sql import (
     require_select,
 )
 
-DEFAULT_ROWS: Final = 100
-_BUDGET_BYTES: Final = 5_000  # of values: what is read, of which as much is shown as fits
-_LARGE_BUDGET_BYTES: Final = 20_000
-_BYTES_FOR_A_PERSON: Final = 10_000_000
-_MOST_COLUMNS: Final = 60
-_AT_ONCE: Final = 2
-_LONGEST_WAIT_S: Final = 30.0
-_PROCESS_TIMEOUT_S: Final = 20.0  # its own deadline counts from when it has started
-_OF_STATES: Final = re.compile(r"\b(state|all_state|robot_now|robot_trajectory)\b", re.IGNORECASE)
-_DELETED: Final = "SELECT coalesce(sum(max(0, purged_rows)), 0) FROM run"
+
+@dataclass(frozen=True)
+class QuerySizes:
+    """How much of a result is read and shown, and how long a statement may take.
+
+    Attributes:
+        rows: Rows, unless a limit is given.
+        values_bytes: Size of the values that are read, of which as much is shown as fits.
+        large_values_bytes: The same where a limit is given.
+        person_values_bytes: The same for a person.
+        columns: Columns.
+        at_once: Statements that run at once: they take memory and a processor each.
+        wait_s: Wall time of waiting for other statements.
+        process_s: Wall time of the process; its own deadline counts from when it has started.
+    """
+
+    rows: int = 100
+    values_bytes: int = 5_000
+    large_values_bytes: int = 20_000
+    person_values_bytes: int = 10_000_000
+    columns: int = 60
+    at_once: int = 2
+    wait_s: float = 30.0
+    process_s: float = 20.0
+
+
+_SIZES: Final = QuerySizes()
 _LESS: Final = (
     "retention has deleted {} states (run.purged_rows), which no table or view of states has: "
     "robot_statistics, webots_query_history and webots_get_trends have what chunks hold of them"
@@ -78,13 +90,13 @@ async def webots_query_sql(
     robot_log, robot_command. Indexed by run_id and sim_time_s. Values:
     json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
     """
-    max_bytes = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
-    most_columns = _MOST_COLUMNS
+    max_bytes = _SIZES.values_bytes if limit is None else _SIZES.large_values_bytes
+    most_columns = _SIZES.columns
     if is_for_a_person():
-        max_bytes, most_columns = _BYTES_FOR_A_PERSON, sys.maxsize
+        max_bytes, most_columns = _SIZES.person_values_bytes, sys.maxsize
     require_select(sql)
     header, deleted = await to_thread.run_sync(_header, recording)
-    found = await _run(recording, sql, limit or DEFAULT_ROWS, max_bytes)
+    found = await _run(recording, sql, limit or _SIZES.rows, max_bytes)
     columns = [cut_for_a_model(name, LONGEST_NAME) for name in found.columns[:most_columns]]
     rows = [list(row[:most_columns]) for row in found.rows]
     budget_tokens = room_tokens(limit, columns)
@@ -94,11 +106,16 @@ async def webots_query_sql(
         longest = budget_tokens // len(columns)  # a character has at most a token
         rows = [[_cut(each, longest) for each in rows[0]]]
     more = len(found.columns) > most_columns
-    wide = f"only the first {_MOST_COLUMNS} columns are shown" if more else None
-    less = _LESS.format(deleted) if deleted and _OF_STATES.search(sql) else None
+    wide = f"only the first {_SIZES.columns} columns are shown" if more else None
+    less = (
+        _LESS.format(deleted)
+        if deleted
+        and re.search(r"\b(state|all_state|robot_now|robot_trajectory)\b", sql, re.IGNORECASE)
+        else None
+    )
     return SqlAnswer(
         **header,
-        result=Table(columns=columns, rows=rows),
+        result=AnswerTable(columns=columns, rows=rows),
         truncated=_truncated(found, len(rows), longest),
         hint="; ".join(filter(None, (less, wide or _none(rows)))) or None,
     )
@@ -107,7 +124,9 @@ async def webots_query_sql(
 def _header(recording: RecordingAccess) -> tuple[dict[str, Any], int]:
     """And how many states retention has deleted."""
     with recording.reader() as connection:
-        (deleted,) = connection.execute(_DELETED).fetchone()
+        (deleted,) = connection.execute(
+            "SELECT coalesce(sum(max(0, purged_rows)), 0) FROM run"
+        ).fetchone()
         return header_of_only(connection), deleted
 
 
@@ -116,13 +135,13 @@ async def _run(recording: RecordingAccess, sql: str, max_rows: int, max_bytes: i
     async with _turn():
         with as_file(recording.database) as file:
             asked = Statement(str(file), sql, max_rows, max_bytes, QUESTION_DEADLINE_S)
-            with anyio.move_on_after(_PROCESS_TIMEOUT_S):
+            with anyio.move_on_after(_SIZES.process_s):
                 ended = await anyio.run_process(
                     LINE, input=asked.encoded(), check=False, stderr=None, cwd=FOLDER
                 )
                 return decode(ended.stdout, ended.returncode, asked)
     raise InvalidInputError(
-        f"no process answered within {_PROCESS_TIMEOUT_S:g} s: this machine is overloaded"
+        f"no process answered within {_SIZES.process_s:g} s: this machine is overloaded"
     )
 
 
@@ -131,12 +150,12 @@ async def _turn() -> AsyncGenerator[None]:
     """Wait until few enough statements run; they take memory and a processor each."""
     turns = _turns.get(None)
     if turns is None:
-        _turns.set(turns := anyio.Semaphore(_AT_ONCE))
-    with anyio.move_on_after(_LONGEST_WAIT_S) as waiting:
+        _turns.set(turns := anyio.Semaphore(_SIZES.at_once))
+    with anyio.move_on_after(_SIZES.wait_s) as waiting:
         await turns.acquire()
     if waiting.cancelled_caught:
         raise InvalidInputError(
-            f"other statements were running for {_LONGEST_WAIT_S:g} s: ask again, one at a time"
+            f"other statements were running for {_SIZES.wait_s:g} s: ask again, one at a time"
         )
     try:
         yield

@@ -7,6 +7,7 @@ import sqlite3
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, cast
 
 import anyio
@@ -16,7 +17,6 @@ from pydantic import BeforeValidator, Field, WithJsonSchema
 from webots_mcp.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.answers.budget import (
     condensed,
-    cut_text,
     figure,
     figures,
     fitting,
@@ -25,25 +25,19 @@ from webots_mcp.answers.budget import (
     shown,
 )
 from webots_mcp.answers.models import TrialsAnswer
+from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
+from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
 from webots_mcp.questions.compare_runs import webots_list_runs
-from webots_mcp.questions.declaring import (
-    DESTROYS,
-    READS,
-    Caller,
-    RobotName,
-    TimeoutS,
-    TrialSetId,
-    merged,
-    question,
-)
-from webots_mcp.questions.send_command import settable
+from webots_mcp.questions.declaring import DESTROYS, READS, Caller, merged, question
+from webots_mcp.questions.parameters import settable
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.parameter import require_known
-from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
+from webots_mcp.steering.run_command import ACTION, known_names, require_possible
+from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
 from webots_mcp.store.parameters import (
@@ -66,22 +60,39 @@ from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import robot_name
 
-_WAIT_S: Final = 60.0
-_TRIAL_S: Final = 300.0
-_LOOK_EVERY_S: Final = 0.05
-_REPORT_EVERY_S: Final = 1.0
 
+@dataclass(frozen=True)
+class TrialAnswerSizes:
+    """How much of a trial set its answer shows, and how long a call waits.
+
+    Attributes:
+        wait_s: Wall time of a call, unless given.
+        trial_s: Wall time of a trial, unless given.
+        poll_s: Wall time between two reads of the set.
+        report_s: Wall time between two reports of progress.
+        table_tokens: Budget of the ranking.
+        why_characters: Characters of the reason of a failure.
+        runs: Runs that are named of each set of parameters.
+    """
+
+    wait_s: float = 60.0
+    trial_s: float = 300.0
+    poll_s: float = 0.05
+    report_s: float = 1.0
+    table_tokens: int = 1_250
+    why_characters: int = 120
+    runs: int = 5
+
+
+_SIZES: Final = TrialAnswerSizes()
 _Value = float | int | bool | str
 CANCELLED: Final = "it was cancelled"
-_TABLE_TOKENS: Final = 1_250
 _IN_SIMULATORS: Final = (
     "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
 )
 _FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
-_LONGEST_WHY: Final = 120
 _RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
 _FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
-_MOST_NAMED_RUNS: Final = 5
 
 
 def _require_sets(given: Any) -> Any:
@@ -135,11 +146,11 @@ async def webots_run_trials(
         str | None, Field(max_length=500, description="Or, unscored, when this holds.")
     ] = None,
     repeats: Annotated[int, Field(ge=1, le=1000, description="Of each set.")] = 1,
-    trial_timeout_wall_s: Annotated[float, Field(gt=0, description="At most.")] = _TRIAL_S,
+    trial_timeout_wall_s: Annotated[float, Field(gt=0, description="At most.")] = _SIZES.trial_s,
     trial_set: TrialSetId = None,
     cancel: Annotated[bool, Field(description="Stop it after this trial.")] = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _SIZES.wait_s,
 ) -> TrialsAnswer:
     """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
 
@@ -273,15 +284,15 @@ async def _wait(
     recording: RecordingAccess, caller: Caller, set_id: int, timeout_wall_s: float
 ) -> None:
     """Until nobody works on the set any more, or the time is over."""
-    until_s, report_s = time.monotonic() + timeout_wall_s, time.monotonic() + _REPORT_EVERY_S
+    until_s, report_s = time.monotonic() + timeout_wall_s, time.monotonic() + _SIZES.report_s
     with recording.reader() as connection:
         while time.monotonic() < until_s:
             if not is_at_work(connection, fetch_trial_set(connection, set_id)):
                 return
             if time.monotonic() >= report_s:
-                report_s += _REPORT_EVERY_S
+                report_s += _SIZES.report_s
                 await caller.report(*progress_of(connection, set_id))
-            await anyio.sleep(_LOOK_EVERY_S)
+            await anyio.sleep(_SIZES.poll_s)
 
 
 # -- answers ----------------------------------------------------------------------------------
@@ -321,7 +332,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
     planned = count_planned(plan, trials)
     state, hint = _state(found, planned - over, at_work=is_at_work(connection, found))
     ranking = ranking_of(trials, best)
-    rows = fitting(_rows(ranking, trials), _TABLE_TOKENS)
+    rows = fitting(_rows(ranking, trials), _SIZES.table_tokens)
     repeats = [] if state == "under way" else repeats_noted(connection, found.id)
     left_out = len(ranking.sets) - len(rows)
     return {
@@ -393,8 +404,8 @@ def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]
         len(ranked.scores),
         ranked.pruned or None,
         len(ranked.failures) or None,
-        why and cut_text(why, _LONGEST_WHY),
-        list(runs[:_MOST_NAMED_RUNS]),
+        why and cut_text(why, _SIZES.why_characters),
+        list(runs[: _SIZES.runs]),
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, cast
@@ -13,25 +13,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.answers.budget import compact_json, notes_of, seconds, some
+from webots_mcp.answers.budget import notes_of, seconds, some
 from webots_mcp.answers.models import CommandAnswer, RunAnswer, ShownPicture
+from webots_mcp.answers.shortening import compact_json
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
-from webots_mcp.questions.declaring import (
-    CHANGES,
-    READS,
+from webots_mcp.questions.arguments import (
     AnyNames,
-    Caller,
     RobotName,
     RunId,
     RunIds,
     Seconds,
     TimeoutS,
     TrialSetId,
-    question,
 )
+from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.reading.segment import full_rate_segments, just_after
@@ -41,16 +39,35 @@ from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, insid
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_WAIT_S: Final = 15.0
-_MOST_RUNS: Final = 5
-_MOST_FRAMES: Final = 16
-_FAR_S: Final = 1.0  # from the time that was asked for
-_LONGEST_SIDE_PX: Final = 1000
-_MAX_SENT_BYTES: Final = 4_000_000  # more than such a picture has pixels: it holds something else
-_JPEG_QUALITY: Final = 85
-_GAP_PX: Final = 4
-_END_WAIT_S: Final = 8.0
-_SAME_S: Final = 0.001  # answers have times to the millisecond
+
+@dataclass(frozen=True)
+class PictureLimits:
+    """How pictures are sent, and how long one is waited for.
+
+    Attributes:
+        wait_s: Wall time for a screenshot or a frame.
+        end_wait_s: Wall time for a screenshot at the end of a run.
+        far_s: Simulation time from which on a picture is not of the requested moment.
+        same_s: Simulation time within which two moments are the same: answers have times to the
+            millisecond.
+        side_px: Longest side of a picture, in pixels.
+        file_bytes: Size of a file that is sent as it is: more than such a picture has pixels, so a
+            larger one holds something else.
+        jpeg_quality: Quality of JPEG, from 1 to 100.
+        gap_px: Gap between pictures of a sheet, in pixels.
+    """
+
+    wait_s: float = 15.0
+    end_wait_s: float = 8.0
+    far_s: float = 1.0
+    same_s: float = 0.001
+    side_px: int = 1000
+    file_bytes: int = 4_000_000
+    jpeg_quality: int = 85
+    gap_px: int = 4
+
+
+_LIMITS: Final = PictureLimits()
 
 
 @question("Get the camera picture", READS, core=True)
@@ -62,9 +79,7 @@ async def webots_get_camera(
         bool, Field(description="Taken now, of lidars and range finders too.")
     ] = False,
     at_s: Annotated[Seconds | None, Field(description="Nearest to this simulation time.")] = None,
-    frames: Annotated[
-        int, Field(ge=1, le=_MOST_FRAMES, description="This many, in one picture.")
-    ] = 1,
+    frames: Annotated[int, Field(ge=1, le=16, description="This many, in one picture.")] = 1,
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> list[str | ShownPicture]:
@@ -78,7 +93,7 @@ async def webots_get_camera(
             "and not from a server that is --read-only"
         )
     dispatcher = Dispatcher(recording, caller.report)
-    answer = await dispatcher.ask(robot, "take_frame", _WAIT_S, {"camera": camera})
+    answer = await dispatcher.ask(robot, "take_frame", _LIMITS.wait_s, {"camera": camera})
     return await to_thread.run_sync(_show, recording, answer)
 
 
@@ -106,7 +121,7 @@ def _show_recorded(
 def _far_off(at_s: float | None, found: list[StoredImage]) -> dict[str, Any]:
     """That the nearest picture is not of the time that was asked for."""
     apart_s = 0.0 if at_s is None else min(abs(each.sim_time_s - at_s) for each in found)
-    if apart_s <= _FAR_S:
+    if apart_s <= _LIMITS.far_s:
         return {}
     return {"hint": f"no picture is nearer to {at_s:g} s than {seconds(apart_s)} s"}
 
@@ -151,7 +166,7 @@ async def webots_take_screenshot(
     caller: Caller,
     quality: Annotated[int, Field(ge=1, le=100, description="Of the file.")] = 90,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _LIMITS.wait_s,
 ) -> list[str | ShownPicture]:
     """The simulation's main view, now, within 1,000 pixels; needs a Supervisor."""
     dispatcher = Dispatcher(recording, caller.report)
@@ -179,7 +194,7 @@ def _no_frame(view: RobotView, camera: str) -> str:
     saved = [f"run_id={run_id}: {names}" for run_id, names in known.items()]
     of_it = f" of {camera!r}" if camera else ""
     hint = (
-        f"no frame{of_it} in this run; there are some of {some(saved, _MOST_RUNS)}"
+        f"no frame{of_it} in this run; there are some of {some(saved, 5)}"
         if known
         else "no camera frame was saved: fresh=true takes one of an enabled camera now, "
         "bridge.save_camera_frame(camera) in the controller's loop records them, "
@@ -197,7 +212,7 @@ async def show_end(recording: RecordingAccess, dispatcher: Dispatcher, answer: R
     Where there is neither, the answer says why.
     """
     try:
-        shot = await dispatcher.ask(answer.robot, "screenshot", _END_WAIT_S, {"quality": 90})
+        shot = await dispatcher.ask(answer.robot, "screenshot", _LIMITS.end_wait_s, {"quality": 90})
         path = cast("dict[str, Any]", shot.result or {}).get("path")
         if shot.outcome != "done" or path is None:
             why = shot.error or shot.hint or f"the screenshot is {shot.outcome}"
@@ -218,7 +233,9 @@ def _show_frame(recording: RecordingAccess, answer: RunAnswer, why: str) -> None
     if ran.get("run_id") is not None:
         with recording.reader() as connection:
             found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
-        frame = next((each for each in found if abs(each.sim_time_s - ran["to_s"]) < _SAME_S), None)
+        frame = next(
+            (each for each in found if abs(each.sim_time_s - ran["to_s"]) < _LIMITS.same_s), None
+        )
     if frame is None:
         answer.picture = {"missing": why}
         return
@@ -295,9 +312,9 @@ def _load_sheet(files: Sequence[Path]) -> ShownPicture:
     from PIL import Image as Pictures
 
     columns = math.ceil(math.sqrt(len(files)))
-    side_px = _LONGEST_SIDE_PX // columns - _GAP_PX
+    side_px = _LIMITS.side_px // columns - _LIMITS.gap_px
     parts = [_thumbnail(file, side_px) for file in files]
-    width, height = (max(part.size[i] for part in parts) + _GAP_PX for i in (0, 1))
+    width, height = (max(part.size[i] for part in parts) + _LIMITS.gap_px for i in (0, 1))
     sheet = Pictures.new("RGB", (columns * width, math.ceil(len(parts) / columns) * height))
     for number, part in enumerate(parts):
         sheet.paste(part, (number % columns * width, number // columns * height))
@@ -321,13 +338,13 @@ def _load_picture(file: Path) -> tuple[ShownPicture, str]:
     """
     with opened(file) as picture:
         picture.load()
-        short = max(picture.size) <= _LONGEST_SIDE_PX
-        if short and picture.format and file.stat().st_size <= _MAX_SENT_BYTES:
+        short = max(picture.size) <= _LIMITS.side_px
+        if short and picture.format and file.stat().st_size <= _LIMITS.file_bytes:
             return ShownPicture(data=file.read_bytes(), format=picture.format.lower()), ""
         scaled = picture.convert("RGB")
-        scaled.thumbnail((_LONGEST_SIDE_PX, _LONGEST_SIDE_PX))
+        scaled.thumbnail((_LIMITS.side_px, _LIMITS.side_px))
         jpeg = io.BytesIO()
-        scaled.save(jpeg, "JPEG", quality=_JPEG_QUALITY)
+        scaled.save(jpeg, "JPEG", quality=_LIMITS.jpeg_quality)
     (width, height), (true_width, true_height) = scaled.size, picture.size
     note = f"shown at {width} x {height} of {true_width} x {true_height} pixels"
     return ShownPicture(data=jpeg.getvalue(), format="jpeg"), note

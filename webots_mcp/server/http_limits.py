@@ -23,10 +23,6 @@ MOST_SESSIONS: Final = 1_000  # of clients before 2026-07-28
 HEADERS_S: Final = 10.0  # from the connection, or from the answer before
 BODY_S: Final = 60.0  # from the headers; a body has at most 4 MiB
 _SESSION: Final = "mcp-session-id"
-_OF_THE_BODY: Final = (b"content-length", b"content-type", b"transfer-encoding")
-_TIMED_OUT: Final = (
-    b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
-)
 
 
 @dataclass
@@ -101,7 +97,7 @@ class SessionLimit:
     async def _end(self, name: str, scope: Scope) -> None:
         """End a session as its client would, by a request of its own."""
         del self._sessions[name]
-        left_out = (*_OF_THE_BODY, _SESSION.encode())
+        left_out = (*(b"content-length", b"content-type", b"transfer-encoding"), _SESSION.encode())
         headers = [each for each in scope["headers"] if each[0] not in left_out]
         headers.append((_SESSION.encode(), name.encode("latin-1")))
 
@@ -163,5 +159,7 @@ class PromptProtocol(H11Protocol):
         is_body, self._clock, self._awaited = self._awaited is h11.SEND_BODY, None, None
         is_answered = self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE)
         if (is_body or self.conn.trailing_data[0]) and not is_answered:
-            self.transport.write(_TIMED_OUT)
+            self.transport.write(
+                b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+            )
         self.transport.close()

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 PATH: Final = "/mcp"
-_GRACE_S: Final = 1  # for answers under way when the server ends
-_IDLE_S: Final = 86_400.0  # people come back to a conversation after hours
 _STRANGER: Final = (
     "This server answers requests with the header 'Authorization: Bearer TOKEN' only; "
     "'webots-mcp token' shows the token to the user who started the server.\n"
@@ -47,7 +45,7 @@ _FOREIGN: Final = "This server answers pages of its own host only.\n"
 _CLOSED: Final = "This server has no valid token: there 'webots-mcp token' says what is wrong.\n"
 
 
-class Place(NamedTuple):
+class Endpoint(NamedTuple):
     """Where a server listens.
 
     Attributes:
@@ -84,9 +82,9 @@ class Place(NamedTuple):
         )
 
 
-def place_of(
+def endpoint_of(
     text: str, allowed: Sequence[str] = (), certificate: Path | None = None, key: Path | None = None
-) -> Place:
+) -> Endpoint:
     """The place that `[HOST:]PORT` names; without a host 127.0.0.1.
 
     Raises:
@@ -95,12 +93,12 @@ def place_of(
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdecimal() and int(port) < 2**16):
         raise InvalidInputError(f"--http {text!r} is not [HOST:]PORT, such as 8000")
-    place = Place(host.strip("[]") or LOOPBACK[0], int(port), allowed, certificate, key)
+    place = Endpoint(host.strip("[]") or LOOPBACK[0], int(port), allowed, certificate, key)
     place.require_safe()
     return place
 
 
-def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) -> None:
+def serve_http(server: MCPServer, place: Endpoint, ready: Callable[[str], object]) -> None:
     """Serve until a signal; `ready` is called with the address as soon as clients may ask.
 
     Raises:
@@ -120,7 +118,7 @@ def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) 
             lifespan="on",
             server_header=False,
             proxy_headers=False,
-            timeout_graceful_shutdown=_GRACE_S,
+            timeout_graceful_shutdown=1,  # for answers under way when the server ends
             ssl_certfile=place.certificate,
             ssl_keyfile=place.key,
         )
@@ -141,17 +139,17 @@ def _is_news(record: logging.LogRecord) -> bool:
     return not (record.exc_info and isinstance(record.exc_info[1], ClientDisconnect))
 
 
-def guarded_app(server: MCPServer, place: Place, most_sessions: int = MOST_SESSIONS) -> ASGIApp:
+def guarded_app(server: MCPServer, place: Endpoint, most_sessions: int = MOST_SESSIONS) -> ASGIApp:
     """The server as an application for requests that are addressed to it and have the token."""
     app = server.streamable_http_app(
         transport_security=_allowing(place),
-        session_idle_timeout=_IDLE_S,
+        session_idle_timeout=86_400.0,  # people come back to a conversation after hours
         max_sessions=most_sessions,
     )
     return gate(SessionLimit(app, most_sessions), place)
 
 
-def _listening(place: Place) -> socket.socket:
+def _listening(place: Endpoint) -> socket.socket:
     family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
     try:
         return socket.create_server((place.host, place.port), family=family)
@@ -169,13 +167,13 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def _names(place: Place) -> tuple[str, ...]:
+def _names(place: Endpoint) -> tuple[str, ...]:
     """The hosts that requests may be addressed to."""
     own = (place.host,) if _is_loopback(place.host) else ()  # such as 127.0.0.2
     return (*LOOPBACK, *own, *place.allowed)
 
 
-def _allowing(place: Place) -> TransportSecuritySettings:
+def _allowing(place: Endpoint) -> TransportSecuritySettings:
     """Requests for these names; pages of the same ones, as far as a browser sends any."""
     names = (*_names(place), *map(str.lower, place.allowed))  # as clients send it
     hosts = [spelled for name in names for spelled in (name, f"{name}:*")]
@@ -183,7 +181,7 @@ def _allowing(place: Place) -> TransportSecuritySettings:
     return TransportSecuritySettings(allowed_hosts=hosts, allowed_origins=origins)
 
 
-def gate(app: ASGIApp, place: Place) -> ASGIApp:
+def gate(app: ASGIApp, place: Endpoint) -> ASGIApp:
     """The application, for requests that are addressed to it and have the token.
 
     The SDK compares the beginning of Host and Origin only, so that both are read here first.

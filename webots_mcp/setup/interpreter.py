@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.extras.requirements import checkout, quoted
-from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.installations import installations
 
 PROBE_TIMEOUT_S: Final = 30.0
 _PREFERENCE: Final = "pythonCommand"
-_SECTION: Final = re.compile(r"\s*\[(.*)\]\s*")
 # For any Python 3. -B leaves no compiled files behind in a folder that is only looked at.
 _PROBE: Final = """
 import json, os, sys
@@ -107,7 +106,7 @@ def _runtime_command(file: Path) -> str | None:
 def _ini_value(text: str, sections: tuple[str, ...], key: str) -> str | None:
     section = ""
     for line in text.splitlines():
-        if found := _SECTION.fullmatch(line.partition(";")[0]):
+        if found := re.fullmatch(r"\s*\[(.*)\]\s*", line.partition(";")[0]):
             section = found[1].strip()
             continue
         name, _, value = line.partition("=")
@@ -179,7 +178,7 @@ def _of_registry() -> dict[str, str]:
     return found
 
 
-def look_into(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpreter:
+def probe_interpreter(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpreter:
     """Start the Python of a controller as Webots would, and import the bridge there."""
     by_rule = chosen(controller)
     settings = {"command": " ".join(by_rule.command), "chosen_by": by_rule.by}

@@ -1,9 +1,9 @@
-"""What is put into a project and taken out again: the bridge's two lines, the observer's robot.
+"""Adding the two lines of the bridge to a controller, and removing them again.
 
 The syntax tree of a controller says where the lines belong; the bytes of the file stay as they are
 everywhere else. What cannot be determined for certain is refused. Each result is checked before it
 is returned: its tree is that of the original with the two statements added, so nothing else has
-changed its meaning. A world stays as it is, byte for byte, but for the node at its end.
+changed its meaning.
 """
 
 from __future__ import annotations
@@ -12,13 +12,10 @@ import ast
 import re
 import tokenize
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from webots_mcp.contract import OBSERVER_NAME
-from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.setup.file_change import FileChange, read
+from webots_mcp.errors import InvalidInputError
 
 IMPORT: Final = "from webots_mcp import MCPBridge"
 _BRIDGE: Final = "MCPBridge"
@@ -31,32 +28,11 @@ _ROBOTS: Final = {
         "CSVSupervisorEnv", "EmitterReceiverRobot", "CSVRobot",
     ),
 }  # fmt: skip
-_PLAIN: Final = "Robot"  # the class without a supervisor's calls
 _MOST_MODULES: Final = 50
-_LINES: Final = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n|\Z)")
 _ADDED: Final = re.compile(
     rb"\s*(?:from webots_mcp import MCPBridge|MCPBridge\.attach\([^()]+\))\s*"
 )
-
 _Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
-COPY_SUFFIX: Final = "_observed"
-CONTROLLER: Final = b'''"""The observer of webots-mcp: it records where all robots are."""
-
-from webots_mcp.simulator.observer import main
-
-main()
-'''
-# Without synchronization the world does not wait for it, and a pause by hand does not stop it:
-# see docs/webots.md.
-_ROBOT: Final = """Robot {{
-  name "{name}"
-  controller "{controller}"
-  supervisor TRUE
-  synchronization FALSE
-}}
-"""
-_HEADER: Final = b"#VRML_SIM "
-_TOKEN: Final = re.compile(rb'"(?:\\.|[^"\\])*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 
 
 class AlreadyPatchedError(InvalidInputError):
@@ -81,7 +57,7 @@ class AttachingPlace(NamedTuple):
     statement: str
 
 
-class _Place(NamedTuple):
+class _InsertionPoint(NamedTuple):
     """The statement after which the robot is attached, what attaches it, and the import's."""
 
     after: ast.stmt
@@ -140,7 +116,7 @@ def is_plain_robot(controller: Path) -> bool:
         files += [each for each in _imported(module, file, controller) if each not in files]
         del files[_MOST_MODULES:]
         made |= _classes_used(list(ast.walk(module)))
-    return made == {_PLAIN}
+    return made == {"Robot"}  # the class without a supervisor's calls
 
 
 def _classes_used(nodes: list[ast.AST]) -> set[str]:
@@ -237,7 +213,7 @@ def _parsed(source: bytes) -> ast.Module:
         raise InvalidInputError(f"it is no Python that can be read: {error}") from error
 
 
-def _place(module: ast.Module) -> _Place:
+def _place(module: ast.Module) -> _InsertionPoint:
     """Where the robot is attached: after its constructor, or after it was assigned to a name."""
     nodes = list(ast.walk(module))
     _refuse_bridge(nodes)
@@ -273,7 +249,7 @@ def _place(module: ast.Module) -> _Place:
         raise InvalidInputError(
             f"the module controller is imported inside the block of line {imported.lineno}"
         )
-    return _Place(after, f"{_BRIDGE}.attach({attach})", imported)
+    return _InsertionPoint(after, f"{_BRIDGE}.attach({attach})", imported)
 
 
 def _refuse_bridge(nodes: list[ast.AST]) -> None:
@@ -422,7 +398,7 @@ def _dotted(node: ast.AST) -> str | None:
 
 def _split(source: bytes) -> list[bytes]:
     """Lines as Python counts them, with their ends."""
-    return [line for line in _LINES.findall(source) if line]
+    return [line for line in re.findall(rb"[^\r\n]*(?:\r\n|\r|\n|\Z)", source) if line]
 
 
 def _insert(lines: list[bytes], after: int, line: bytes) -> None:
@@ -435,7 +411,7 @@ def _insert(lines: list[bytes], after: int, line: bytes) -> None:
     lines.insert(after, line + ending)
 
 
-def _indented(lines: list[bytes], place: _Place, encoding: str) -> bytes:
+def _indented(lines: list[bytes], place: _InsertionPoint, encoding: str) -> bytes:
     """What attaches the robot, indented as the statement before it.
 
     Raises:
@@ -468,166 +444,3 @@ def _is_proven(before: ast.Module, patched: bytes, attach: str) -> bool:
         return ast.dump(Without().visit(_parsed(patched))) == ast.dump(before)
     except (InvalidInputError, RecursionError):
         return False
-
-
-# -- the observer in a world ----------------------------------------------------------------------
-
-
-def with_observer(world: bytes, *, extern: bool = False) -> bytes:
-    """The world with an observer at its end; unchanged where it has one.
-
-    Args:
-        world: What its file holds.
-        extern: Its controller is started by a person, as by `webots-mcp observe`.
-
-    Raises:
-        InvalidInputError: It is no world of Webots.
-    """
-    if _find(world) is not None:
-        return world
-    robot = _ROBOT.format(name=OBSERVER_NAME, controller="<extern>" if extern else OBSERVER_NAME)
-    ending = b"\r\n" if b"\r\n" in world else b"\n"
-    gap = b"" if world.endswith((b"\n", b"\r")) else ending
-    return world + gap + robot.encode().replace(b"\n", ending)
-
-
-def without_observer(world: bytes) -> bytes:
-    """The world without its observer, wherever it stands and whatever Webots has made of it.
-
-    Raises:
-        InvalidInputError: It is no world of Webots, or has no observer.
-    """
-    found = _find(world)
-    if found is None:
-        raise InvalidInputError(f"there is no robot {OBSERVER_NAME!r} at the top of this world")
-    start, end = found
-    rest = world[end:]
-    line_end = re.match(rb"[ \t]*(\r\n|\n|\r)?", rest)
-    return world[:start] + rest[line_end.end() if line_end else 0 :]
-
-
-def has_observer(world: bytes) -> bool:
-    """Whether an observer stands at the top of a world."""
-    return world.startswith(_HEADER) and _find(world) is not None
-
-
-def copy_of(world: Path) -> Path:
-    """Where the copy with the observer belongs: next to the world, which finds its files there."""
-    return world.with_name(f"{world.stem}{COPY_SUFFIX}{world.suffix}")
-
-
-def world_change(world: Path, *, in_place: bool, extern: bool) -> FileChange:
-    """What is to be written so that a world has an observer.
-
-    Raises:
-        InvalidInputError: It is no world, or has an observer already and is to be copied.
-        OSError: It cannot be read.
-    """
-    before = read(world)
-    if before is None or world.suffix != ".wbt":
-        raise InvalidInputError(f"there is no world {world}: give a .wbt file")
-    if in_place:
-        return FileChange(world, before, with_observer(before, extern=extern))
-    if has_observer(before):
-        raise InvalidInputError(f"{world} has an observer already: open it, or give another world")
-    copy = copy_of(world)
-    return FileChange(copy, read(copy), with_observer(before, extern=extern))
-
-
-def undo(world: Path) -> FileChange | None:
-    """What is to be written so that a world has none; None where the file is a copy to delete.
-
-    Raises:
-        InvalidInputError: It has no observer.
-        CommandRefusedError: It is a copy in which something else was changed too.
-        OSError: It cannot be read.
-    """
-    held = read(world)
-    if held is None:
-        raise InvalidInputError(f"there is no file {world}")
-    without = without_observer(held)
-    if not world.stem.endswith(COPY_SUFFIX):
-        return FileChange(world, held, without)
-    source = world.with_name(f"{world.stem.removesuffix(COPY_SUFFIX)}{world.suffix}")
-    if read(source) not in (without, without.rstrip(b"\r\n")):
-        raise CommandRefusedError(
-            f"{world} differs from {source.name} in more than the observer: delete it by hand if "
-            "nothing in it is needed"
-        )
-    return None
-
-
-def controller_change(project: Path) -> FileChange:
-    """What is to be written so that the project has the observer's controller.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    file = _controller_of(project)
-    return FileChange(file, read(file), CONTROLLER)
-
-
-def python_change(controller: Path, python: str) -> FileChange:
-    """What is to be written so that Webots starts the observer's controller with that Python.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    file = controller.with_name("runtime.ini")
-    return FileChange(file, read(file), _runtime(python))
-
-
-def unused_controller(project: Path, python: str) -> list[Path]:
-    """The observer's files that no world of the project needs, as far as we have written them.
-
-    Raises:
-        OSError: They cannot be read.
-    """
-    worlds = (project / "worlds").rglob("*.wbt")
-    if any(f'"{OBSERVER_NAME}"'.encode() in world.read_bytes() for world in worlds):
-        return []
-    file = _controller_of(project)
-    ours = {file: CONTROLLER, file.with_name("runtime.ini"): _runtime(python)}
-    return [each for each, content in ours.items() if read(each) == content]
-
-
-def _runtime(python: str) -> bytes:
-    return f"[python]\nCOMMAND = {python}\n".encode()
-
-
-def _controller_of(project: Path) -> Path:
-    return project / "controllers" / OBSERVER_NAME / f"{OBSERVER_NAME}.py"
-
-
-def _find(world: bytes) -> tuple[int, int] | None:
-    """Where the observer's node begins and ends."""
-    if not world.startswith(_HEADER):
-        raise InvalidInputError("it is no world of Webots, which begins with '#VRML_SIM R2025a'")
-    for start, end, name in _robots(world):
-        if name == OBSERVER_NAME.encode():
-            return start, end
-    return None
-
-
-def _robots(world: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """The Robot nodes at the top of a world: where each begins and ends, and its name."""
-    depth, start, name = 0, 0, b""
-    before: list[re.Match[bytes]] = []  # the words at this place of the top
-    last = b""
-    for token in _TOKEN.finditer(world):
-        word = token[0]
-        if word.startswith(b"#"):
-            continue
-        if word in (b"}", b"]"):
-            depth -= 1
-            if depth == 0 and before and before[-1][0] == b"Robot":
-                yield start, token.end(), name
-            if depth == 0:
-                before, name = [], b""
-        elif depth == 0 and word not in (b"{", b"["):
-            before = [*before, token][-3:]
-            start = before[0].start() if before[0][0] == b"DEF" else token.start()
-        if depth == 1 and last == b"name" and word.startswith(b'"'):
-            name = word[1:-1]
-        depth += word in (b"{", b"[")
-        last = word

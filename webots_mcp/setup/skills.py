@@ -19,10 +19,9 @@ _BEGIN: Final = "<!-- webots-mcp: its lines begin here -->"
 _END: Final = "<!-- webots-mcp {}: updated by 'webots-mcp init --skills' until you change it -->\n"
 _OURS: Final = r"(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->(?:\r?\n)?{}"
 _KEPT: Final = "it is kept, as you wrote or changed it: remove {} to get that of this version"
-_PAGE: Final = re.compile(r"---\nname: (\S+)\ndescription: (.+?\.) ")
 
 
-class Part(NamedTuple):
+class ManagedText(NamedTuple):
     """A text of ours in a file of the project: the whole file, or some lines of it."""
 
     file: Path
@@ -61,20 +60,20 @@ def skill_files() -> list[Path]:
     return sorted(PLUGIN.glob("skills/*/SKILL.md"))
 
 
-def parts_of(project: Path) -> Iterator[Part]:
+def managed_texts(project: Path) -> Iterator[ManagedText]:
     """What a project gets: each skill, and the lines that name them for clients without skills."""
     lines = list[str]()
     for page in skill_files():
         text = page.read_text("utf-8")
         place = Path(".claude", "skills", page.parent.name, page.name)
-        yield Part(project / place, text, is_whole=True)
-        if named := _PAGE.match(text):
+        yield ManagedText(project / place, text, is_whole=True)
+        if named := re.match(r"---\nname: (\S+)\ndescription: (.+?\.) ", text):
             lines.append(f"- `{place.as_posix()}`: {named[2]}\n")
     head = (
         "## Webots\n\nThe MCP server `webots` and the command `webots-mcp` read what the robots of "
         "this project record,\nand steer the simulation. Before you do one of these, read its page:"
     )
-    yield Part(project / "AGENTS.md", f"{head}\n\n{''.join(lines)}", is_whole=False)
+    yield ManagedText(project / "AGENTS.md", f"{head}\n\n{''.join(lines)}", is_whole=False)
 
 
 def _digest(text: str) -> str:

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import PROJECT_DATA_FOLDER
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.installations import installations
 
 WAY_OUT: Final = (
     "keep the recording on a local disk of the side where Webots runs (--data-dir), and let the "
@@ -27,7 +27,6 @@ WAY_OUT: Final = (
 )
 _PROC_VERSION: Final = Path("/proc/version")
 _DRIVE: Final = re.compile(r"[A-Za-z]:\\")
-_PATIENCE_S: Final = 30  # PowerShell takes seconds to start the first time
 
 
 class Windows(NamedTuple):
@@ -123,7 +122,12 @@ def windows_server(project: Path) -> tuple[list[str] | None, str | None]:
 def _answer(*command: str) -> str:
     try:
         ended = subprocess.run(
-            command, capture_output=True, timeout=_PATIENCE_S, check=True, stdin=subprocess.DEVNULL
+            # PowerShell takes seconds to start the first time.
+            command,
+            capture_output=True,
+            timeout=30,
+            check=True,
+            stdin=subprocess.DEVNULL,
         )
     except (OSError, subprocess.SubprocessError) as error:
         raise CommandRefusedError(

@@ -13,19 +13,15 @@ from webots_mcp.database.connection import transaction
 from webots_mcp.database.files import full_path
 from webots_mcp.database.location import find_project, require_world_of
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
-from webots_mcp.simulator.console import as_row
+from webots_mcp.simulator.console_lines import as_row
 from webots_mcp.simulator.orders import WebotsAddress, WebotsLine, address_of
 from webots_mcp.simulator.project import controllers_in, has_bridge
 from webots_mcp.simulator.starting import LaunchedWebots, Show, Start
 from webots_mcp.store.logs import ConsoleRows
 from webots_mcp.store.recording import RecordingAccess
 
-_SHOWN_LINES: Final = 3
 _EXTERN: Final = "<extern>"
 _NOBODYS: Final = (_EXTERN, "<none>", "<generic>", "void")
-_NO_NEWS: Final = ("INFO:", "DEBUG:")
-_TROUBLE: Final = re.compile(r"^(WARNING|ERROR):|\b\w*(Error|Exception)\b")
-_NEWEST: Final = "SELECT coalesce(max(id), 0) FROM session"
 _SINCE: Final = (
     "SELECT robot.name, s.pid, s.instance, "
     "(SELECT min(id) FROM run WHERE session_id = s.id "
@@ -88,7 +84,7 @@ class SessionStart(NamedTuple):
     world: str | None
 
 
-class Launch:
+class WebotsLaunch:
     """A Webots that we have started, and what is recorded in it.
 
     Args:
@@ -159,15 +155,15 @@ class Launch:
         elif self.start.mode == "pause":
             reasons.append("it begins paused: controllers are started when it is played")
         if printed:
-            reasons.append(f"its console has: {' | '.join(printed[-_SHOWN_LINES:])}")
+            reasons.append(f"its console has: {' | '.join(printed[-3:])}")
         return reasons
 
 
 def _is_problem(line: WebotsLine) -> bool:
     """Whether a line is from stderr, or looks so: `xvfb-run` may mix both streams."""
     if line.stream == "stderr":
-        return bool(line.text.strip()) and not line.text.startswith(_NO_NEWS)
-    return bool(_TROUBLE.search(line.text))
+        return bool(line.text.strip()) and not line.text.startswith(("INFO:", "DEBUG:"))
+    return bool(re.search(r"^(WARNING|ERROR):|\b\w*(Error|Exception)\b", line.text))
 
 
 def why_silent(
@@ -205,7 +201,9 @@ def why_silent(
 
 def newest_in(recording: RecordingAccess) -> int:
     """The newest session of a recording; 0 where there is none yet."""
-    return next((newest for (newest,) in _read(recording, _NEWEST)), 0)
+    return next(
+        (newest for (newest,) in _read(recording, "SELECT coalesce(max(id), 0) FROM session")), 0
+    )
 
 
 def starts_since(recording: RecordingAccess, session: int) -> list[SessionStart]:

@@ -1,22 +1,16 @@
-"""Orders for a Webots that runs: by its WebSocket, and as the last resort by its keys.
+"""Orders for a running Webots, over its WebSocket.
 
-Its WebSocket listens at the port of `--port` in every Webots. Webots carries out orders only where
-it was started with `--stream`; its console it sends to every client. This module never sends the
-bare words `w3d` and `x3d`, which pause the simulation at its next step.
-
-The keys are those of Webots' menu actions in R2023b to R2025a, with Command in place of Ctrl on
-macOS. They go to the window of one Webots, or nowhere.
+Every Webots listens at the port of `--port`. It carries out orders only if it was started with
+`--stream`; its console it sends to every client. This module never sends the bare words `w3d` and
+`x3d`, which pause the simulation at its next step.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
@@ -27,15 +21,9 @@ if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
-
 MAX_MESSAGE_BYTES: Final = 4 << 20
 ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
 _CLOSING_S: Final = 0.2
-_LOOK_S: Final = 0.02  # whether the ping was answered
-# A robot of this name need not exist: asking for a window begins the logs for this client.
-_BEGIN_CONSOLE: Final = "robot:" + json.dumps(
-    {"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":")
-)
 # What is sent, and how what comes back begins. The time in ms is a limit; negative: none.
 _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "pause": ("pause", ("pause",)),  # "paused by client", and "pause: <ms>" to the others
@@ -46,17 +34,7 @@ _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "reload": ("reload", ("delete world", "loading:", "world:", "scene load completed")),
 }
 _SAID_TO_ALL: Final = ("stdout:", "stderr:", "robot")  # also without --stream
-_LONGEST_WORDS: Final = 200
-_LONGEST_OTHER: Final = 60
 RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
-_PRESSING_TIMEOUT_S: Final = 10.0
-_ON_MACOS: Final = (
-    "allow the program that runs this under System Settings, Privacy & Security, Accessibility"
-)
-_ON_WINDOWS: Final = (
-    "it needs exactly one window of Webots, and Windows' leave to bring it to the front"
-)
-_TITLE: Final = "Webots R20"  # "<world> (<project>) - Webots R2023b"
 
 
 class WebotsAddress(NamedTuple):
@@ -224,12 +202,12 @@ def _give(
         pong = stream.ping()
         is_alive = False
         while (now_s := time.monotonic()) < until_s:
-            message = stream.receive(min(until_s, now_s + _LOOK_S))
-            line = message.text.partition("\n")[0][:_LONGEST_WORDS] if message else ""
+            message = stream.receive(min(until_s, now_s + 0.02))
+            line = message.text.partition("\n")[0][:200] if message else ""
             if message and line.startswith(answers):
                 return OrderReply(line, is_alive=True)
             if message and not line.startswith(_SAID_TO_ALL):
-                other = other or line[:_LONGEST_OTHER]
+                other = other or line[:60]
             if pong.is_set() and not is_alive:
                 is_alive = True
                 if not late:
@@ -258,7 +236,10 @@ def why_not_obeyed(address: WebotsAddress, reply: OrderReply) -> str:
 
 def begin_console(stream: Stream) -> None:
     """Have Webots send its console to all its clients, from the first line not sent yet."""
-    stream.send(_BEGIN_CONSOLE)
+    stream.send(
+        "robot:"
+        + json.dumps({"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":"))
+    )
 
 
 def console_lines(text: str) -> Iterator[WebotsLine]:
@@ -279,137 +260,3 @@ def console_lines(text: str) -> Iterator[WebotsLine]:
 
 def _left_s(until_s: float) -> float:
     return max(until_s - time.monotonic(), 0.001)
-
-
-class Key(NamedTuple):
-    """What is pressed together with Ctrl, or Command."""
-
-    name: str
-    shift: bool = False
-
-    @property
-    def spoken(self) -> str:
-        """As a person reads it."""
-        return f"Ctrl+{'Shift+' * self.shift}{self.name.upper()}"
-
-
-KEYS: Final[dict[Order, Key]] = {
-    "pause": Key("0"),
-    "step": Key("1"),
-    "resume": Key("2"),
-    "fast": Key("3"),
-    "reset": Key("t", shift=True),
-    "reload": Key("r", shift=True),
-}
-
-
-def press(order: Order, pid: int | None, platform: str = sys.platform) -> None:
-    """Press the keys of an order in Webots' window.
-
-    Args:
-        order: What Webots is to do.
-        pid: The process of the wanted Webots; None where there can be only one.
-        platform: As `sys.platform` names it.
-
-    Raises:
-        CommandRefusedError: The window was not found, the keys could not be sent, or how that
-                is done on this platform is not known.
-    """
-    key = KEYS[order]
-    try:
-        if platform == "linux":
-            _press_in_x11(key, pid)
-        elif platform == "darwin":
-            _run(macos_command(key, pid), _ON_MACOS)
-        elif platform == "win32":
-            _run(windows_command(key, pid), _ON_WINDOWS)
-        else:
-            raise CommandRefusedError(f"no way to press keys on {platform!r} is known")
-    except CommandRefusedError as error:
-        raise CommandRefusedError(f"{error}; or press {key.spoken} in Webots yourself") from error
-
-
-def macos_command(key: Key, pid: int | None) -> list[str]:
-    """The command that presses a key on macOS, in the window of that process."""
-    of_pid = (
-        'tell application "System Events" to set frontmost of '
-        f"(first process whose unix id is {pid}) to true"
-    )
-    held = "{command down, shift down}" if key.shift else "{command down}"
-    script = (
-        'tell application "Webots" to activate' if pid is None else of_pid,
-        "delay 0.3",
-        f'tell application "System Events" to keystroke "{key.name}" using {held}',
-    )
-    return ["osascript", *(part for line in script for part in ("-e", line))]
-
-
-def windows_command(key: Key, pid: int | None) -> list[str]:
-    """The command that presses a key on Windows; its exit code is 3 where no one window is it."""
-    wanted = f"$_.MainWindowTitle -like '*{_TITLE}*'" + (f" -and $_.Id -eq {pid}" if pid else "")
-    script = (
-        f"$found = @(Get-Process | Where-Object {{ {wanted} }}); "
-        "if ($found.Count -ne 1) { exit 3 }; "
-        "$shell = New-Object -ComObject WScript.Shell; "
-        "if (-not $shell.AppActivate($found[0].Id)) { exit 4 }; "
-        "Start-Sleep -Milliseconds 300; "
-        f"$shell.SendKeys('^{'+' * key.shift}{key.name}')"
-    )
-    return ["powershell", "-NoProfile", "-NonInteractive", "-Command", script]
-
-
-def _press_in_x11(key: Key, pid: int | None) -> None:
-    window = _x11_window(pid)
-    keys = f"ctrl+{'shift+' * key.shift}{key.name}"
-    to_front = _attempt(["xdotool", "windowactivate", "--sync", window])
-    if to_front.returncode:  # there is no window manager
-        _run(["xdotool", "windowfocus", "--sync", window], "its window cannot have the focus")
-    _run(["xdotool", "key", "--clearmodifiers", keys], "the X server did not take the keys")
-
-
-def _x11_window(pid: int | None) -> str:
-    """The only window of Webots, of that process where windows have a process id.
-
-    Raises:
-        CommandRefusedError: There is none, or it is not clear which of several.
-    """
-    found = _attempt(["xdotool", "search", "--onlyvisible", "--name", f" - {_TITLE}"])
-    windows = found.stdout.split()
-    found = [each for each in windows if pid is None or _owner(each) in (pid, None)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise CommandRefusedError(f"{len(found)} windows could be that of the wanted Webots")
-    where = f"on the display {os.environ.get('DISPLAY') or '(DISPLAY is not set)'}"
-    if os.environ.get("WAYLAND_DISPLAY"):
-        where += "; this is a Wayland session, which hides windows from xdotool"
-    raise CommandRefusedError(f"no window of Webots was found {where}")
-
-
-def _owner(window: str) -> int | None:
-    printed = _attempt(["xdotool", "getwindowpid", window]).stdout.strip()
-    return int(printed) if printed.isdecimal() else None
-
-
-def _run(command: Sequence[str], advice: str) -> None:
-    ended = _attempt(command)
-    if ended.returncode:
-        reason = ended.stderr.strip()[:300] or f"exit code {ended.returncode}"
-        raise CommandRefusedError(f"{command[0]} did not press the keys ({reason}): {advice}")
-
-
-def _attempt(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    try:
-        return subprocess.run(
-            command,
-            check=False,
-            capture_output=True,
-            text=True,
-            stdin=subprocess.DEVNULL,
-            timeout=_PRESSING_TIMEOUT_S,
-        )
-    except FileNotFoundError as error:
-        install = " (apt install xdotool)" if command[0] == "xdotool" else ""
-        raise CommandRefusedError(f"the program {command[0]} is not there{install}") from error
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise CommandRefusedError(f"{command[0]} could not be run: {error}") from error

@@ -22,20 +22,17 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import quoted
 
 _PYTHON: Final = "Python"
-_BRIDGE: Final = b"MCPBridge"
 # Of a world file: strings and names; a comment is neither, and hides what is in it.
 _WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
 # By language: how the files of a controller end that are built before Webots starts it.
 _SOURCES: Final = {"C": (".c",), "C++": (".cpp", ".cc", ".cxx"), "Java": (".java",)}
 _ALL_SOURCES: Final = (".c", ".cpp", ".cc", ".cxx", ".java", ".m", ".h", ".hpp", ".hh")
-_WRITES: Final = re.compile(rb"webots_mcp\.h|setCustomData|wb_robot_set_custom_data")
 _CALLS: Final = {
     "C": 'wb_robot_set_custom_data("{...}")',
     "C++": 'robot->setCustomData("{...}")',
     "Java": 'robot.setCustomData("{...}")',
     "MATLAB": "wb_robot_set_custom_data('{...}')",
 }
-_HEADER: Final = "include webots_mcp.h ('webots-mcp header' writes it), or "
 _ONE_LINE: Final = (
     "write its values as JSON with {} in each step: an observer ('webots-mcp init --observer "
     "WORLD') records them; see docs/any-language.md"
@@ -62,7 +59,11 @@ class ProjectController(NamedTuple):
     @property
     def advice(self) -> str:
         """How it is recorded, where the bridge cannot be used in it."""
-        header = _HEADER if self.language in ("C", "C++") else ""
+        header = (
+            "include webots_mcp.h ('webots-mcp header' writes it), or "
+            if self.language in ("C", "C++")
+            else ""
+        )
         call = _CALLS.get(self.language, _CALLS["C"])
         return f"{header}{_ONE_LINE.format(call)}"
 
@@ -137,14 +138,17 @@ def _source(folder: Path) -> ProjectController | None:
 
 def has_bridge(controller: Path) -> bool:
     """Whether a file of a controller's folder speaks of the bridge."""
-    return any(_BRIDGE in file.read_bytes() for file in sorted(controller.glob("*.py")))
+    return any(b"MCPBridge" in file.read_bytes() for file in sorted(controller.glob("*.py")))
 
 
 def writes_states(controller: ProjectController) -> bool:
     """Whether a controller in another language says what it does: by our header, or customData."""
     folder = controller.file.parent
     files = [each for each in folder.rglob("*.*") if each.suffix in _ALL_SOURCES]
-    return any(_WRITES.search(each.read_bytes()) for each in files)
+    return any(
+        re.search(rb"webots_mcp\.h|setCustomData|wb_robot_set_custom_data", each.read_bytes())
+        for each in files
+    )
 
 
 def has_observer(project: Path) -> bool:

@@ -24,7 +24,8 @@ from typing import IO, TYPE_CHECKING, Final, Literal, NamedTuple
 from webots_mcp.database.liveness import process_alive
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator import program_keeper
-from webots_mcp.simulator.instances import DEFAULT_PORT, Instance, find_webots, instances
+from webots_mcp.simulator.installations import find_webots
+from webots_mcp.simulator.instances import DEFAULT_PORT, Instance, instances
 from webots_mcp.simulator.orders import WebotsAddress, WebotsLine
 
 if TYPE_CHECKING:
@@ -32,16 +33,9 @@ if TYPE_CHECKING:
 
 Mode = Literal["pause", "realtime", "fast"]
 Show = Callable[[WebotsLine], None]
-
-_HEADLESS: Final = ("--no-rendering", "--minimize")
-_LAST_PORT: Final = (1 << 16) - 1
 _HARD: Final = signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL
 # Ctrl-C in a Windows console must reach this process only; elsewhere a new session ensures that.
 _GROUP_OF_ITS_OWN: Final = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-_KEPT_LINES: Final = 200
-_LOOK_EVERY_S: Final = 0.5  # at all processes of this machine
-_OUTPUT_WAIT_S: Final = 1.0  # a child that outlives it may hold its output open
-_KEEP_LAYOUT: Final = "WEBOTS_DISABLE_SAVE_SCREEN_PERSPECTIVE_ON_CLOSE"
 
 
 class CommandLine(NamedTuple):
@@ -78,7 +72,7 @@ class Start:
             "--stderr",
             f"--port={self.port}",
             *([f"--mode={self.mode}"] if self.mode else []),
-            *(_HEADLESS if self.headless else ()),
+            *(("--no-rendering", "--minimize") if self.headless else ()),
             *(["--stream"] if self.streams else []),
         ]
 
@@ -98,7 +92,7 @@ def free_port(first: int = DEFAULT_PORT) -> int:
     Raises:
         CommandRefusedError: All are taken.
     """
-    for port in range(first, _LAST_PORT + 1):
+    for port in range(first, 1 << 16):
         if _is_free(port):
             return port
     raise CommandRefusedError(f"no port from {first} on is free")
@@ -205,11 +199,13 @@ class LaunchedWebots(KeptProgram):
     """
 
     def __init__(self, start: Start, environment: Mapping[str, str], show: Show) -> None:
-        unseen = {_KEEP_LAYOUT: "1"} if start.headless else {}  # the window's layout stays as it is
+        unseen = (
+            {"WEBOTS_DISABLE_SAVE_SCREEN_PERSPECTIVE_ON_CLOSE": "1"} if start.headless else {}
+        )  # the window's layout stays as it is
         command = start.command_line()
         super().__init__(command, {**unseen, **environment}, subprocess.PIPE, subprocess.PIPE)
         self._show = show
-        self._lines = deque[WebotsLine](maxlen=_KEPT_LINES)
+        self._lines = deque[WebotsLine](maxlen=200)
         self._instance: Instance | None = None
         self._look_again_s = 0.0
         self._readers = [
@@ -228,7 +224,7 @@ class LaunchedWebots(KeptProgram):
     def instance(self) -> Instance | None:
         """The instance as the system shows it; None before it listens, or where it is not shown."""
         if self._instance is None and time.monotonic() > self._look_again_s:
-            self._look_again_s = time.monotonic() + _LOOK_EVERY_S
+            self._look_again_s = time.monotonic() + 0.5
             pids = self.pids
             found = (each for each in instances() if each.is_listening and each.pid in pids)
             self._instance = next(found, None)
@@ -262,7 +258,7 @@ class LaunchedWebots(KeptProgram):
     def wait_for_output(self) -> None:
         """Wait until all lines of a Webots that is over were shown."""
         for reader in self._readers:
-            reader.join(_OUTPUT_WAIT_S)
+            reader.join(1.0)  # a child that outlives it may hold its output open
 
     def _read(self, name: str, pipe: IO[bytes]) -> None:
         with pipe:

@@ -20,10 +20,7 @@ from webots_mcp.signals.naming import harmless_first
 
 Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000
-_MOST_SEED: Final = 2**63
-_STEPS_TOLERANCE: Final = 1e-9
 _GRID: Final = "grid"
-_REQUIRED: Final = ("world", "score")
 _NUMBER: Final = (int, float)
 _RANGE_KINDS: Final[dict[str, Any]] = {
     "low": _NUMBER, "high": _NUMBER, "step": _NUMBER, "log": bool, "choices": list,
@@ -38,7 +35,7 @@ _HOW_MANY: Final = "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or 
 
 
 @dataclass(frozen=True)
-class Range:
+class ParameterRange:
     """What may be tried of one parameter: the numbers of a range, or one of some choices.
 
     Attributes:
@@ -87,7 +84,7 @@ class Range:
         if self.log and not (self.is_whole and step == 1):
             raise InvalidInputError("log and step go together only as whole numbers with step = 1")
         steps = round((high - low) / step)
-        if steps < 1 or not math.isclose(low + steps * step, high, rel_tol=_STEPS_TOLERANCE):
+        if steps < 1 or not math.isclose(low + steps * step, high, rel_tol=1e-9):
             raise InvalidInputError(f"high={high} must be a number of steps={step} above low={low}")
 
 
@@ -120,7 +117,7 @@ class TrialPlan:
     robot: str | None = None
     timeout_s: float = 300.0
     prune: str | None = None
-    ranges: dict[str, Range] = field(default_factory=dict[str, Range])
+    ranges: dict[str, ParameterRange] = field(default_factory=dict[str, ParameterRange])
     search: Search | None = None
     sets: int = 0
     seed: int = 0
@@ -159,7 +156,7 @@ class TrialPlan:
             )
         if self.sets < 1:
             raise InvalidInputError("sets is missing: how many sets are to be searched for?")
-        if not 0 <= self.seed < _MOST_SEED:
+        if not 0 <= self.seed < (2**63):
             raise InvalidInputError(f"seed={self.seed} must be 0 or more, and less than 2**63")
 
     @property
@@ -230,7 +227,7 @@ def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Worl
     if _GRID in found:
         found = found | {"parameters": combinations(found[_GRID], "[grid] ")}
     found = {name: value for name, value in found.items() if name != _GRID}
-    for name in _REQUIRED:
+    for name in ("world", "score"):
         if name not in found:
             raise InvalidInputError(f"{name} is missing")
     if "ranges" in found:
@@ -268,7 +265,7 @@ def _require_tables(parameters: list[Any]) -> None:
         raise InvalidInputError("the same parameters are given twice: use repeats")
 
 
-def _read_ranges(tables: dict[str, Any]) -> dict[str, Range]:
+def _read_ranges(tables: dict[str, Any]) -> dict[str, ParameterRange]:
     """The ranges of `[ranges]` in a plan.
 
     Raises:
@@ -279,13 +276,13 @@ def _read_ranges(tables: dict[str, Any]) -> dict[str, Range]:
     return {name: _range_of(name, table) for name, table in tables.items()}
 
 
-def _range_of(name: str, table: Any) -> Range:
+def _range_of(name: str, table: Any) -> ParameterRange:
     try:
         if not isinstance(table, dict):
             raise InvalidInputError("write { low = 0.5, high = 10.0 } or { choices = [...] }")
         found = cast("dict[str, Any]", table)
         _require_kinds(found, _RANGE_KINDS)
-        return Range(**found)
+        return ParameterRange(**found)
     except InvalidInputError as error:
         raise InvalidInputError(f"[ranges] {name}: {error}") from error
 
@@ -306,7 +303,7 @@ def _require_kinds(table: dict[str, Any], kinds: Mapping[str, Any]) -> None:
             raise InvalidInputError(f"{key}={value!r} is a {type(value).__name__}")
 
 
-def _as_plain(ranges: dict[str, Range]) -> dict[str, Any]:
+def _as_plain(ranges: dict[str, ParameterRange]) -> dict[str, Any]:
     """In JSON's terms, without what is not given."""
     return {
         name: {key: value for key, value in asdict(each).items() if value not in (None, False)}

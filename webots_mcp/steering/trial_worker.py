@@ -14,17 +14,15 @@ import threading
 import time
 from collections.abc import Mapping
 from contextvars import copy_context
+from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.database.queue import Command, CommandQueue, fetch_command, find_command
+from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.judging.run_score import score_run
-from webots_mcp.steering.dispatch import (
-    ACTION,
-    BLOCK_NOTICED_S,
-    find_target,
-    withdraw_if_blocked,
-)
+from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, withdraw_if_blocked
+from webots_mcp.steering.run_command import ACTION
+from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, stored_plan
 from webots_mcp.store.parameters import (
     TrialRecord,
@@ -48,30 +46,33 @@ from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import find_block, robot_name
 
 OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
-_LOOK_EVERY_S: Final = 0.02
-# Long enough that simulation time visibly goes back at the next reset, by which it is detected.
-_SOME_STEPS_S: Final = 0.2
-_SETTLE_EVERY_S: Final = 1.0
-_BLOCK_SOUGHT_EVERY_S: Final = 0.25  # whether something keeps the loop from a command
-_PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
-_END_PATIENCE_S: Final = 2.0  # the same where the server ends
-_ASKER: Final = "trials"
-_SET_PARAMETERS: Final = "set_parameters"
-_ENDS: Final = {"condition held": "until", "simulation time reached": "for_s", "pruned": "prune"}
-_RUN_OF: Final = (
-    "SELECT min(id) FROM run WHERE session_id = ? AND started_wall_time_s >= "
-    "(SELECT claimed_wall_time_s FROM command WHERE id = ?)"
-)
-# Rows may follow the last heartbeat.
-_REACHED: Final = (
-    "SELECT max(last_sim_time_s, coalesce((SELECT max(sim_time_s) FROM state WHERE run_id = run.id)"
-    ", last_sim_time_s)) FROM run WHERE id = ?"
-)
-_HANGS: Final = (
-    "the loop of robot {!r} does not call bridge.get_command() any more: check what it is waiting "
-    "for, or restart its controller"
-)
 
+
+@dataclass(frozen=True)
+class TrialTimes:
+    """Times of working on trials, in seconds of wall time unless stated otherwise.
+
+    Attributes:
+        poll_s: Between two reads of a command.
+        settle_s: Between two rounds of taking in rows that wait in files.
+        block_search_s: Between two searches for what keeps the loop from a command.
+        patience_s: For a command that takes a round of the loop.
+        end_patience_s: The same when the server ends.
+        new_run_sim_s: Simulation time of the run after the last trial: long enough that time
+            visibly goes back at the next reset, by which a reset is detected.
+    """
+
+    poll_s: float = 0.02
+    settle_s: float = 1.0
+    block_search_s: float = 0.25
+    patience_s: float = 5.0
+    end_patience_s: float = 2.0
+    new_run_sim_s: float = 0.2
+
+
+_TIMES: Final = TrialTimes()
+_ASKER: Final = "trials"
+_ENDS: Final = {"condition held": "until", "simulation time reached": "for_s", "pruned": "prune"}
 _log = logging.getLogger(__name__)
 
 
@@ -105,7 +106,7 @@ class TrialWorker(threading.Thread):
     def stop(self) -> None:
         """End the running trial, which will be run again later, and leave the set as it is."""
         self._stopping.set()
-        self.join(2 * _END_PATIENCE_S + 1)
+        self.join(2 * _TIMES.end_patience_s + 1)
 
     def run(self) -> None:
         """Run the rest of the set, as long as this thread has the set's lease."""
@@ -153,9 +154,12 @@ class TrialWorker(threading.Thread):
         with self._job.writer() as connection:
             finish_trial(connection, trial, result)
         if not command.is_final:
-            raise CommandRefusedError(_HANGS.format(self._robot))
+            raise CommandRefusedError(
+                f"the loop of robot {self._robot!r} does not call bridge.get_command() any more: "
+                "check what it is waiting for, or restart its controller"
+            )
 
-    def _sent(self, trial: TrialRecord) -> Command:
+    def _sent(self, trial: TrialRecord) -> QueuedCommand:
         """The command that runs a trial; one that was sent already is not sent again."""
         with self._job.writer() as connection:
             known = find_command(connection, _key(trial))
@@ -204,17 +208,19 @@ class TrialWorker(threading.Thread):
             borrow_parameters(connection, self.set_id, view.session.id, former)
         return view
 
-    def _watched(self, command: Command, timeout_s: float) -> Command:
+    def _watched(self, command: QueuedCommand, timeout_s: float) -> QueuedCommand:
         """Wait until the command is final; a run that takes longer is ended."""
         command = self._settled(command.id, timeout_s)
         if not command.is_final:
             self._cancel(command)
-            command = self._settled(command.id, _PATIENCE_S)
+            command = self._settled(command.id, _TIMES.patience_s)
         return command
 
-    def _settled(self, command_id: int, timeout_s: float, *, hurried: bool = False) -> Command:
+    def _settled(
+        self, command_id: int, timeout_s: float, *, hurried: bool = False
+    ) -> QueuedCommand:
         """The command, once it is final or the time is over."""
-        until_s, settle_s = time.monotonic() + timeout_s, time.monotonic() + _SETTLE_EVERY_S
+        until_s, settle_s = time.monotonic() + timeout_s, time.monotonic() + _TIMES.settle_s
         search_s = time.monotonic() + BLOCK_NOTICED_S
         with self._recording.reader() as connection:
             while not (command := fetch_command(connection, command_id)).is_final:
@@ -222,21 +228,21 @@ class TrialWorker(threading.Thread):
                 if now_s >= until_s:
                     break
                 if now_s >= settle_s:
-                    settle_s = now_s + _SETTLE_EVERY_S
+                    settle_s = now_s + _TIMES.settle_s
                     self._recording.settle()
                 if command.status == "pending" and now_s >= search_s:
-                    search_s = now_s + _BLOCK_SOUGHT_EVERY_S
+                    search_s = now_s + _TIMES.block_search_s
                     if withdraw_if_blocked(self._recording, command):
                         continue
                 if hurried:
-                    time.sleep(_LOOK_EVERY_S)
-                elif self._stopping.wait(_LOOK_EVERY_S):
+                    time.sleep(_TIMES.poll_s)
+                elif self._stopping.wait(_TIMES.poll_s):
                     self._cancel(command)
-                    self._settled(command_id, _END_PATIENCE_S, hurried=True)
+                    self._settled(command_id, _TIMES.end_patience_s, hurried=True)
                     raise _StopError
         return command
 
-    def _cancel(self, command: Command) -> None:
+    def _cancel(self, command: QueuedCommand) -> None:
         """Cancel a pending command, or end a running one."""
         with self._job.writer() as connection:
             queue = CommandQueue(connection)
@@ -246,7 +252,7 @@ class TrialWorker(threading.Thread):
 
     # -- results -------------------------------------------------------------------------------
 
-    def _result(self, trial: TrialRecord, command: Command) -> TrialResult:
+    def _result(self, trial: TrialRecord, command: QueuedCommand) -> TrialResult:
         """The result of a trial.
 
         Raises:
@@ -258,7 +264,13 @@ class TrialWorker(threading.Thread):
                 find_target(connection, self._robot, ACTION)  # raises with the reason, if any
             raise CommandRefusedError(f"trial {trial.number} was not run: {command.error}")
         with self._recording.reader() as connection:
-            run_id = connection.execute(_RUN_OF, (command.session_id, command.id)).fetchone()[0]
+            run_id = connection.execute(
+                (
+                    "SELECT min(id) FROM run WHERE session_id = ? AND started_wall_time_s >= "
+                    "(SELECT claimed_wall_time_s FROM command WHERE id = ?)"
+                ),
+                (command.session_id, command.id),
+            ).fetchone()[0]
             if command.status != "done":
                 why = self._too_long if command.status == "claimed" else command.error
                 return TrialResult(run_id, None, f"{_reached(connection, run_id)}: {why}")
@@ -336,7 +348,7 @@ class TrialWorker(threading.Thread):
             return
         with self._job.writer() as connection:
             command = self._ask_back(connection, noted)
-        patience_s = _END_PATIENCE_S if self._stopping.is_set() else _PATIENCE_S
+        patience_s = _TIMES.end_patience_s if self._stopping.is_set() else _TIMES.patience_s
         if command is not None:
             command = self._settled(command.id, patience_s, hurried=True)
         if command is None or command.status == "done":
@@ -347,14 +359,16 @@ class TrialWorker(threading.Thread):
                 f"its parameters were not restored: {command.error or command.status}"
             )
 
-    def _ask_back(self, connection: sqlite3.Connection, noted: TrialSetRecord) -> Command | None:
+    def _ask_back(
+        self, connection: sqlite3.Connection, noted: TrialSetRecord
+    ) -> QueuedCommand | None:
         """The command that restores the parameters; None without any, or without its controller."""
         assert noted.robot_id is not None and noted.former_values is not None
         former = json.loads(noted.former_values)
         if noted.stop_reason is None and not self._stopping.is_set():
             action, params = ACTION, _new_run_with(former)
         elif former:  # no reset: a person may want to see the state that the trial left
-            action, params = _SET_PARAMETERS, {"values": former, "when": "now", "by": "trial"}
+            action, params = "set_parameters", {"values": former, "when": "now", "by": "trial"}
         else:
             return None
         try:
@@ -401,7 +415,7 @@ class TrialWorkers:
 
 def _new_run_with(values: Mapping[str, Any]) -> dict[str, Any]:
     """The `run` parameters that begin a new run, so that the last trial's run does not continue."""
-    return {"for_s": _SOME_STEPS_S, "parameters": values, "by": "trial", **OF_EACH_TRIAL}
+    return {"for_s": _TIMES.new_run_sim_s, "parameters": values, "by": "trial", **OF_EACH_TRIAL}
 
 
 def _key(trial: TrialRecord) -> str:
@@ -434,5 +448,11 @@ def _require_untouched(
 def _reached(connection: sqlite3.Connection, run_id: int | None) -> str:
     if run_id is None:
         return "its run did not start"
-    reached_s = connection.execute(_REACHED, (run_id,)).fetchone()[0]
+    reached_s = connection.execute(
+        # Rows may follow the last heartbeat.
+        "SELECT max(last_sim_time_s, coalesce("
+        "(SELECT max(sim_time_s) FROM state WHERE run_id = run.id), last_sim_time_s)) "
+        "FROM run WHERE id = ?",
+        (run_id,),
+    ).fetchone()[0]
     return f"did not reach its end, only {reached_s:.3f} s"

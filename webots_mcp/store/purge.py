@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import KEPT_FRAME
-from webots_mcp.database.connection import LONGEST_WRITE_S, Step, is_busy
+from webots_mcp.database.connection import LONGEST_WRITE_S, AtomicStatements, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks, remake_if_damaged
 from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force
@@ -49,7 +49,7 @@ _SET_STORED: Final = (  # what others deleted was not counted
     "UPDATE row_group SET stored_row_count = (SELECT count(*) FROM json_each(?) j "
     "CROSS JOIN state s ON s.id = j.value) WHERE id = ?"
 )
-# Many rows go at once, in one statement: see `Step`. What is left in `going` went.
+# Many rows go at once, in one statement: see `AtomicStatements`. What is left in `going` went.
 _GOING: Final = "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
 _NOT_GOING: Final = (
     "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
@@ -89,7 +89,7 @@ _BEFORE_DELETION: Final = {
 }
 _DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
 _STEPS: Final = {
-    table: Step(
+    table: AtomicStatements(
         f"purge_{table}",
         ("group_id",),
         _NOT_GOING.format(table=table, kept=KEPT),

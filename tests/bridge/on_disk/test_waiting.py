@@ -22,8 +22,8 @@ from tests.bridge.conftest import (
 )
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
-from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.database.waiting_file import Entry, WaitingFile
+from webots_mcp.bridge.recorder import ConnectionLock
+from webots_mcp.database.waiting_file import WaitingEntry, WaitingFile
 from webots_mcp.standin import InProcessSupervisor
 
 
@@ -100,13 +100,13 @@ def test_a_row_of_which_the_disk_took_a_part_is_not_in_the_file(tmp_path: Path) 
     import resource
 
     file = WaitingFile(tmp_path / "waiting", lambda: {})
-    file.append([Entry(1, "log", None, ("whole",))])
+    file.append([WaitingEntry(1, "log", None, ("whole",))])
     size = file.path.stat().st_size
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size + 5, limits[1]))
     try:
         with pytest.raises(OSError, match="the disk is full"):
-            file.append([Entry(2, "log", None, ("cut",))])
+            file.append([WaitingEntry(2, "log", None, ("cut",))])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert file.path.stat().st_size == size
@@ -217,11 +217,12 @@ def test_a_signals_handler_that_logs_in_the_middle_of_a_row_deadlocks_nothing(
     bridge: MCPBridge, robot: InProcessSupervisor, filed: Recording
 ) -> None:
     def trace(frame: object, event: str, _: object) -> object:
-        code = getattr(frame, "f_code")  # noqa: B009
-        if code is Recorder._write.__code__ and event == "call":  # pyright: ignore[reportPrivateUsage]
+        if getattr(frame, "f_code") is not ConnectionLock.acquire.__code__:  # noqa: B009
+            return None
+        if event == "return":  # from here on the row has the lock
             sys.settrace(None)
             bridge.log("from within")
-        return None
+        return trace
 
     sys.settrace(trace)  # pyright: ignore[reportArgumentType]
     try:

@@ -16,7 +16,7 @@ from webots_mcp.judging.detection import events
 from webots_mcp.judging.detection.events import find_events, timeline
 from webots_mcp.judging.detection.kinds import Event, EventKind, EventOptions
 from webots_mcp.judging.detection.search import Search
-from webots_mcp.plotting.parts import event_lanes, parts_of
+from webots_mcp.plotting.plotted_runs import event_lanes, plotted_runs
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 
@@ -52,7 +52,7 @@ def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
         each for each in compare_runs(tilting, [1, 2]).measures if each.name == "tilted per min"
     )
     assert [spread and round(spread.median, 1) for spread in measure.spread] == [2.0, 2.0]
-    (part,) = parts_of(tilting, [whole], ["tilt"])
+    (part,) = plotted_runs(tilting, [whole], ["tilt"])
     lanes, _ = event_lanes(tilting, part, ["tilt"])
     assert lanes[0].name == "tilted" and len(lanes[0].intervals) == 2
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from tests.server.conftest import Connect, ask, ask_until, fail
 from tests.server.story import rows_of
 from tests.server.trials.conftest import HANGS_AT, TunableDriver, trials, value_of
 from webots_mcp.database.connection import connect as database
+from webots_mcp.steering import trial_worker
 from webots_mcp.store.retention import KEPT
 
 pytestmark = pytest.mark.anyio
@@ -76,7 +78,7 @@ async def test_a_trial_without_a_score_or_an_end_failed_and_is_not_zero(
 async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
     connect: Connect, tunable: TunableDriver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.steering.trial_worker._PATIENCE_S", 0.1)
+    monkeypatch.setattr(trial_worker, "_TIMES", replace(trial_worker._TIMES, patience_s=0.1))
     async with connect() as client:
         answer = await trials(client, parameters={"kp": [HANGS_AT]}, trial_timeout_wall_s=1)
         (row,) = rows_of(answer["ranked"])

@@ -13,7 +13,7 @@ from tests.server.story import rows_of
 from tests.server.trials.conftest import TunableDriver, trials, value_of
 from tests.waiting import until
 from webots_mcp import MCPBridge
-from webots_mcp.answers.budget import tokens_of
+from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.database.connection import connect as database
 from webots_mcp.standin import InProcessSupervisor
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from webots_mcp.setup.doctor.recording_checks import judge_sqlite
+from webots_mcp.setup.doctor.machine_checks import judge_sqlite
 
 
 @pytest.mark.parametrize(

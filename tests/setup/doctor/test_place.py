@@ -10,7 +10,7 @@ import pytest
 
 from tests import unprivileged
 from tests.setup.doctor.conftest import found
-from webots_mcp.setup.doctor.recording_checks import Mount, judge_file_system
+from webots_mcp.setup.doctor.machine_checks import Mount, judge_file_system
 
 LOCAL = Mount("/", "ext4")
 

@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from tests.simulator.webots_server import WebotsServer
 from tests.waiting import wait_for
 from webots_mcp.contract import host_name
 from webots_mcp.database.liveness import holder_of
-from webots_mcp.simulator import console
+from webots_mcp.simulator import console, console_lines
 from webots_mcp.simulator.console import follow_console, job_of
 from webots_mcp.simulator.instances import Instance
 from webots_mcp.store.recording import RecordingAccess
@@ -59,8 +60,8 @@ def messages(recorded: Recorded, source: str | None = None) -> list[str]:
 @pytest.fixture(autouse=True)
 def at_short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody else records these lines, and nothing has to be spared."""
-    for interval in ("_HOLD_S", "_LOOK_S", "_SHORTEST_PAUSE_S"):
-        monkeypatch.setattr(console, interval, 0.05)
+    short = replace(console._TIMES, hold_s=0.05, receive_s=0.05, min_pause_s=0.05)
+    monkeypatch.setattr(console, "_TIMES", short)
 
 
 @pytest.fixture
@@ -111,7 +112,7 @@ def test_what_controllers_print_and_what_webots_says_become_rows_with_their_sour
 def test_of_what_was_said_before_it_is_told_that_nobody_knows_when(
     recorded: Recorded, follow: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(console, "MOST_OLD_LINES", 2)
+    monkeypatch.setattr(console_lines, "MOST_OLD_LINES", 2)
     with WebotsServer(streams=False) as server:
         begin_run(recorded, server.port)
         for each in range(5):
@@ -207,7 +208,7 @@ def test_who_does_not_answer_is_named_and_asked_again(
     greeting: bytes,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(console, "_CONNECTING_S", 0.3)
+    monkeypatch.setattr(console, "_TIMES", replace(console._TIMES, connecting_s=0.3))
     callers: list[socket.socket] = []
     with socket.create_server(("127.0.0.1", 0)) as door:
 

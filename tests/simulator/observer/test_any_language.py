@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.setup.project_edits import CONTROLLER, with_observer
+from webots_mcp.setup.observer_edits import CONTROLLER, with_observer
 from webots_mcp.standin import Simulation
 
 WORLD = "#VRML_SIM R2025a utf8\nWorldInfo { basicTimeStep 16 }\n" + "".join(

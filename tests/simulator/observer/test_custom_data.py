@@ -12,10 +12,10 @@ from tests.simulator.observer.conftest import OBSERVER, STEP_MS, Watching
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge.custom_data import LONGEST_TEXT, signals_of
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.questions.robot_state import webots_get_world_info
+from webots_mcp.questions.list_robots import webots_get_world_info
 from webots_mcp.setup.doctor import all_checks, diagnose, subject_of
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.steering.dispatch import find_target
+from webots_mcp.steering.target import find_target
 from webots_mcp.store.recording import RecordingAccess
 
 WORLD = """#VRML_SIM R2025a utf8
@@ -73,7 +73,7 @@ class Robots:
 
     def look_for_bridges(self) -> None:
         """As after half a second."""
-        self.watching.observer.custom_data._look_again_s = 0.0  # pyright: ignore[reportPrivateUsage]
+        self.watching.observer.custom_data._check_sessions_s = 0.0  # pyright: ignore[reportPrivateUsage]
 
 
 @pytest.fixture

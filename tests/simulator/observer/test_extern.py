@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.simulator.observer.conftest import CROWD
-from webots_mcp.setup.project_edits import with_observer
+from webots_mcp.setup.observer_edits import with_observer
 from webots_mcp.standin import Simulation
 
 

@@ -19,7 +19,7 @@ from tests.bridge.processes.conftest import PatientSimulation
 from tests.simulator.observer.conftest import STEP_MS, Watching
 from webots_mcp.database.connection import connect
 from webots_mcp.database.pauses import SET_FREE, set_breakpoint
-from webots_mcp.setup.project_edits import with_observer
+from webots_mcp.setup.observer_edits import with_observer
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.standin import InProcessSupervisor
 

@@ -13,8 +13,8 @@ import pytest
 
 from tests.steering.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.questions.run_trials import set_facts
-from webots_mcp.steering.trial_plan import Range, Search, TrialPlan
-from webots_mcp.steering.trial_run import next_parameters
+from webots_mcp.steering.trial_plan import ParameterRange, Search, TrialPlan
+from webots_mcp.steering.trial_search import next_parameters
 from webots_mcp.store.parameters import TrialRecord
 from webots_mcp.store.recording import RecordingAccess
 
@@ -24,7 +24,10 @@ PARAMETERS = "SELECT parameters FROM trial ORDER BY number"
 
 def a_plan(search: Search = "tpe", **more: Any) -> TrialPlan:
     """Of no world: no simulator is started."""
-    ranges: dict[str, Any] = {"kp": Range(0.0, 10.0), "gait": Range(choices=["trot", "walk"])}
+    ranges: dict[str, Any] = {
+        "kp": ParameterRange(0.0, 10.0),
+        "gait": ParameterRange(choices=["trot", "walk"]),
+    }
     given: dict[str, Any] = {"ranges": ranges, "sets": 40, "seed": 7} | more
     return TrialPlan(score="last(x)", for_s=1.0, search=search, **given)
 
@@ -75,6 +78,7 @@ speed = { choices = [1.0, 9.0] }
 """
 
 
+@pytest.mark.slow
 def test_a_search_runs_trials_and_ends_early_what_is_pruned(
     project: Path, plan: Write, run: Run
 ) -> None:
@@ -98,6 +102,7 @@ def test_a_search_runs_trials_and_ends_early_what_is_pruned(
     assert "every other parameter set was pruned" in table
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_search_that_was_killed_goes_on_as_if_it_had_not_been(
     project: Path, plan: Write, run: Run
@@ -195,10 +200,10 @@ def test_a_search_that_is_none_is_refused_before_anything_is_written(
 
 def test_values_keep_to_their_ranges() -> None:
     ranges = {
-        "whole": Range(1, 9, step=2),
-        "half": Range(0.0, 2.0, step=0.5),
-        "log": Range(0.001, 1000.0, log=True),
-        "order": Range(1, 1000, step=1, log=True),
+        "whole": ParameterRange(1, 9, step=2),
+        "half": ParameterRange(0.0, 2.0, step=0.5),
+        "log": ParameterRange(0.001, 1000.0, log=True),
+        "order": ParameterRange(1, 1000, step=1, log=True),
     }
 
     found = [each.values for each in tried(a_plan("random", ranges=ranges), lambda _: 0.0)]

@@ -1,4 +1,4 @@
-"""The command that writes a report, to any file; an assistant's question is in `making`."""
+"""The command that writes a report to any file; the question of assistants is in `making`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from webots_mcp.cli.options import (
     make_chunks_first,
     only_reading,
 )
-from webots_mcp.cli.terminal import print_json, print_notes, printable, shown_progress
+from webots_mcp.cli.streams import shown_progress
+from webots_mcp.cli.terminal import print_json, print_notes, printable
 
 
 @only_reading

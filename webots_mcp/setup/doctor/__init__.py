@@ -29,14 +29,12 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 Verdict = Literal["ok", "warning", "wrong", "not checked"]
-
 _WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not checked", "ok")
 PAGE: Final = "docs/troubleshooting.md"
-_RECOVER: Final = (
-    "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
-)
 # From the controller's machine to the client; within a module the order is that of its functions.
-_IN_ORDER: Final = ("recording_checks", "controller_checks", "webots_checks")
+_IN_ORDER: Final = (
+    "machine_checks", "recording_checks", "controller_checks", "simulation_check", "webots_checks",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -123,19 +121,19 @@ class Examined:
 
 
 @dataclass(frozen=True)
-class Link:
+class Check:
     """A link of the chain.
 
     Attributes:
         name: In one word or a few; the heading of its part of the page.
-        look: Looks at it.
+        run: Yields what it finds.
         well: What is seen where it finds nothing.
         needs_recording: It is not looked at where there is no recording that can be read.
         starts_process: It takes seconds: a server does not ask it of itself.
     """
 
     name: str
-    look: Callable[[Examined], Iterator[Diagnosis]]
+    run: Callable[[Examined], Iterator[Diagnosis]]
     well: str = ""
     needs_recording: bool = False
     starts_process: bool = False
@@ -149,7 +147,7 @@ class Link:
 class Checked(NamedTuple):
     """A check and what it found."""
 
-    check: Link
+    check: Check
     finding: Diagnosis
 
     @property
@@ -158,12 +156,14 @@ class Checked(NamedTuple):
         return self.finding.verdict == "ok"
 
 
-def check(name: str, **options: Any) -> Callable[[Callable[[Examined], Iterator[Diagnosis]]], Link]:
-    """Declare a function as a check; a `Link` has the options."""
-    return lambda look: Link(name, look, **options)
+def check(
+    name: str, **options: Any
+) -> Callable[[Callable[[Examined], Iterator[Diagnosis]]], Check]:
+    """Declare a function as a check; a `Check` has the options."""
+    return lambda run: Check(name, run, **options)
 
 
-def all_checks(*, with_server: bool = False) -> list[Link]:
+def all_checks(*, with_server: bool = False) -> list[Check]:
     """All that the modules declare, in the order of the chain.
 
     Args:
@@ -171,7 +171,7 @@ def all_checks(*, with_server: bool = False) -> list[Link]:
     """
     modules = [import_module(f"{__package__}.{name}") for name in _IN_ORDER]
     declared = [each for module in modules for each in vars(module).values()]
-    checks = [each for each in declared if isinstance(each, Link)]
+    checks = [each for each in declared if isinstance(each, Check)]
     return [each for each in checks if with_server or not each.starts_process]
 
 
@@ -198,7 +198,7 @@ def ago(seconds: float) -> str:
     return f"{max(seconds, 0.0):.1f} s ago"
 
 
-def diagnose(subject: Examined, checks: Sequence[Link] | None = None) -> list[Checked]:
+def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[Checked]:
     """Run the checks, all but those that start a process; what cannot be looked at says why."""
     with ExitStack() as stack:
         try:
@@ -206,20 +206,24 @@ def diagnose(subject: Examined, checks: Sequence[Link] | None = None) -> list[Ch
             subject = replace(subject, connection=connection)
         except WebotsMCPError as error:
             subject = replace(subject, unread=error)
-        return [Checked(each, _look(each, subject)) for each in checks or all_checks()]
+        return [Checked(each, _run_check(each, subject)) for each in checks or all_checks()]
 
 
-def _look(check: Link, subject: Examined) -> Diagnosis:
+def _run_check(check: Check, subject: Examined) -> Diagnosis:
     """Run one check; one that fails reports that, and the others still run."""
     if check.needs_recording and subject.connection is None:
         return unclear("there is no recording that can be read")
     try:
-        return worst(list(check.look(subject)) or [ok(check.well)])
+        return worst(list(check.run(subject)) or [ok(check.well)])
     except ModuleNotFoundError as error:
         return unclear(f"the Python package {error.name!r} is missing")
     except Exception as error:  # noqa: BLE001  (it is reported)
         if is_damage(error):
-            return wrong(f"the database is damaged: {text_of(error)}", _RECOVER)
+            fix = (
+                "stop what records there, save rows with 'sqlite3 FILE .recover', and move the "
+                "file away"
+            )
+            return wrong(f"the database is damaged: {text_of(error)}", fix)
         return unclear(f"{type(error).__name__}: {error}")
 
 

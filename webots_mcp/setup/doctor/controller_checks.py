@@ -11,10 +11,10 @@ from webots_mcp.contract import WORLD_ENDING, WORLD_FOLDER
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.setup.doctor import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
-from webots_mcp.setup.interpreter import Interpreter, chosen, look_into
+from webots_mcp.setup.interpreter import Interpreter, chosen, probe_interpreter
 from webots_mcp.setup.project_edits import AlreadyPatchedError, attaching_place, is_plain_robot
 from webots_mcp.signals.naming import find_position
-from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.installations import installations
 from webots_mcp.simulator.project import (
     NO_POSITION_OF_ITS_OWN,
     NO_SUPERVISOR,
@@ -65,7 +65,7 @@ def _of_each(subject: Examined, project: Path) -> Iterator[Diagnosis]:
             if subject.probes_python:
                 command = chosen(each.file).command
                 if command not in pythons:
-                    pythons[command] = look_into(each.file)
+                    pythons[command] = probe_interpreter(each.file)
                 yield from _of_python(pythons[command], file)
 
 

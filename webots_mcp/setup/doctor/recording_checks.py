@@ -1,21 +1,17 @@
-"""What this machine brings along, where a recording lies, who writes it, and what waits in it."""
+"""Checks of a recording: whether it can be read, who writes to it, and what waits in it.
+
+Each check names the robot or the file that it is about.
+"""
 
 from __future__ import annotations
 
-import os
-import platform
-import shutil
-import sqlite3
-import sys
-import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.contract import CUSTOM_DATA, DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
+from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.database.connection import (
-    OLDEST_SQLITE,
     FrozenConnection,
     connect,
     is_there,
@@ -26,7 +22,6 @@ from webots_mcp.database.connection import (
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.waiting_file import count_rows, waiting_paths
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
-from webots_mcp.extras.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.doctor import (
     Diagnosis,
     Examined,
@@ -38,7 +33,6 @@ from webots_mcp.setup.doctor import (
     warning,
     wrong,
 )
-from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.recording import GETTING_STARTED, RobotView, name_of
 from webots_mcp.store.robots import (
@@ -48,191 +42,11 @@ from webots_mcp.store.robots import (
     rows_waiting,
 )
 
-_OLDEST_PYTHON: Final = (3, 10)
-_NEWEST_PYTHON: Final = (3, 13)  # that it was tried with
-# Two connections that write or checkpoint at once could damage a file before these versions
-# (sqlite.org/wal.html, "The WAL-reset bug"); the two older branches were mended as well.
-_WAL_RESET_MENDED: Final = (3, 51, 3)
-_WAL_RESET_MENDED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
-# Names of file systems as the operating systems have them; in none does SQLite share memory.
-_NETWORK: Final = (
-    "nfs", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afpfs", "webdav", "ncpfs", "afs", "ceph",
-    "glusterfs", "lustre", "beegfs", "fuse.sshfs", "fuse.glusterfs", "fuse.s3fs", "fuse.rclone",
-)  # fmt: skip
-_SHARED_WITH_HOST: Final = ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs")
-_WINDOWS_FROM_WSL: Final = ("9p", "drvfs")
-_WSL_FROM_WINDOWS: Final = ("//wsl$/", "//wsl.localhost/")
-_FULL_BYTES: Final = 50_000_000
-_LOW_BYTES: Final = 1_000_000_000
-_IN_MEMORY: Final = "the recording is in memory"
-_LOCAL: Final = (
-    f"record in a folder of this machine's own disk: {DATA_DIR_VARIABLE}, --data-dir, or "
-    "MCPBridge(robot, data_dir=...), the same for controllers and server"
-)
 _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "
     "MCPBridge.attach(robot), which does, before anything takes or replaces robot.step"
 )
-_READ_FASTER: Final = (
-    "give the observer's Robot node 'synchronization TRUE' and the robot's step in ms as "
-    "controllerArgs, or let the robot write less often"
-)
-_LONG_AT_WORK_S: Final = 30.0
 _NOT_POLLED_S: Final = 5.0
-_UNFINISHED: Final = (
-    "SELECT id, robot_id, action, status, session_id, created_wall_time_s, expires_wall_time_s, "
-    "coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
-    "WHERE status IN ('pending', 'claimed') ORDER BY id"
-)
-
-
-@check("Python")
-def python(_: Examined) -> Iterator[Diagnosis]:
-    """The Python that runs this; `Recording now` has that of the controllers."""
-    seen = f"{platform.python_version()} at {sys.executable}"
-    if sys.version_info[:2] < _OLDEST_PYTHON:
-        yield wrong(seen, "use Python 3.10 or newer")
-    elif sys.version_info[:2] > _NEWEST_PYTHON:
-        yield warning(f"{seen}: newer than what this was tried with", "use Python 3.13")
-    else:
-        yield ok(seen)
-
-
-@check("Packages", well="all that the server needs are installed")
-def packages(_: Examined) -> Iterator[Diagnosis]:
-    """What the server and most commands need; a bridge does without."""
-    if missing := missing_requirements():
-        seen = f"missing: {', '.join(map(package_of, missing))} (a bridge does without)"
-        yield wrong(seen, f"run {install_line(missing)}")
-
-
-@check("SQLite")
-def sqlite(_: Examined) -> Iterator[Diagnosis]:
-    """The SQLite of this Python."""
-    yield judge_sqlite(sqlite3.sqlite_version_info)
-
-
-def judge_sqlite(version: tuple[int, ...]) -> Diagnosis:
-    """Whether a version can be used."""
-    seen = ".".join(map(str, version))
-    if version < OLDEST_SQLITE:
-        fix = "use a Python with a newer one (python.org, conda and Debian 12 have it)"
-        return wrong(f"{seen} is too old: 3.38 is needed", fix)
-    mended = _WAL_RESET_MENDED_IN_BRANCH.get((version[0], version[1]))
-    if version < _WAL_RESET_MENDED and (mended is None or version[2] < mended):
-        seen += (
-            ", which has the WAL-reset bug: webots-mcp checkpoints so that it cannot strike; let "
-            "no other program write to the file while a robot records"
-        )
-    return ok(seen)
-
-
-@check("Data folder", well=_IN_MEMORY)
-def data_folder(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether it is there, and may be written."""
-    if subject.file is None:
-        return
-    folder = subject.file.parent
-    seen = f"{folder}, chosen by: {subject.chosen_by}"
-    if not folder.exists():
-        yield warning(
-            f"{seen}; it is not there yet",
-            "start a controller with an MCPBridge, which makes it; if it records elsewhere, name "
-            "that folder with --data-dir",
-        )
-    elif not folder.is_dir():
-        yield wrong(f"{seen}; it is a file", "name the folder with --data-dir")
-    else:
-        try:  # a read-only file system ignores the folder's rights
-            with tempfile.TemporaryFile(dir=folder):
-                yield ok(seen)
-        except OSError as error:
-            yield wrong(
-                f"{seen}; it cannot be written: {error.strerror or error}",
-                "give this user the right to write there, or name another with --data-dir; a "
-                "recording that only has to be read can: webots-mcp serve --read-only",
-            )
-
-
-class Mount(NamedTuple):
-    """A file system and its mount point, as psutil lists them."""
-
-    point: str
-    kind: str
-    is_remote: bool = False
-
-
-@check("File system", well=_IN_MEMORY)
-def file_system(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether processes can share memory there, which WAL needs."""
-    if subject.file is None:
-        return
-    import psutil
-
-    mounts = [
-        Mount(part.mountpoint, part.fstype, "remote" in part.opts.split(","))
-        for part in psutil.disk_partitions(all=True)
-    ]
-    yield judge_file_system(str(subject.file.parent), mounts, in_wsl=is_wsl())
-
-
-def judge_file_system(folder: str, mounts: Iterable[Mount], *, in_wsl: bool) -> Diagnosis:
-    """Whether a recording may lie in a folder, on a machine with these file systems."""
-    path = folder.replace("\\", "/")
-    if path.lower().startswith(_WSL_FROM_WINDOWS):
-        return _across_the_border(folder, "a folder of WSL, seen from Windows")
-    if path.startswith("//"):
-        return _on_the_network(folder, "a network drive")
-    above = [mount for mount in mounts if _is_in(path, mount.point.replace("\\", "/"))]
-    if not above:
-        return unclear(f"the system does not show on which drive {folder} is")
-    mount = max(above, key=lambda mount: len(mount.point))
-    kind = mount.kind.lower()
-    if in_wsl and kind in _WINDOWS_FROM_WSL:
-        return _across_the_border(folder, f"a drive of Windows, seen from WSL ({kind})")
-    if mount.is_remote or kind in _NETWORK:
-        return _on_the_network(folder, f"a network drive ({mount.kind} at {mount.point})")
-    if kind in (*_SHARED_WITH_HOST, *_WINDOWS_FROM_WSL):
-        seen = f"{folder} is shared with a virtual machine's host ({mount.kind} at {mount.point})"
-        return warning(f"{seen}: both at once would not see each other's locks", _LOCAL)
-    return ok(f"{mount.kind or 'of an unnamed kind'} at {mount.point}")
-
-
-def _across_the_border(folder: str, what: str) -> Diagnosis:
-    seen = (
-        f"{folder} is {what}: SQLite cannot share memory across that border, so that controllers "
-        "and server lock each other out or damage the file"
-    )
-    return wrong(seen, WAY_OUT)
-
-
-def _on_the_network(folder: str, what: str) -> Diagnosis:
-    seen = (
-        f"{folder} is on {what}: SQLite's log needs memory that processes share, which network "
-        "file systems do not have"
-    )
-    return wrong(seen, _LOCAL)
-
-
-def _is_in(path: str, point: str) -> bool:
-    if os.name == "nt" or point[1:2] == ":":
-        path, point = path.lower(), point.lower()
-    return f"{path}/".startswith(f"{point.rstrip('/')}/")
-
-
-@check("Free space", well=_IN_MEMORY)
-def free_space(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether there is room for what will be recorded."""
-    if subject.file is None:
-        return
-    folder = next(folder for folder in subject.file.parents if folder.exists())
-    free = shutil.disk_usage(folder).free
-    seen = f"{free / 1e9:.1f} GB free"
-    fix = "make room: 'webots-mcp prune --dry-run' lists what could be deleted"
-    if free < _FULL_BYTES:
-        yield wrong(f"{seen}: the disk is full", fix)
-    else:
-        yield warning(seen, fix) if free < _LOW_BYTES else ok(seen)
 
 
 @check("Database", well="in memory")
@@ -315,7 +129,11 @@ def rows(subject: Examined) -> Iterator[Diagnosis]:
             fix = "see free space and the folder's rights; what was dropped is lost"
             yield wrong(seen, fix) if view.robot.live else warning(seen, fix)
         elif view.robot.kind == CUSTOM_DATA and view.robot.live and error and "(seq)" in error:
-            yield warning(error[:200], _READ_FASTER)
+            yield warning(
+                error[:200],
+                "give the observer's Robot node 'synchronization TRUE' and the robot's step in ms "
+                "as controllerArgs, or let the robot write less often",
+            )
         elif waiting.get("rows_waiting"):
             yield warning(
                 f"{waiting['rows_waiting']} rows of {name} wait in {waiting['waiting_in']}{why}",
@@ -370,7 +188,14 @@ class _Unfinished(NamedTuple):
 @check("Commands", needs_recording=True)
 def commands(subject: Examined) -> Iterator[Diagnosis]:
     """What waits for a controller, and for how long."""
-    unfinished = [_Unfinished(*row) for row in subject.opened.execute(_UNFINISHED)]
+    unfinished = [
+        _Unfinished(*row)
+        for row in subject.opened.execute(
+            "SELECT id, robot_id, action, status, session_id, created_wall_time_s, "
+            "expires_wall_time_s, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
+            "WHERE status IN ('pending', 'claimed') ORDER BY id"
+        )
+    ]
     by_robot = {view.robot.id: view for view in subject.views}
     for each in unfinished:
         judge = _claimed if each.status == "claimed" else _pending
@@ -398,7 +223,7 @@ def _claimed(command: _Unfinished, view: RobotView) -> Iterator[Diagnosis]:
     if session is None or not session.is_alive(view.now_s):
         seen = f"{_named(command, view)} was claimed by a controller that is gone: it is lost"
         yield warning(seen, "ask again; a server that may write settles it")
-    elif at_work_s >= _LONG_AT_WORK_S:
+    elif at_work_s >= 30.0:
         inside = handler_at_work(view.connection, session, view.now_s)
         seen = inside or f"{_named(command, view)} is under way since {ago(at_work_s)}"
         yield warning(seen, "wait for it, or send cancel_run; a handler must return soon")

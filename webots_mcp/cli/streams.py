@@ -1,0 +1,136 @@
+"""The streams to which a command writes: a terminal obeys nothing that is in a recording.
+
+Names, texts and log lines come from controllers and from recordings of others. Control characters,
+and those that turn the direction of writing, are spelled out as JSON escapes, so that JSON stays
+the same data. Progress is shown on stderr: on a terminal in one line, else every few seconds.
+"""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import io
+import select
+import sys
+import time
+from collections.abc import Callable, Generator
+from typing import Any, Final, TextIO, cast
+
+from webots_mcp.signals.naming import spelled_out
+
+_PLAIN_INTERVAL_S: Final = 3.0  # between two lines where no line can be rewritten
+
+
+class _SpelledOut:
+    """A text stream to another one."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        self.stream.write(spelled_out(text))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+class _Bytes(io.RawIOBase):
+    """A binary stream to a text stream; what is no UTF-8 is replaced."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._stream.write(self._decoder.decode(bytes(data)))
+        return len(data)
+
+
+@contextlib.contextmanager
+def spelling_out() -> Generator[None]:
+    """Inside, whatever is printed to stdout or stderr is spelled out."""
+    out, err = (cast("TextIO", _SpelledOut(stream)) for stream in (sys.stdout, sys.stderr))
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        yield
+
+
+def binary_stdout() -> Any:
+    """Where data is written as it is; on a terminal it is spelled out as all else."""
+    return _Bytes(sys.stdout) if sys.stdout.isatty() else sys.stdout.buffer
+
+
+def wait(seconds: float) -> None:
+    """Wait for the next look, or end where nobody reads a pipe any more (`tail | head`).
+
+    Raises:
+        BrokenPipeError: The reader is gone; printing would tell only when there is a line.
+    """
+    try:
+        output = sys.stdout.fileno()
+        watch = select.poll()  # not on Windows
+    except (AttributeError, OSError):
+        return time.sleep(seconds)
+    watch.register(output, 0)
+    if watch.poll(seconds * 1000):
+        raise BrokenPipeError
+
+
+def rewrite(stream: TextIO, text: str = "") -> None:
+    """Put a text in the place of the line that stands there, on a terminal; elsewhere nothing."""
+    if stream.isatty():
+        raw = stream.stream if isinstance(stream, _SpelledOut) else stream
+        raw.write(f"\r{spelled_out(text)}\x1b[K")
+        raw.flush()
+
+
+@contextlib.contextmanager
+def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
+    """A function to call with how much is done and how much there is.
+
+    It writes to stderr, because stdout may be the data: on a terminal one line, which vanishes at
+    the end; elsewhere a line every 3 s, so that short work stays silent.
+    """
+    is_terminal = sys.stderr.isatty()
+    next_s = 0.0 if is_terminal else time.monotonic() + _PLAIN_INTERVAL_S
+
+    def show(done: int, of: int) -> None:
+        nonlocal next_s
+        if time.monotonic() < next_s:
+            return
+        text = f"{doing}: {100 * done // max(of, 1)} %"
+        if is_terminal:
+            next_s = time.monotonic() + 0.1
+            rewrite(sys.stderr, text)
+        else:
+            next_s = time.monotonic() + _PLAIN_INTERVAL_S
+            print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
+
+    if not is_terminal:
+        yield show
+        return
+    try:
+        yield show
+    finally:
+        rewrite(sys.stderr)
+
+
+@contextlib.contextmanager
+def line_of_progress() -> Generator[None]:
+    """Inside, `show_progress` has a line, which vanishes at the end."""
+    try:
+        yield
+    finally:
+        rewrite(sys.stderr)
+
+
+async def show_progress(progress: float, total: float | None, text: str) -> None:
+    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
+    rewrite(sys.stderr, text)

@@ -1,0 +1,112 @@
+"""Texts in the words of the command line: `last_s=-3` is `--last -3` there.
+
+The questions name their arguments as the MCP tools do. For the command that runs it is known which
+option each is typed by. Hints that name a tool name the command that gives the same answer.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from contextvars import ContextVar
+from typing import Final, NamedTuple
+
+_UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
+_NOT_ON: Final = r"(?![\w'\"])"
+_OTHERS: Final = {  # by tool: those that are answered by a command of another name or function
+    "get_full_state": "tail", "get_robot_state": "tail", "monitor": "tail",
+    "breakpoint": "breakpoint", "list_commands breakpoints": "breakpoint",
+    "list_commands parameters": "parameters", "set_parameters": "parameters",
+    "list_commands outcome": "wait", "list_runs trials": "trials", "run_trials": "trials",
+    "plot": "plot", "report": "report",
+    "simulation_control": "send", "world_reset": "send reset",
+}  # fmt: skip
+_FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
+    "start the server with --data-dir or --database": "give --data-dir or --database",
+    "the resource webots://schema": "'.schema' in the sqlite3 shell",
+}
+_TOOL: Final = re.compile(
+    r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
+)
+_CODE: Final = re.compile(r"(\b(?:bridge\.\w+|MCPBridge)\([^()]*\))")  # of a controller
+_running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
+
+
+def speak_of(arguments: Iterable[Typed]) -> None:
+    """Let `as_typed` speak of these arguments: those of the command that runs."""
+    _running.set(tuple(arguments))
+
+
+def running() -> tuple[Typed, ...]:
+    """The arguments of the command that runs."""
+    return _running.get()
+
+
+class Typed(NamedTuple):
+    """An argument, as a person types it.
+
+    Attributes:
+        turned_off: Of a flag, the option that turns it off; empty where there is none.
+    """
+
+    name: str
+    typed: str
+    value_name: str
+    turned_off: str = ""
+
+
+def value_name(option: str) -> str:
+    """The word for an option's value, as help shows it."""
+    return option.lstrip("-").replace("-", "_").upper()
+
+
+def as_typed(text: str) -> str:
+    """The text with a person's options instead of the names of arguments.
+
+    A name that is a common word (`since`) is meant only where a value follows it, or where it is
+    joined to another one ("since and until").
+    """
+    parts = _CODE.split(text)
+    parts[::2] = map(_text_as_typed, parts[::2])
+    return "".join(parts)
+
+
+def _text_as_typed(text: str) -> str:
+    for of_a_client, of_a_person in _FOR_A_CLIENT.items():
+        text = text.replace(of_a_client, of_a_person)
+    text = _TOOL.sub(_command_for, text)
+    typed = {each.name: each.typed for each in _running.get()}
+    for each in _running.get():
+        shown = f"{each.typed} {each.value_name}" if each.typed.startswith("-") else each.typed
+        text = re.sub(rf"{_UNQUOTED}{each.name}=(\[['.]+\]|\.\.\.)", shown, text)
+        text = re.sub(rf"{_UNQUOTED}{each.name}=true\b", each.typed, text)
+        text = re.sub(rf"{_UNQUOTED}{each.name}=false\b", each.turned_off or each.typed, text)
+        text = re.sub(rf"{_UNQUOTED}{each.name}=", f"{each.typed} ", text)
+        if "_" in each.name:
+            text = re.sub(rf"{_UNQUOTED}{each.name}{_NOT_ON}", each.typed, text)
+    words = "|".join(name for name in typed if "_" not in name)
+    if not words:
+        return text
+    for form in (
+        rf"(?<=\bwith )(?:this )?({words}){_NOT_ON}",
+        rf"(?<=\bsee )({words}){_NOT_ON}",
+        rf"{_UNQUOTED}({words})(?= for more)",
+    ):
+        text = re.sub(form, lambda found: typed[found[1]], text)
+    joined = rf"{_UNQUOTED}({words}) (and|or) ({words}){_NOT_ON}"
+    return re.sub(joined, lambda found: f"{typed[found[1]]} {found[2]} {typed[found[3]]}", text)
+
+
+def commands_by_tool() -> dict[str, str]:
+    """The command that answers what a tool does, by the tool's name without `webots_`."""
+    from webots_mcp.cli.commands import COMMANDS
+
+    return {each.name.removeprefix("webots_"): name for name, each in COMMANDS.items()} | _OTHERS
+
+
+def _command_for(found: re.Match[str]) -> str:
+    """The command that answers what a tool does; the tool itself where there is none."""
+    tool, what, number = found["tool"], found["what"], found["id"]
+    command = commands_by_tool().get(f"{tool} {what}" if what else tool)
+    whole = f"{command} {number}" if number else command
+    return f"'webots-mcp {whole}'" if command else found[0]

@@ -1,0 +1,113 @@
+"""Arguments that several questions share, with the same name, bounds and text everywhere.
+
+Each is an annotated type: pydantic reads its bounds, and clients show its description.
+"""
+
+from __future__ import annotations
+
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Final,
+)
+
+from pydantic import (
+    AfterValidator,
+    Field,
+    ValidationInfo,
+    WithJsonSchema,
+)
+
+from webots_mcp import contract
+
+if TYPE_CHECKING:
+    pass
+
+
+# Clients put a call aside after two minutes; some of this time is for a busy database.
+MAX_WAIT_S: Final = 90
+FOR_A_PERSON: Final = "person"  # the context of a validation: whoever waits can press Ctrl-C
+LONGEST_NAME: Final = 200
+_CURSOR: Final = "From the last answer."
+
+
+def _as_id(value: int) -> int:
+    if value >= 2**63:  # what SQLite can compare with
+        raise ValueError("be an id from an earlier answer")
+    return value
+
+
+def _as_seconds(value: float) -> float:
+    if not abs(value) <= 1e12:  # NaN is none either
+        raise ValueError("be a number of seconds")
+    return value
+
+
+def _as_wait(value: float, info: ValidationInfo) -> float:
+    if info.context != FOR_A_PERSON and value > MAX_WAIT_S:
+        raise ValueError(f"be less than or equal to {MAX_WAIT_S}")
+    return _as_seconds(value)
+
+
+# Bounds that only an absurd value meets stay out of the schemas, which every client carries along:
+# `CheckedTool` leaves the lengths of texts out, a validator has the others. The bounds beside a
+# validator stand before it: behind it pydantic does not know JSON Schema's words.
+Id = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
+_Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
+Seconds = Annotated[float, AfterValidator(_as_seconds)]
+_Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
+RobotName = Annotated[
+    Annotated[str, Field(max_length=LONGEST_NAME)] | None, Field(description="If several.")
+]
+RunId = Annotated[Id | None, Field(description="Else the current run.")]
+TrialSetId = Annotated[Id | None, Field(description="From webots_run_trials.")]
+LastS = Annotated[_Duration | None, Field(description="The last simulated seconds.")]
+StartS = Annotated[Seconds | None, Field(description="From this simulation time.")]
+EndS = Annotated[Seconds | None, Field(description="Before this simulation time.")]
+WaitS = Annotated[
+    float, Field(ge=0.1, json_schema_extra={"maximum": MAX_WAIT_S}), AfterValidator(_as_wait)
+]
+TimeoutS = Annotated[WaitS, Field(description="At most.")]
+TimeOfDay = Annotated[bool, Field(description="Add wall-clock times.")]
+Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
+TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
+# A number is as good; one type that holds both is shorter than two.
+_WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
+Since = Annotated[_WallTime, Field(description="From, ISO 8601 with zone.")]
+Until = Annotated[_WallTime, Field(description="Before.")]
+Names = Annotated[
+    list[str],
+    Field(
+        min_length=1,
+        max_length=50,
+        description="Their names; 'pose' is all below it, '*' any text.",
+    ),
+]
+AnyNames = Annotated[list[str] | None, Field(max_length=50, description="'*' is any text.")]
+# Of a parameter. A whole number is a number as well, and stays one. What it may be is the
+# parameter's to say, and would take as much room as all else.
+Value = Annotated[float | int | bool | str, WithJsonSchema({})]
+MaxPoints = Annotated[
+    int | None, Field(ge=1, le=500, description="The most buckets, or rows with raw.")
+]
+ShownLimit = Annotated[int | None, Field(ge=1, le=500, description="Most shown.")]
+LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
+Limit = Annotated[int, Field(ge=1, le=500, description="Most shown.")]
+RunIds = Annotated[list[Id] | None, Field(max_length=10, description="From webots_list_runs.")]
+Position = Annotated[
+    list[str] | None,
+    Field(min_length=2, max_length=2, description="Signals of x and y, if not found."),
+]
+Mode = Annotated[
+    str | None, Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found.")
+]
+# What a client gives for a `Scope`, which tools take whole.
+SCOPE: Final = {
+    "last_s": LastS,
+    "start_s": StartS,
+    "end_s": EndS,
+    "since_wall_time": Since,
+    "until_wall_time": Until,
+    "robot": RobotName,
+    "run_id": RunId,
+}

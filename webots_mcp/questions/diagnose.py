@@ -1,0 +1,62 @@
+"""The question why nothing works: the checks of `webots-mcp doctor`, answered to a model.
+
+What is wrong comes first; of what passed only the names are shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from webots_mcp.answers.models import (
+    DiagnosisAnswer,
+)
+from webots_mcp.answers.shortening import (
+    cut_text,
+    tokens_in,
+)
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.setup.doctor import Checked, diagnose, subject_of, worst
+from webots_mcp.store.recording import RecordingAccess
+
+_LONGEST_TEXT: Final = 320
+_BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
+
+
+@question("Diagnose the set-up", READS, core=True)
+def webots_diagnose(recording: RecordingAccess) -> DiagnosisAnswer:
+    """When nothing comes, or time stands still: each link from Webots and controller to here.
+
+    Data folder, database, who records, what waits, why the simulation stands, which Webots run,
+    client files.
+    """
+    checked = diagnose(subject_of(recording, "how this server was started"))
+    return DiagnosisAnswer(
+        verdict=worst([each.finding for each in checked]).verdict,
+        failed=_failed(checked) or None,
+        not_checked=_by_reason(checked) or None,
+        passed=", ".join(each.check.name for each in checked if each.is_well),
+    )
+
+
+def _failed(checked: Sequence[Checked]) -> list[dict[str, str]]:
+    """What is wrong before what might be."""
+    told: list[dict[str, str]] = []
+    left = _BUDGET_TOKENS
+    for verdict in ("wrong", "warning"):
+        for check, finding in checked:
+            if finding.verdict == verdict:
+                head = {"check": check.name, "verdict": verdict}
+                texts = {"seen": finding.seen, "fix": finding.fix or ""}
+                cut = {name: cut_text(text, _LONGEST_TEXT) for name, text in texts.items() if text}
+                left -= sum(map(tokens_in, cut.values()))
+                told.append(head | (cut if left > 0 else {}))
+    return told
+
+
+def _by_reason(checked: Sequence[Checked]) -> dict[str, str]:
+    names: dict[str, list[str]] = {}
+    for check, finding in checked:
+        if finding.verdict == "not checked":
+            names.setdefault(cut_text(finding.seen, _LONGEST_TEXT), []).append(check.name)
+    return {reason: ", ".join(those) for reason, those in names.items()}

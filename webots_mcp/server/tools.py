@@ -1,0 +1,274 @@
+"""Questions as MCP tools: their schemas, their arguments as clients give them, and their answers.
+
+The SDK ignores an argument that a tool does not have, so that the answer would be to another
+question than was asked; and it reports an invalid value in the words of its validator. Here both
+are refused in words on which a model can act.
+
+The calls of the first server with tools of these names are accepted too: all arguments in one
+object `params`, and a `response_format`, which changes nothing. Arguments whose type has pydantic's
+`SkipJsonSchema` are others of its arguments: they are accepted, and are in no schema.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+import logging
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, Final, cast
+
+from mcp import MCPError
+from mcp.server.mcpserver import Context, Image
+from mcp.server.mcpserver.exceptions import ToolError
+from mcp.server.mcpserver.tools import Tool
+from mcp.types import (
+    CallToolResult,
+    ContentBlock,
+    TextContent,
+    ToolAnnotations,
+)
+from pydantic import ValidationError
+
+from webots_mcp.answers.models import ShownPicture
+from webots_mcp.answers.shortening import compact_json, cut_text
+from webots_mcp.errors import WebotsMCPError
+from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.faults import faults_of, shown_value
+from webots_mcp.signals.naming import harmless_first, perhaps_meant
+from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.requests import Requester
+
+_WRAPPER: Final = "params"
+_FORMAT: Final = "response_format"
+_UNSAID: Final = (
+    "title", "anyOf", "maxLength", "minLength", "maxProperties", "minProperties", "maxItems",
+)  # fmt: skip
+_USUAL: Final[Mapping[str, tuple[Any, ...]]] = {  # what a model takes for granted
+    "default": (None, "", False),  # and 0
+    "minimum": (0, 1),
+    "exclusiveMinimum": (0,),
+    "minItems": (1,),
+    "additionalProperties": (True, {}),
+}
+_log = logging.getLogger(__name__)
+
+
+def tool_of(question: Question, recording: RecordingAccess, *, output_schema: bool = False) -> Tool:
+    """A question on a recording as a tool; its schemas, which take milliseconds, are made once."""
+    tool = _tool(question, output_schema)
+    return tool.model_copy(update={"fn": functools.partial(tool.fn, recording)})
+
+
+@functools.cache
+def _tool(question: Question, output_schema: bool) -> Tool:
+    effect = question.effect
+    return CheckedTool.from_function(
+        _answering(question),
+        title=question.title,
+        description=inspect.getdoc(question.function),
+        annotations=ToolAnnotations(
+            read_only_hint=effect.reads,
+            destructive_hint=None if effect.reads else effect.destroys,
+            idempotent_hint=None if effect.reads else effect.repeats or None,
+            open_world_hint=False,
+        ),
+        structured_output=None if output_schema else False,
+    ).model_copy(update={"of_controller": question.of_controller})
+
+
+def _answering(question: Question) -> Callable[..., Any]:
+    """The question as the SDK calls it, after a recording; with an answer whatever happens."""
+
+    @functools.wraps(question.function)
+    async def wrapper(recording: RecordingAccess, ctx: Context[Any], **arguments: Any) -> Any:
+        companions = ctx.request_context.lifespan_context
+        caller = Caller("mcp", ctx.report_progress, companions, _requester(ctx))
+        try:
+            return _as_result(await question.ask(recording, arguments, caller))
+        except WebotsMCPError as error:
+            rows = f" (left out: {'; '.join(error.left_out)})" if error.left_out else ""
+            # It may repeat what the model itself has sent.
+            raise ToolError(f"{cut_text(str(error), 4_000)}{rows}") from error
+        except (MCPError, ToolError):
+            raise
+        except Exception as error:
+            _log.exception("%s failed", question.name)
+            raise ToolError(
+                "a defect of webots-mcp, or rows that it did not write "
+                f"({type(error).__name__}: {str(error)[:200]}); ask for another range "
+                "or by another tool, and report what the server wrote to stderr"
+            ) from error
+
+    context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=Context[Any])
+    own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in question.parameters]
+    vars(wrapper)["__signature__"] = question.signature.replace(parameters=[*own, context])
+    wrapper.__annotations__ = {"ctx": Context[Any]}
+    return wrapper
+
+
+def _requester(ctx: Context[Any]) -> Requester:
+    """The client, as it has named itself, and the transport that its call came by."""
+    asked = ctx.request_context
+    client = asked.session.client_params
+    name, version = (client.client_info.name, client.client_info.version) if client else ("", "")
+    return Requester(name, version, "stdio" if asked.request is None else "http")
+
+
+def _as_result(reply: Reply) -> CallToolResult:
+    """Structured content and the same as compact text; pictures and their captions as they are."""
+    content = [_block(each) for each in reply.shown]
+    if reply.data is None:
+        return CallToolResult(content=content)
+    bad = reply.data.get("outcome") in ("failed", "expired", "cancelled", "lost")
+    return CallToolResult(content=content, structured_content=reply.data, is_error=bad)
+
+
+def _block(shown: str | ShownPicture) -> ContentBlock:
+    if isinstance(shown, str):
+        return TextContent(text=shown)
+    return Image(data=shown.data, format=shown.format).to_image_content()
+
+
+class CheckedTool(Tool):
+    """A tool of ours, which takes no arguments but its own.
+
+    Attributes:
+        of_controller: The argument that takes names which the controller has declared.
+    """
+
+    of_controller: str | None = None
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Say so in the schema as well, and leave out of it what says nothing."""
+        slim = {name: _slim(schema) for name, schema in self.parameters["properties"].items()}
+        self.parameters |= {"properties": slim, "additionalProperties": False}
+        self.parameters.pop("title", None)
+
+    async def run(
+        self, arguments: dict[str, Any], context: Any, convert_result: bool = False
+    ) -> Any:
+        """Run the tool.
+
+        Raises:
+            ToolError: An argument is unknown, missing or out of bounds, or the tool refused.
+        """
+        properties = self.parameters["properties"]
+        required = self.parameters.get("required", ())
+        arguments = _unwrapped(arguments, properties, required)
+        if unknown := arguments.keys() - self.fn_metadata.arg_model.model_fields.keys():
+            raise ToolError(self._unknown(arguments, unknown))
+        meant = {
+            name: _as_meant(value, properties.get(name, {}))
+            for name, value in arguments.items()
+            if value is not None or name in required  # null is as good as left out
+        }
+        try:
+            return await super().run(meant, context, convert_result)
+        except ToolError as error:
+            if isinstance(error.__cause__, ValidationError):
+                raise ToolError(faults_of(error.__cause__)) from error
+            raise
+
+    def _unknown(self, arguments: dict[str, Any], unknown: Collection[str]) -> str:
+        """Which argument the tool does not have, and what was perhaps meant."""
+        names = [name for name in arguments if name in unknown]
+        listed, inside = list(self.parameters["properties"]), self.of_controller
+        typo = next((name for name in names if perhaps_meant(name, listed)), None)
+        said = f"unknown argument {shown_value(typo or names[0])}"
+        if inside and inside not in arguments and typo is None:
+            own = {name: value for name, value in arguments.items() if name not in unknown}
+            call = self._call(own, inside, _unboxed({name: arguments[name] for name in names}))
+            return f"{said}: names of the controller go into `{inside}`: {call}"
+        near = harmless_first(typo or names[0], listed)
+        return f"{said}: there is {', '.join(near) or 'none'}"
+
+    def _call(self, own: Mapping[str, Any], inside: str, values: Mapping[str, Any]) -> str:
+        """A call with all that the tool requires; values that would make it too long are dots."""
+        required = self.parameters.get("required", ())
+        lacking = {each: "..." for each in required if each != inside and each not in own}
+        given = {name: compact_json(value) for name, value in own.items()}
+        whole = lacking | given | {inside: compact_json(values)}
+        if sum(map(len, whole.values())) > 300:
+            short = {n: value if len(value) <= 60 else "..." for n, value in given.items()}
+            whole = lacking | short | {inside: "{...}"}
+        return f"{self.name}({', '.join(f'{name}={value}' for name, value in whole.items())})"
+
+
+def _unboxed(values: dict[str, Any]) -> dict[str, Any]:
+    """Names of the controller with their values, also where another tool's argument held them."""
+    (name, value), *others = values.items()
+    is_box = (
+        not others
+        and name in ("params", "parameters", "values", "arguments", "args")
+        and isinstance(value, dict)
+    )
+    return cast("dict[str, Any]", value) if is_box else values
+
+
+def _slim(schema: dict[str, Any]) -> dict[str, Any]:
+    """A parameter's schema without what says nothing.
+
+    That is its name once more, null or an empty default for "may be left out", and bounds that only
+    an absurd value exceeds.
+    """
+    choices: list[dict[str, Any]]
+    choices = [choice for choice in schema.get("anyOf", ()) if choice != {"type": "null"}]
+    whole = schema | (choices[0] if len(choices) == 1 else {})
+    kept = {
+        key: value
+        for key, value in whole.items()
+        if key not in _UNSAID and value not in _USUAL.get(key, ()) and not _is_absurd(key, value)
+    }
+    if "items" in kept:
+        kept["items"] = _slim(kept["items"])
+    return kept | ({"anyOf": choices} if len(choices) > 1 else {})
+
+
+def _is_absurd(key: str, value: Any) -> bool:
+    """Whether it is a bound beyond what anybody asks for."""
+    return key == "maximum" and value >= 1_000
+
+
+def _unwrapped(
+    arguments: dict[str, Any], own: Collection[str], required: Iterable[str]
+) -> dict[str, Any]:
+    """The arguments of a tool without the wrapper and the format of the first server's calls.
+
+    Raises:
+        ToolError: It is no format of that server.
+    """
+    outer = _without_format(arguments)
+    is_needed = any(name not in outer for name in required)
+    if outer.keys() != {_WRAPPER} or (_WRAPPER in own and not is_needed):
+        return outer
+    inner = _as_object(outer[_WRAPPER])
+    return outer if inner is None else _without_format(inner)
+
+
+def _without_format(arguments: dict[str, Any]) -> dict[str, Any]:
+    asked = arguments.get(_FORMAT)
+    if asked not in (None, "json", "markdown"):
+        raise ToolError(f"{_FORMAT} must be 'json' or 'markdown', not {shown_value(asked)}")
+    return {name: value for name, value in arguments.items() if name != _FORMAT}
+
+
+def _as_object(value: Any) -> dict[str, Any] | None:
+    """An object, or the JSON text of one."""
+    if isinstance(value, str):
+        try:
+            value = json.loads(value)
+        except (ValueError, RecursionError):
+            return None
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else None
+
+
+def _as_meant(value: Any, schema: dict[str, Any]) -> Any:
+    """One item, where a list is asked for, is a list of one."""
+    is_one = schema.get("type") == "array" and value is not None and not _is_list(value)
+    return [value] if is_one else value
+
+
+def _is_list(value: object) -> bool:
+    """Whether it is a list, or the JSON text of one, which the SDK reads."""
+    return isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("["))

@@ -502,7 +502,7 @@ def tail(
         following = not no_follow and recorded.may_change()
         while following:
             wait(interval_s)
-            recorded.recording().take_in()
+            recorded.recording().ingest()
             _print_lines(_newest_states_only(follower.read_new()), as_json=json)
 
 

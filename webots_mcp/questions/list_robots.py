@@ -198,7 +198,7 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
     """What an observer has seen of the world, robots first."""
     if world is None:
         return {}
-    bodies = [*world.told.get("robots", ()), *world.told.get("solids", ())]
+    bodies = [*world.content.get("robots", ()), *world.content.get("solids", ())]
     shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
     used = [
         column
@@ -208,10 +208,10 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
     rows = fitting([_in_world(body, used) for body in shown], budget_tokens)
     more = f"the first {len(rows)} of {len(bodies)} bodies are shown"
     return {
-        "title": world.told.get("title"),
+        "title": world.content.get("title"),
         "observer": world.observer,
         "in_world": AnswerTable(columns=used, rows=rows),
-        "hint": more if len(rows) < len(bodies) or world.told.get("more") else None,
+        "hint": more if len(rows) < len(bodies) or world.content.get("more") else None,
     }
 
 

@@ -32,7 +32,7 @@ from webots_mcp.questions.arguments import (
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.reading.segment import just_after, kept_stretches
+from webots_mcp.store.reading.segment import full_rate_segments, just_after
 from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside, opened
 
@@ -132,7 +132,7 @@ def _told_of(view: RobotView, found: list[StoredImage]) -> dict[str, Any]:
     if first.kind != KEPT_FRAME:
         return {"camera": first.device}
     within = (first.run_id, first.sim_time_s, just_after(last.sim_time_s))
-    reasons = [each.reason for each in kept_stretches(view.connection, *within)]
+    reasons = [each.reason for each in full_rate_segments(view.connection, *within)]
     return {"camera": first.device, "kept": "; ".join(reasons)}
 
 

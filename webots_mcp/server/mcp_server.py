@@ -43,7 +43,7 @@ from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
-from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, take_in_journals
+from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, ingest_journals
 from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.recording import OpenReaders, RecordingAccess
@@ -141,7 +141,7 @@ def _lifespan(
             ask(connection, unasked)
             unasked.clear()
         if isinstance(recording.database, Path):
-            take_in_journals(connection, recording.database, MAINTAINER_BUDGET_S)
+            ingest_journals(connection, recording.database, MAINTAINER_BUDGET_S)
         project.recompile_if_changed(connection)
         reap_if_dead(connection)
         make_chunks(connection, pause_s=0.002)  # for the robots to write between two short writes
@@ -150,7 +150,7 @@ def _lifespan(
     def make_database() -> None:
         """Where controllers have begun to record that never open it."""
         if isinstance(recording.database, Path) and not recording.database.exists():
-            recording.take_in()
+            recording.ingest()
 
     @asynccontextmanager
     async def lifespan(_: MCPServer) -> AsyncGenerator[Companions]:

@@ -52,10 +52,10 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.recording import RecordingAccess, is_over_a_value
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.run_rows import reading_texts
-from webots_mcp.store.signals import RegisteredSignal, enter_signals, registered, seen_in, tell_more
+from webots_mcp.store.signals import RegisteredSignal, enter_signals, may_widen, registered, seen_in
 
 GROUP_ROWS: Final = 1024
-LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
+MIN_ROWS_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
 _IDS_AT_ONCE: Final = 20_000
 _FIRST_AT_ONCE: Final = 100_000  # bytes
 _STEP_BYTES: Final = 5_000  # a chunk takes as long as so many bytes, and its own besides
@@ -159,7 +159,7 @@ _DELETE_CHUNKS: Final = (  # unless its maker has ended in the meantime what it 
     "FROM row_group WHERE id = ? AND is_complete = 0) LIMIT 20)"
 )
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
-LEAST_ROWS: Final = 2000  # a question reads fewer as they are
+MIN_ROWS_ON_DEMAND: Final = 2000  # a question reads fewer as they are
 _BATCH_ROWS: Final = 2000
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
 _LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
@@ -267,7 +267,7 @@ class _RunChunks:
         """Make those of rows up to an id; how many rows were put into chunks."""
         rows, least_rows, has_ended = 0, self._least_rows, self._has_ended()
         if has_ended:
-            least_rows = min(least_rows, LEAST_AT_END)
+            least_rows = min(least_rows, MIN_ROWS_AT_END)
         at = reached(self._connection, self._run_id)
         # Once a later group is stored, the ids of rows that came late would no longer show them.
         while rows < budget_rows and len(late := self._late(at, last_id)):
@@ -459,11 +459,11 @@ def _signals_of(
 ) -> dict[str, RegisteredSignal]:
     """The robot's signals by name; what some rows tell of them is entered."""
     known = registered(connection, robot_id)
-    room = max(0, MAX_SIGNALS - len(known))
-    fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
-    # A state may have many times more names than there is room for.
+    budget = max(0, MAX_SIGNALS - len(known))
+    fresh = [name for name, each in columns.values.items() if may_widen(known.get(name), each)]
+    # A state may have many times more names than there is budget for.
     entered = [name for name in fresh if name in known]
-    entered += islice((name for name in fresh if name not in known), room)
+    entered += islice((name for name in fresh if name not in known), budget)
     if entered:
         known = enter_signals(connection, robot_id, seen_in(columns, entered))
     return known
@@ -568,7 +568,7 @@ def make_missing_chunks(
         total = left = _rows_left(connection)
         holder = holder_of(connection, "maintainer") or ""
         is_frozen = isinstance(connection, FrozenConnection)
-    if total < LEAST_ROWS:
+    if total < MIN_ROWS_ON_DEMAND:
         return ""
     if holder.startswith("server ") and not is_frozen:
         return _say(total, "the server that maintains the recording makes them")
@@ -589,7 +589,7 @@ def make_missing_chunks(
                     why = "ask again to continue"
     except (DatabaseError, *FAILURES) as error:
         why = str(error)
-    return _say(left, why) if left >= LEAST_ROWS else ""
+    return _say(left, why) if left >= MIN_ROWS_ON_DEMAND else ""
 
 
 def _rows_left(connection: sqlite3.Connection) -> int:
@@ -633,18 +633,18 @@ def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
         payloads: Bytes of the record of each row.
         page_bytes: Of the database.
     """
-    room = page_bytes - _PAGE_HEAD_BYTES
+    space = page_bytes - _PAGE_HEAD_BYTES
     full_pages = own_bytes = filled = used = rows = 0
     for payload in payloads:
         local, own = _cell(payload, page_bytes)
         own_bytes += own
-        if used + local > room:
+        if used + local > space:
             full_pages, filled, used, rows = full_pages + 1, filled + used, 0, 0
         used, rows = used + local, rows + 1
     if not rows:
         return 0.0
     # The last page goes on with other rows: it will be as full as the others.
-    per_byte = page_bytes / (room - used / rows / 2)
+    per_byte = page_bytes / (space - used / rows / 2)
     if full_pages:
         per_byte = full_pages * page_bytes / filled
     return full_pages * page_bytes + used * per_byte + own_bytes
@@ -655,8 +655,8 @@ def _cell(payload: int, page_bytes: int) -> tuple[int, int]:
     most, least = page_bytes - 35, (page_bytes - 12) * 32 // 255 - 23
     if payload <= most:
         return payload + _CELL_HEAD_BYTES, 0
-    link_room = page_bytes - _LINK_BYTES
-    local = least + (payload - least) % link_room
+    overflow_space = page_bytes - _LINK_BYTES
+    local = least + (payload - least) % overflow_space
     local = local if local <= most else least
-    pages = -(-(payload - local) // link_room)
+    pages = -(-(payload - local) // overflow_space)
     return local + _CELL_HEAD_BYTES + _LINK_BYTES, pages * page_bytes

@@ -328,12 +328,12 @@ class WorldSeen:
 
     Attributes:
         observer: Its name.
-        told: What there is: title, robots, solids.
+        content: What there is: title, robots, solids.
         places: Where each is, by the word that it has in signals; its newest of the run.
     """
 
     observer: str
-    told: dict[str, Any]
+    content: dict[str, Any]
     places: dict[str, dict[str, float | None]]
 
 
@@ -705,8 +705,8 @@ def _left_stacks(connection: sqlite3.Connection, session: SessionRecord) -> str 
     """Where a dead process had hung, as the file has it that nobody has taken in yet."""
     path = _path_of(connection, session, stacks_path)
     stacks = stacks_at(path) if path else None
-    is_told = stacks and stacks.is_hang and stacks.began_after(session.last_seen_wall_time_s)
-    return f"{stacks.log_values(None)['message']}" if stacks and is_told else None
+    is_current = stacks and stacks.is_hang and stacks.began_after(session.last_seen_wall_time_s)
+    return f"{stacks.log_values(None)['message']}" if stacks and is_current else None
 
 
 def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:

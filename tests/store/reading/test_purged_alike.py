@@ -25,7 +25,7 @@ def around_a_purge(
     before = asked()
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(chunk_making, "GROUP_ROWS", 10)
-        patched.setattr(chunk_making, "LEAST_AT_END", 1)
+        patched.setattr(chunk_making, "MIN_ROWS_AT_END", 1)
         prune(connection, folder, Retention(state=Limit(rows=left), outlive=0), rest=False)
         rows = connection.execute("SELECT count(*) FROM state").fetchone()[0]
         assert left - 10 < rows <= left

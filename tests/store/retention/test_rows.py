@@ -27,7 +27,7 @@ from webots_mcp.store.retention_plan import plan
 def short_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Groups of ten rows."""
     monkeypatch.setattr(chunk_making, "GROUP_ROWS", 10)
-    monkeypatch.setattr(chunk_making, "LEAST_AT_END", 10)
+    monkeypatch.setattr(chunk_making, "MIN_ROWS_AT_END", 10)
 
 
 def test_the_oldest_groups_go_first_until_the_rest_fits(

@@ -118,7 +118,7 @@ def _pairs(run: RunUnderCheck) -> Iterator[tuple[RegisteredSignal, RegisteredSig
     motion, known = run.motion, run.search.known
     there = [
         name for name, each in known.items()
-        if each.kind in ("num", "angle") and run.frame.zones(name).value_count.any()
+        if each.kind in ("num", "angle") and run.frame.zone_map(name).value_count.any()
     ]  # fmt: skip
     away = {each.name for each in (*(motion.position or ()), motion.heading, motion.height) if each}
     for name in there:
@@ -128,7 +128,7 @@ def _pairs(run: RunUnderCheck) -> Iterator[tuple[RegisteredSignal, RegisteredSig
         target, _ = find_targets(name, there)
         if target is None or not _HOLDING.isdisjoint(words):
             continue
-        zones = run.frame.zones(target)
+        zones = run.frame.zone_map(target)
         if (zones.min < 0).any() or (zones.max > 0).any():
             yield known[name], known[target]
 

@@ -177,7 +177,7 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
             or not _RANGES.isdisjoint(_words(name))
         ):
             continue
-        zones = run.frame.zones(name)
+        zones = run.frame.zone_map(name)
         if zones.change_count.sum() < _MANY_VALUES:
             continue
         clock, values = run.frame.usable(name)

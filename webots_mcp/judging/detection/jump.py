@@ -36,7 +36,7 @@ from webots_mcp.judging.detection.kinds import (
 )
 from webots_mcp.judging.detection.search import MOST_NAMED, Search
 from webots_mcp.signals.naming import in_snake_case, listed, metres_in
-from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.signals import RegisteredSignal
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
@@ -84,7 +84,7 @@ def jump_events(search: Search) -> Iterator[Event]:
             unit = f" {signal.unit}" if signal.unit else ""
             near = f"{signal.name}: steps up to {largest:.2g}{unit}, a jump is one over {least:.2g}"
             search.note_nearest("jump", largest / least, near + unit)
-        rows = int(frame.zones(signal.name).value_count.sum())
+        rows = int(frame.zone_map(signal.name).value_count.sum())
         if len(jumps) > max(3, MOST_JUMPS_SHARE * rows):
             many = f"not in {signal.name}: large steps are normal for it ({len(jumps)} found)"
             search.not_searched("jump", many)
@@ -143,7 +143,7 @@ def find_jumps(frame: Frame, name: str, score: float) -> tuple[list[Jump], float
         name: Of the signal.
         score: How much larger than usual a step has to be.
     """
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     changes, largest = _steps_of(zones)
     for most in (1, SAMPLED_CHUNKS):
         parts = [frame.rows(*span).usable(name) for span in _sampled(zones, changes, most)]
@@ -175,7 +175,7 @@ def _interval_s(parts: Sequence[Array]) -> float:
     return usual_interval_s(max(parts, key=len, default=np.zeros(0))) or math.inf
 
 
-def _steps_of(zones: Zones) -> tuple[Indexes, Array]:
+def _steps_of(zones: ZoneMap) -> tuple[Indexes, Array]:
     """How often a signal changes in each chunk, and its largest step, with those into the chunk."""
     changes: Indexes = np.array(zones.change_count)
     largest = np.nan_to_num(zones.largest_step)
@@ -186,7 +186,7 @@ def _steps_of(zones: Zones) -> tuple[Indexes, Array]:
     return changes, largest
 
 
-def _sampled(zones: Zones, weights: Indexes, most: int) -> list[tuple[int, int]]:
+def _sampled(zones: ZoneMap, weights: Indexes, most: int) -> list[tuple[int, int]]:
     """Rows of some chunks, at equal shares of all weights; all that have one, if these are few."""
     sampled = weights > 0
     if np.count_nonzero(sampled) > most:
@@ -343,7 +343,7 @@ def find_leaps(frame: Frame, x: str, y: str, at_least_m: float) -> list[tuple[fl
         y: That of the other.
         at_least_m: Shorter ones are none.
     """
-    zones, of_y = frame.zones(x), frame.zones(y)
+    zones, of_y = frame.zone_map(x), frame.zone_map(y)
     along = _steps_of(zones)[1] * metres_in(x), _steps_of(of_y)[1] * metres_in(y)
     has_gaps: Flags = zones.value_count + of_y.value_count < 2 * zones.row_count
     # After a row that lacks one of them, the step is that of several rows.
@@ -460,7 +460,7 @@ def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tupl
     asked = least, _longest_period_s(search)
     shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
     for signal in search.in_time("oscillation", signals):
-        for span in _changing(frame.zones(signal.name), least):
+        for span in _changing(frame.zone_map(signal.name), least):
             if span not in shared:
                 part = frame.rows(*span)
                 shared[span] = part, EvenRows.of(part.times)
@@ -473,7 +473,7 @@ def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tupl
                 yield signal.name, swing
 
 
-def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:
+def _changing(zones: ZoneMap, least: int) -> list[tuple[int, int]]:
     """Rows of the chunks in which the value changes, and of those next to them."""
     if int(zones.change_count.sum()) < least:
         return []

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import os
+import shutil
 import signal
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -26,6 +29,18 @@ from tests.recordings.fixtures import (
 from webots_mcp.database.connection import connect
 
 __all__ = ["database", "empty", "looked_at", "recorded", "rover", "rover_recordings"]
+
+pytest_plugins = ["tests.progress"]
+
+# Hundreds of processes import the package: none of them compiles it anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+# Recordings of tests need not outlast the machine: in memory, no commit waits for a disk.
+_MEMORY = Path("/dev/shm")
+_MEMORY_BYTES = 4_000_000_000  # all tests at once take a tenth of it
+if _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free > _MEMORY_BYTES:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
 
 # The same examples each time, so that a red run was made red by the change that it tests;
 # `pytest --hypothesis-profile=explore` looks for new ones. No machine is too slow for them.

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlparse
 
-import jsonschema
 import pytest
 
 pytest.importorskip("hatchling", reason="hatchling is not installed")
@@ -132,6 +131,8 @@ def unpacked(tmp_path: Path) -> Path:
 
 
 def test_the_manifest_of_the_bundle_is_valid_and_of_this_version(unpacked: Path) -> None:
+    import jsonschema  # it takes a second, of one process
+
     manifest = json.loads((unpacked / "manifest.json").read_text("utf-8"))
     jsonschema.validate(manifest, MANIFEST)
     assert manifest["version"] == __version__
@@ -168,6 +169,8 @@ def test_the_bundle_installs_the_wheel_that_is_in_it_and_starts_the_server(
 def test_server_json_is_valid_of_this_version_and_of_the_name_that_the_index_shows(
     source: str,
 ) -> None:
+    import jsonschema  # it takes a second, of one process
+
     from hatch_build import Readme
 
     server = bundle.server_of(source)

@@ -6,7 +6,9 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -86,8 +88,8 @@ def test_the_tests_run_side_by_side_unless_pytest_is_told_what_to_do(
     python = checkout / ".venv" / "bin" / "python"
     write_program(python, '[ "$2" != pytest ] || echo "$@"')
     (checkout / "pyproject.toml").touch()
-    for there in ("chromium", "initdb"):  # else they would be installed
-        write_program(tmp_path / "bin" / there, "")
+    for program in ("chromium", "initdb"):  # else they would be installed
+        write_program(tmp_path / "bin" / program, "")
     path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PYTHON": str(python), "PATH": path}
 
@@ -97,3 +99,58 @@ def test_the_tests_run_side_by_side_unless_pytest_is_told_what_to_do(
 
     assert asked().split()[:3] == ["-m", "pytest", "-n"]
     assert asked("--pdb", "tests/signals") == "-m pytest --pdb tests/signals\n"
+    assert asked("--no-install", "--fast").split()[2] == "--fast"
+
+
+@pytest.fixture
+def bare(checkout: Path, tmp_path: Path) -> Callable[..., list[str]]:
+    """Run the tests where no Chromium is; return what it says, and what is done, line by line."""
+    python = checkout / ".venv" / "bin" / "python"
+    write_program(python, '[ "$2" != pytest ] || echo "> pytest"')
+    (checkout / "pyproject.toml").touch()
+    programs = tmp_path / "bin"
+    write_program(programs / "initdb", "")
+    write_program(programs / "id", "echo ${USER_ID:-0}")
+    says = "echo Need to get 99 MB of archives."
+    write_program(programs / "apt-get", f'case $* in *assume-no*) {says};; *) echo "> $*";; esac')
+    for name in ("sh", "cat", "cksum", "dirname", "sed"):
+        (programs / name).symlink_to(str(shutil.which(name)))
+
+    def run(*options: str, **environment: str) -> list[str]:
+        line = [checkout / "run", "tests", *options]
+        environment |= {"PYTHON": str(python), "PATH": str(programs)}
+        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        ended = subprocess.run(line, env=environment, stdin=subprocess.DEVNULL, check=True, **pipes)
+        return [each for each in ended.stdout.splitlines() if "into .venv" not in each]
+
+    return run
+
+
+def test_before_a_browser_is_installed_its_name_use_and_size_are_said(
+    bare: Callable[..., list[str]],
+) -> None:
+    install = "> install -y -qq -o Dpkg::Options::=--force-confold chromium"
+    assert bare() == [
+        "run: Chromium is missing: the tests of the live page need it",
+        "> update -qq",
+        "run: apt-get install chromium",
+        "run:   Need to get 99 MB of archives.",
+        "run: to skip those tests instead: ./run tests --no-install",
+        install,
+        "> pytest",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "user", "said"),
+    [
+        (["--no-install"], "0", "nothing is installed (--no-install)"),
+        ([], "1000", "install what is missing"),
+    ],
+)
+def test_nothing_is_installed_where_it_is_declined_or_not_allowed(
+    bare: Callable[..., list[str]], options: list[str], user: str, said: str
+) -> None:
+    first, second, *done = bare(*options, USER_ID=user)
+    assert "Chromium" in first and said in second
+    assert done == ["> pytest"]

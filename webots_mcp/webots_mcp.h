@@ -407,18 +407,18 @@ static inline void wmcp__end_run(wmcp *w, const char *reason) {
   wmcp__write_line(w, &w->log);
 }
 
-/* Names a value that is stored otherwise; `size` of what was cut, or -1 for those in an array. */
-static inline void wmcp__replace(wmcp *w, const char *name, const char *what, long long size) {
+/* Names a value that is stored otherwise, or all nulls in an array. */
+static inline void wmcp__replace(wmcp *w, const char *name, const char *what, int in_array) {
   wmcp__put(&w->replaced, w->replaced.length ? "," : "{", 1);
   wmcp__string(&w->replaced, name, WMCP_MAX_NAME);
-  if (size == -1) w->replaced.length--, wmcp__put(&w->replaced, ".*\"", 3);
-  wmcp__format(&w->replaced, size > 0 ? ":\"@[#]\"" : ":\"@\"", what, size);
+  if (in_array) w->replaced.length--, wmcp__put(&w->replaced, ".*\"", 3);
+  wmcp__format(&w->replaced, ":\"@\"", what);
 }
 
 static inline int wmcp__start_value(wmcp *w, const char *name) {
   if (!w || !w->is_due || !name) return 0;
   if (w->row.length + w->replaced.length > WMCP_MAX_ROW) {
-    if (w->values) wmcp__replace(w, "", "dict cut", 0);
+    if (w->values) wmcp__replace(w, "", "too large", 0);
     return w->values = 0;
   }
   if (w->values++) wmcp__put(&w->row, ",", 1);
@@ -519,7 +519,7 @@ static inline void wmcp_text(wmcp *w, const char *name, const char *value) {
   if (!wmcp__start_value(w, name)) return;
   size_t cut = value ? wmcp__string(&w->row, value, WMCP_MAX_TEXT) : 0;
   if (!value) wmcp__put(&w->row, "null", 4);
-  if (cut) wmcp__replace(w, name, "text", (long long)cut);
+  if (cut) wmcp__replace(w, name, "too large", 0);
 }
 
 /* An array of at most 20,000 numbers. */
@@ -528,7 +528,7 @@ static inline void wmcp_array(wmcp *w, const char *name, const double *values, s
   int is_mixed = 0, is_whole = values && count <= WMCP_MAX_ITEMS;
   if (!wmcp__start_value(w, name)) return;
   wmcp__format(&w->row, is_whole ? "[" : "null");
-  if (values && !is_whole) wmcp__replace(w, name, "array", (long long)count);
+  if (values && !is_whole) wmcp__replace(w, name, "too large", 0);
   for (size_t i = 0; is_whole && i < count; i++) {
     if (i) wmcp__put(&w->row, ",", 1);
     what = wmcp__not_finite(values[i]);
@@ -537,7 +537,7 @@ static inline void wmcp_array(wmcp *w, const char *name, const double *values, s
     first = what ? what : first;
   }
   if (is_whole) wmcp__put(&w->row, "]", 1);
-  if (first) wmcp__replace(w, name, is_mixed ? "not finite" : first, -1);
+  if (first) wmcp__replace(w, name, is_mixed ? "not finite" : first, 1);
 }
 
 /* The same of floats, as lidars and range finders give them. */

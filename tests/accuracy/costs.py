@@ -14,8 +14,8 @@ import anyio
 from tests.accuracy.page import table
 from tests.benchmarks.core import Bench, Line
 from tests.benchmarks.kills import measure_interrupts, measure_kills
-from tests.golden.asking import OVER_HTTP, TOOLS, ask_tools
-from tests.golden.drawing import KINDS
+from tests.golden.asking import TOOLS, ask_tools
+from tests.golden.recordings import RECORDINGS
 from tests.golden.stored import drawn
 from tests.tool_list import counts_of
 from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
@@ -67,14 +67,14 @@ def _cells(line: Line) -> tuple[str, ...]:
 def answers(bench: Bench) -> Iterator[str]:
     """The tools' answers about the recordings of the golden answers, and the list of the tools."""
     told = dict[str, list[int]]()
-    for name in list(KINDS)[: bench.count(len(KINDS))]:
+    for name in list(RECORDINGS)[: bench.count(len(RECORDINGS))]:
         bench.say(f"answers about {name}")
-        with drawn(KINDS[name]) as folder:
-            for asked, answer in anyio.run(ask_tools, KINDS[name], folder / "webots.db").items():
-                if asked.endswith(OVER_HTTP):
-                    continue
+        recording = RECORDINGS[name]
+        with drawn(recording) as folder:
+            answered = anyio.run(ask_tools, recording, folder / "webots.db", TOOLS)
+            for asked, answer in answered.items():
                 tokens = tokens_in(json.dumps(answer, ensure_ascii=False, separators=(",", ":")))
-                told.setdefault(TOOLS[asked.removesuffix(" of a part")][0], []).append(tokens)
+                told.setdefault(TOOLS[asked][0], []).append(tokens)
     every = [tokens for each in told.values() for tokens in each]
     memory = MemoryDatabase()
     server = {core: create_server(memory, memory.data_dir, core=core) for core in (False, True)}
@@ -98,8 +98,8 @@ def answers(bench: Bench) -> Iterator[str]:
 
 
 _READ: Final = """\
-Each question is asked of nine recordings of which the accepted answers are stored (`python -m
+Each question is asked of three recordings of which the accepted answers are stored (`python -m
 tests.golden`), in its usual form and in others. An answer has at most {budget} tokens by design,
-and up to {large} where `limit` or `max_points` asks for more, which the longest ones are. With
+and up to {large} where `limit` or `max_points` asks for more. With
 `serve --tools core` the list has {tools} tools and {tokens} tokens. Tokens are counted by a rule
 of this package (`tokens_in`); each model has its own tokenizer, which was not asked."""

@@ -35,14 +35,16 @@ from webots_mcp.database.connection import connect as connect_recording
 from webots_mcp.database.connection import create_schema
 from webots_mcp.plugins.pool.fetching import fetch
 from webots_mcp.plugins.pool.pool_contents import (
-    Choice,
-    meant,
+    RunFilter,
     open_pool,
     pooled_runs,
+    resolve_filter,
 )
 from webots_mcp.plugins.pool.pool_interface import Batch, batches, table
-from webots_mcp.plugins.pool.postgres_pool import Connection, PostgresShipment, connect, prepare
-from webots_mcp.plugins.pool.shipping import Order, Report, ship
+from webots_mcp.plugins.pool.postgres_connection import Connection, connect
+from webots_mcp.plugins.pool.postgres_pool import PostgresShipment
+from webots_mcp.plugins.pool.postgres_schema import prepare
+from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.recording import RecordingAccess
 
 _RESOLUTION_S: Final = 0.01  # of a process's times
@@ -77,7 +79,7 @@ def measure_listing(bench: Bench) -> Iterable[Line]:
             recorded.folder / DATABASE_NAME, recorded.folder, read_only=True
         )
         url = str(bench.place("listed"))
-        ship(Order(recording, partial(open_pool, url, ships=True)), Report())
+        ship(ShippingJob(recording, partial(open_pool, url, ships=True)), ShippingReport())
     (shipped,) = Path(url).glob("recording=*")
     for _ in range(recordings - 1):
         other = shipped.with_name(f"recording={new_uuid()}")
@@ -119,13 +121,13 @@ def measure_room(bench: Bench) -> Iterable[Line]:
             bench.say(what)
             url = make()
             recording = RecordingAccess(database, database.parent, read_only=True)
-            order = Order(recording, partial(open_pool, url, ships=True), full=full)
-            shipped_s = processor_s(lambda order=order: ship(order, Report()))
+            order = ShippingJob(recording, partial(open_pool, url, ships=True), full=full)
+            shipped_s = processor_s(lambda order=order: ship(order, ShippingReport()))
             here = bench.place(what)
             with closing(connect_recording(here / DATABASE_NAME, "writer", create=True)) as db:
                 create_schema(db)
                 with open_pool(url) as pool:
-                    wanted = meant(pool, Choice(since="0"))
+                    wanted = resolve_filter(pool, RunFilter(since="0"))
                     fetched_s = processor_s(partial(fetch, pool, db, here, wanted))
             yield _room(what, _size_of(url, server), rows, states)
             yield Line(f"{what}: ship", "", "", 1e6 * shipped_s / rows, "us/row")

@@ -31,8 +31,9 @@ from tests.bridge.monsters import (
     shared_dicts,
 )
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import encoding
-from webots_mcp.bridge.encoding import MAX_NAMED, MAX_ROW_BYTES, Encoded
+from webots_mcp.bridge import cleaning, encoding
+from webots_mcp.bridge.cleaning import MAX_NAMED
+from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
 from webots_mcp.signals.register import StateChanges
 
 POSE = [1.5, 2.5, 0.25]
@@ -97,11 +98,11 @@ def test_what_is_cut_is_counted_and_said_once(bridge: MCPBridge, recording: Reco
     (replaced, _) = [
         json.loads(replaced) for replaced in recording.rows("SELECT replaced FROM state")
     ]
-    assert replaced["t"] == "text[200000]"
-    assert set(replaced.values()) == {"too deep", "text[200000]", "nan"}
+    assert replaced["t"] == "too large"
+    assert set(replaced.values()) == {"too deep", "too large", "nan"}
     logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
     assert len(logged) == 2
-    assert "t was cut: text[200000]" in logged
+    assert "t could not be stored whole: too large" in logged
 
 
 @pytest.mark.usefixtures("encoder")
@@ -195,16 +196,25 @@ STORED: dict[str, tuple[Any, object, dict[str, str]]] = {
         {"scan": [0.5, None, None]},
         {"scan.1": "inf", "scan.2": "nan"},
     ),
-    "mute key": ({"a": {Mute(): 2, 3: 4}}, {"a": {"<Mute>": 2, "3": 4}}, {"a.<Mute>": "key"}),
-    "unreadable": (Unreadable(x=1), {}, {"": "type Unreadable: no items"}),
-    "long text": ({"t": "ab" * 100_000}, {"t": "ab" * 50_000}, {"t": "text[200000]"}),
-    "long key": ({"k" * 300: 1}, {"k" * 200: 1}, {"k" * 200: "key[300]"}),
-    "int key": ({10**4000: 1}, {"<int>": 1}, {"<int>": "key"}),
-    "tuple key": ({tuple(range(100_000)): 1}, {"<tuple>": 1}, {"<tuple>": "key"}),
+    "mute key": (
+        {"a": {Mute(): 2, 3: 4}},
+        {"a": {"<Mute>": 2, "3": 4}},
+        {"a.<Mute>": "unsupported: Mute"},
+    ),
+    "map": (
+        {"map": [[[1, 2]] * 100] * 100, "image": [[0] * 200 for _ in range(200)]},
+        {"map": None, "image": None},
+        {"map": "too large", "image": "too large"},
+    ),
+    "unreadable": (Unreadable(x=1), {}, {"": "unsupported: Unreadable"}),
+    "long text": ({"t": "ab" * 100_000}, {"t": "ab" * 50_000}, {"t": "too large"}),
+    "long key": ({"k" * 300: 1}, {"k" * 200: 1}, {"k" * 200: "too large"}),
+    "int key": ({10**4000: 1}, {"<int>": 1}, {"<int>": "unsupported: int"}),
+    "tuple key": ({tuple(range(100_000)): 1}, {"<tuple>": 1}, {"<tuple>": "unsupported: tuple"}),
     "many keys": (
         {f"key{i}": i for i in range(MANY)},
         {f"key{i}": i for i in range(1000)},
-        {"": f"dict[{MANY}]"},
+        {"": "too large"},
     ),
 }
 
@@ -263,15 +273,13 @@ def test_whatever_is_published_sqlite_can_read_it_and_it_is_bounded_and_what_is_
     with pytest.MonkeyPatch.context() as patch:
         if not with_orjson:
             patch.setattr(encoding, "orjson", None)
-        patch.setattr(encoding, "LONGEST_S", math.inf)
+        patch.setattr(cleaning, "OBJECTS_BUDGET_S", math.inf)
         encoded = encoding.encode(state)
         stored = json.loads(encoded.text)
         again = encoding.encode(stored)
     assert_bounded(encoded)
     assert Lazy.asked <= 2 * MOST_LOOKED_AT
-    if not any(
-        kind.startswith(("array[", "dict", "too deep")) for kind in encoded.replaced.values()
-    ):
+    if not {"too large", "too deep"}.intersection(encoded.replaced.values()):
         assert json.loads(again.text) == stored
         assert again.replaced == {}
 
@@ -297,7 +305,7 @@ def test_rows_are_the_same_whatever_the_rows_before_had_in_place_of_numbers(
     with pytest.MonkeyPatch.context() as patch:
         if not with_orjson:
             patch.setattr(encoding, "orjson", None)
-        encode_alone = encoding._encode_replacing  # pyright: ignore[reportPrivateUsage]
+        encode_alone = encoding._clean_and_encode  # pyright: ignore[reportPrivateUsage]
         for state in [*states, *states]:
             before = repr(state)
             encoded, alone = encoding.encode(state), encode_alone(state)
@@ -377,8 +385,8 @@ class FailsMidway(dict[str, object]):
 @pytest.mark.parametrize(
     ("mapping", "stored", "named"),
     [
-        (NeverEnding(a=1), {"0": 0}, "dict cut after 1"),
-        (FailsMidway(), {"left": 1, "['right']": 2}, "type FailsMidway: the bus is off"),
+        (NeverEnding(a=1), {"0": 0}, "too large"),
+        (FailsMidway(), {"left": 1, "['right']": 2}, "unsupported: FailsMidway"),
     ],
 )
 def test_what_a_mapping_does_not_give_is_named_and_the_rest_is_recorded(
@@ -416,10 +424,10 @@ def test_keys_that_are_new_in_every_state_do_not_fill_the_memory() -> None:
 
 @pytest.mark.usefixtures("encoder")
 def test_objects_that_take_too_long_cost_themselves_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoding, "LONGEST_S", -1.0)
+    monkeypatch.setattr(cleaning, "OBJECTS_BUDGET_S", -1.0)
     encoded = encoding.encode({"a": [Decimal(1), Decimal(2)], "b": {"c": 2.5}, "d": math.nan})
     assert json.loads(encoded.text)["b"] == {"c": 2.5}
-    assert encoded.replaced["a.1"] == "type Decimal: no time left"
+    assert encoded.replaced["a.1"] == "too large"
     assert encoded.replaced["d"] == "nan"
 
 
@@ -445,10 +453,10 @@ def test_arrays_that_there_is_no_room_for_are_not_read() -> None:
     Counted.read = 0
     encoded = encoding.encode({"a": [Counted(15_000, 120_000) for _ in range(500)]})
     assert Counted.read <= 4
-    assert encoded.replaced["a.499"] == "array[15000]"
+    assert encoded.replaced["a.499"] == "too large"
     few = encoding.encode({"a": Counted(10, 40_000_000)})
     assert Counted.read <= 4
-    assert few.replaced == {"a": "array of 40000000 bytes"}
+    assert few.replaced == {"a": "too large"}
 
 
 @pytest.mark.usefixtures("encoder")
@@ -456,3 +464,40 @@ def test_values_that_are_few_enough_are_bounded_by_the_bytes_of_their_row() -> N
     texts = {"\U0001f600" * 56 + f"{number:04}": "\U0001f600" * 15 for number in range(3_900)}
     assert sum(len(f"{key}{text}".encode()) for key, text in texts.items()) > MAX_ROW_BYTES
     assert_bounded(encoding.encode(texts))
+
+
+def test_many_mappings_without_end_cost_no_more_than_one_row() -> None:
+    EndlessDict.asked = 0
+    encoded = encoding.encode({"monsters": [EndlessDict(a=1) for _ in range(500)], "pose": POSE})
+    assert EndlessDict.asked <= 2 * MOST_LOOKED_AT
+    assert json.loads(encoded.text)["pose"] == POSE
+    assert_bounded(encoded)
+
+
+def test_a_dict_that_changes_while_it_is_read_costs_itself_only() -> None:
+    wheels: dict[str, Any] = {"left": math.nan, "right": 2.5}
+
+    class Growing:
+        """Adds to the dict that it is in, as another thread might."""
+
+        def tolist(self) -> float:
+            wheels[f"wheel {len(wheels)}"] = 1.0
+            return 0.5
+
+    wheels["middle"] = Growing()
+    wheels["last"] = 1.5
+    encoded = encoding.encode({"wheels": wheels, "pose": POSE})
+    assert json.loads(encoded.text)["pose"] == POSE
+    assert json.loads(encoded.text)["wheels"] == {"left": None, "right": 2.5, "middle": 0.5}
+    assert encoded.replaced == {"wheels": "unsupported: dict", "wheels.left": "nan"}
+
+
+KINDS = {"nan", "inf", "-inf", "too large", "too deep"}
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize("make", MONSTERS.values(), ids=MONSTERS)
+def test_few_kinds_say_what_was_replaced(make: Callable[[], Any]) -> None:
+    encoded = encoding.encode({"monster": make(), "raw": b"\1", "text": "\ud800"})
+    named = {path: kind for path, kind in encoded.replaced.items() if path}
+    assert all(kind in KINDS or kind.startswith("unsupported: ") for kind in named.values())

@@ -76,9 +76,9 @@ def test_numbers_arrays_and_structures_are_recorded_as_numbers(
     }
     (replaced,) = recording.rows("SELECT replaced FROM state")
     assert json.loads(replaced) == {
-        "name": "bytes",
-        "seen.0.colors": "null pointer",
-        "seen.0._model": "pointer of unknown length",
+        "name": "unsupported: bytes",
+        "seen.0.colors": "unsupported: LP_c_double",
+        "seen.0._model": "unsupported: c_char_p",
     }
 
 
@@ -101,7 +101,7 @@ def test_a_position_costs_no_more_than_a_list(monkeypatch: pytest.MonkeyPatch) -
     def refuse(state: object) -> Any:
         raise AssertionError(f"{state} took the slow path")
 
-    monkeypatch.setattr(encoding, "_encode_replacing", refuse)
+    monkeypatch.setattr(encoding, "_clean_and_encode", refuse)
     position = (ctypes.c_double * 3)(*POSE)
     assert json.loads(encoding.encode({"at": position}).text) == {"at": POSE}
 
@@ -125,7 +125,7 @@ NOWHERE = 8  # an address that ends the process when it is followed
 def test_a_pointer_is_named_and_never_followed(pointer: Any) -> None:
     text, replaced, _ = encoding.encode({"touch": pointer, "pose": POSE})
     assert json.loads(text) == {"touch": None, "pose": POSE}
-    assert replaced == {"touch": "pointer of unknown length"}
+    assert replaced == {"touch": f"unsupported: {type(pointer).__name__}"}
 
 
 @pytest.mark.usefixtures("encoder")
@@ -138,12 +138,16 @@ def test_an_array_of_c_strings_is_not_read_through() -> None:
 @pytest.mark.usefixtures("encoder")
 def test_a_null_pointer_is_named() -> None:
     null = ctypes.POINTER(ctypes.c_double)()
-    assert encoding.encode({"touch": null}) == ('{"touch":null}', {"touch": "null pointer"}, 0)
+    assert encoding.encode({"touch": null}) == (
+        '{"touch":null}',
+        {"touch": "unsupported: LP_c_double"},
+        0,
+    )
 
 
 def test_ctypes_is_not_imported_for_a_state_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "ctypes")
-    assert encoding.encode({"handle": object()}).replaced == {"handle": "type object"}
+    assert encoding.encode({"handle": object()}).replaced == {"handle": "unsupported: object"}
     assert "ctypes" not in sys.modules
 
 

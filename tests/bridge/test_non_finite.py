@@ -20,7 +20,7 @@ def without_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(state: object) -> Any:
         raise AssertionError(f"{state} took the slow path")
 
-    monkeypatch.setattr(encoding, "_encode_replacing", refuse)
+    monkeypatch.setattr(encoding, "_clean_and_encode", refuse)
 
 
 @pytest.mark.usefixtures("encoder")

@@ -71,5 +71,10 @@ def test_each_shell_has_a_script_that_knows_every_command(
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
     assert [name for name in COMMANDS if name not in script] == []
-    assert main(["completion", shell, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"shell": shell, "script": script[:-1]}
+
+
+def test_a_script_comes_as_json_as_well(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "zsh", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told.keys() == {"shell", "script"}
+    assert told["shell"] == "zsh" and told["script"].startswith("#compdef webots-mcp")

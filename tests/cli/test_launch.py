@@ -67,6 +67,7 @@ def _assert_told(launch: Launch, world: Path, *options: str, text: str) -> None:
     raise AssertionError(told)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_it_says_who_records_and_leaves_nothing_running_however_it_ends(
     launch: Launch, project: Callable[..., Path], number: signal.Signals, tmp_path: Path
@@ -114,6 +115,7 @@ def test_a_port_that_is_taken_is_told_by_the_one_that_webots_took(
     assert port < taken <= port + 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("controller", "said"),
     [

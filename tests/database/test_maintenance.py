@@ -70,7 +70,7 @@ def test_a_lease_that_was_taken_before_the_clock_was_set_back_is_free(
 def test_a_log_is_copied_while_it_is_written_begun_anew_when_it_is_long_and_cut_when_it_rests(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.database.maintenance.LONG_LOG_BYTES", 5_000_000)
+    monkeypatch.setattr("webots_mcp.database.maintenance.LONG_LOG_BYTES", 4_000_000)
     assert isinstance(recorded.database, Path)
     log = Path(f"{recorded.database}-wal")
     robot = recorded.robot()
@@ -90,7 +90,7 @@ def test_a_log_is_copied_while_it_is_written_begun_anew_when_it_is_long_and_cut_
         reader.execute("BEGIN")
         reader.execute("SELECT count(*) FROM state").fetchone()
         long = grow(200)  # what the reader looks at keeps the log from that
-        assert long > 5_000_000
+        assert long > 4_000_000
     assert grow(10) < long + 1_000_000
     assert grow(100) < long + 1_000_000  # where 3 MB would have been added
     assert grow(0) < 10_000

@@ -19,8 +19,10 @@ from webots_mcp.database.queue import (
     CLAIM,
     MAX_PARAMS_BYTES,
     CommandQueue,
+    _while_busy,
     any_unfinished,
     fetch_command,
+    find_command,
     list_commands,
 )
 from webots_mcp.errors import InvalidInputError
@@ -171,3 +173,79 @@ def test_commands_are_listed_newest_first_in_pages(recorded: Recorded) -> None:
 def test_an_unknown_command_is_an_error(recorded: Recorded) -> None:
     with pytest.raises(InvalidInputError, match="no command 5"):
         fetch_command(recorded.connection, 5)
+
+
+def test_the_same_parameters_in_another_order_are_the_same_request(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    first = queue.enqueue(robot.id, "go", {"x": 1, "y": 2}, idempotency_key="k")
+    assert queue.enqueue(robot.id, "go", {"y": 2, "x": 1}, idempotency_key="k").id == first.id
+
+
+def test_parameters_of_exactly_the_limit_are_taken_as_they_are_written(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    text = "ü" * ((MAX_PARAMS_BYTES - len('{"t": ""}')) // 2)
+    filled = text + "x" * (
+        MAX_PARAMS_BYTES - len(json.dumps({"t": text}, ensure_ascii=False).encode())
+    )
+    command = queue.enqueue(robot.id, "go", {"t": filled})
+    assert len(command.params.encode()) == MAX_PARAMS_BYTES
+    assert json.loads(command.params) == {"t": filled}
+
+
+def test_a_caller_that_leaves_cancels_what_waits_and_only_notes_what_runs(
+    recorded: Recorded,
+) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    waits = queue.enqueue(robot.id, "go")
+    assert queue.leave(waits.id, "the client left") is False
+    assert fetch_command(recorded.connection, waits.id).status == "cancelled"
+    runs = queue.enqueue(robot.id, "go")
+    assert claim(recorded.connection, robot.id, robot.session_id) == [runs.id]
+    assert queue.leave(runs.id, "the client left") is True
+    noted = fetch_command(recorded.connection, runs.id)
+    assert (noted.status, noted.error) == ("claimed", "the client left; the command continues")
+    assert queue.leave(waits.id, "again") is False
+    assert fetch_command(recorded.connection, waits.id).error == "the client left"
+
+
+def test_a_command_is_found_by_its_key(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    command = queue.enqueue(robot.id, "go", idempotency_key="k")
+    assert find_command(recorded.connection, "k") == command
+    assert find_command(recorded.connection, "another") is None
+
+
+@pytest.mark.parametrize(
+    ("result", "decoded"), [(None, None), ('{"x": 1}', {"x": 1}), ("no JSON", None)]
+)
+def test_a_result_that_is_no_json_is_none(
+    recorded: Recorded, result: str | None, decoded: object
+) -> None:
+    command = CommandQueue(recorded.connection).enqueue(recorded.robot().id, "go")
+    assert command._replace(result=result).decoded_result() == decoded
+
+
+def test_a_statement_is_sent_three_times_while_the_database_is_busy_and_else_once(
+    tmp_path: Path,
+) -> None:
+    file, sent = tmp_path / "webots.db", list[str]()
+    with closing(sqlite3.connect(file)) as holder, closing(sqlite3.connect(file, 0)) as other:
+        holder.execute("CREATE TABLE t (x)")
+        holder.execute("BEGIN IMMEDIATE")
+
+        def insert(table: str, released_at: int) -> sqlite3.Cursor:
+            sent.append(table)
+            if len(sent) == released_at:
+                holder.rollback()
+            return other.execute(f"INSERT INTO {table} VALUES (1)")
+
+        with pytest.raises(sqlite3.OperationalError, match="locked"):
+            _while_busy(lambda: insert("t", released_at=0))
+        assert sent == ["t"] * 3
+        sent.clear()
+        with pytest.raises(sqlite3.OperationalError, match="no such table"):
+            _while_busy(lambda: insert("missing", released_at=0))
+        assert sent == ["missing"]
+        sent.clear()
+        assert _while_busy(lambda: insert("t", released_at=3)).rowcount == 1
+        assert sent == ["t"] * 3

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.golden.drawing import KINDS
 from tests.judging.checks.judging import HEALTHY
 from tests.judging.checks.labelled import FAULTS, WRITTEN, healthy, record
+from tests.recordings.drawn import DRAWN
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, bundled
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.standin import Simulation
 
-RECORDED_BY_CODE = {*KINDS, HEALTHY, *FAULTS, *WRITTEN}
+RECORDED_BY_CODE = {*DRAWN, HEALTHY, *FAULTS, *WRITTEN}
 LIVE, NOTHING = "live", "nothing"
 
 
@@ -24,8 +24,8 @@ LIVE, NOTHING = "live", "nothing"
 def subject(of: str, folder: Path) -> Generator[Path]:
     """The database of a subject in a folder that is there; while it is asked, a live one drives."""
     file = folder / DATABASE_NAME
-    if of in KINDS:
-        KINDS[of].draw(folder)
+    if of in DRAWN:
+        DRAWN[of](folder)
     elif of in RECORDED_BY_CODE:
         _draw_labelled(of, file)
     elif of == LIVE:

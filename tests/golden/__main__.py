@@ -1,7 +1,8 @@
-"""Asks every question of every golden recording: `python -m tests.golden [--accept] [NAME ...]`.
+"""Ask every question of every golden recording: `python -m tests.golden [--accept] [NAME ...]`.
 
-Without `--accept` it prints how the answers differ from those stored in `answers/`; with it those
-of today take their place. Whoever accepts says in the commit why each answer changed.
+Without `--accept` it prints how the answers differ from those stored in `answers/`; with it today's
+answers take their place, all of them or those of the questions that `--question` names. Whoever
+accepts says in the commit why each answer changed.
 """
 
 from __future__ import annotations
@@ -9,22 +10,33 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from fnmatch import fnmatchcase
 
-from tests.golden.drawing import KINDS
-from tests.golden.stored import answers_of, difference, store
+from tests.golden.recordings import RECORDINGS
+from tests.golden.stored import answers_of, difference, store, stored
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.golden", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(KINDS)} (all)")
-    parser.add_argument("--accept", action="store_true", help="store the answers of today")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(RECORDINGS)}")
+    parser.add_argument("--accept", action="store_true", help="store today's answers")
+    parser.add_argument(
+        "--question", action="append", metavar="PATTERN",
+        help="only these questions, such as 'check*' or 'events*'; may be given several times",
+    )  # fmt: skip
     arguments = parser.parse_args()
-    if unknown := set(arguments.names) - set(KINDS):
-        parser.error(f"no recording {', '.join(unknown)}: there is {', '.join(KINDS)}")
+    if unknown := set(arguments.names) - set(RECORDINGS):
+        parser.error(f"no recording {', '.join(unknown)}: there are {', '.join(RECORDINGS)}")
     logging.disable(logging.WARNING)  # of client and server: each call
     differing = 0
-    for name in arguments.names or KINDS:
+    for name in arguments.names or RECORDINGS:
         answers = answers_of(name)
+        if patterns := arguments.question:
+            answers = {
+                asked: text if any(fnmatchcase(asked, each) for each in patterns) else before
+                for asked, text in answers.items()
+                if (before := stored(name).get(asked, text)) is not None
+            }
         found = difference(name, answers)
         differing += bool(found)
         print(found or f"{name}: {len(answers)} answers as stored")

@@ -1,4 +1,7 @@
-"""Every question that is asked of each recording, by what it asks and not by the name of a tool."""
+"""Every question that is asked of each recording, by what it asks and not by the name of a tool.
+
+All is asked in this process: tools by a client in memory, the rest by a call.
+"""
 
 from __future__ import annotations
 
@@ -6,25 +9,24 @@ import csv
 import hashlib
 import io
 import json
+import re
 import sqlite3
-from collections.abc import AsyncGenerator, Iterator
-from contextlib import asynccontextmanager, closing, redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import closing, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final, cast
 from unittest.mock import patch
 
 import anyio
-import httpx2
 from mcp import Client
-from mcp.client.streamable_http import streamable_http_client
-from mcp.server import MCPServer
 
-from tests.golden.drawing import Kind
+from tests.golden.recordings import GoldenRecording
 from tests.plugins.report.conftest import Shown
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
+from webots_mcp.extras.plugins import export_formats
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
@@ -38,16 +40,13 @@ from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
 Answers = dict[str, Any]
 
-_VIEWS: Final = (
-    "robot_run", "robot_command", "robot_event", "robot_period", "robot_log", "robot_parameter",
-    "robot_kept", "robot_now", "robot_trajectory",
-)  # fmt: skip
-_IN_A_BUNDLE: Final = ("run", "state", "log", "event", "image", "kept_stretch", "kept_state")
-OVER_HTTP: Final = ", over HTTP"  # behind the name of a question that was asked so once more
-_WALL_TIME: Final = "wall time"  # in a report; how long follows
-_ROWS_SHOWN: Final = 12
-_POINTS_SHOWN: Final = 6  # of a curve, evenly from it
-_NOT_MEASURED: Final = ("wall_time_s", "id", "run_id")  # columns of an export
+IN_A_BUNDLE: Final = ("run", "state", "log", "event", "image", "kept_stretch", "kept_state")
+ROWS_SHOWN: Final = 4
+POINTS_SHOWN: Final = 6  # of a curve, evenly from it
+NOT_MEASURED: Final = ("wall_time_s", "id", "run_id")  # columns of an export
+
+PART_OF_STATE: Final = "part_of_state"  # in arguments: the first name of the signal X
+PICTURE_S: Final = "picture_s"  # in arguments: when the recording has a picture
 
 # question: (tool, arguments). A tool that is renamed or merged is changed here, and no answer.
 TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
@@ -56,15 +55,15 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "state": ("webots_get_robot_state", {}),
     "sensors": ("webots_get_sensors", {}),
     "full state": ("webots_get_full_state", {}),
-    "a part of the full state": ("webots_get_full_state", {"path": "pose"}),
+    "a part of the full state": ("webots_get_full_state", {"path": PART_OF_STATE}),
     "newest logs": ("webots_get_logs", {}),
     "warnings": ("webots_get_logs", {"level": "warning", "lines": 5}),
     "what just happened": ("webots_monitor", {"lookback_wall_s": 60}),
     "signals": ("webots_list_signals", {}),
-    "signals of a pattern": ("webots_list_signals", {"pattern": "pose*"}),
+    "signals of a pattern": ("webots_list_signals", {"pattern": "X"}),
     "history": ("webots_query_history", {"signals": ["*"], "max_points": 6}),
     "history of the mode": ("webots_query_history", {"signals": ["mode"]}),
-    "history in rows": ("webots_query_history", {"signals": ["pose*"], "raw": True}),
+    "history in rows": ("webots_query_history", {"signals": ["X"], "raw": True, "last_s": 0.3}),
     "trends": ("webots_get_trends", {}),
     "trends of the mode": ("webots_get_trends", {"signals": ["mode"]}),
     "events": ("webots_find_events", {}),
@@ -90,85 +89,154 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "parameters": ("webots_get_parameters", {}),
     "trials": ("webots_get_trials", {}),
     "commands": ("webots_list_commands", {}),
-    "breakpoints": ("webots_list_breakpoints", {}),
     "SELECT": ("webots_query_sql", {"sql": "SELECT count(*) AS n, max(sim_time_s) FROM state"}),
+    "pictures": ("webots_get_camera", {"at_s": PICTURE_S}),
+    "plot": ("webots_plot", {}),
+    "check": ("webots_check_run", {}),
+    "check of an expectation": ("webots_check_run", {"expect": ["X > -100"]}),
+    "outcome of a command": ("webots_wait_for_command", {"command_id": 1, "timeout_wall_s": 1}),
+    "diagnosis": ("webots_diagnose", {}),
+    "scene": ("webots_get_scene", {}),
+    "field of a node": ("webots_get_field", {"path": "ROBOT.translation"}),
+}
+NEEDS_A_SIMULATION: Final = ("scene", "field of a node")
+"""Questions that read, but a running simulation and no recording."""
+
+# What changes something is asked last. A recording alone takes labels and gives reports; what needs
+# a running simulation says that there is none.
+ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
+    "label a run": ("webots_annotate_run", {"label": "golden", "note": "asked in a test"}),
+    "write a report": ("webots_report", {"file": "report.html"}),
+    "set a breakpoint": ("webots_breakpoint", {"condition": "X > 1e6"}),
+    "breakpoints": ("webots_list_breakpoints", {}),
+    "remove a breakpoint": ("webots_remove_breakpoint", {"breakpoint_id": 1}),
+    "send a command": ("webots_send_command", {"action": "blink", "timeout_wall_s": 1}),
+    "set parameters": ("webots_set_parameters", {"values": {"speed": 0.3}, "timeout_wall_s": 1}),
+    "run on": ("webots_run", {"for_s": 1.0, "timeout_wall_s": 1}),
+    "run trials": (
+        "webots_run_trials",
+        {"parameters": [{"speed": 0.3}], "score": "max(X)", "for_s": 1.0},
+    ),
+    "take a screenshot": ("webots_take_screenshot", {"timeout_wall_s": 1}),
+    "pause": ("webots_simulation_control", {"command": "pause", "timeout_wall_s": 1}),
+    "reset the world": ("webots_world_reset", {"timeout_wall_s": 1}),
+    "reload the world": ("webots_world_reload", {"timeout_wall_s": 1}),
+    "reset the controller": ("webots_reset_controller_state", {"timeout_wall_s": 1}),
+    "load a world": ("webots_load_world", {"world": "worlds/absent.wbt", "timeout_wall_s": 1}),
+    "launch a world": ("webots_launch_world", {"world": "worlds/absent.wbt", "timeout_wall_s": 1}),
+    "quit Webots": ("webots_quit", {"timeout_wall_s": 1}),
+    "set a field": ("webots_set_field", {"path": "BALL.translation", "value": [0, 0, 1]}),
+    "add a node": ("webots_add_node", {"vrml": "Solid { }"}),
+    "remove a node": ("webots_remove_node", {"path": "BALL"}),
+    "edit the scene": ("webots_edit_scene", {"action": "remove", "path": "BALL"}),
 }
 _OF_A_PART: Final = ("newest logs", "history", "trends", "events", "timeline")
 
 
-def ask_all(kind: Kind, folder: Path) -> Answers:
-    """All answers of a recording, each as plain data; of a refusal its text.
+def ask_all(recording: GoldenRecording, folder: Path) -> Answers:
+    """All answers about a recording, each as plain data; of a refusal its text.
 
     Questions have a clock that stands still: none is cut short on a slow machine.
     """
     with patch.object(Deadline.__init__, "__defaults__", (QUESTION_DEADLINE_S, lambda: 0.0)):
-        return _ask_all(kind, folder)
+        return _ask_all(recording, folder)
 
 
-def _ask_all(kind: Kind, folder: Path) -> Answers:
+def _ask_all(recording: GoldenRecording, folder: Path) -> Answers:
     file = folder / "webots.db"
-    found = anyio.run(ask_tools, kind, file)
+    found = anyio.run(ask_tools, recording, file, TOOLS | _parts_of(recording))
+    found["diagnosis"] = _checks_of(found["diagnosis"])
+    if not recording.has_own_clock:  # the machine's pace is a check too
+        for name in ("check", "check of an expectation"):
+            del found[name]["outcome"]
     with closing(connect(file, "reader")) as connection:
-        found |= {f"view {name}": _view(connection, name) for name in _VIEWS}
-        found |= dict(_plots(connection, kind))
-        found["report"] = _report(connection, kind, folder)
-        found |= dict(_exports(connection, kind, folder))
-    return found
+        found |= dict(_views(connection))
+        found |= dict(_plots(connection, recording))
+        found["report"] = _report(connection, recording, folder)
+        found |= dict(_exports(connection, recording, folder))
+    return found | anyio.run(ask_tools, recording, file, ACTIONS)
 
 
-async def ask_tools(kind: Kind, file: Path) -> Answers:
-    """What the tools answer of the recording in that file; of a refusal its texts."""
+def _checks_of(diagnosis: Any) -> list[str]:
+    """The names of the checks of a diagnosis; what they found is this machine's."""
+    names = [each["check"] for each in diagnosis.get("failed", [])]
+    names += diagnosis.get("passed", "").split(", ")
+    for checks in diagnosis.get("not_checked", {}).values():
+        names += checks.split(", ")
+    return sorted(filter(None, names))
+
+
+def _parts_of(recording: GoldenRecording) -> dict[str, tuple[str, dict[str, Any]]]:
+    """The questions about an interval of the recording."""
+    start_s, end_s = recording.part
+    return {
+        f"{name} of a part": (tool, arguments | {"start_s": start_s, "end_s": end_s})
+        for name, (tool, arguments) in TOOLS.items()
+        if name in _OF_A_PART
+    }
+
+
+async def ask_tools(
+    recording: GoldenRecording, file: Path, asked: dict[str, tuple[str, dict[str, Any]]]
+) -> Answers:
+    """What the tools answer about the recording in that file; of a refusal its texts."""
     found: Answers = {}
-    asked = dict(TOOLS)
-    part = {"start_s": kind.part[0], "end_s": kind.part[1]}
-    for name in _OF_A_PART:
-        tool, arguments = TOOLS[name]
-        asked[f"{name} of a part"] = (tool, arguments | part)
-    single = [each for each in all_questions() if not isinstance(each, MergedQuestion)]
-    known = {each.name: each.arguments.model_fields for each in single}
-    server = create_server(file, file.parent, read_only=True)
-    async with Client(server) as client, _client_over_http(server) as other:
+    known = {
+        each.name: each.arguments.model_fields
+        for each in sorted(all_questions(), key=lambda each: not isinstance(each, MergedQuestion))
+    }
+    async with Client(create_server(file, file.parent)) as client:
         for name, (tool, arguments) in asked.items():
-            subject = {"robot": kind.robot, "run_id": kind.run_id, "where": _where(kind, arguments)}
-            taken = {key: subject[key] for key in subject if key in known[tool] and subject[key]}
-            for asker, addition in ((client, ""), (other, OVER_HTTP)):
-                result = await asker.call_tool(tool, arguments | taken)
-                texts = [block.text for block in result.content if block.type == "text"]
-                found[name + addition] = result.structured_content or texts
-                assert result.is_error == (result.structured_content is None), name
+            given = {"robot": recording.robot, "run_id": recording.run_id} | {
+                key: _about(recording, value) for key, value in arguments.items()
+            }
+            taken = {
+                key: value
+                for key, value in given.items()
+                if key in known[tool] and value is not None
+            }
+            result = await client.call_tool(tool, taken)
+            texts = [block.text for block in result.content if block.type == "text"]
+            found[name] = result.structured_content or [_read(text) for text in texts]
     return found
 
 
-@asynccontextmanager
-async def _client_over_http(server: MCPServer) -> AsyncGenerator[Client]:
-    """A client of the handshake that most have, on the server's HTTP application."""
-    app = server.streamable_http_app()
-    carrier = httpx2.AsyncClient(transport=httpx2.ASGITransport(app), timeout=60)
-    async with carrier, server.session_manager.run():
-        transport = streamable_http_client("http://localhost:8000/mcp", http_client=carrier)
-        async with Client(transport, mode="legacy") as client:
-            yield client
+def _read(text: str) -> Any:
+    """What a picture's caption says as data; of a refusal its text."""
+    if text.startswith("{"):
+        return json.loads(text)
+    return re.sub(r"^Error executing tool \w+: ", "", text)
 
 
-def _where(kind: Kind, arguments: dict[str, Any]) -> str | None:
-    condition = arguments.get("where")
-    return condition and condition.replace("X", kind.x)
+def _about(recording: GoldenRecording, value: Any) -> Any:
+    """An argument with the recording's own signal and time in it."""
+    if value == PICTURE_S:
+        return recording.picture_s
+    if value == PART_OF_STATE:
+        return recording.x.partition(".")[0]
+    if isinstance(value, list):
+        return [_about(recording, each) for each in cast("list[Any]", value)]
+    return re.sub(r"\bX\b", recording.x, value) if isinstance(value, str) else value
 
 
-def _view(connection: sqlite3.Connection, name: str) -> Any:
-    """How many rows a view has, and the first of them."""
-    (count,) = connection.execute(f"SELECT count(*) FROM {name}").fetchone()
-    cursor = connection.execute(f"SELECT * FROM {name} ORDER BY 1, 2, 3, 4")
-    columns = [column for column, *_ in cursor.description]
-    rows = [dict(zip(columns, row, strict=True)) for row in cursor.fetchmany(_ROWS_SHOWN)]
-    return {"rows": count, "first": rows}
+def _views(connection: sqlite3.Connection) -> Iterator[tuple[str, Any]]:
+    """Of each view how many rows it has, and the first of them."""
+    named = connection.execute("SELECT name FROM sqlite_master WHERE type = 'view' ORDER BY name")
+    for (name,) in named.fetchall():
+        (count,) = connection.execute(f"SELECT count(*) FROM {name}").fetchone()
+        cursor = connection.execute(f"SELECT * FROM {name} ORDER BY 1, 2, 3, 4")
+        columns = [column for column, *_ in cursor.description]
+        rows = [dict(zip(columns, row, strict=True)) for row in cursor.fetchmany(ROWS_SHOWN)]
+        yield f"view {name}", {"rows": count, "first": rows}
 
 
-def _plots(connection: sqlite3.Connection, kind: Kind) -> Iterator[tuple[str, Any]]:
+def _plots(connection: sqlite3.Connection, recording: GoldenRecording) -> Iterator[tuple[str, Any]]:
     """What plots of the run, of a part of it and of trials are painted from."""
-    scope = Scope(robot=kind.robot, run_id=kind.run_id)
+    scope = Scope(robot=recording.robot, run_id=recording.run_id)
     whole = [find_range(connection, scope)]
-    part = [find_range(connection, replace(scope, start_s=kind.part[0], end_s=kind.part[1]))]
+    part = [
+        find_range(connection, replace(scope, start_s=recording.part[0], end_s=recording.part[1]))
+    ]
     for name, ranges in (("", whole), (" of a part", part)):
         yield f"plot of signals{name}", _composed(compose_signals, connection, ranges, ["*"])
         yield f"plot of the trajectory{name}", _composed(compose_trajectory, connection, ranges)
@@ -190,32 +258,38 @@ def _data(value: Any) -> Any:
         return {str(key): _data(each) for key, each in cast("dict[Any, Any]", value).items()}
     if isinstance(value, list | tuple):
         each_of = [_data(each) for each in cast("list[Any]", value)]
-        if len(each_of) <= 2 * _POINTS_SHOWN:
+        if len(each_of) <= 2 * POINTS_SHOWN:
             return each_of
-        every = len(each_of) // _POINTS_SHOWN
+        every = len(each_of) // POINTS_SHOWN
         return {"count": len(each_of), "some": each_of[::every]}
     return value
 
 
-def _report(connection: sqlite3.Connection, kind: Kind, folder: Path) -> Any:
-    """The words of a report of the run, line by line, and what it holds."""
-    run_id = find_range(connection, Scope(robot=kind.robot, run_id=kind.run_id)).segments[0].run_id
-    report = make_report(connection, [run_id], folder)
-    words = [*filter(None, (" ".join(each.split()) for each in Shown(report.html).words))]
-    if not kind.clock and (before := words.index(_WALL_TIME)):
-        words[before + 1] = "CLOCK"
-    return {"holds": report.holds, "left out": report.left_out, "text": words}
+def _report(connection: sqlite3.Connection, recording: GoldenRecording, folder: Path) -> Any:
+    """The headings of a report of the run and what it holds; its words are those of the answers."""
+    scope = Scope(robot=recording.robot, run_id=recording.run_id)
+    report = make_report(connection, [find_range(connection, scope).segments[0].run_id], folder)
+    headings = re.findall(r"<h[1-3][^>]*>(.*?)</h[1-3]>", report.html.decode(), re.DOTALL)
+    texts = [" ".join(Shown(each.encode()).text.split()) for each in headings]
+    return {"holds": report.holds, "left out": report.left_out, "headings": texts}
 
 
-def _exports(connection: sqlite3.Connection, kind: Kind, folder: Path) -> Iterator[tuple[str, Any]]:
-    whole = find_range(connection, Scope(robot=kind.robot, run_id=kind.run_id))
+def _exports(
+    connection: sqlite3.Connection, recording: GoldenRecording, folder: Path
+) -> Iterator[tuple[str, Any]]:
+    whole = find_range(connection, Scope(robot=recording.robot, run_id=recording.run_id))
     for form in ("csv", "jsonl"):
         sink = io.BytesIO()
         rows = export(connection, whole, form, sink)
         yield f"export as {form}", {"rows": rows, **_content(form, sink.getvalue())}
-    for form in ("mcap", "rrd"):
-        file = folder / f"golden.{form}"
-        yield f"export as {form}", export_for_viewers(connection, folder, whole, form, file).counts
+    for each in export_formats():
+        file = folder / f"golden.{each.name}"
+        if each.for_viewers:
+            exported = export_for_viewers(connection, folder, whole, each.name, file)
+            yield f"export as {each.name}", exported.counts
+        else:
+            with file.open("wb") as sink:
+                yield f"export as {each.name}", {"rows": export(connection, whole, each.name, sink)}
     yield "export as bundle", _imported_again(whole.segments[0].run_id, folder)
     try:
         sink = io.BytesIO()
@@ -237,7 +311,7 @@ def _imported_again(run_id: int, folder: Path) -> dict[str, int]:
             status = main(command)
         assert status == 0, command
     with closing(connect(back / "webots.db", "reader")) as connection:
-        counts = [(of, connection.execute(f"SELECT count(*) FROM {of}")) for of in _IN_A_BUNDLE]
+        counts = [(of, connection.execute(f"SELECT count(*) FROM {of}")) for of in IN_A_BUNDLE]
         return {of: found.fetchone()[0] for of, found in counts}
 
 
@@ -248,6 +322,6 @@ def _content(form: str, content: bytes) -> dict[str, Any]:
         return {"columns": lines[0].split(",")}
     rows = [json.loads(line) for line in lines]
     names = dict.fromkeys(name for row in rows for name in row)
-    told = [{name: row[name] for name in row if name not in _NOT_MEASURED} for row in rows]
+    told = [{name: row[name] for name in row if name not in NOT_MEASURED} for row in rows]
     digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
     return {"columns": list(names), "values": digest[:16]}

@@ -11,39 +11,32 @@ from pathlib import Path
 from typing import Final
 from unittest.mock import patch
 
-from tests.golden.asking import OVER_HTTP, ask_all
-from tests.golden.drawing import CONTROLLER, KINDS, Kind
+from tests.golden.asking import ask_all
+from tests.golden.recordings import RECORDINGS, GoldenRecording
 from tests.golden.text import Portable
+from tests.recordings.drawn import CONTROLLER
 
 _FOLDER: Final = Path(__file__).parent / "answers"
 _HEADING: Final = "== "
 
 
 @contextmanager
-def drawn(kind: Kind) -> Generator[Path]:
-    """A folder with such a recording, for as long as that lasts."""
+def drawn(recording: GoldenRecording) -> Generator[Path]:
+    """A folder with such a recording, while the context lasts."""
     with tempfile.TemporaryDirectory() as folder_name:
         folder = Path(folder_name)
         program = patch.object(sys.modules["__main__"], "__file__", str(CONTROLLER), create=True)
         with program, patch.object(sys, "argv", [str(CONTROLLER)]):
-            kind.draw(folder)
+            recording.draw(folder)
         yield folder
 
 
 def answers_of(name: str) -> dict[str, str]:
-    """Draw a recording, and what each question answers of it today, as portable text.
-
-    What is answered over HTTP is there only where it is something else.
-    """
-    kind = KINDS[name]
-    with drawn(kind) as folder:
-        portable = Portable(kind, folder)
-        texts = {asked: portable.text(told) for asked, told in ask_all(kind, folder).items()}
-    return {
-        asked: text
-        for asked, text in texts.items()
-        if not asked.endswith(OVER_HTTP) or text != texts[asked.removesuffix(OVER_HTTP)]
-    }
+    """Draw a recording and return today's answer to each question, as portable text."""
+    recording = RECORDINGS[name]
+    with drawn(recording) as folder:
+        portable = Portable(recording, folder)
+        return {asked: portable.text(each) for asked, each in ask_all(recording, folder).items()}
 
 
 def stored(name: str) -> dict[str, str]:

@@ -8,7 +8,8 @@ from itertools import compress
 from pathlib import Path
 from typing import Any, Final, cast
 
-from tests.golden.drawing import CHECKOUT, Kind
+from tests.golden.recordings import GoldenRecording
+from tests.recordings.drawn import CHECKOUT
 from webots_mcp import __version__
 
 _WIDTH: Final = 160
@@ -19,7 +20,7 @@ _ASKED_NOW: Final = re.compile(
 )
 # What the clock of the machine that recorded tells: only where it was a real one.
 _RECORDED_THEN: Final = re.compile(
-    r"(^|_)(wall|utc|pace|factor|started|ended|created|claimed|finished|waiting|running|commit)(_|$)"
+    r"(^|_)(wall|utc|pace|factor|started|ended|created|claimed|finished|waiting|running|commit|polls)(_|$)"
     r"|^(since|until|when|clock|longest_step_s|rows_per_s|own_ms|step_wait_ms)$"
 )
 _UUID: Final = re.compile(r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b")
@@ -32,14 +33,16 @@ _MADE: Final = re.compile(r"Made on .*? UTC")
 _UNIX: Final = re.compile(r"\b1[7-9]\d{8}(\.\d+)?\b")
 _PACE: Final = re.compile(r", at [\d.,]+ times real time")
 _KEEPS_PACE: Final = "keeps pace"
+_OTHER_ROUTES: Final = re.compile(r"websocket: .*", re.DOTALL)  # what else this machine offers
 _CLOCK: Final = re.compile(r"\b\d\d:\d\d:\d\d(\.\d+)?\b")
 
 
 class Portable:
     """Makes the answers of one recording portable: what a clock tells is left out."""
 
-    def __init__(self, kind: Kind, folder: Path) -> None:
-        self._real_clock = not kind.clock
+    def __init__(self, recording: GoldenRecording, folder: Path) -> None:
+        self._untrue = recording.untrue
+        self._real_clock = not recording.has_own_clock
         self._named_here = (
             (str(folder), "FOLDER"), (str(CHECKOUT), "CHECKOUT"), (__version__, "VERSION"),
         )  # fmt: skip
@@ -54,14 +57,15 @@ class Portable:
             if isinstance(named.get("columns"), list) and isinstance(named.get("rows"), list):
                 named = named | self._table(named["columns"], named["rows"])
             told = {key: self._made(each) for key, each in named.items() if self._told(key)}
-            return {key: each for key, each in told.items() if each != {}}
+            return {
+                key: each
+                for key, each in told.items()
+                if each != {} and not (isinstance(each, str) and each in self._untrue)
+            }
         if isinstance(value, list | tuple):
             items = list(cast("list[Any]", value))
-            if self._real_clock and _KEEPS_PACE in items:  # a check, its outcome and its evidence
-                at = items.index(_KEEPS_PACE)
-                del items[at : at + 3]
-            if "host" in items[:-1]:  # a label of a report, before its value
-                items[items.index("host") + 1] = "HOST"
+            if self._real_clock:
+                items = [each for each in items if _KEEPS_PACE not in (each, *_first_of(each))]
             return [self._made(each) for each in items]
         if isinstance(value, float):
             return float(f"{value:.{_DIGITS}g}")
@@ -80,7 +84,10 @@ class Portable:
             return False
         return not (self._real_clock and _RECORDED_THEN.search(name))
 
-    def _words(self, text: str) -> str:
+    def _words(self, text: str) -> Any:
+        if text.startswith("{") and text.endswith("}"):  # JSON, such as a state in a view
+            return self._made(json.loads(text))
+        text = _OTHER_ROUTES.sub("other routes", text)
         for written, stands in self._named_here:
             text = text.replace(written, stands)
         text = _VERSIONS.sub(r"\1 VERSION", _COMMIT.sub("COMMIT", _UUID.sub("UUID", text)))
@@ -91,6 +98,10 @@ class Portable:
             for pattern in (_MOMENT, _CLOCK, _UNIX):
                 text = pattern.sub("CLOCK", text)
         return text
+
+
+def _first_of(value: Any) -> list[Any]:
+    return cast("list[Any]", value)[:1] if isinstance(value, list) else []
 
 
 def _lines(value: Any, indent: str) -> list[str]:

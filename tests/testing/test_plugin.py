@@ -14,6 +14,7 @@ pytest_plugins = ["pytester"]
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 def test_the_documentations_examples_work_as_printed(pytester: pytest.Pytester) -> None:
     text = (ROOT / "docs" / "testing.md").read_text("utf-8")
     blocks = re.findall(r"```python\n(# (\S+\.py)\n.*?)```", text, re.DOTALL)
@@ -26,6 +27,7 @@ def test_the_documentations_examples_work_as_printed(pytester: pytest.Pytester) 
     pytester.runpytest_subprocess("-Werror", "-p", "no:cacheprovider").assert_outcomes(passed=6)
 
 
+@pytest.mark.slow
 def test_the_documentations_failure_is_todays(pytester: pytest.Pytester) -> None:
     text = (ROOT / "docs" / "testing.md").read_text("utf-8")
     (code,) = re.findall(r"```python\n# test_rover.py\n(.*?)```", text, re.DOTALL)
@@ -46,6 +48,7 @@ def _copy_project(folder: Path) -> None:
         (folder / name).write_text((ROOT / "examples" / name).read_text("utf-8"))
 
 
+@pytest.mark.slow
 def test_the_example_passes() -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "examples/tests"]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from webots_mcp.bridge.cleaning import BYTES_AS_TEXT, TEXT_WITH_SURROGATES, TOO_LARGE
 from webots_mcp.bridge.encoding import Encoded, encode
 from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
@@ -16,8 +17,7 @@ from webots_mcp.database.pauses import PAUSED
 
 MOST_LOG_CHARACTERS: Final = 10_000
 _MOST_LOGGER_CHARACTERS: Final = 200
-_NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
-_CUT: Final = ("text[", "key[", "dict cut")
+_NOT_LOST: Final = ("nan", "inf", "-inf", BYTES_AS_TEXT, TEXT_WITH_SURROGATES)
 _MOST_LOST_PATHS: Final = 20
 _LEVELS: Final = {"stdout": "info", "stderr": "warning"}
 
@@ -68,7 +68,7 @@ class Journal:
             if kind in _NOT_LOST or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
                 continue
             self._lost.add(path)
-            what = "was cut" if kind.startswith(_CUT) else "could not be stored"
+            what = "could not be stored whole" if kind == TOO_LARGE else "could not be stored"
             self.log("warning", "bridge", f"{path or 'state'} {what}: {kind}")
 
 

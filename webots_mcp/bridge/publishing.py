@@ -11,9 +11,10 @@ from itertools import islice
 from typing import Any, Final, cast
 
 from webots_mcp.bridge.breakpoints import Breakpoints, Watch
+from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.commands import Reloads
 from webots_mcp.bridge.devices import DeviceReader
-from webots_mcp.bridge.encoding import MAX_KEY_CHARACTERS, encode, key_text
+from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.keeping import Keeper

@@ -41,9 +41,12 @@ def in_current_schema(database: Path) -> Generator[Path]:
     Raises:
         DatabaseError: The recording does not exist, or its tables are not ours.
     """
-    with closing(connect(database, "reader")) as connection:
-        version = schema_version(connection)
-        is_frozen = isinstance(connection, FrozenConnection)
+    try:
+        with closing(connect(database, "reader")) as connection:
+            version = schema_version(connection)
+            is_frozen = isinstance(connection, FrozenConnection)
+    except sqlite3.Error:  # whoever reads it says what is wrong with it
+        version, is_frozen = 0, False
     if version != PREVIOUS_SCHEMA_VERSION:
         yield database
         return

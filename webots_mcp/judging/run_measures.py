@@ -25,10 +25,10 @@ from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
 from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.frame_summary import change_points
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Deadline, Segment
+from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.runs import run_info
 from webots_mcp.store.signals import RegisteredSignal
 

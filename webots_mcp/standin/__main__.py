@@ -1,4 +1,4 @@
-"""Runs a world in the foreground: `python -m webots_mcp.standin WORLD`."""
+"""The command that runs a world in the foreground: `python -m webots_mcp.standin WORLD`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from types import FrameType
 from webots_mcp.standin import Simulation, StandInError
 from webots_mcp.standin.simulation import ConsoleRecorder
 
-_ALL_ENDED_S = 1.0  # without a controller; a reload is without one for milliseconds
+_ALL_ENDED_S = 1.0
+"""How long no controller may run before the simulation ends. A reload takes milliseconds."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until the time or the last controller ends, a supervisor quits, or Ctrl-C or SIGTERM.
+    """Run until the time is over, the last controller ends, a supervisor quits, or Ctrl-C.
 
     Returns:
         The exit status of `run_world`.
@@ -39,13 +40,14 @@ def run_world(
     Args:
         world: A .wbt file.
         mode: pause, realtime or fast.
-        duration_s: It ends after so much simulated time; None: with its last controller.
-        controllers: Files that control robots, by name, instead of what the world says.
-        recorder: Keeps what is printed.
+        duration_s: Simulated time after which it ends; None to end with the last controller.
+        controllers: Controller files by robot name, instead of those that the world names.
+        recorder: Stores the lines of the console.
 
     Returns:
-        The exit status: that of `simulationQuit`, else that of the first controller that ended with
-        an error (128 and the number for a signal), else 0; 2 for a world that cannot be used.
+        The status given to `simulationQuit`, else the exit status of the first controller that
+        ended with an error (for a signal 128 plus its number), else 0; 2 for a world that cannot
+        be used.
     """
     stopped = threading.Event()
 
@@ -71,17 +73,17 @@ def run_world(
 
 
 def _wait(simulation: Simulation, stopped: threading.Event, duration_s: float | None) -> None:
-    led_s = time.monotonic()  # when a controller was last seen that can act
+    active_s = time.monotonic()  # The last time at which a controller ran or could connect.
 
     def is_over() -> bool:
-        nonlocal led_s
+        nonlocal active_s
         if stopped.is_set() or not simulation.is_running:
             return True
         if duration_s is not None:
             return simulation.time_s >= duration_s
         if simulation.can_go_on:
-            led_s = time.monotonic()
-        return time.monotonic() - led_s > _ALL_ENDED_S
+            active_s = time.monotonic()
+        return time.monotonic() - active_s > _ALL_ENDED_S
 
     simulation.wait_for(is_over, timeout_s=float("inf"))
 

@@ -1,33 +1,24 @@
-"""What lets a world run, and what the simulator answers to the messages of controllers."""
+"""The answers of the simulator to the messages of controllers."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
 
 from controller.session import Message
 
 from webots_mcp.standin.arena import Body
 from webots_mcp.standin.devices import FetchedSensor
+from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.pictures import Label
-from webots_mcp.standin.simulator import Mode, Robot, Simulator, TrackedKey
-from webots_mcp.standin.vrml import (
-    NODE_TYPES,
-    FieldDefinition,
-    Node,
-    Parser,
-    WorldError,
-    descendants_of,
-)
-from webots_mcp.standin.world import as_text, load_world
+from webots_mcp.standin.simulator import Mode, SimulatedRobot, Simulator, TrackedKey
+from webots_mcp.standin.vrml import NODE_TYPES, FieldDefinition, Parser, WorldNode, descendants_of
+from webots_mcp.standin.world import as_text
 
 CUSTOM_DATA_TAG: Final = 0
-"""Stands for the robot itself where devices have their tags."""
-
-_FOLLOWED_OF_PROTOS: Final = ("translation", "rotation", "name", "customData")
+"""Tag of the robot itself among the tags of its devices."""
+_LIVE_PROTO_FIELDS: Final = ("translation", "rotation", "name", "customData")
+"""Fields of a PROTO node that can be set after it was built."""
 
 FieldReference = tuple[int, str]
 """Node id and field name."""
@@ -35,8 +26,8 @@ FieldSet = tuple[FieldReference, int | None, Any]
 """A field, the index of an entry or None, and the new value."""
 
 
-def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
-    """The data that a controller receives when it connects."""
+def description(simulator: Simulator, robot: SimulatedRobot) -> dict[str, Any]:
+    """Return the data that a controller receives when it connects."""
     fields = robot.node.fields
     requests = SupervisorRequests(simulator, robot)
     return {
@@ -57,8 +48,8 @@ def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
     }
 
 
-def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | None:
-    """Answer a controller; None if the answer has to wait until simulated time has passed."""
+def answer(simulator: Simulator, robot: SimulatedRobot, message: Message) -> Message | None:
+    """Return the answer to a controller; None if it has to wait until simulated time has passed."""
     kind, *rest = message
     if kind == "step":
         return _step(simulator, robot, *rest)
@@ -71,8 +62,8 @@ def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | No
     return ("answer", requests.carry_out(operation, arguments), int(simulator.mode))
 
 
-def step_over(simulator: Simulator, robot: Robot) -> Message:
-    """The answer to a step request: time, mode and the values measured since the last one."""
+def step_over(simulator: Simulator, robot: SimulatedRobot) -> Message:
+    """Return the answer to a step request: time, mode and the values since the last one."""
     values: list[tuple[Any, Any]] = [*robot.fresh.items()]
     robot.fresh.clear()
     requests = SupervisorRequests(simulator, robot)
@@ -82,7 +73,7 @@ def step_over(simulator: Simulator, robot: Robot) -> Message:
 
 def _step(
     simulator: Simulator,
-    robot: Robot,
+    robot: SimulatedRobot,
     duration_ms: int,
     changes: list[Any],
     field_sets: list[FieldSet],
@@ -100,8 +91,8 @@ def _step(
     return None
 
 
-class _GoneError(Exception):
-    """Something was asked of a node that was removed."""
+class _NodeRemovedError(Exception):
+    """A request names a node that was removed."""
 
 
 class SupervisorRequests:
@@ -111,47 +102,47 @@ class SupervisorRequests:
     Webots' C functions without `wb_supervisor_`.
     """
 
-    def __init__(self, simulator: Simulator, robot: Robot) -> None:
+    def __init__(self, simulator: Simulator, robot: SimulatedRobot) -> None:
         self._simulator = simulator
         self._world = simulator.world
         self._robot = robot
 
     def carry_out(self, operation: str, arguments: list[Any]) -> Any:
-        """Answer one request by name."""
+        """Answer one request by its name; None if it names a node that was removed."""
         method: Callable[..., Any] = getattr(self, f"on_{operation}")
         try:
             return method(*arguments)
-        except _GoneError:
+        except _NodeRemovedError:
             return None
 
     def sent(self, what: TrackedKey) -> Any:
-        """The pose or field that is sent with the steps; None where its node is gone."""
+        """Return a tracked pose or field; None if its node was removed."""
         if isinstance(what[1], str):
             return self.carry_out("field_get", [what, None])
         return self.carry_out("node_get_pose", [*what])
 
-    def _node(self, node_id: int) -> Node:
+    def _node(self, node_id: int) -> WorldNode:
         node = self._world.node(node_id)
         if node is None:
-            raise _GoneError(node_id)
+            raise _NodeRemovedError(node_id)
         return node
 
     # Nodes ---------------------------------------------------------------------------------------
 
     def on_node_get_from_def(self, def_path: str) -> Any:
-        """A node by its DEF name."""
+        """Return a node by its DEF name."""
         return self.shown(self._world.find(def_path))
 
     def on_node_get_from_id(self, node_id: int) -> Any:
-        """A node by its number."""
+        """Return a node by its number."""
         return self.shown(self._world.node(node_id))
 
     def on_node_get_parent_node(self, node_id: int) -> Any:
-        """The node around a node."""
+        """Return the parent of a node."""
         return self.shown(self._world.parent_of(self._node(node_id)))
 
-    def shown(self, node: Node | None) -> Any:
-        """What a controller is sent of a node: see `NodeFacts` of its package."""
+    def shown(self, node: WorldNode | None) -> Any:
+        """Return the data about a node for a controller: `NodeFacts` of its package."""
         if node is None:
             return None
         type_name = node.proto_name or node.type_name
@@ -162,29 +153,29 @@ class SupervisorRequests:
     # Fields --------------------------------------------------------------------------------------
 
     def on_node_get_field(self, node_id: int, name: str) -> Any:
-        """Type and number of entries of a field; None if the node has no such field."""
+        """Return type and number of entries of a field; None if the node has no such field."""
         node = self._node(node_id)
-        return _described(node, name, self._world.protos.shown_definitions(node))
+        return _described(node, name, self._world.protos.visible_fields(node))
 
     def on_node_get_base_node_field(self, node_id: int, name: str) -> Any:
-        """The same of the node that a PROTO node is made of."""
+        """Return the same of the base node of a PROTO node."""
         node = self._node(node_id)
         return _described(node, name, NODE_TYPES[node.type_name])
 
     def on_node_get_field_names(self, node_id: int) -> list[str]:
-        """The names of all fields of a node."""
-        return [*self._world.protos.shown_definitions(self._node(node_id))]
+        """Return the names of all fields of a node."""
+        return [*self._world.protos.visible_fields(self._node(node_id))]
 
     def on_field_get(self, field: FieldReference, index: int | None) -> Any:
-        """The value of a field or of one entry of it; None beyond its end."""
+        """Return the value of a field or of one entry; None beyond its end."""
         node_id, name = field
         value = self._node(node_id).fields[name]
         if index is not None:
             value = value[index] if -len(value) <= index < len(value) else None
-        return self.shown(value) if isinstance(value, Node) else value
+        return self.shown(value) if isinstance(value, WorldNode) else value
 
     def set_fields(self, field_sets: list[FieldSet]) -> None:
-        """Write fields, and let what they describe follow."""
+        """Write fields, and update what they describe."""
         for (node_id, name), index, value in field_sets:
             node = self._world.node(node_id)
             if node is None:
@@ -196,7 +187,7 @@ class SupervisorRequests:
             self._follow(node, name, value)
 
     def on_field_insert(self, field: FieldReference, index: int, value: Any) -> int:
-        """Add an entry; the number of entries after it."""
+        """Insert an entry, and return the number of entries after that."""
         node_id, name = field
         node = self._node(node_id)
         values: list[Any] = node.fields[name]
@@ -205,11 +196,11 @@ class SupervisorRequests:
         return len(values)
 
     def on_field_remove(self, field: FieldReference, index: int | None) -> int:
-        """Remove an entry, or the node of a single field; the number of entries after it."""
+        """Remove an entry or the node of a single field; return the number of entries left."""
         node_id, name = field
         node = self._node(node_id)
         value = node.fields[name] if index is None else node.fields[name][index]
-        if isinstance(value, Node):
+        if isinstance(value, WorldNode):
             self._remove(value)
         else:
             del node.fields[name][index]
@@ -217,7 +208,7 @@ class SupervisorRequests:
         return -1 if index is None else len(node.fields[name])
 
     def on_field_import(self, field: FieldReference, index: int | None, text: str) -> int:
-        """Add a node; the number of entries after it, which shows whether it was taken."""
+        """Add a node if possible, and return the number of entries after that."""
         node_id, name = field
         around = self._node(node_id)
         many: list[Any] | None = None if index is None else around.fields[name]
@@ -233,13 +224,13 @@ class SupervisorRequests:
                     f"what is one is left out{self._world.why_not(type_name)}."
                 )
             self._simulator.added.append(nodes[0])
-            self._stand_anew(around)
+            self._update_around(around)
         except WorldError as error:
             self._simulator.log(f"ERROR: importing a node: {error}")
         return -1 if many is None else len(many)
 
     def on_node_remove(self, node_id: int) -> Any:
-        """Remove a node; the field that it stood in, and the number of entries left there."""
+        """Remove a node; return its parent, the field that held it and the entries left there."""
         found = self._remove(self._node(node_id))
         if found is None:
             return None
@@ -248,7 +239,7 @@ class SupervisorRequests:
         count = len(cast("list[Any]", left)) if isinstance(left, list) else -1
         return self._world.id_of(parent), name, count
 
-    def _remove(self, node: Node) -> tuple[Node, str] | None:
+    def _remove(self, node: WorldNode) -> tuple[WorldNode, str] | None:
         if _holds_robot(node):
             self._simulator.log("ERROR: the stand-in removes no robots")
             return None
@@ -257,35 +248,35 @@ class SupervisorRequests:
             return None
         found = self._world.remove(node)
         if found is not None:
-            self._stand_anew(found[0])
+            self._update_around(found[0])
         return found
 
-    def _stand_anew(self, around: Node) -> None:
+    def _update_around(self, around: WorldNode) -> None:
         self._simulator.arena.follow()
         if body := self._body_around(around):
-            self._simulator.stand_anew(body)
+            self._simulator.update_pose(body)
 
     def on_node_export_string(self, node_id: int) -> str:
-        """A node and all in it, as written in a world file."""
+        """Return a node and everything in it, as written in a world file."""
         return as_text(self._node(node_id), self._world.protos)
 
-    def _follow(self, node: Node, name: str, value: Any) -> None:
+    def _follow(self, node: WorldNode, name: str, value: Any) -> None:
         if node.type_name == "Robot" and name == "customData":
             self._simulator.robot_of(node).fresh[CUSTOM_DATA_TAG] = value
-        elif node.proto_name and name not in _FOLLOWED_OF_PROTOS:
+        elif node.proto_name and name not in _LIVE_PROTO_FIELDS:
             self._simulator.log(
                 f"WARNING: {node.proto_name}.{name} was set, which changes nothing: "
                 "the stand-in builds PROTO nodes once"
             )
         elif body := self._body_around(node):
-            self._simulator.stand_anew(body)
+            self._simulator.update_pose(body)
 
-    # Places --------------------------------------------------------------------------------------
+    # Poses ---------------------------------------------------------------------------------------
 
     def on_node_get_pose(self, node_id: int, seen_from_id: int | None = None) -> Any:
-        """Orientation (9 numbers) and position (3), seen from the world or another node.
+        """Return orientation (9 numbers) and position (3), seen from the world or another node.
 
-        None for what has no place.
+        None for a node without a pose.
         """
         frame = self._world.frame_of(self._node(node_id))
         if frame is not None and seen_from_id is not None:
@@ -294,7 +285,7 @@ class SupervisorRequests:
         return None if frame is None else (frame.rotation, frame.translation)
 
     def on_node_get_velocity(self, node_id: int) -> Any:
-        """Linear and angular velocity; None for what is not a Solid."""
+        """Return linear and angular velocity; None for a node that is no Solid."""
         node = self._node(node_id)
         body = self._body_around(node)
         if body is None or "boundingObject" not in node.fields:
@@ -302,20 +293,20 @@ class SupervisorRequests:
         return [*body.velocity_mps, 0.0, 0.0, 0.0, body.yaw_rate_radps]
 
     def on_node_set_velocity(self, node_id: int, velocity: list[float]) -> None:
-        """Set a body in motion, on the plane."""
+        """Set the velocity of a body on the plane."""
         if body := self._body_around(self._node(node_id)):
             body.velocity_mps, body.yaw_rate_radps = (velocity[0], velocity[1]), velocity[5]
             body.is_pushed = True
 
     def on_node_reset_physics(self, node_id: int) -> None:
-        """Take a body's speed away."""
+        """Stop a body."""
         if body := self._body_around(self._node(node_id)):
             body.stop()
         for robot in self._simulator.robots:
             if robot.node is self._node(node_id):
                 robot.vehicle.stop()
 
-    def _body_around(self, node: Node | None) -> Body | None:
+    def _body_around(self, node: WorldNode | None) -> Body | None:
         bodies = {body.node: body for body in self._simulator.arena.bodies}
         while node is not None and node not in bodies:
             node = self._world.parent_of(node)
@@ -324,11 +315,11 @@ class SupervisorRequests:
     # The simulation ------------------------------------------------------------------------------
 
     def on_simulation_set_mode(self, mode: int) -> None:
-        """Any number that is no mode pauses, as in Webots."""
+        """Set the mode. As in Webots, any other number pauses."""
         self._simulator.mode = Mode(mode) if mode in [*Mode] else Mode.PAUSE
 
     def on_simulation_reset(self) -> None:
-        """Reset with the next physics step."""
+        """Reset the world at the end of the next physics step."""
         self._simulator.is_reset_wanted = True
 
     def on_world_reload(self) -> None:
@@ -344,13 +335,13 @@ class SupervisorRequests:
         self._simulator.wanted = status
 
     def on_export_image(self, path: str, quality: int) -> None:
-        """Write a picture of the arena; relative paths start from the controller's folder."""
+        """Write a picture of the arena; relative paths start in the controller's folder."""
         self._simulator.export(self._robot.folder / path, quality)
 
     def on_set_label(
         self, number: int, text: str, x: float, y: float, size: float, rgb: int
     ) -> None:
-        """Show a text over the picture; an empty one takes it away."""
+        """Show a text over the picture; an empty text removes it."""
         if not 0 <= number <= 99:
             self._simulator.log(f"ERROR: setLabel: the id {number} is not between 0 and 99")
         elif text:
@@ -359,173 +350,13 @@ class SupervisorRequests:
             self._simulator.labels.pop(number, None)
 
 
-def _holds_robot(node: Node) -> bool:
+def _holds_robot(node: WorldNode) -> bool:
     return any(each.type_name == "Robot" for each in (node, *descendants_of(node)))
 
 
-def _described(node: Node, name: str, definitions: Mapping[str, FieldDefinition]) -> Any:
+def _described(node: WorldNode, name: str, definitions: Mapping[str, FieldDefinition]) -> Any:
     definition = definitions.get(name)
     if definition is None:
         return None
     many = definition.type_name.startswith("MF")
     return definition.type_name, len(node.fields[name]) if many else -1
-
-
-# -- what lets a world run -------------------------------------------------------------------------
-
-
-class Seat(ABC):
-    """Where the controller of a robot is reached, in this process or in another one."""
-
-    robot: Robot
-    is_ending = False
-    """Whether the next thing it asks for is answered by the end."""
-    was_told = False
-    """Whether it knows that it has to quit."""
-
-    @abstractmethod
-    def reply(self, message: Message) -> None:
-        """Send an answer."""
-
-    def tell_to_quit(self) -> None:
-        """Send the one answer after which `step` returns -1."""
-        if not self.was_told:
-            self.was_told = True
-            self.robot.remaining_ms = None
-            self.reply(("quit",))
-
-
-class Driver(ABC):
-    """A world in motion and those who control its robots.
-
-    The methods named after buttons are a person's hands on Webots' window: they return once the
-    simulation has obeyed.
-    """
-
-    def __init__(self, world: str | Path, mode: Mode, log: Callable[[str], None]) -> None:
-        self.simulator = Simulator(load_world(world), mode, log)
-        self.exit_status: int | None = None
-        """The status given to `simulationQuit`; None while the simulation is there."""
-
-    @property
-    def time_s(self) -> float:
-        """Simulated time in seconds."""
-        return self.simulator.time_s
-
-    @property
-    def mode(self) -> Mode:
-        """How the simulation runs."""
-        return self.simulator.mode
-
-    def robot(self, name: str) -> Robot:
-        """What is really the case with a robot: its `position`, `yaw_rad`, `collisions`, ...
-
-        Raises:
-            WorldError: The world has no robot with this name.
-        """
-        return self.simulator.robot(name)
-
-    # A person's hands ----------------------------------------------------------------------------
-
-    def pause(self) -> None:
-        """Press pause."""
-        self._obey(partial(self._set_mode, Mode.PAUSE))
-
-    def resume(self) -> None:
-        """Press play: real time."""
-        self._obey(partial(self._set_mode, Mode.REAL_TIME))
-
-    def fast(self) -> None:
-        """Press fast."""
-        self._obey(partial(self._set_mode, Mode.FAST))
-
-    def step(self) -> None:
-        """Press step: one basic time step, then pause."""
-        self._obey(self._step_once)
-
-    def reset(self) -> None:
-        """Reset the world; all controllers are ended and start again."""
-        self._obey(self._reset)
-
-    def reload(self) -> None:
-        """Read the world from its file again; all controllers are ended and start again."""
-        self._obey(lambda: self._load(self.simulator.world.path))
-
-    def quit(self, status: int = 0) -> None:
-        """Close the window."""
-        self._obey(partial(self._quit, status))
-
-    # What differs with where the controllers are -------------------------------------------------
-
-    @property
-    @abstractmethod
-    def _seats(self) -> Sequence[Seat]: ...
-
-    @abstractmethod
-    def _obey(self, function: Callable[[], None]) -> None:
-        """Do what a person wants, between two physics steps."""
-
-    @abstractmethod
-    def _step_once(self) -> None: ...
-
-    @abstractmethod
-    def _end(self, seats: Sequence[Seat]) -> None: ...
-
-    def _start(self, seats: Sequence[Seat]) -> None:  # noqa: B027 - in one process there is none
-        """Start controllers that have been ended."""
-
-    def _enter_world(self) -> None:  # noqa: B027
-        """Have controllers for the robots of a world that was loaded."""
-
-    # Between two physics steps -------------------------------------------------------------------
-
-    def _set_mode(self, mode: Mode) -> None:
-        self.simulator.mode = mode
-
-    def _reset(self) -> None:
-        self._end(self._seats)
-        self.simulator.reset()
-        self._start(self._seats)
-
-    def _load(self, path: Path) -> None:
-        """Read a world; a bad one is named and the old one stays."""
-        self._end(self._seats)
-        try:
-            self.simulator = Simulator(load_world(path), self.mode, self.simulator.log)
-        except WorldError as error:
-            self.simulator.log(f"ERROR: {error}; the world stays as it was")
-            self.simulator.reset()
-        self._enter_world()
-
-    def _quit(self, status: int) -> None:
-        self.exit_status = status
-        self._end(self._seats)
-
-    def _serve(self, seat: Seat, message: Message) -> None:
-        """Answer a controller, unless the answer has to wait for a physics step.
-
-        One that is to end may still have the picture or scan of its last sample: Webots sends those
-        with the step.
-        """
-        if seat.is_ending and message[0] != "fetch":
-            seat.tell_to_quit()
-        elif reply := answer(self.simulator, seat.robot, message):
-            seat.reply(reply)
-
-    def _advance(self) -> None:
-        """Make one physics step and answer those who have waited for it."""
-        done = self.simulator.advance()
-        for seat in self._seats:
-            if seat.robot in done:
-                seat.reply(step_over(self.simulator, seat.robot))
-        self._carry_out_wanted()
-
-    def _carry_out_wanted(self) -> None:
-        wanted, self.simulator.wanted = self.simulator.wanted, None
-        match wanted:
-            case None:
-                return
-            case int(status):
-                self._quit(status)
-            case path:
-                self._load(Path(path or self.simulator.world.path))

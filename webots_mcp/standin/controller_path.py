@@ -1,6 +1,7 @@
-"""Where the stand-in's `controller` package is, and how it becomes importable here.
+"""The folder of the stand-in's `controller` package.
 
-Importing this module does it: it has to come before every module that imports `controller`.
+Importing this module makes the package importable. It has to be imported before every module that
+imports `controller`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 LIBRARY: Final = Path(__file__).parent / "lib"
-"""The folder that holds the `controller` package; it belongs in front of PYTHONPATH."""
+"""The folder that holds the `controller` package; it has to come first in PYTHONPATH."""
 
 _loaded = sys.modules.get("controller")
 if _loaded is not None and str(LIBRARY) not in str(_loaded.__file__):

@@ -1,4 +1,4 @@
-"""The controllers of a world: which program each robot runs, its process and its connection."""
+"""The controllers of a world's robots: their programs, processes and connections."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from typing import IO, Final, Protocol
 
 from controller.session import Inbox, Message, pack
 
-from webots_mcp.standin.controller_answers import Seat
+from webots_mcp.standin.base_simulation import ControllerEndpoint
 from webots_mcp.standin.controller_path import LIBRARY
-from webots_mcp.standin.simulator import Robot, Simulator
-from webots_mcp.standin.vrml import StandInError
+from webots_mcp.standin.errors import StandInError
+from webots_mcp.standin.simulator import SimulatedRobot, Simulator
 
 _TERMINATION_S: Final = 1.0
-"""How long a process may take to end after it was asked to."""
+"""How long a process may take to end after SIGTERM."""
 _LAST_LINES_S: Final = 0.5
-"""How long its last lines are waited for: a grandchild may hold the pipes open."""
+"""How long to wait for the last lines of a process: a child of it may hold the pipes open."""
 
-_NOBODY: Final = ("", "<none>", "void", "<generic>")
+_NO_CONTROLLER: Final = ("", "<none>", "void", "<generic>")
 _EXTERN: Final = "<extern>"
 _INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
 _EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
 
 
 class ControllerProcess:
-    """A running controller; what it prints is passed on line by line, with the stream's name."""
+    """A running controller. Its output is passed on line by line with the name of the stream."""
 
     def __init__(
         self,
@@ -52,11 +52,11 @@ class ControllerProcess:
             text=True,
             encoding="utf-8",
             errors="replace",
-            start_new_session=os.name == "posix",  # Ctrl-C is for the simulator alone
+            start_new_session=os.name == "posix",  # Ctrl-C must reach the simulator only.
         )
         self.pid = self._process.pid
         self.was_ended = False
-        """Whether it had to be ended by force."""
+        """Whether it was ended by force."""
         self._on_line = on_line
         self._on_exit = on_exit
         self._readers = [
@@ -70,7 +70,7 @@ class ControllerProcess:
 
     @property
     def exit_code(self) -> int | None:
-        """The exit status; negative: the signal that ended it; None while it runs."""
+        """Return the exit status; for a signal its negative number; None while it runs."""
         return self._process.returncode
 
     def kill(self) -> None:
@@ -78,7 +78,7 @@ class ControllerProcess:
         self._process.kill()
 
     def end(self) -> None:
-        """Terminate the process, the hard way if need be, and wait until it is gone."""
+        """Terminate the process, kill it if it does not end, and wait for that."""
         if self.exit_code is None:
             self.was_ended = True
             self._process.terminate()
@@ -101,7 +101,7 @@ class ControllerProcess:
         self._on_exit(self)
 
 
-class Connection:
+class ControllerConnection:
     """The socket of one controller."""
 
     def __init__(self, stream: socket.socket) -> None:
@@ -110,12 +110,12 @@ class Connection:
         self._inbox = Inbox()
 
     def send(self, message: Message) -> None:
-        """Send an answer; a controller that is gone is noticed when its socket is read."""
+        """Send an answer. The end of a controller is noticed when its socket is read."""
         with suppress(OSError):
             self.stream.sendall(pack(message))
 
     def receive(self) -> list[Message] | None:
-        """The messages that have arrived; None if the controller is gone."""
+        """Return the messages that have arrived; None if the controller has disconnected."""
         try:
             data = self.stream.recv(1 << 16)
         except OSError:
@@ -127,85 +127,85 @@ class Connection:
 
 
 class PrintLine(Protocol):
-    """What takes the lines of the console."""
+    """A function that receives the lines of the console."""
 
     def __call__(self, line: str, stream: str | None = None, /) -> None:
         """Take a line.
 
         Args:
             line: The text.
-            stream: Where a controller printed it, `stdout` or `stderr`; None for the simulator's.
+            stream: `stdout` or `stderr` for lines of controllers; None for lines of the simulator.
         """
 
 
 @dataclass
-class Launch:
-    """How controllers are started, the same for all robots of a simulation."""
+class ControllerLaunch:
+    """Settings and results of starting controllers, shared by all robots of a simulation."""
 
     python: str
     environment: Mapping[str, str]
     overrides: Mapping[str, Path]
-    """Controller files by robot name, instead of what the world says."""
+    """Controller files by robot name, instead of those that the world names."""
     print_line: PrintLine
     on_exit: Callable[[], None]
     token: str
-    """What controllers show to be let in."""
+    """Secret that controllers present to connect."""
     port: int = 0
-    """Where controllers find the simulator on this machine; 0 before it has started."""
+    """Port of the simulator on this machine; 0 before it has started."""
     folder: Path = Path()
-    """The simulator's own folder, named after the port as Webots names its own."""
+    """Folder of the simulator, named after the port as Webots does."""
     failure: int | None = None
-    """The exit status of the first controller that ended with an error, but not by force."""
+    """Exit status of the first controller that ended with an error, but not by force."""
 
 
-class Controller(Seat):
-    """A robot's controller, through all its processes."""
+class Controller(ControllerEndpoint):
+    """The controller of a robot, across all processes that run it one after the other."""
 
-    def __init__(self, robot: Robot, launch: Launch) -> None:
+    def __init__(self, robot: SimulatedRobot, launch: ControllerLaunch) -> None:
         self.robot = robot
         self.launch = launch
         self.file: Path | None = None
-        """Its program; None if the robot has none or a person starts it."""
+        """File of its program; None if it has none or a person starts it."""
         self.process: ControllerProcess | None = None
         self.starts = 0
-        """How often a process was started for the robot."""
-        self.connection: Connection | None = None
+        """Number of processes that were started for the robot."""
+        self.connection: ControllerConnection | None = None
         self.has_left = False
-        """Whether the present process has closed its connection."""
+        """Whether the current process has closed its connection."""
 
     @property
     def name(self) -> str:
-        """The robot's name."""
+        """Return the robot's name."""
         return self.robot.name
 
     @property
     def pid(self) -> int | None:
-        """The process id; None if no process was started."""
+        """Return the process id; None if no process was started."""
         return self.process.pid if self.process else None
 
     @property
     def exit_code(self) -> int | None:
-        """The exit status of the last process; negative: a signal; None while it runs."""
+        """Return the exit status of the last process; for a signal negative; None while it runs."""
         return self.process.exit_code if self.process else None
 
     @property
     def is_running(self) -> bool:
-        """Whether there is a process that has not exited."""
+        """Return whether its process has not exited."""
         return self.process is not None and self.process.exit_code is None
 
     @property
     def may_act(self) -> bool:
-        """Whether it runs or is connected, or a person may still start it."""
+        """Return whether it runs or is connected, or a person may still start it."""
         return self.is_running or self.connection is not None or self._is_extern
 
     @property
     def was_started(self) -> bool:
-        """Whether there is nothing to start any more."""
+        """Return whether nothing remains to be started."""
         return self.process is not None or self.file is None
 
     @property
     def holds_up(self) -> bool:
-        """Whether the world has to wait for this controller before the next physics step."""
+        """Return whether the world has to wait for this controller before the next physics step."""
         if not self.robot.is_synchronous or self.robot.remaining_ms is not None:
             return False
         if self.connection is not None:
@@ -215,34 +215,34 @@ class Controller(Seat):
         return self.is_running and not self.has_left
 
     @property
-    def has_to_be_told(self) -> bool:
-        """Whether it is connected and does not know yet that it has to quit."""
+    def awaits_quit(self) -> bool:
+        """Return whether it is connected and was not told to quit yet."""
         return self.connection is not None and not self.was_told
 
     @property
     def is_leaving(self) -> bool:
-        """Whether it was asked to quit, or has left, and is still running."""
+        """Return whether it was told to quit, or has disconnected, and still runs."""
         is_going = self.was_told or self.has_left
         return is_going and (self.is_running or self.connection is not None)
 
     @property
     def _is_extern(self) -> bool:
-        """Whether a person starts its program."""
+        """Return whether a person starts its program."""
         is_extern = self.robot.node.fields["controller"] == _EXTERN
         return is_extern and self.name not in self.launch.overrides
 
-    def enter(self, robot: Robot, simulator: Simulator) -> None:
+    def enter(self, robot: SimulatedRobot, simulator: Simulator) -> None:
         """Control a robot of a world that was loaded.
 
-        Only the world's own name of a controller has to be one: links that stand in the project are
-        followed, as Webots does, and a file that the caller names may lie anywhere.
+        The controller that a world names has to be a plain folder name. As in Webots, links in the
+        project are followed. A file that the caller names may be anywhere.
         """
         self.robot, self.process, self.file = robot, None, None
         self.was_told = False
         name: str = robot.node.fields["controller"]
         if robot.name in self.launch.overrides:
             self.file = self.launch.overrides[robot.name].resolve()
-        elif name in (*_NOBODY, _EXTERN):
+        elif name in (*_NO_CONTROLLER, _EXTERN):
             return
         elif name == ".." or Path(name).name != name:
             self._warn(
@@ -253,7 +253,7 @@ class Controller(Seat):
             self.file = simulator.world.path.parent.parent / "controllers" / name / f"{name}.py"
 
     def start(self) -> None:
-        """Start a process, if the robot has a controller file."""
+        """Start a process if the robot has a controller file."""
         self.has_left = self.was_told = False
         self.process = None
         if self.file is None:
@@ -278,7 +278,11 @@ class Controller(Seat):
         )
 
     def environment(self) -> dict[str, str]:
-        """The variables that Webots sets for a controller, or a person for an extern one."""
+        """Return the environment of a controller, as Webots sets it, or a person for an extern one.
+
+        Raises:
+            StandInError: The simulation has not started.
+        """
         launch = self.launch
         if not launch.port:
             raise StandInError("start the simulation before you ask how to reach it")
@@ -290,7 +294,7 @@ class Controller(Seat):
         if self._is_extern:
             url = f"tcp://127.0.0.1:{launch.port}/{self.name}"
             return merged | dict(zip(_EXTERN_VARIABLES, (url, launch.token), strict=True))
-        folder = f"{launch.folder}{os.sep}"  # Webots writes it so
+        folder = f"{launch.folder}{os.sep}"  # With a separator at the end, as Webots writes it.
         own = dict(zip(_INTERN_VARIABLES, (self.name, folder), strict=True))
         return merged | own | {"PYTHONIOENCODING": "UTF-8"}
 
@@ -298,7 +302,7 @@ class Controller(Seat):
         self.launch.print_line(f"WARNING: {self.name}: {what}")
 
     def _warn_of_extern(self) -> None:
-        """Warn that its controller is not started here, for which the world may wait for ever."""
+        """Warn that a person has to start its controller, for which the world may wait for ever."""
         waits = "the world waits for it" if self.robot.is_synchronous else "it has none until then"
         self._warn(
             "the controller is <extern>, so somebody else has to start it; "
@@ -308,12 +312,12 @@ class Controller(Seat):
         )
 
     def reply(self, message: Message) -> None:
-        """Send an answer, if it is there."""
+        """Send an answer, if it is connected."""
         if self.connection:
             self.connection.send(message)
 
     def tell_to_quit(self) -> None:
-        """Send the end, if it is there."""
+        """Tell it to quit, if it is connected."""
         if self.connection:
             super().tell_to_quit()
 
@@ -323,7 +327,7 @@ class Controller(Seat):
             self.process.kill()
 
     def end(self) -> None:
-        """End the process by force, if it is still there."""
+        """End the process by force, if it still runs."""
         if self.process is None:
             return
         if self.is_running and self.was_told:

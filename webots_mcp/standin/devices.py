@@ -1,6 +1,6 @@
-"""The devices of a simulated robot: what they measure, and what they let a controller set.
+"""The devices of a simulated robot: what they measure, and what a controller can set.
 
-Constants of a device are the fields of its node: the controller receives them when it connects.
+The constants of a device are the fields of its node. The controller receives them when it connects.
 """
 
 from __future__ import annotations
@@ -12,53 +12,55 @@ from itertools import pairwise, product
 from math import atan2, cos, hypot, inf, nan, pi, sin
 from typing import Any, Final
 
-from webots_mcp.standin import pictures
-from webots_mcp.standin.arena import Arena, Body, Joint, Part, Vehicle, bounding_parts
-from webots_mcp.standin.geometry import Frame, Shape, Vector, nearest_m, targets_from
-from webots_mcp.standin.vrml import Node, children_of
+from webots_mcp.standin.arena import Arena, Body, BodyPart, bounding_parts
+from webots_mcp.standin.camera_view import CameraView, render
+from webots_mcp.standin.geometry import CoordinateFrame, Shape, Vector, nearest_m, targets_from
+from webots_mcp.standin.vehicle import Joint, Vehicle
+from webots_mcp.standin.vrml import WorldNode, children_of
 from webots_mcp.standin.world import World, own_frame
 
 _SUN_M: Final = 1000.0
-"""How far away a DirectionalLight is, where something may stand in its light."""
+"""Distance of a DirectionalLight: far enough for its rays to be parallel."""
 _NOT_SENT: Final = ("children", "boundingObject", "physics")
+"""Fields of a device's node that no getter of Webots returns."""
 
 
 @dataclass(frozen=True)
-class Site:
-    """What a device is built into."""
+class Mounting:
+    """The place that a device is built into: robot, arena, joint and position in the robot."""
 
     vehicle: Vehicle
     arena: Arena
-    frame: Frame
-    """Where the device stands in the robot."""
+    frame: CoordinateFrame
+    """Position and orientation of the device in the robot."""
     joint: Joint | None
 
     @property
     def body(self) -> Body:
-        """The robot's body."""
+        """Return the robot's body."""
         return self.vehicle.body
 
-    def pose(self) -> Frame:
-        """The device in the world."""
+    def pose(self) -> CoordinateFrame:
+        """Return position and orientation of the device in the world."""
         return self.body.frame.then(self.frame)
 
-    def place(self) -> tuple[float, float, float, float]:
-        """The device in the world: x, y, z in metres and yaw in radians."""
+    def position_and_yaw(self) -> tuple[float, float, float, float]:
+        """Return where the device is in the world: x, y, z in metres and yaw in radians."""
         body, (x, y, z) = self.body, self.frame.translation
         c, s = cos(body.yaw_rad), sin(body.yaw_rad)
         yaw = body.yaw_rad + self.frame.yaw_rad
         return body.x + c * x - s * y, body.y + s * x + c * y, body.z + z, yaw
 
     def axis(self) -> Vector:
-        """Where the device's x axis points."""
+        """Return the direction of the device's x axis, a unit vector."""
         r = self.pose().rotation
         return r[0], r[3], r[6]
 
 
-class Device:
-    """One device; subclasses measure or set something."""
+class SimulatedDevice:
+    """One device of a robot. Subclasses measure or set something."""
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         self.tag = tag
         self.node = node
         self.site = site
@@ -67,7 +69,7 @@ class Device:
         self._wait_ms = 0.0
 
     def description(self) -> dict[str, Any]:
-        """The data about the device that the controller receives when it connects."""
+        """Return the data about the device that the controller receives when it connects."""
         joint, joints = self.site.joint, self.site.vehicle.joints
         return {
             "tag": self.tag,
@@ -86,7 +88,14 @@ class Device:
         self._wait_ms = 0.0
 
     def is_due(self, passed_ms: float) -> bool:
-        """Let time pass; True if it is time to measure."""
+        """Count down to the next sample.
+
+        Args:
+            passed_ms: Simulated time since the last call.
+
+        Returns:
+            True if it is time to measure.
+        """
         if not self.period_ms:
             return False
         self._wait_ms -= passed_ms
@@ -96,25 +105,28 @@ class Device:
         return True
 
     def put_value(self, fresh: dict[int, Any]) -> None:
-        """Measure, and put the value where those are that the controller has not been sent yet."""
+        """Measure, and add the value to those that the controller has not received yet."""
         fresh[self.tag] = self.measure(self.period_ms)
 
     def measure(self, period_ms: float) -> Any:
-        """What the sensor shows now, as the wire carries it."""
+        """Return the value that the sensor shows now, as it is sent to the controller."""
         raise AttributeError(f"{self.node.type_name} {self.name!r} measures nothing")
 
 
-def _sent(node: Node) -> dict[str, Any]:
-    """The fields of a device and of what belongs to it, as a Zoom."""
+def _sent(node: WorldNode) -> dict[str, Any]:
+    """Return the fields of a device and of the nodes in them, such as the Zoom of a camera."""
     return {
-        name: _sent(value) if isinstance(value, Node) else value
+        name: _sent(value) if isinstance(value, WorldNode) else value
         for name, value in node.fields.items()
         if name not in _NOT_SENT
     }
 
 
 def looked_up(table: Sequence[Sequence[float]], measured: float) -> float:
-    """The value that a lookup table gives, without its noise; an empty one changes nothing."""
+    """Return the value that a lookup table gives, without its noise.
+
+    An empty table leaves the value as it was measured.
+    """
     if not table:
         return measured
     if measured <= table[0][0]:
@@ -125,16 +137,13 @@ def looked_up(table: Sequence[Sequence[float]], measured: float) -> float:
     return table[-1][1]
 
 
-def resolved(node: Node, measured: float) -> float:
-    """A value as the sensor's `resolution` and `lookupTable` show it."""
+def resolved(node: WorldNode, measured: float) -> float:
+    """Return a value after the sensor's `lookupTable` and `resolution`."""
     value, resolution = looked_up(node.fields["lookupTable"], measured), node.fields["resolution"]
     return round(value / resolution) * resolution if resolution > 0.0 else value
 
 
-# Joints ------------------------------------------------------------------------------------------
-
-
-class Motor(Device):
+class SimulatedMotor(SimulatedDevice):
     """Turns a joint."""
 
     def configure(self, setting: str, value: Any) -> None:
@@ -150,62 +159,61 @@ class Motor(Device):
             joint.acceleration_radps2 = value
 
 
-class PositionSensor(Device):
-    """Says how far a joint has turned or slid, in radians or metres."""
+class SimulatedPositionSensor(SimulatedDevice):
+    """Measures how far a joint has turned or slid, in radians or metres."""
 
     def measure(self, period_ms: float) -> float:
-        """The angle of the joint in radians."""
+        """Return the position of the joint: radians, of a slider metres."""
         return self.site.joint.position_rad if self.site.joint else nan
 
 
-# Where the robot is and how it moves -------------------------------------------------------------
-
-
-class Gps(Device):
-    """Where the sensor is, and how fast it moved since its last sample."""
+class SimulatedGps(SimulatedDevice):
+    """Measures the sensor's position and its mean velocity since the last sample."""
 
     _last: tuple[float, float, float] | None = None
 
     def make_due(self) -> None:
-        """Forget the last place as well."""
+        """Forget the last position as well."""
         super().make_due()
         self._last = None
 
     def measure(self, period_ms: float) -> list[list[float]]:
-        """Position in metres and velocity in metres a second."""
-        here = self.site.place()[:3]
-        before = self._last or here
-        self._last = here
+        """Return position in metres and velocity in metres per second."""
+        position = self.site.position_and_yaw()[:3]
+        before = self._last or position
+        self._last = position
         seconds = period_ms / 1000.0
-        return [[*here], [(a - b) / seconds for a, b in zip(here, before, strict=True)]]
+        velocity = [(a - b) / seconds for a, b in zip(position, before, strict=True)]
+        return [[*position], velocity]
 
 
-class InertialUnit(Device):
-    """Roll, pitch and yaw in radians; the floor is flat, so only yaw ever changes."""
-
-    def measure(self, period_ms: float) -> list[float]:
-        """Roll, pitch and yaw, yaw between -pi and pi."""
-        return [0.0, 0.0, _turn(self.site.place()[3])]
-
-
-class MotionSensor(Device, ABC):
-    """Three numbers along the sensor's own axes; a disabled axis shows NaN."""
+class SimulatedInertialUnit(SimulatedDevice):
+    """Measures roll, pitch and yaw. The floor is flat, so only yaw ever changes."""
 
     def measure(self, period_ms: float) -> list[float]:
-        """What is felt along x, y and z of the sensor."""
-        felt = self.site.pose().direction(self.feel(period_ms / 1000.0))
+        """Return roll, pitch and yaw in radians, yaw between -pi and pi."""
+        return [0.0, 0.0, _wrapped(self.site.position_and_yaw()[3])]
+
+
+class SimulatedVectorSensor(SimulatedDevice, ABC):
+    """Measures a vector along the sensor's own axes. A disabled axis shows NaN."""
+
+    def measure(self, period_ms: float) -> list[float]:
+        """Return the vector along x, y and z of the sensor."""
+        sensed = self.site.pose().direction(self.sense(period_ms / 1000.0))
         axes = (self.node.fields[axis] for axis in ("xAxis", "yAxis", "zAxis"))
         return [
-            resolved(self.node, value) if on else nan for value, on in zip(felt, axes, strict=True)
+            resolved(self.node, value) if is_on else nan
+            for value, is_on in zip(sensed, axes, strict=True)
         ]
 
     @abstractmethod
-    def feel(self, period_s: float) -> Vector:
-        """What is felt now, along the axes of the world."""
+    def sense(self, period_s: float) -> Vector:
+        """Return the vector along the axes of the world."""
 
 
-class Accelerometer(MotionSensor):
-    """The change of the sensor's velocity since its last sample, and what carries its weight."""
+class SimulatedAccelerometer(SimulatedVectorSensor):
+    """Measures the change of the sensor's velocity since its last sample, plus gravity."""
 
     _last_mps: tuple[float, float] | None = None
 
@@ -214,8 +222,8 @@ class Accelerometer(MotionSensor):
         super().make_due()
         self._last_mps = None
 
-    def feel(self, period_s: float) -> Vector:
-        """Metres a second squared; standing still, the reaction to gravity, upwards."""
+    def sense(self, period_s: float) -> Vector:
+        """Return metres per second squared; at rest the reaction to gravity, which is upwards."""
         now, before = self._velocity_mps(), self._last_mps
         self._last_mps = now
         (vx, vy), (ux, uy) = now, before or now
@@ -227,44 +235,44 @@ class Accelerometer(MotionSensor):
         return vx - turning * (y - body.y), vy + turning * (x - body.x)
 
 
-class Gyro(MotionSensor):
-    """How fast the robot turns, radians a second."""
+class SimulatedGyro(SimulatedVectorSensor):
+    """Measures how fast the robot turns."""
 
-    def feel(self, period_s: float) -> Vector:
-        """On a flat floor it turns about the vertical axis only."""
+    def sense(self, period_s: float) -> Vector:
+        """Return radians per second. On a flat floor a robot turns about the vertical axis only."""
         return 0.0, 0.0, self.site.body.yaw_rate_radps
 
 
-class Compass(MotionSensor):
-    """Where north is: the direction of the world's y axis."""
+class SimulatedCompass(SimulatedVectorSensor):
+    """Measures the direction of north, which is the world's y axis."""
 
-    def feel(self, period_s: float) -> Vector:
-        """A unit vector."""
+    def sense(self, period_s: float) -> Vector:
+        """Return a unit vector."""
         return 0.0, 1.0, 0.0
 
 
-class TouchSensor(Device):
-    """Feels what the robot runs into on the side where the sensor's bounding object is.
+class SimulatedTouchSensor(SimulatedDevice):
+    """Detects contact on the side of the robot where the sensor's bounding object is.
 
-    A robot touches things as a disc, so the sensor answers for the part of that disc which its
-    bounding object covers, seen from the middle.
+    A robot touches obstacles as a disc. The sensor reports contacts with the sector of that disc
+    that its bounding object covers, seen from the centre.
     """
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         super().__init__(tag, node, site)
         disc = site.body.footprint
         parts = bounding_parts(node, site.frame)
         self._sides = [side for part in parts for side in _sides(part, disc.ahead_m, disc.left_m)]
 
     def measure(self, period_ms: float) -> float:
-        """1 while it touches something, else 0."""
+        """Return 1 while the sensor touches something, else 0."""
         yaw = self.site.body.yaw_rad
         angles = [atan2(-y, -x) - yaw for x, y in self.site.body.touched]
-        return float(any(abs(_turn(a - at)) <= half for a in angles for at, half in self._sides))
+        return float(any(abs(_wrapped(a - at)) <= half for a in angles for at, half in self._sides))
 
 
-def _sides(part: Part, ahead_m: float, left_m: float) -> Iterator[tuple[float, float]]:
-    """The directions that a part covers: the middle one and half of the angle, in radians."""
+def _sides(part: BodyPart, ahead_m: float, left_m: float) -> Iterator[tuple[float, float]]:
+    """Yield the sector that a part covers: its middle direction and half its angle, in radians."""
     (x, y, _), (hx, hy, _) = part.frame.translation, part.half_m
     x, y = x - ahead_m, y - left_m
     if hypot(x, y) <= min(hx, hy):
@@ -274,59 +282,58 @@ def _sides(part: Part, ahead_m: float, left_m: float) -> Iterator[tuple[float, f
     corners = [
         part.frame.point((sx * hx, sy * hy, 0.0)) for sx, sy in product((-1.0, 1.0), repeat=2)
     ]
-    angles = [_turn(atan2(cy - left_m, cx - ahead_m) - middle) for cx, cy, _ in corners]
+    angles = [_wrapped(atan2(cy - left_m, cx - ahead_m) - middle) for cx, cy, _ in corners]
     yield middle, max(abs(angle) for angle in angles)
 
 
-def _turn(angle_rad: float) -> float:
+def _wrapped(angle_rad: float) -> float:
+    """Return the same angle between -pi and pi."""
     return angle_rad - 2.0 * pi * round(angle_rad / (2.0 * pi))
 
 
-# What the robot sees -----------------------------------------------------------------------------
-
-
-class DistanceSensor(Device):
-    """One ray along the sensor's x axis, translated by the lookup table; noise is left out."""
+class SimulatedDistanceSensor(SimulatedDevice):
+    """Measures along one ray in the direction of the sensor's x axis, without noise."""
 
     def measure(self, period_ms: float) -> float:
-        """The looked-up value of the distance."""
-        x, y, z, yaw = self.site.place()
+        """Return the value of the lookup table for the distance."""
+        x, y, z, yaw = self.site.position_and_yaw()
         table = self.node.fields["lookupTable"] or [[0.0, 0.0, 0.0]]
         targets = targets_from(self.site.arena.obstacles(self.site.body), x, y, z, table[-1][0])
         return looked_up(table, nearest_m(targets, cos(yaw), sin(yaw)))
 
 
-class FetchedSensor(Device, ABC):
-    """A sensor of pictures or scans: its value is their number, they stay here until asked for."""
+class FetchedSensor(SimulatedDevice, ABC):
+    """A sensor of pictures or scans. It sends their number, and the data only on request."""
 
     _samples = 0
 
     def measure(self, period_ms: float) -> int:
-        """Note what there is to see; the number of the sample."""
-        self.look()
+        """Store what the picture or scan is made from, and return the number of the sample."""
+        self.capture()
         self._samples += 1
         return self._samples
 
     @abstractmethod
-    def look(self) -> None:
-        """Note what there is to see now."""
+    def capture(self) -> None:
+        """Store what the next picture or scan is made from."""
 
     @abstractmethod
     def fetch(self) -> Any:
-        """The picture or scan of the last sample."""
+        """Return the picture or scan of the last sample."""
 
 
-class Lidar(FetchedSensor):
-    """A level fan of rays from left to right; inf where nothing is in range."""
+class SimulatedLidar(FetchedSensor):
+    """Measures along a level fan of rays from left to right; inf where nothing is in range."""
 
     _seen: tuple[tuple[float, float, float, float], list[Shape]] | None = None
 
-    def look(self) -> None:
-        """Note where everything stands."""
-        self._seen = (self.site.place(), self.site.arena.scene(without=self.site.body))
+    def capture(self) -> None:
+        """Store where everything stands."""
+        scene = self.site.arena.scene(without=self.site.body)
+        self._seen = (self.site.position_and_yaw(), scene)
 
     def fetch(self) -> list[float]:
-        """Distances in metres, layer after layer."""
+        """Return the distances in metres, layer after layer."""
         if self._seen is None:
             return []
         (x, y, z, yaw), shapes = self._seen
@@ -343,15 +350,15 @@ class Lidar(FetchedSensor):
         return [distance if low <= distance <= high else inf for distance in ranges]
 
 
-class Camera(FetchedSensor):
-    """Renders its image when the picture is read."""
+class SimulatedCamera(FetchedSensor):
+    """Takes pictures. They are rendered when they are read."""
 
-    _seen: pictures.View | None = None
+    _seen: CameraView | None = None
 
-    def look(self) -> None:
-        """Note where everything stands."""
-        self._seen = pictures.View(
-            *self.site.place(),
+    def capture(self) -> None:
+        """Store where everything stands."""
+        self._seen = CameraView(
+            *self.site.position_and_yaw(),
             width=self.node.fields["width"],
             height=self.node.fields["height"],
             field_of_view_rad=self.node.fields["fieldOfView"],
@@ -359,48 +366,51 @@ class Camera(FetchedSensor):
         )
 
     def fetch(self) -> bytes:
-        """The picture: blue, green, red and alpha of each pixel."""
-        return b"" if self._seen is None else pictures.render(self._seen, self.site.arena.colors)
+        """Return blue, green, red and alpha of each pixel."""
+        return b"" if self._seen is None else render(self._seen, self.site.arena.colors)
 
 
-class LightSensor(Device):
-    """Adds up the irradiance of all lights, as Webots does; nothing reflects light."""
+class SimulatedLightSensor(SimulatedDevice):
+    """Measures the sum of the irradiance of all lights, as Webots does, without reflections."""
 
     def measure(self, period_ms: float) -> float:
-        """The looked-up value of the irradiance."""
+        """Return the value of the lookup table for the irradiance."""
         world = self.site.arena.world
         irradiance = sum(self._from(light, world) for light in self.site.arena.lights)
         return resolved(self.node, irradiance)
 
-    def _from(self, light: Node, world: World) -> float:
+    def _from(self, light: WorldNode, world: World) -> float:
+        """Return the irradiance from one light."""
         fields, seen_through = light.fields, self.node.fields["colorFilter"]
         if not fields["on"]:
             return 0.0
-        way, distance_m = self._way_to(light, world)
-        direct = fields["intensity"] * max(_dot(self.site.axis(), way), 0.0)
+        direction, distance_m = self._direction_to(light, world)
+        direct = fields["intensity"] * max(_dot(self.site.axis(), direction), 0.0)
         color = _dot(fields["color"], seen_through) / 3.0
         return color * _attenuation(light, distance_m) * (fields["ambientIntensity"] + direct)
 
-    def _way_to(self, light: Node, world: World) -> tuple[Vector, float]:
-        """The direction of a light, a unit vector, and its distance in metres."""
+    def _direction_to(self, light: WorldNode, world: World) -> tuple[Vector, float]:
+        """Return the direction of a light, a unit vector, and its distance in metres."""
         frame = world.frame_around(light)
         if light.type_name == "DirectionalLight":
             x, y, z = frame.turned(light.fields["direction"])
             return _unit((-x, -y, -z)), _SUN_M
-        return _way(self.site.pose().translation, frame.point(light.fields["location"]))
+        return _direction_and_distance_m(
+            self.site.pose().translation, frame.point(light.fields["location"])
+        )
 
 
-def _attenuation(light: Node, distance_m: float) -> float:
+def _attenuation(light: WorldNode, distance_m: float) -> float:
     if light.type_name == "DirectionalLight":
         return 1.0
     a, b, c = light.fields["attenuation"]
     return 1.0 / max(a + b * distance_m + c * distance_m**2, 1e-9)
 
 
-def _way(here: Vector, there: Vector) -> tuple[Vector, float]:
-    """From one place to another: a unit vector and metres."""
-    way = (there[0] - here[0], there[1] - here[1], there[2] - here[2])
-    return _unit(way), hypot(*way)
+def _direction_and_distance_m(start: Vector, end: Vector) -> tuple[Vector, float]:
+    """Return the direction from one point to another, a unit vector, and their distance."""
+    offset = (end[0] - start[0], end[1] - start[1], end[2] - start[2])
+    return _unit(offset), hypot(*offset)
 
 
 def _dot(a: Vector, b: Vector) -> float:
@@ -413,50 +423,47 @@ def _unit(vector: Vector) -> Vector:
     return x / length, y / length, z / length
 
 
-# Messages ----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Packet:
-    """What a controller has sent; channel and range are those of the moment when it did."""
+    """A packet that a controller sent, with the channel and range at that moment."""
 
     data: bytes
     channel: int
     range_m: float
-    """How far it reaches; negative: everywhere."""
+    """How far the packet reaches; negative for everywhere."""
 
 
-class Emitter(Device):
-    """Sends packets; they arrive in the basic time step after which they were sent."""
+class SimulatedEmitter(SimulatedDevice):
+    """Sends packets. They arrive in the basic time step after which they were sent."""
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         super().__init__(tag, node, site)
         self._packets: list[Packet] = []
 
     def configure(self, setting: str, value: Any) -> None:
-        """Take a packet to send; the fields show channel and range of the last, as in Webots."""
+        """Queue a packet. The fields show channel and range of the last packet, as in Webots."""
         if setting == "send":
             packet = Packet(*value)
             self._packets.append(packet)
             self.node.fields |= {"channel": packet.channel, "range": packet.range_m}
 
     def make_due(self) -> None:
-        """Forget what was to be sent as well."""
+        """Drop the queued packets as well."""
         super().make_due()
         self._packets.clear()
 
-    def transmit(self, receivers: Sequence[Receiver]) -> None:
-        """Bring what is to be sent to all receivers of other robots that can hear it."""
+    def transmit(self, receivers: Sequence[SimulatedReceiver]) -> None:
+        """Deliver the queued packets to the receivers of other robots."""
         packets, self._packets = self._packets, []
         for receiver in receivers if packets else ():
             if receiver.site.body is not self.site.body:
-                receiver.hear(packets, self)
+                receiver.take(packets, self)
 
 
-class Receiver(Device):
-    """Queues packets until its controller gets them with the next sample."""
+class SimulatedReceiver(SimulatedDevice):
+    """Queues packets until its controller receives them with the next sample."""
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
+    def __init__(self, tag: int, node: WorldNode, site: Mounting) -> None:
         super().__init__(tag, node, site)
         self._arrived: list[tuple[bytes, Vector, float]] = []
 
@@ -467,18 +474,18 @@ class Receiver(Device):
             self.node.fields["channel"] = value
 
     def make_due(self) -> None:
-        """Forget what has arrived as well."""
+        """Drop the packets that have arrived as well."""
         super().make_due()
         self._arrived.clear()
 
-    def hear(self, packets: list[Packet], emitter: Emitter) -> None:
-        """Take those packets of an emitter that it can hear."""
+    def take(self, packets: list[Packet], emitter: SimulatedEmitter) -> None:
+        """Queue the packets of an emitter that are in range and on a channel it listens to."""
         if not self.period_ms or self.node.fields["type"] != emitter.node.fields["type"]:
             return
-        here, there = self.site.pose(), emitter.site.pose()
-        way, distance_m = _way(here.translation, there.translation)
+        own, other = self.site.pose(), emitter.site.pose()
+        outside, distance_m = _direction_and_distance_m(own.translation, other.translation)
         strength = 1.0 / distance_m**2 if distance_m else inf
-        direction = here.direction(way)
+        direction = own.direction(outside)
         self._arrived.extend(
             (packet.data, direction, strength)
             for packet in packets
@@ -490,46 +497,46 @@ class Receiver(Device):
         return -1 in (mine, channel) or mine == channel
 
     def put_value(self, fresh: dict[int, Any]) -> None:
-        """Add the packets to those that the controller has not been sent yet."""
+        """Add the packets to those that the controller has not received yet."""
         fresh.setdefault(self.tag, []).extend(self._arrived)
         self._arrived.clear()
 
 
-DEVICES: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
-    "RotationalMotor": Motor,
-    "LinearMotor": Motor,
-    "PositionSensor": PositionSensor,
-    "DistanceSensor": DistanceSensor,
-    "GPS": Gps,
-    "InertialUnit": InertialUnit,
-    "Lidar": Lidar,
-    "Camera": Camera,
-    "LED": Device,
-    "Accelerometer": Accelerometer,
-    "Compass": Compass,
-    "Gyro": Gyro,
-    "LightSensor": LightSensor,
-    "TouchSensor": TouchSensor,
-    "Emitter": Emitter,
-    "Receiver": Receiver,
+DEVICES: Final[dict[str, Callable[[int, WorldNode, Mounting], SimulatedDevice]]] = {
+    "RotationalMotor": SimulatedMotor,
+    "LinearMotor": SimulatedMotor,
+    "PositionSensor": SimulatedPositionSensor,
+    "DistanceSensor": SimulatedDistanceSensor,
+    "GPS": SimulatedGps,
+    "InertialUnit": SimulatedInertialUnit,
+    "Lidar": SimulatedLidar,
+    "Camera": SimulatedCamera,
+    "LED": SimulatedDevice,
+    "Accelerometer": SimulatedAccelerometer,
+    "Compass": SimulatedCompass,
+    "Gyro": SimulatedGyro,
+    "LightSensor": SimulatedLightSensor,
+    "TouchSensor": SimulatedTouchSensor,
+    "Emitter": SimulatedEmitter,
+    "Receiver": SimulatedReceiver,
 }
 """The devices that the stand-in has, by node type."""
 
 
-def devices_in(vehicle: Vehicle, arena: Arena) -> list[Device]:
-    """All devices of a robot in the order of the scene tree; tags count from 1."""
-    found: list[tuple[Node, Site]] = []
-    _find(vehicle.body.node, Site(vehicle, arena, Frame(), None), found)
+def devices_in(vehicle: Vehicle, arena: Arena) -> list[SimulatedDevice]:
+    """Return all devices of a robot in the order of the scene tree; tags count from 1."""
+    found: list[tuple[WorldNode, Mounting]] = []
+    _find(vehicle.body.node, Mounting(vehicle, arena, CoordinateFrame(), None), found)
     return [DEVICES[node.type_name](tag, node, site) for tag, (node, site) in enumerate(found, 1)]
 
 
-def _find(node: Node, site: Site, found: list[tuple[Node, Site]]) -> None:
+def _find(node: WorldNode, site: Mounting, found: list[tuple[WorldNode, Mounting]]) -> None:
     joints = {joint.node: joint for joint in site.vehicle.joints}
     for child in children_of(node):
         if child.type_name == "Robot":
             continue
         frame = site.frame.then(own_frame(child))
-        here = Site(site.vehicle, site.arena, frame, joints.get(child, site.joint))
+        inner = Mounting(site.vehicle, site.arena, frame, joints.get(child, site.joint))
         if child.type_name in DEVICES:
-            found.append((child, here))
-        _find(child, here, found)
+            found.append((child, inner))
+        _find(child, inner, found)

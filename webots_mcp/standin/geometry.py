@@ -1,4 +1,7 @@
-"""Places in space, and the shapes that stand on the plane."""
+"""Coordinate frames, and upright shapes on a plane that rays hit and that push a disc away.
+
+A box is a turned rectangle, a cylinder or a ball a disc, each between a bottom and a top.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +14,29 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """A rotation by rows, as `Node.getOrientation` gives it."""
 Vector = tuple[float, float, float]
 
-UNTURNED: Final[Matrix] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+IDENTITY: Final[Matrix] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+Color = tuple[float, float, float]
+"""Red, green and blue, each 0 to 1."""
+Push: TypeAlias = "tuple[float, float] | None"
+"""The shift in metres that frees a shape from another; None if they do not touch."""
+Target: TypeAlias = "Edge | Circle | EnclosingShape"
+"""What a ray from a point can hit."""
+Shape: TypeAlias = "UprightBox | Disc"
 
 
-class Frame(NamedTuple):
-    """Where something is, seen from what it stands in."""
+class CoordinateFrame(NamedTuple):
+    """Position and orientation of something, seen from its parent."""
 
-    rotation: Matrix = UNTURNED
+    rotation: Matrix = IDENTITY
     translation: Vector = (0.0, 0.0, 0.0)
 
     @property
     def yaw_rad(self) -> float:
-        """Heading: the turn about the vertical axis."""
+        """Return the heading: the rotation about the vertical axis."""
         return atan2(self.rotation[3], self.rotation[0])
 
     def point(self, local: Sequence[float]) -> Vector:
-        """A point given in this frame, seen from outside."""
+        """Return a point of this frame, seen from the parent."""
         x, y, z = local
         r, (tx, ty, tz) = self.rotation, self.translation
         return (
@@ -35,35 +45,35 @@ class Frame(NamedTuple):
             r[6] * x + r[7] * y + r[8] * z + tz,
         )
 
-    def inverse(self) -> Frame:
-        """What this frame stands in, seen from this frame."""
+    def inverse(self) -> CoordinateFrame:
+        """Return the parent, seen from this frame."""
         r = self.rotation
-        turned = Frame((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
+        turned = CoordinateFrame((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
         x, y, z = turned.point(self.translation)
-        return Frame(turned.rotation, (-x, -y, -z))
+        return CoordinateFrame(turned.rotation, (-x, -y, -z))
 
     def direction(self, outside: Sequence[float]) -> Vector:
-        """A direction given outside, seen from this frame."""
+        """Return a direction of the parent, seen from this frame."""
         return self.inverse().turned(outside)
 
     def turned(self, local: Sequence[float]) -> Vector:
-        """A direction given in this frame, seen from outside."""
-        return Frame(self.rotation).point(local)
+        """Return a direction of this frame, seen from the parent."""
+        return CoordinateFrame(self.rotation).point(local)
 
-    def then(self, inner: Frame) -> Frame:
-        """A frame given in this frame, seen from outside."""
+    def then(self, inner: CoordinateFrame) -> CoordinateFrame:
+        """Return a frame inside this one, seen from the parent."""
         a, b = self.rotation, inner.rotation
         rows = ((a[i], a[i + 1], a[i + 2]) for i in (0, 3, 6))
         product = (p * b[k] + q * b[k + 3] + r * b[k + 6] for p, q, r in rows for k in (0, 1, 2))
-        return Frame(cast("Matrix", tuple(product)), self.point(inner.translation))
+        return CoordinateFrame(cast("Matrix", tuple(product)), self.point(inner.translation))
 
 
 def _rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
-    """The matrix of an SFRotation (axis x, y, z and angle in radians)."""
+    """Return the matrix of an SFRotation (axis x, y, z and angle in radians)."""
     x, y, z, angle = axis_angle
     length = hypot(x, y, z)
     if length == 0.0:
-        return UNTURNED
+        return IDENTITY
     x, y, z = x / length, y / length, z / length
     c, s = cos(angle), sin(angle)
     v = 1.0 - c
@@ -74,38 +84,28 @@ def _rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
     )
 
 
-def frame_of(translation: Sequence[float], axis_angle: Sequence[float]) -> Frame:
-    """The frame that a `translation` and a `rotation` field describe."""
+def frame_of(translation: Sequence[float], axis_angle: Sequence[float]) -> CoordinateFrame:
+    """Return the frame that a `translation` and a `rotation` field describe."""
     x, y, z = translation
-    return Frame(_rotation_matrix(axis_angle), (x, y, z))
-
-
-# Shapes that stand upright on a plane, and how rays hit them and they push a disc away ------------
-# A box is a turned rectangle, a cylinder or a ball a disc, each between a bottom and a top.
-
-
-Color = tuple[float, float, float]
-"""Red, green and blue, each 0 to 1."""
-Push: TypeAlias = "tuple[float, float] | None"
-"""By how much, in metres, something has to move to be clear; None if it is clear."""
+    return CoordinateFrame(_rotation_matrix(axis_angle), (x, y, z))
 
 
 class Edge(NamedTuple):
-    """One side of a block, seen from a point: everything is relative to that point."""
+    """One side of a box. All values are relative to the point that it is seen from."""
 
     nx: float
     ny: float
     offset_m: float
-    """Distance from the point to the line of the edge."""
+    """Distance from the point to the line through the edge."""
     ex: float
     ey: float
     start_m: float
-    """Where the edge begins, measured along (ex, ey)."""
+    """Start of the edge, measured along (ex, ey)."""
     length_m: float
     shape: Shape
 
     def distance_m(self, dx: float, dy: float) -> float:
-        """How far the ray in direction (dx, dy) runs until it hits; inf if it does not."""
+        """Return the length of a ray in direction (dx, dy) until it hits; inf if it does not."""
         closing = self.nx * dx + self.ny * dy
         if closing <= 1e-12:
             return inf
@@ -114,12 +114,12 @@ class Edge(NamedTuple):
         return distance if 0.0 <= along <= self.length_m else inf
 
     def inward(self, distance_m: float, dx: float, dy: float) -> tuple[float, float]:
-        """The direction straight into the shape where a ray hits it."""
+        """Return the direction at right angles into the shape where a ray hits it."""
         return self.nx, self.ny
 
 
 class Circle(NamedTuple):
-    """The outline of a disc, seen from a point."""
+    """The outline of a disc, relative to the point that it is seen from."""
 
     x: float
     y: float
@@ -129,37 +129,34 @@ class Circle(NamedTuple):
     shape: Shape
 
     def distance_m(self, dx: float, dy: float) -> float:
-        """How far the ray in direction (dx, dy) runs until it hits; inf if it does not."""
+        """Return the length of a ray in direction (dx, dy) until it hits; inf if it does not."""
         ahead = self.x * dx + self.y * dy
         square = ahead * ahead - self.gap_m2
         return ahead - sqrt(square) if ahead > 0.0 and square >= 0.0 else inf
 
     def inward(self, distance_m: float, dx: float, dy: float) -> tuple[float, float]:
-        """The direction straight into the shape where a ray hits it."""
+        """Return the direction at right angles into the shape where a ray hits it."""
         return (self.x - distance_m * dx) / self.radius_m, (
             self.y - distance_m * dy
         ) / self.radius_m
 
 
-class Here(NamedTuple):
-    """A shape that the point is inside of."""
+class EnclosingShape(NamedTuple):
+    """A shape around the point that rays start from."""
 
     shape: Shape
 
     def distance_m(self, dx: float, dy: float) -> float:
-        """Nothing: the ray ends where it starts."""
+        """Return 0: the ray ends where it starts."""
         return 0.0
 
     def inward(self, distance_m: float, dx: float, dy: float) -> tuple[float, float]:
-        """The ray's own direction."""
+        """Return the ray's own direction."""
         return dx, dy
 
 
-Target: TypeAlias = "Edge | Circle | Here"
-
-
 @dataclass(frozen=True)
-class Block:
+class UprightBox:
     """A box that stands upright."""
 
     x: float
@@ -177,7 +174,7 @@ class Block:
         return self.cos_yaw * dx + self.sin_yaw * dy, self.cos_yaw * dy - self.sin_yaw * dx
 
     def targets(self, x: float, y: float, height_m: float | None, reach_m: float) -> list[Target]:
-        """The sides that can be seen from a point, at one height or (None) at any."""
+        """Return the sides that can be seen from a point, at one height or (None) at any."""
         if height_m is not None and not self.bottom_m <= height_m <= self.top_m:
             return []
         u, v = self._local(x, y)
@@ -186,7 +183,7 @@ class Block:
         if beyond_x > reach_m or beyond_y > reach_m:
             return []
         if beyond_x <= 0.0 and beyond_y <= 0.0:
-            return [] if height_m is None else [Here(self)]
+            return [] if height_m is None else [EnclosingShape(self)]
         c, s = self.cos_yaw, self.sin_yaw
         seen: list[Target] = []
         if beyond_x > 0.0:
@@ -198,7 +195,7 @@ class Block:
         return seen
 
     def push(self, x: float, y: float, radius_m: float) -> Push:
-        """What moves a disc out of this block, the shortest way."""
+        """Return the shortest shift that moves a disc out of this box."""
         u, v = self._local(x, y)
         if abs(u) >= self.half_x_m + radius_m or abs(v) >= self.half_y_m + radius_m:
             return None
@@ -214,7 +211,7 @@ class Block:
         if distance := hypot(du, dv):
             depth = max(radius_m - distance, 0.0) / distance
             return du * depth, dv * depth
-        if a - abs(u) < b - abs(v):  # the centre is inside: leave by the nearest side
+        if a - abs(u) < b - abs(v):  # The centre is inside the box: leave by the nearest side.
             return (a - abs(u) + radius_m) * (1.0 if u >= 0.0 else -1.0), 0.0
         return 0.0, (b - abs(v) + radius_m) * (1.0 if v >= 0.0 else -1.0)
 
@@ -232,14 +229,14 @@ class Disc:
     is_ball: bool = False
 
     def targets(self, x: float, y: float, height_m: float | None, reach_m: float) -> list[Target]:
-        """The outline as seen from a point, at one height or (None) at any."""
+        """Return the outline seen from a point, at one height or (None) at any."""
         radius = self.radius_m if height_m is None else self._radius_at(height_m)
         cx, cy = self.x - x, self.y - y
         gap = cx * cx + cy * cy - radius * radius
         if radius <= 0.0 or gap > reach_m * (reach_m + 2.0 * radius):
             return []
         if gap <= 0.0:
-            return [] if height_m is None else [Here(self)]
+            return [] if height_m is None else [EnclosingShape(self)]
         return [Circle(cx, cy, radius, gap, self)]
 
     def _radius_at(self, height_m: float) -> float:
@@ -251,7 +248,7 @@ class Disc:
         return sqrt(max(self.radius_m**2 - above**2, 0.0))
 
     def push(self, x: float, y: float, radius_m: float) -> Push:
-        """What moves another disc out of this one."""
+        """Return the shift that moves another disc out of this one."""
         dx, dy = x - self.x, y - self.y
         distance = hypot(dx, dy)
         depth = self.radius_m + radius_m - distance
@@ -260,26 +257,23 @@ class Disc:
         return (dx / distance * depth, dy / distance * depth) if distance else (depth, 0.0)
 
 
-Shape: TypeAlias = "Block | Disc"
-
-
 def targets_from(
     shapes: Iterable[Shape], x: float, y: float, height_m: float | None, reach_m: float = inf
 ) -> list[Target]:
-    """Everything that rays from a point can hit.
+    """Return everything that rays from a point can hit.
 
     Args:
-        shapes: What there is.
-        x: Where the rays start, metres.
-        y: Where the rays start, metres.
-        height_m: Only what is there at this height; None for everything around the point.
-        reach_m: How long the rays are; what is farther away may be left out.
+        shapes: The shapes around the point.
+        x: Start of the rays, in metres.
+        y: Start of the rays, in metres.
+        height_m: Height of the rays; None for shapes at any height.
+        reach_m: Length of the rays. Shapes that are farther away may be left out.
     """
     return [t for shape in shapes for t in shape.targets(x, y, height_m, reach_m)]
 
 
 def nearest_m(targets: Iterable[Target], dx: float, dy: float) -> float:
-    """Distance to the first thing in the direction of a unit vector; inf if there is none."""
+    """Return the distance to the first target in the direction of a unit vector; inf for none."""
     nearest = inf
     for target in targets:
         distance = target.distance_m(dx, dy)

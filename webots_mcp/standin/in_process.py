@@ -1,4 +1,4 @@
-"""Robots for unit tests: the same classes, without a second process and without a socket."""
+"""Robots for unit tests, whose simulation runs within the test's process."""
 
 from __future__ import annotations
 
@@ -12,24 +12,31 @@ from controller.robot import Robot, Supervisor
 from controller.session import Message
 
 from webots_mcp.contract import bundled
-from webots_mcp.standin.controller_answers import Driver, Seat, description
+from webots_mcp.standin.base_simulation import BaseSimulation, ControllerEndpoint
+from webots_mcp.standin.controller_answers import description
+from webots_mcp.standin.errors import (
+    RequestAfterEndError,
+    StandInError,
+    WorldError,
+    WouldBlockError,
+)
 from webots_mcp.standin.simulator import Mode
-from webots_mcp.standin.simulator import Robot as SimulatedRobot
-from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError
+from webots_mcp.standin.simulator import SimulatedRobot as SimulatedRobot
 
 DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"
 """A 4 m x 4 m arena with a few obstacles and one two-wheeled robot, "rover"."""
 
+
 _LONGEST_STEP_MS: Final = 1 << 31
 
 
-class InProcessSimulation(Driver):
-    """A world that the robots of this process move themselves, step by step.
+class InProcessSimulation(BaseSimulation):
+    """A simulation whose time passes only inside the `step` calls of robots in this process.
 
-    There is no thread and no pacing: time passes while a robot is inside `step`. Several robots
-    may share a simulation. Each has its own clock: the one that is behind finds that its time has
-    passed already, so stepping them in turn keeps them together, and none waits for another. After
-    a reset or a reload a new robot object may take the place of one that was ended.
+    There is no thread and no pacing. Several robots may share a simulation. Each has its own clock:
+    for a robot that is behind, the requested time has passed already. Stepping robots in turn
+    therefore keeps them together, and none waits for another. After a reset or a reload, a new
+    robot object can replace one that was ended.
     """
 
     def __init__(self, world: str | Path = DEFAULT_WORLD, *, pause_timeout_s: float = 0.0) -> None:
@@ -37,21 +44,21 @@ class InProcessSimulation(Driver):
 
         Args:
             world: A .wbt file.
-            pause_timeout_s: How long a `step` in a paused simulation waits for another thread to
-                resume it, before it raises `WouldBlockError`; seconds of wall time.
+            pause_timeout_s: How long `step` in a paused simulation waits for another thread to
+                resume it before it raises `WouldBlockError`, in seconds of wall time.
 
         Raises:
             WorldError: The world cannot be used.
         """
         self.console: list[str] = []
-        """What Webots would show in its console."""
+        """Lines that Webots would show in its console."""
         self._pause_timeout_s = pause_timeout_s
         self._changed = threading.Condition(threading.RLock())
         self._links: list[_LocalLink] = []
         super().__init__(world, Mode.FAST, self.console.append)
 
     @property
-    def _seats(self) -> Sequence[_LocalLink]:
+    def _endpoints(self) -> Sequence[_LocalLink]:
         return self._links
 
     def _obey(self, function: Callable[[], None]) -> None:
@@ -63,11 +70,11 @@ class InProcessSimulation(Driver):
         self.simulator.mode = Mode.PAUSE
         self._advance()
 
-    def _end(self, seats: Sequence[Seat]) -> None:
-        for seat in seats:
-            seat.is_ending = True
-            if seat.robot.remaining_ms is not None:
-                seat.tell_to_quit()
+    def _end(self, endpoints: Sequence[ControllerEndpoint]) -> None:
+        for endpoint in endpoints:
+            endpoint.is_ending = True
+            if endpoint.robot.remaining_ms is not None:
+                endpoint.tell_to_quit()
         self._links = [link for link in self._links if not link.is_ending]
         self._changed.notify_all()
 
@@ -92,7 +99,7 @@ class InProcessSimulation(Driver):
         return robots[0] if name is None else self.simulator.robot(name)
 
     def take(self, link: _LocalLink, message: Message) -> None:
-        """Take a controller's request, and let time pass as far as it asks for."""
+        """Answer a controller's request, unless time has to pass first."""
         with self._changed:
             self._serve(link, message)
             self._carry_out_wanted()
@@ -116,14 +123,14 @@ class InProcessSimulation(Driver):
                     self._advance()
 
     def leave(self, link: _LocalLink) -> None:
-        """Forget a controller that is done."""
+        """Disconnect a controller that has finished."""
         with self._changed:
             if link in self._links:
                 self._links.remove(link)
                 link.robot.forget_controller()
 
 
-class _LocalLink(Seat):
+class _LocalLink(ControllerEndpoint):
     """Both ends of the connection of an in-process robot."""
 
     def __init__(self, simulation: InProcessSimulation, robot: SimulatedRobot) -> None:
@@ -149,7 +156,7 @@ class _LocalLink(Seat):
         return self.replies.popleft()
 
     def exit(self) -> NoReturn:
-        raise ControllerEndedError(
+        raise RequestAfterEndError(
             "step() has returned -1: a controller process would end here, without a word. "
             "Leave the loop when step() returns -1 and make no further request"
         )
@@ -161,10 +168,10 @@ class _LocalLink(Seat):
 class InProcessRobot(Robot):
     """A `controller.Robot` for unit tests, in a simulation within this process.
 
-    Subclass it like `Robot`; there may be as many as a test wants. What differs from a controller
-    process: `step` in a paused simulation raises `WouldBlockError` where it would wait for ever,
-    and a request after `step` has returned -1 raises `ControllerEndedError` where the process
-    would end.
+    Subclass it like `Robot`; a test may have any number of them. It differs from a controller
+    process in two ways: where `step` would wait for ever in a paused simulation it raises
+    `WouldBlockError`, and where a request after the end would end the process it raises
+    `ControllerEndedError`.
     """
 
     def __init__(
@@ -176,8 +183,8 @@ class InProcessRobot(Robot):
         """Connect to a robot of a world.
 
         Args:
-            name: The robot's name; None: the first robot. If the world has one robot only, that
-                one takes the name.
+            name: The robot's name; None for the first robot. The only robot of a world takes any
+                name.
             world: A .wbt file to load, or a simulation to share with other robots.
 
         Raises:
@@ -186,7 +193,7 @@ class InProcessRobot(Robot):
         """
         shared = isinstance(world, InProcessSimulation)
         self.simulation = world if shared else InProcessSimulation(world)
-        """The simulation: a person's hands, and what is really the case."""
+        """The simulation, with its buttons and the true state of its robots."""
         self._wanted_name = name
         super().__init__()
 
@@ -197,5 +204,5 @@ class InProcessRobot(Robot):
 class InProcessSupervisor(InProcessRobot, Supervisor):
     """A `controller.Supervisor` for unit tests; see `InProcessRobot`.
 
-    Whether it has a supervisor's rights is the world's business, as in Webots.
+    As in Webots, the world decides whether it has a supervisor's rights.
     """

@@ -1,4 +1,4 @@
-"""A running simulation with real controller processes, and the loop that runs it."""
+"""A running simulation whose controllers are real processes, and the loop that runs it."""
 
 from __future__ import annotations
 
@@ -22,40 +22,44 @@ from typing import Final, Protocol, TypeVar, cast
 
 from controller.session import ADDRESS_FILE, Message
 
-from webots_mcp.standin.controller_answers import Driver, Seat, description
-from webots_mcp.standin.controllers import Connection, Controller, Launch
+from webots_mcp.standin.base_simulation import BaseSimulation, ControllerEndpoint
+from webots_mcp.standin.controller_answers import description
+from webots_mcp.standin.controllers import Controller, ControllerConnection, ControllerLaunch
+from webots_mcp.standin.errors import StandInError
 from webots_mcp.standin.simulator import Mode
-from webots_mcp.standin.vrml import StandInError
 
 _MODES: Final = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
-_NOTICE_S: Final = 0.002
+_NOTIFY_INTERVAL_S: Final = 0.002
+"""Minimum time between two notifications of waiting threads: each costs a thread switch."""
 _RECHECK_S: Final = 0.05
+"""Maximum time between two checks of a condition that a thread waits for."""
 _CONSOLE_LINES: Final = 10_000
 _PATIENCE_S: Final = 1.0
-"""How long Webots waits for a controller to ask for something, and then for it to exit."""
+"""How long Webots waits for a controller to make a request, and then for it to exit."""
 _MAX_LAG_S: Final = 0.1
-"""Real time that is lost is caught up with at most so much."""
+"""Maximum delay behind real time that is caught up."""
 
 T = TypeVar("T")
 
 
 class ConsoleRecorder(Protocol):
-    """What keeps the lines of a simulation's console."""
+    """Stores the lines of a simulation's console."""
 
     def begin(self, port: int) -> None:
-        """Begin with the simulation that controllers know by this port."""
+        """Begin a simulation that controllers know by this port."""
 
     def put(self, stream: str, line: str) -> None:
         """Take a line of `stdout` or `stderr`: `[robot] text` from controllers, others from Webots.
 
-        It is called from one thread at a time, also before `begin`.
+        Called from one thread at a time, also before `begin`.
         """
 
 
-class Simulation(Driver):
-    """A world that runs in a background thread, its controllers as processes of their own.
+class StandInSimulation(BaseSimulation):
+    """A world that runs in a background thread; `webots_mcp.standin.Simulation`.
 
-    Use it in a `with` statement; leaving it ends all controllers.
+    Its controllers are processes of their own. Use it in a `with` statement; leaving it ends all
+    controllers.
     """
 
     def __init__(
@@ -75,15 +79,15 @@ class Simulation(Driver):
             world: A .wbt file, best in a project: `worlds/x.wbt` next to `controllers/`.
             mode: `pause`, `realtime` or `fast`, as for Webots' `--mode`. A world that is loaded
                 in pause starts its controllers with the first step.
-            console: Is called with each line of Webots' console, from one thread at a time.
-            recorder: Takes the same lines, as Webots gives them to its clients.
+            console: Called with each line of Webots' console, from one thread at a time.
+            recorder: Receives the same lines, as Webots sends them to its clients.
             environment: Variables for the controllers, on top of those of this process.
             controllers: Controller files by robot name, instead of those that the world names.
-            python: The interpreter of the controllers.
+            python: Interpreter that runs the controllers.
 
         Raises:
-            WorldError: The world cannot be used, or has no robot that `controllers` names.
-            StandInError: There is no such mode.
+            WorldError: The world cannot be used, or lacks a robot that `controllers` names.
+            StandInError: The mode is unknown.
         """
         if mode not in _MODES:
             raise StandInError(f"mode has to be one of {', '.join(_MODES)}, not {mode!r}")
@@ -96,16 +100,16 @@ class Simulation(Driver):
         self._folder = Path(tempfile.mkdtemp(prefix="webots-standin-"))
         self._clean_up = weakref.finalize(self, shutil.rmtree, self._folder, True)
         overrides = {name: Path(file) for name, file in (controllers or {}).items()}
-        self._launch = Launch(
+        self._launch = ControllerLaunch(
             python, environment or {}, overrides, self._print, self._exited, secrets.token_hex(16)
         )
         self.controllers: list[Controller] = []
         """One for each robot, in the order of the scene tree."""
         super().__init__(world, _MODES[mode], self._print)
         for name in overrides:
-            self.robot(name)  # refuses a name that the world does not have
+            self.robot(name)  # Raises for a name that the world does not have.
         self._find_controllers()
-        self._admitted: dict[Connection, Controller] = {}
+        self._admitted: dict[ControllerConnection, Controller] = {}
         self._calls: deque[tuple[Callable[[], None], Future[None]]] = deque()
         self._steps_asked = 0
         self._due_s = 0.0
@@ -114,9 +118,9 @@ class Simulation(Driver):
         self._bell_rope: socket.socket
         self._thread = threading.Thread(target=self._run, name="simulation", daemon=True)
 
-    # Life ----------------------------------------------------------------------------------------
+    # Start and end -------------------------------------------------------------------------------
 
-    def start(self, shown_port: int | None = None) -> Simulation:
+    def start(self, shown_port: int | None = None) -> StandInSimulation:
         """Start the controllers and, unless it is to be paused, time.
 
         Args:
@@ -131,22 +135,22 @@ class Simulation(Driver):
         self._launch.folder = self._folder / str(shown_port or self._launch.port)
         if self._recorder:
             self._recorder.begin(int(self._launch.folder.name))
-        self._launch.folder.mkdir()  # it is this user's alone
+        self._launch.folder.mkdir()  # Only this user can read it.
         address = f"{self._launch.port} {self._launch.token}"
         (self._launch.folder / ADDRESS_FILE).write_text(address, encoding="utf-8")
         self._thread.start()
         return self
 
     def close(self) -> None:
-        """Quits, if that has not happened yet, and waits until all processes are gone."""
+        """Quit, unless that happened before, and wait until all processes have ended."""
         if self._thread.is_alive():
-            with suppress(StandInError):  # it was quit otherwise meanwhile
+            with suppress(StandInError):  # A controller may have quit it meanwhile.
                 self.quit()
         if self._thread.ident is not None:
             self._thread.join()
         self._clean_up()
 
-    def __enter__(self) -> Simulation:
+    def __enter__(self) -> StandInSimulation:
         return self.start()
 
     def __exit__(self, *_: object) -> None:
@@ -154,33 +158,33 @@ class Simulation(Driver):
 
     @property
     def is_running(self) -> bool:
-        """Whether the simulation has not been quit."""
+        """Return whether the simulation has not been quit."""
         return self.exit_status is None
 
     @property
     def can_go_on(self) -> bool:
-        """Whether a controller runs or may still come, or there never was one."""
+        """Return whether a controller runs or may still connect, or none was ever started."""
         started = [each for each in self.controllers if each.process is not None]
         return not started or any(each.may_act for each in self.controllers)
 
     @property
     def failure(self) -> int | None:
-        """The exit status of the first controller that ended with an error by itself.
+        """Return the exit status of the first controller that ended with an error by itself.
 
-        128 and its number for a signal; None if there is none.
+        For a signal that is 128 plus its number; None if no controller failed.
         """
         return self._launch.failure
 
-    # What is the case ----------------------------------------------------------------------------
+    # State ---------------------------------------------------------------------------------------
 
     @property
     def console(self) -> list[str]:
-        """The last lines of the console: `[robot] text` from controllers, others from Webots."""
+        """Return the last lines of the console; lines of controllers begin with `[robot]`."""
         with self._printing:
             return [*self._lines]
 
     def controller(self, name: str) -> Controller:
-        """A robot's controller: its `pid`, `exit_code`, `starts`, `kill()`, ...
+        """Return a robot's controller: its `pid`, `exit_code`, `starts`, `kill()`, ...
 
         Raises:
             WorldError: The world has no robot with this name.
@@ -189,7 +193,7 @@ class Simulation(Driver):
         return next(controller for controller in self.controllers if controller.robot is robot)
 
     def environment_of(self, name: str) -> dict[str, str]:
-        """The environment that makes a program of yours the controller of an <extern> robot.
+        """Return the environment that makes a program of yours the controller of an <extern> robot.
 
         Raises:
             StandInError: There is no such robot, or the simulation has not started.
@@ -197,17 +201,17 @@ class Simulation(Driver):
         return self.controller(name).environment()
 
     def wait_for(self, condition: Callable[[], T], timeout_s: float = 10.0) -> T:
-        """Wait until something is the case; looks whenever something has happened.
+        """Wait until a condition holds. It is checked whenever something has happened.
 
         Args:
-            condition: Is called in this thread until its value is true.
-            timeout_s: The longest time to wait, in seconds of wall time.
+            condition: Called in this thread until its value is true.
+            timeout_s: Maximum time to wait, in seconds of wall time.
 
         Returns:
             The true value.
 
         Raises:
-            TimeoutError: It was not the case in time; the message ends with the console.
+            TimeoutError: The condition did not hold in time; the text ends with the console.
         """
         deadline_s = time.monotonic() + timeout_s
         while not (value := condition()):
@@ -238,7 +242,7 @@ class Simulation(Driver):
             raise StandInError("the simulation has ended") from None
 
     def _wake(self) -> None:
-        """Let the loop look around, if it waits."""
+        """Wake up the loop, if it waits."""
         with suppress(OSError):
             self._bell_rope.send(b"!")
 
@@ -257,9 +261,9 @@ class Simulation(Driver):
         self._tell()
 
     def _notice(self) -> None:
-        """Called in the simulation's thread when something has happened, as after each step."""
+        """Notify threads in `wait_for`; called in the simulation's thread, such as after a step."""
         now_s = time.monotonic()
-        if now_s - self._noticed_s > _NOTICE_S:  # a thread switch for each step would cost too much
+        if now_s - self._noticed_s > _NOTIFY_INTERVAL_S:
             self._noticed_s = now_s
             self._tell()
 
@@ -284,7 +288,7 @@ class Simulation(Driver):
             self._shut_down()
 
     def _patience_s(self) -> float | None:
-        """How long to listen before the next physics step; None: until something is heard."""
+        """Return how long to wait for messages before the next physics step; None for no limit."""
         wants_to_advance = self.mode is not Mode.PAUSE or self._steps_asked
         if not wants_to_advance or any(each.holds_up for each in self.controllers):
             return None
@@ -294,7 +298,7 @@ class Simulation(Driver):
 
     def _advance(self) -> None:
         now_s, step_s = time.monotonic(), self.simulator.world.basic_time_step_ms / 1000.0
-        # A step that came early, as all do in fast mode, is no reason to wait longer for the next.
+        # A step that was made early, as in fast mode, must not delay the next one.
         self._due_s = max(min(self._due_s, now_s) + step_s, now_s - _MAX_LAG_S)
         self._steps_asked = max(self._steps_asked - 1, 0)
         super()._advance()
@@ -314,7 +318,7 @@ class Simulation(Driver):
             function, future = self._calls.popleft()
             try:
                 future.set_result(function())
-            except Exception as error:  # noqa: BLE001 - it is the caller's
+            except Exception as error:  # noqa: BLE001 - The caller receives it.
                 future.set_exception(error)
             self._notice()
 
@@ -330,23 +334,23 @@ class Simulation(Driver):
         self._notice()
 
     def _cancel_calls(self) -> None:
-        with suppress(IndexError):  # both threads may get here at once
+        with suppress(IndexError):  # Both threads may get to this point at once.
             while self._calls:
                 self._calls.popleft()[1].cancel()
 
     # Controllers ---------------------------------------------------------------------------------
 
     @property
-    def _seats(self) -> Sequence[Controller]:
+    def _endpoints(self) -> Sequence[Controller]:
         return self.controllers
 
     def _welcome(self, door: socket.socket) -> None:
-        connection = Connection(door.accept()[0])
+        connection = ControllerConnection(door.accept()[0])
         self._selector.register(
             connection.stream, selectors.EVENT_READ, partial(self._hear, connection)
         )
 
-    def _hear(self, connection: Connection, _: socket.socket) -> None:
+    def _hear(self, connection: ControllerConnection, _: socket.socket) -> None:
         messages = connection.receive()
         if messages is None:
             self._forget(connection)
@@ -359,7 +363,7 @@ class Simulation(Driver):
             else:
                 self._admit(connection, message)
 
-    def _admit(self, connection: Connection, message: Message) -> None:
+    def _admit(self, connection: ControllerConnection, message: Message) -> None:
         _, token, name = message
         controller = next((c for c in self.controllers if c.name == name), None)
         if not hmac.compare_digest(token, self._launch.token):
@@ -374,7 +378,7 @@ class Simulation(Driver):
             connection.send(("welcome", description(self.simulator, controller.robot)))
             self._notice()
 
-    def _forget(self, connection: Connection) -> None:
+    def _forget(self, connection: ControllerConnection) -> None:
         self._selector.unregister(connection.stream)
         connection.stream.close()
         if controller := self._admitted.pop(connection, None):
@@ -383,7 +387,7 @@ class Simulation(Driver):
             self._notice()
 
     def _find_controllers(self) -> None:
-        """A controller for each robot of the world; those of the world before are kept by name."""
+        """Make a controller for each robot; reuse controllers of the previous world by name."""
         known = {controller.name: controller for controller in self.controllers}
         self.controllers = [
             known.get(robot.name) or Controller(robot, self._launch)
@@ -392,19 +396,19 @@ class Simulation(Driver):
         for controller, robot in zip(self.controllers, self.simulator.robots, strict=True):
             controller.enter(robot, self.simulator)
 
-    def _start(self, seats: Sequence[Seat]) -> None:
+    def _start(self, endpoints: Sequence[ControllerEndpoint]) -> None:
         for controller in self.controllers:
-            if controller in seats:
+            if controller in endpoints:
                 controller.start()
 
-    def _end(self, seats: Sequence[Seat]) -> None:
-        """As Webots does it: a second to ask, a second to exit, then by force."""
-        controllers = [controller for controller in self.controllers if controller in seats]
+    def _end(self, endpoints: Sequence[ControllerEndpoint]) -> None:
+        """End controllers as Webots does: a second for a request, one to exit, then by force."""
+        controllers = [controller for controller in self.controllers if controller in endpoints]
         for controller in controllers:
             controller.is_ending = True
             if controller.robot.remaining_ms is not None:
                 controller.tell_to_quit()
-        self._listen_until(lambda: not any(c.has_to_be_told for c in controllers))
+        self._listen_until(lambda: not any(c.awaits_quit for c in controllers))
         for controller in controllers:
             controller.tell_to_quit()
         self._listen_until(lambda: not any(c.is_leaving for c in controllers))
@@ -414,20 +418,20 @@ class Simulation(Driver):
                 self._forget(connection)
             controller.is_ending = False
 
-    # What a person or a controller wants ---------------------------------------------------------
+    # Modes, steps and worlds ---------------------------------------------------------------------
 
     def _set_mode(self, mode: Mode) -> None:
         super()._set_mode(mode)
         self._start_late()
 
     def _step_once(self) -> None:
-        """One basic time step as soon as all controllers have asked."""
+        """Make one basic time step as soon as all controllers have asked for one."""
         self.simulator.mode = Mode.PAUSE
         self._steps_asked += 1
         self._start_late()
 
     def _start_late(self) -> None:
-        """A world that was loaded in pause starts its controllers only when time is to pass."""
+        """Start controllers of a world that was loaded in pause, once time is to pass."""
         self._due_s = time.monotonic()
         if self.mode is not Mode.PAUSE or self._steps_asked:
             self._start([each for each in self.controllers if not each.was_started])

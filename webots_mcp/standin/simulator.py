@@ -1,7 +1,7 @@
-"""The simulation itself: robots, time and modes; no messages, no processes, no sockets.
+"""The simulation itself: robots, time and modes, without messages, processes and sockets.
 
-A `Driver` makes the physics steps (`advance`) and carries out what the simulation wants done to
-itself (`wanted`).
+A `BaseSimulation` calls `advance` for each physics step, and carries out the request in `wanted`
+that a controller made for the whole simulation.
 """
 
 from __future__ import annotations
@@ -12,19 +12,25 @@ from math import ceil
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
-from webots_mcp.standin.devices import Device, Emitter, Receiver, devices_in
-from webots_mcp.standin.pictures import Label, Picture, save_picture
-from webots_mcp.standin.vrml import Node, WorldError
+from webots_mcp.standin.arena import Arena, Body
+from webots_mcp.standin.devices import (
+    SimulatedDevice,
+    SimulatedEmitter,
+    SimulatedReceiver,
+    devices_in,
+)
+from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.pictures import Label, PictureRequest, save_picture
+from webots_mcp.standin.vehicle import Vehicle, joints_in
+from webots_mcp.standin.vrml import WorldNode
 from webots_mcp.standin.world import World
 
 TrackedKey: TypeAlias = "tuple[int, int | str | None]"
-"""The id of a node and its field, or for its pose the node that it is seen from (None: the world).
-"""
+"""A field: node id and name. A pose: node id and the id it is seen from, None for the world."""
 
 
 class Mode(IntEnum):
-    """How the simulation runs; the numbers are those of `Supervisor.SIMULATION_MODE_...`."""
+    """Mode of the simulation; the numbers are those of `Supervisor.SIMULATION_MODE_...`."""
 
     PAUSE = 0
     REAL_TIME = 1
@@ -32,71 +38,73 @@ class Mode(IntEnum):
 
 
 Wanted: TypeAlias = "str | int"
-"""What a controller asked to be done to the whole simulation.
+"""A request of a controller for the whole simulation.
 
-A world to be loaded, empty to read the same one again, or the exit status to quit with.
+The path of a world to load, empty to reload the present one, or the exit status to quit with.
 """
 
 
-class Robot:
-    """A robot of the world and the state of its controller's requests."""
+class SimulatedRobot:
+    """A robot of the world, and the state of its controller's requests."""
 
     def __init__(self, body: Body, arena: Arena) -> None:
-        self.node: Node = body.node
+        self.node: WorldNode = body.node
         self.vehicle = Vehicle(body, joints_in(body.node))
-        self.devices: dict[int, Device] = {d.tag: d for d in devices_in(self.vehicle, arena)}
+        self.devices: dict[int, SimulatedDevice] = {
+            d.tag: d for d in devices_in(self.vehicle, arena)
+        }
         self.folder = Path.cwd()
-        """Where the relative paths of its controller start."""
+        """Folder that relative paths of its controller start in."""
         self.remaining_ms: float | None = None
-        """Simulated time until the step that the controller asked for is over; None: no request."""
+        """Simulated time until the requested step is over; None if there is no request."""
         self.ahead_ms = 0.0
-        """Simulated time that has passed since the end of the last step it asked for."""
+        """Simulated time since the end of the last requested step."""
         self.delay_ms = 0
-        """By how much the last step came too late, for robots without synchronization."""
+        """Delay of the last step, of robots without synchronization."""
         self.fresh: dict[int, Any] = {}
-        """Values that the controller has not been sent yet, by tag."""
+        """Values that the controller has not received yet, by tag."""
         self._tracked: dict[TrackedKey, tuple[int, float]] = {}
-        """What is sent with the steps: the periods, and when each is due, in ms."""
+        """Period and next due time in ms of each pose and field that is sent with the steps."""
 
     @property
     def name(self) -> str:
-        """The `name` field."""
+        """Return the `name` field."""
         return self.node.fields["name"]
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether the world waits for its controller."""
+        """Return whether the world waits for its controller."""
         return self.node.fields["synchronization"]
 
     @property
     def position(self) -> tuple[float, float, float]:
-        """Where it really is, in metres."""
+        """Return its true position in metres."""
         body = self.vehicle.body
         return body.x, body.y, body.z
 
     @property
     def yaw_rad(self) -> float:
-        """Where it really heads."""
+        """Return its true heading."""
         return self.vehicle.body.yaw_rad
 
     @property
     def collisions(self) -> int:
-        """How often it began to touch something that does not give way."""
+        """Return how often it began to touch something that cannot be pushed away."""
         return self.vehicle.collisions
 
     @property
     def is_touching(self) -> bool:
-        """Whether it drives against something now."""
+        """Return whether it is pressing against something now."""
         return self.vehicle.touching
 
     def track(self, what: TrackedKey, period_ms: int) -> None:
-        """Send it with the steps, at once and then once in a period; 0 ends that."""
+        """Send a pose or field with the steps, at once and then once a period; 0 ends that."""
         self._tracked.pop(what, None)
         if period_ms:
             self._tracked[what] = (period_ms, 0.0)
 
     def due(self, time_ms: float) -> list[TrackedKey]:
-        """The tracked poses and fields that are to be sent now."""
+        """Return the tracked poses and fields that have to be sent now."""
         due = [what for what, (_, due_ms) in self._tracked.items() if time_ms >= due_ms]
         for what in due:
             period_ms, _ = self._tracked[what]
@@ -104,11 +112,11 @@ class Robot:
         return due
 
     def make_tracked_due(self) -> None:
-        """After a reset they are due at once, as sensors are."""
+        """Make tracked poses and fields due at once, as sensors are after a reset."""
         self._tracked = {what: (period_ms, 0.0) for what, (period_ms, _) in self._tracked.items()}
 
     def forget_controller(self) -> None:
-        """Make ready for another controller: no request, no sensor enabled, motors still."""
+        """Prepare for another controller: no request, all sensors disabled, motors at rest."""
         self.remaining_ms, self.ahead_ms = None, 0.0
         self.fresh.clear()
         self._tracked.clear()
@@ -119,7 +127,7 @@ class Robot:
 
 
 class Simulator:
-    """One world in motion."""
+    """One running world."""
 
     def __init__(self, world: World, mode: Mode, log: Callable[[str], None]) -> None:
         self.world = world
@@ -127,7 +135,7 @@ class Simulator:
         self.log = log
         self.arena = Arena(world)
         self.robots = [
-            Robot(b, self.arena) for b in self.arena.bodies if b.node.type_name == "Robot"
+            SimulatedRobot(b, self.arena) for b in self.arena.bodies if b.node.type_name == "Robot"
         ]
         names = [robot.name for robot in self.robots]
         if double := {name for name in names if names.count(name) > 1}:
@@ -137,17 +145,17 @@ class Simulator:
         if not self.robots and world.left_out:
             raise WorldError(self.no_robot())
         devices = [device for robot in self.robots for device in robot.devices.values()]
-        self._emitters = [device for device in devices if isinstance(device, Emitter)]
-        self._receivers = [device for device in devices if isinstance(device, Receiver)]
+        self._emitters = [device for device in devices if isinstance(device, SimulatedEmitter)]
+        self._receivers = [device for device in devices if isinstance(device, SimulatedReceiver)]
         self.time_ms = 0.0
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
         self.is_reset_wanted = False
-        """Whether everything is put back at the end of the next physics step."""
+        """Whether the world is reset at the end of the next physics step."""
         self.wanted_after_step: Wanted | None = None
-        self.added: list[Node] = []
-        """What controllers have added: the next reset removes it."""
-        self._pictures: list[Picture] = []
+        self.added: list[WorldNode] = []
+        """Nodes that controllers have added; the next reset removes them."""
+        self._pictures: list[PictureRequest] = []
         self._start = {
             node: ([*node.fields["translation"]], [*node.fields["rotation"]])
             for node in world.nodes
@@ -156,18 +164,22 @@ class Simulator:
 
     @property
     def time_s(self) -> float:
-        """Simulated time in seconds."""
+        """Return simulated time in seconds."""
         return self.time_ms / 1000.0
 
-    def robot(self, name: str) -> Robot:
-        """The robot with this name."""
+    def robot(self, name: str) -> SimulatedRobot:
+        """Return the robot with this name.
+
+        Raises:
+            WorldError: The world has no such robot.
+        """
         for robot in self.robots:
             if robot.name == name:
                 return robot
         raise WorldError(self.no_robot(name))
 
     def no_robot(self, name: str | None = None) -> str:
-        """Why there is no robot of this name, or none at all, in words."""
+        """Return the text that says why there is no robot of this name, or none at all."""
         if left_out := self.left_out_robots(name):
             types = [*dict.fromkeys(node.type_name for node in left_out)]
             return (
@@ -181,25 +193,25 @@ class Simulator:
         asked = "no robot" if name is None else f"no robot {name!r}"
         return f"{asked} in {self.world.path.name}; it has {known or 'none'}"
 
-    def left_out_robots(self, name: str | None = None) -> list[Node]:
-        """What was left out of the world and may be this robot, or any: what has a controller."""
+    def left_out_robots(self, name: str | None = None) -> list[WorldNode]:
+        """Return nodes that were left out and may be this robot: those with a controller."""
         at_top = [n for n in self.world.left_out if self.world.parent_of(n) is self.world.root]
         robots = [node for node in self.world.left_out if _has_controller(node)]
         if name is None:
             return robots or at_top
         return [node for node in robots if node.fields.get("name", name) == name]
 
-    def robot_of(self, node: Node) -> Robot:
-        """The robot that a Robot node describes."""
+    def robot_of(self, node: WorldNode) -> SimulatedRobot:
+        """Return the robot that a Robot node describes."""
         return next(robot for robot in self.robots if robot.node is node)
 
-    def ask_step(self, robot: Robot, duration_ms: int) -> bool:
-        """Take a controller's request to simulate; True if that much has passed already."""
+    def ask_step(self, robot: SimulatedRobot, duration_ms: int) -> bool:
+        """Take a controller's request for a step; True if that much time has passed already."""
         basic = self.world.basic_time_step_ms
         robot.remaining_ms = ceil(duration_ms / basic) * basic - robot.ahead_ms
         return self._is_over(robot)
 
-    def _is_over(self, robot: Robot) -> bool:
+    def _is_over(self, robot: SimulatedRobot) -> bool:
         if robot.remaining_ms is None or robot.remaining_ms > 0.0:
             return False
         late_ms = -robot.remaining_ms
@@ -208,8 +220,8 @@ class Simulator:
         robot.delay_ms = 0 if robot.is_synchronous else int(late_ms)
         return True
 
-    def advance(self) -> list[Robot]:
-        """Make one physics step; returns the robots whose controllers have waited for it."""
+    def advance(self) -> list[SimulatedRobot]:
+        """Make one physics step; return the robots whose controllers waited for it."""
         basic = self.world.basic_time_step_ms
         for robot in self.robots:
             robot.vehicle.drive(self.arena, basic / 1000.0)
@@ -219,7 +231,7 @@ class Simulator:
         self.time_ms += basic
         if self.is_reset_wanted:
             self.reset()
-            self.time_ms = basic  # the step that resets counts
+            self.time_ms = basic  # The step that resets counts.
         for robot in self.robots:
             self._measure(robot, basic)
         self._render()
@@ -227,12 +239,12 @@ class Simulator:
             self.wanted, self.wanted_after_step = self.wanted_after_step, None
         return [robot for robot in self.robots if self._let_pass(robot, basic)]
 
-    def _measure(self, robot: Robot, passed_ms: float) -> None:
+    def _measure(self, robot: SimulatedRobot, passed_ms: float) -> None:
         for device in robot.devices.values():
             if device.is_due(passed_ms):
                 device.put_value(robot.fresh)
 
-    def _let_pass(self, robot: Robot, passed_ms: float) -> bool:
+    def _let_pass(self, robot: SimulatedRobot, passed_ms: float) -> bool:
         if robot.remaining_ms is None:
             robot.ahead_ms += passed_ms
             return False
@@ -240,7 +252,7 @@ class Simulator:
         return self._is_over(robot)
 
     def reset(self) -> None:
-        """Put everything back to the start of the world, at time 0; controllers go on."""
+        """Return everything to the start of the world, at time 0. Controllers keep running."""
         self.is_reset_wanted = False
         self.time_ms = 0.0
         added, self.added = self.added, []
@@ -250,7 +262,7 @@ class Simulator:
         for node, (translation, rotation) in self._start.items():
             node.fields["translation"], node.fields["rotation"] = [*translation], [*rotation]
         for body in self.arena.bodies:
-            self.stand_anew(body)
+            self.update_pose(body)
             body.stop()
             body.touched.clear()
         for robot in self.robots:
@@ -260,15 +272,15 @@ class Simulator:
             for device in robot.devices.values():
                 device.make_due()
 
-    def stand_anew(self, body: Body) -> None:
-        """Let a body follow its node's fields."""
+    def update_pose(self, body: Body) -> None:
+        """Move a body to the pose in its node's fields."""
         frame = self.world.frame_of(body.node)
         assert frame is not None
         body.stand(frame)
 
     def export(self, path: Path, quality: int) -> None:
-        """Write a picture: at once when paused, else with the next rendering."""
-        self._pictures.append(Picture(path, quality))
+        """Write a picture: at once if paused, else with the next step."""
+        self._pictures.append(PictureRequest(path, quality))
         if self.mode is Mode.PAUSE:
             self._render()
 
@@ -277,12 +289,12 @@ class Simulator:
         for picture in pictures:
             self._save(picture)
 
-    def _save(self, picture: Picture) -> None:
+    def _save(self, picture: PictureRequest) -> None:
         try:
             save_picture(picture, self.arena, self.time_s, [*self.labels.values()])
         except (OSError, ValueError, ImportError) as error:
             self.log(f"ERROR: cannot export the image {picture.path}: {error}")
 
 
-def _has_controller(node: Node) -> bool:
+def _has_controller(node: WorldNode) -> bool:
     return "controller" in node.fields or "controllerArgs" in node.fields

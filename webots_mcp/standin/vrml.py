@@ -1,6 +1,6 @@
-"""Reads the VRML dialect of .wbt and .proto files into trees of nodes with typed fields.
+"""The parser of the VRML dialect of .wbt and .proto files.
 
-A node of a PROTO becomes what it stands for.
+It makes trees of nodes, whose fields `give_types` turns into Python values of their types.
 
 StandInError
 ├── WorldError            the world file cannot be used; names the line
@@ -10,95 +10,89 @@ StandInError
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import cached_property
-from math import cos, pi, sin, tan
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
-DATA: Final = Path(__file__).with_name("data")
-"""The folder of the node types and of the PROTO nodes that are built in."""
+from webots_mcp.standin.errors import WorldError
 
-Value: TypeAlias = "bool | str | Node | list[float] | list[Value] | None"
-"""A field as written: numbers are always a list of floats, `[...]` is a list of anything."""
+DATA: Final = Path(__file__).with_name("data")
+"""Folder of the node types and the built-in PROTO nodes."""
+
+Value: TypeAlias = "bool | str | WorldNode | list[float] | list[Value] | None"
+"""A field as written: numbers are always a list of floats, `[...]` is a list of any values."""
 NUMBERS_IN: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
-"""How many numbers make one value of a type; all other types take one."""
+"""Numbers in one value of a type; all other types take one."""
 
 _FIELD_KEYWORDS: Final = (
     *("field", "vrmlField", "w3dField", "exposedField"),
     *("unconnectedField", "hiddenField", "deprecatedField"),
 )
 _FIRST_RELEASE: Final = "R2022"
-"""The oldest one with the axes of today."""
+"""The oldest release with the present axes."""
 
 _TOKEN: Final = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]|[^\s\[\]{}",#]+)')
 _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
 _NAME: Final = re.compile(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z")
 _WORDS: Final[dict[str, bool | None]] = {"TRUE": True, "FALSE": False, "NULL": None}
-HOME_VARIABLE: Final = "WEBOTS_HOME"
-BUILT_IN: Final = sorted(file.stem for file in DATA.glob("*.proto"))
-_OF_WEBOTS: Final = re.compile(
-    r"(?:webots://|https://raw\.githubusercontent\.com/cyberbotics/webots/[^/]+/)(projects/.+)"
-)
 
 
 class FieldDefinition(NamedTuple):
-    """What a node type says about one of its fields."""
+    """The definition of a field in a node type."""
 
     type_name: str
     """`SFVec3f`, `MFNode` and so on."""
     default: Value
-    """As written."""
+    """The default as written."""
     is_hidden: bool = False
-    """Whether only the PROTO itself uses it."""
+    """Whether only the PROTO itself uses the field."""
 
 
 class Token(NamedTuple):
-    """A word of the file and the line it stands on."""
+    """A word of the file and its line."""
 
     text: str
     line: int
 
 
 @dataclass(eq=False)
-class Node:
-    """A node of the scene tree; the parser fills in the fields that the file names, as `Value`s."""
+class WorldNode:
+    """A node of the scene tree. The parser sets the fields that the file names, as `Value`s."""
 
     type_name: str
     def_name: str
     line: int
     fields: dict[str, Any] = field(default_factory=lambda: {})
     proto_name: str = ""
-    """Of a PROTO node that was built: its own name; its type is that of what it is made of."""
+    """Name of the PROTO, if it was built from one. Its type is then that of its base node."""
     parameters: frozenset[str] = frozenset()
-    """Fields that a PROTO node has and its base node has not; the nodes in them stand in that."""
+    """Fields that only the PROTO has. Nodes in them are part of the base node as well."""
 
 
-def children_of(node: Node) -> Iterator[Node]:
-    """The nodes in the fields of a node, in the order of the file."""
+def children_of(node: WorldNode) -> Iterator[WorldNode]:
+    """Yield the nodes in the fields of a node, in the order of the file."""
     for name, value in node.fields.items():
         if name in node.parameters:
             continue
-        if isinstance(value, Node):
+        if isinstance(value, WorldNode):
             yield value
         elif isinstance(value, list):
             items = cast("list[Any]", value)
-            yield from (item for item in items if isinstance(item, Node))
+            yield from (item for item in items if isinstance(item, WorldNode))
 
 
-def descendants_of(node: Node) -> Iterator[Node]:
-    """Everything inside a node, from the top of the file to the bottom."""
+def descendants_of(node: WorldNode) -> Iterator[WorldNode]:
+    """Yield every node inside a node, in the order of the file."""
     for child in children_of(node):
         yield child
         yield from descendants_of(child)
 
 
 def tokens_of(text: str) -> Iterator[Token]:
-    """Split a world into words; comments, commas and white space fall away."""
+    """Split a world into words, without comments, commas and white space."""
     line, position = 1, 0
     while position < len(text):
         match = _TOKEN.match(text, position)
@@ -110,32 +104,8 @@ def tokens_of(text: str) -> Iterator[Token]:
         position = match.end()
 
 
-class StandInError(Exception):
-    """Anything the stand-in refuses to do."""
-
-
-class WorldError(StandInError):
-    """A world file that the stand-in cannot use."""
-
-    def __init__(self, message: str, line: int | None = None) -> None:
-        super().__init__(message if line is None else f"line {line}: {message}")
-        self.line = line
-
-
-class WouldBlockError(StandInError):
-    """An in-process `step` that would never return, because the simulation is paused."""
-
-
-class ControllerEndedError(StandInError):
-    """The API was used after `step` had returned -1.
-
-    A controller process would end here without a word (C `exit`); in process that would end the
-    whole test run, hence an exception.
-    """
-
-
 class Parser:
-    """Recursive descent over the words of one file."""
+    """A recursive-descent parser of the words of one file."""
 
     def __init__(
         self,
@@ -147,21 +117,21 @@ class Parser:
 
         Args:
             text: The text, or the words of a PROTO's body.
-            given: Of a PROTO's body the values of its fields, for `IS`.
-            line: Where the PROTO node stands in the world: that of all nodes in the body.
+            given: Values of the fields of a PROTO, for `IS` in its body.
+            line: Line of the PROTO node in the world, which all nodes of the body are given.
         """
         self._tokens = [*tokens_of(text)] if isinstance(text, str) else text
         self._given = given
         self._line = line
         self._next = 0
-        self._defined: dict[str, Node] = {}
+        self._defined: dict[str, WorldNode] = {}
         self.urls: dict[str, str] = {}
-        """Where the file says that PROTOs come from, by their names."""
+        """URLs of PROTOs by name, from EXTERNPROTO."""
         self._last_line = self._tokens[-1].line if self._tokens else 1
 
-    def nodes(self) -> list[Node]:
-        """The nodes at the top of the file, in order."""
-        nodes: list[Node] = []
+    def nodes(self) -> list[WorldNode]:
+        """Return the nodes at the top of the file, in order."""
+        nodes: list[WorldNode] = []
         while self._next < len(self._tokens):
             if not self._takes_externproto():
                 line = self._tokens[self._next].line
@@ -173,7 +143,7 @@ class Parser:
         return nodes
 
     def _takes_externproto(self) -> bool:
-        """Read `EXTERNPROTO "url"`, if that comes next."""
+        """Read `EXTERNPROTO "url"` if it comes next; return whether it did."""
         if self._peek().text == "IMPORTABLE":
             self._take()
         if self._peek().text != "EXTERNPROTO":
@@ -186,12 +156,12 @@ class Parser:
         return True
 
     def definitions(self, end: str) -> dict[str, FieldDefinition]:
-        """The fields of a node type, up to a closing bracket."""
+        """Return the fields of a node type, up to a closing bracket."""
         found: dict[str, FieldDefinition] = {}
         while (token := self._take()).text != end:
             keyword = token.text if token.text in _FIELD_KEYWORDS else ""
             type_token = self._take() if keyword else token
-            if self._peek().text == "{":  # the values that are allowed
+            if self._peek().text == "{":  # The list of allowed values.
                 self._skip_braces()
             name = self._name("a field name")
             found[name.text] = FieldDefinition(
@@ -207,7 +177,7 @@ class Parser:
                 return
 
     def types(self) -> dict[str, dict[str, FieldDefinition]]:
-        """Fields by node type, from a text as Webots writes its node files."""
+        """Return fields by node type, from a text in the format of Webots' node files."""
         known: dict[str, dict[str, FieldDefinition]] = {}
         while self._next < len(self._tokens):
             name = self._take().text
@@ -216,7 +186,7 @@ class Parser:
         return known
 
     def proto(self) -> tuple[str, dict[str, FieldDefinition], Sequence[Token]]:
-        """The definition of a PROTO: its name, its fields and the words of its body."""
+        """Return the definition of a PROTO: its name, its fields and the words of its body."""
         while self._takes_externproto():
             pass
         if self._take().text != "PROTO":
@@ -244,7 +214,7 @@ class Parser:
             raise WorldError(f"expected {what}, found {token.text!r}", token.line)
         return token
 
-    def _node(self) -> Node:
+    def _node(self) -> WorldNode:
         token = self._name("a node")
         if token.text == "USE":
             return self._used()
@@ -255,16 +225,16 @@ class Parser:
         name = self._name("a DEF name").text
         return self._body(self._name("a node type"), name)
 
-    def _used(self) -> Node:
+    def _used(self) -> WorldNode:
         token = self._name("a DEF name")
         if token.text not in self._defined:
             raise WorldError(f"USE {token.text} comes before any DEF {token.text}", token.line)
         return self._defined[token.text]
 
-    def _body(self, type_token: Token, def_name: str) -> Node:
-        is_inner = self._line is not None  # in a PROTO: not to be found from outside
+    def _body(self, type_token: Token, def_name: str) -> WorldNode:
+        is_inner = self._line is not None  # Nodes in a PROTO cannot be found from outside.
         line = type_token.line if self._line is None else self._line
-        node = Node(type_token.text, "" if is_inner else def_name, line)
+        node = WorldNode(type_token.text, "" if is_inner else def_name, line)
         brace = self._take()
         if brace.text != "{":
             raise WorldError(
@@ -272,7 +242,7 @@ class Parser:
             )
         while self._peek().text != "}":
             token = self._name("a field name or }")
-            if token.text == "hidden":  # what Webots keeps of a saved simulation
+            if token.text == "hidden":  # State of a simulation that was saved.
                 self._value(self._take())
             else:
                 node.fields[token.text] = self._value(token)
@@ -334,10 +304,10 @@ def _word(token: Token) -> bool | str | None:
 
 
 def require_release(text: str, what: str = "world") -> None:
-    """Read the first line of a file.
+    """Check the first line of a file.
 
     Raises:
-        WorldError: It is none of Webots', or of a release with other axes.
+        WorldError: It is not a file of Webots, or of a release with different axes.
     """
     first, first_line = "#VRML_SIM R2023b utf8", text.partition("\n")[0]
     release = re.match(r"#VRML_SIM (R20\d\d)[ab]?\S* utf8", first_line)
@@ -352,14 +322,14 @@ def require_release(text: str, what: str = "world") -> None:
 
 
 NODE_TYPES: Final = Parser((DATA / "nodes.txt").read_text(encoding="utf-8")).types()
-"""Fields by node type."""
+"""Definitions of fields by node type."""
 
 
-def give_types(node: Node, definitions: Mapping[str, FieldDefinition]) -> None:
-    """Give a node all fields that its type has, with values of their types.
+def give_types(node: WorldNode, definitions: Mapping[str, FieldDefinition]) -> None:
+    """Give a node all fields of its type, with values of the right types.
 
     Raises:
-        WorldError: A value is of another type; names the field and the line.
+        WorldError: A value has the wrong type; the text names the field and the line.
     """
     written = node.fields
     node.fields = {}
@@ -368,7 +338,7 @@ def give_types(node: Node, definitions: Mapping[str, FieldDefinition]) -> None:
         node.fields[name] = _typed(value, name, definition, node)
 
 
-def _typed(value: Value, name: str, definition: FieldDefinition, node: Node) -> Value:
+def _typed(value: Value, name: str, definition: FieldDefinition, node: WorldNode) -> Value:
     many, kind = definition.type_name[:2] == "MF", definition.type_name[2:]
     try:
         if not many:
@@ -386,7 +356,7 @@ def _typed(value: Value, name: str, definition: FieldDefinition, node: Node) -> 
 
 def _single(value: Value, kind: str) -> Any:
     if kind in ("Bool", "String", "Node"):
-        expected = {"Bool": bool, "String": str, "Node": (Node, type(None))}[kind]
+        expected = {"Bool": bool, "String": str, "Node": (WorldNode, type(None))}[kind]
         if not isinstance(value, expected):
             raise TypeError(kind)
         return value
@@ -409,7 +379,7 @@ def _several_numbers(value: Value, kind: str) -> Value:
 
 
 def _numbers(value: Any) -> list[float]:
-    """Numbers one after the other; those of a field that was given its type already, too."""
+    """Return all numbers of a value in one list, also if it was given its type before."""
     if isinstance(value, list):
         return [number for item in cast("list[Any]", value) for number in _numbers(item)]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -418,191 +388,4 @@ def _numbers(value: Any) -> list[float]:
 
 
 def _shown(value: Value) -> str:
-    return f"a {value.type_name} node" if isinstance(value, Node) else repr(value)
-
-
-# -- what a PROTO stands for -----------------------------------------------------------------------
-#
-# PROTO nodes that most worlds have are built in, with the sizes and defaults of Webots and without
-# its looks (`data/*.proto`). Others are read from their files: those that the world names by
-# EXTERNPROTO, those of its project's `protos/`, and those of the Webots that WEBOTS_HOME names.
-# Files that are templates in JavaScript are not read.
-
-
-"""The names of those that need no file of Webots."""
-
-
-@dataclass(frozen=True)
-class Proto:
-    """The definition of a PROTO node."""
-
-    file: Path
-    fields: Mapping[str, FieldDefinition]
-    body: Sequence[Token]
-
-    @property
-    def base_type(self) -> str:
-        """The type of the node that it is made of."""
-        words = [token.text for token in self.body[:3]]
-        return words[2] if words[0] == "DEF" else words[0]
-
-    @property
-    def shown(self) -> dict[str, FieldDefinition]:
-        """The fields that a world sets and a supervisor sees."""
-        return {name: each for name, each in self.fields.items() if not each.is_hidden}
-
-
-class Protos:
-    """The PROTO nodes that a world may have."""
-
-    def __init__(self, world: Path, urls: Mapping[str, str]) -> None:
-        self._project = world.parent.parent / "protos"
-        self._files: dict[str, Path] = {}
-        self._known: dict[str, Proto | None] = {}
-        self.urls: dict[str, str] = {}
-        """What EXTERNPROTO says, by name."""
-        self.why_not: dict[str, str] = {}
-        """Why the file of a PROTO cannot be used, by its name."""
-        self._note(urls, world.parent)
-
-    def find(self, name: str) -> Proto | None:
-        """The definition of a PROTO; None where there is none that the stand-in can use."""
-        if name not in self._known:
-            self._known[name] = None  # one that is made of itself is made of nothing
-            self._known[name] = self._read(name)
-        return self._known[name]
-
-    def _read(self, name: str) -> Proto | None:
-        file = self._file_of(name)
-        if file is None:
-            return None
-        try:
-            text = file.read_text(encoding="utf-8")
-            require_release(text, "PROTO file")
-            if re.search(r"%[<{]", text):
-                raise WorldError("it is a template in JavaScript")
-            parser = Parser(text)
-            _, fields, body = parser.proto()
-        except (OSError, ValueError, WorldError) as error:
-            self.why_not[name] = f"{file.name}: {error}"
-            return None
-        self._note(parser.urls, file.parent)
-        proto = Proto(file, fields, body)
-        if proto.base_type in NODE_TYPES or self.find(proto.base_type):
-            return proto
-        self.why_not[name] = f"{file.name}: it is made of a {proto.base_type} node"
-        return None
-
-    def _note(self, urls: Mapping[str, str], folder: Path) -> None:
-        for name, url in urls.items():
-            self.urls.setdefault(name, url)
-            of_webots = _OF_WEBOTS.fullmatch(url)
-            if of_webots and self._home:
-                self._files.setdefault(name, self._home / of_webots[1])
-            elif "://" not in url:
-                self._files.setdefault(name, folder / url)
-
-    def _file_of(self, name: str) -> Path | None:
-        if name in BUILT_IN:
-            return DATA / f"{name}.proto"
-        if name in self._files:
-            return self._files[name]
-        if "/" not in name and (self._project / f"{name}.proto").is_file():
-            return self._project / f"{name}.proto"
-        return self._installed.get(name)
-
-    @cached_property
-    def _home(self) -> Path | None:
-        """The folder of the installed Webots that holds `projects`."""
-        home = Path(os.environ.get(HOME_VARIABLE) or "/nowhere")
-        return next(
-            (root for root in (home, home / "Contents") if (root / "projects").is_dir()), None
-        )
-
-    @cached_property
-    def _installed(self) -> dict[str, Path]:
-        """The files of the installed Webots by name, for worlds without EXTERNPROTO."""
-        files = (self._home / "projects").rglob("*.proto") if self._home else ()
-        return {file.stem: file for file in files}
-
-    def build(self, node: Node) -> None:
-        """Make a PROTO node what it stands for; its own fields and those of its base are there.
-
-        Raises:
-            WorldError: A field has a value of another type, or the body is not understood.
-        """
-        proto = self.find(node.type_name)
-        assert proto is not None
-        give_types(node, proto.shown)
-        own = {name: each.default for name, each in proto.fields.items() if each.is_hidden}
-        derive = _DERIVED.get(node.type_name) if proto.file.parent == DATA else None
-        given = deepcopy(own) | node.fields | (derive(node.fields) if derive else {})
-        try:
-            (base,) = Parser(proto.body, given, node.line).nodes()
-        except (WorldError, ValueError) as error:
-            raise WorldError(f"{proto.file.name}: {error}", node.line) from None
-        if base.type_name in NODE_TYPES:
-            give_types(base, NODE_TYPES[base.type_name])
-        else:
-            self.build(base)
-        node.parameters = frozenset(node.fields.keys() - base.fields.keys()) | base.parameters
-        node.fields = node.fields | base.fields
-        node.proto_name, node.type_name = node.type_name, base.type_name
-
-    def shown_definitions(self, node: Node) -> Mapping[str, FieldDefinition]:
-        """The fields that a supervisor sees of a node: of a PROTO node its own."""
-        proto = self.find(node.proto_name) if node.proto_name else None
-        return proto.shown if proto else NODE_TYPES[node.type_name]
-
-
-# Values of the built-in ones that are computed from their fields ----------------------------------
-
-
-def _e_puck(fields: Mapping[str, Any]) -> dict[str, Any]:
-    is_second = fields["version"] == "2"
-    return {
-        "maxVelocity": 7.536 if is_second else 6.28,
-        "mass": 0.13 if is_second else 0.15,
-        "model": f"GCtronic e-puck{'2' if is_second else ''}",
-    }
-
-
-def _loose_box(fields: Mapping[str, Any]) -> dict[str, Any]:
-    physics = Node("Physics", "", 0, {"density": [-1.0], "mass": [fields["mass"]]})
-    return {"physics": physics if fields["mass"] > 0.0 else None}
-
-
-def _rectangle_arena(fields: Mapping[str, Any]) -> dict[str, Any]:
-    (x, y), thickness, height = fields["floorSize"], fields["wallThickness"], fields["wallHeight"]
-    east, north, z = (x + thickness) / 2.0, (y + thickness) / 2.0, height / 2.0
-    return {
-        **{"east": [east, 0.0, z], "west": [-east, 0.0, z]},
-        **{"north": [0.0, north, z], "south": [0.0, -north, z]},
-        **{"alongX": [x + 2.0 * thickness, thickness, height], "alongY": [thickness, y, height]},
-    }
-
-
-def _circle_arena(fields: Mapping[str, Any]) -> dict[str, Any]:
-    radius, thickness, height = fields["radius"], fields["wallThickness"], fields["wallHeight"]
-    count = max(fields["subdivision"], 8)
-    middle_m = radius + thickness / 2.0
-    length_m = 2.0 * (radius + thickness) * tan(pi / count)
-    walls: list[Node] = []
-    for angle in (2.0 * pi * i / count for i in range(count)):
-        place = [middle_m * cos(angle), middle_m * sin(angle), height / 2.0]
-        wall: dict[str, Any] = {"translation": place, "rotation": [0.0, 0.0, 1.0, angle]}
-        wall |= {"size": [thickness, length_m, height], "name": "wall"}
-        wall["appearance"] = fields["wallAppearance"]
-        walls.append(Node("SolidBox", "", 0, wall))
-    return {"floorSize": [2.0 * radius, 2.0 * radius], "walls": walls}
-
-
-_DERIVED: Final[dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]]] = {
-    "CardboardBox": _loose_box,
-    "CircleArena": _circle_arena,
-    "E-puck": _e_puck,
-    "RectangleArena": _rectangle_arena,
-    "Wall": lambda fields: {"middle": [0.0, 0.0, fields["size"][2] / 2.0]},
-    "WoodenBox": _loose_box,
-    "Youbot": lambda fields: {} if fields["numberOfArms"] else {"arm": []},
-}
+    return f"a {value.type_name} node" if isinstance(value, WorldNode) else repr(value)

@@ -6,48 +6,48 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.standin.geometry import Frame, frame_of
+from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.geometry import CoordinateFrame, frame_of
+from webots_mcp.standin.protos import Protos
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
-    Node,
     Parser,
-    Protos,
-    WorldError,
+    WorldNode,
     children_of,
     descendants_of,
     give_types,
     require_release,
 )
 
-_NAME_OF_LACKING: Final = {
+_NAME_OF_MISSING: Final = {
     **{"Altimeter": "altimeter", "Brake": "brake", "Connector": "connector", "Pen": "pen"},
     **{"Display": "display", "Radar": "radar", "RangeFinder": "range-finder", "Skin": "skin"},
     **{"Speaker": "speaker", "VacuumGripper": "vacuum gripper"},
 }
-"""What devices that the stand-in does not have are called, unless the world gives them a name."""
+"""Default names of devices that the stand-in does not have, by node type."""
 _UNSCALED: Final = [1.0, 1.0, 1.0]
 
 
 class World:
     """The scene tree of one world file.
 
-    After loading, every node has all fields that its type has, as Python values: `float`, `int`,
-    `bool`, `str`, a list of floats for vectors, rotations and colors, a `Node` or None, and lists
-    of those for MF fields.
+    After loading, every node has all fields of its type as Python values: `float`, `int`, `bool`,
+    `str`, a list of floats for vectors, rotations and colors, a `WorldNode` or None, and lists of
+    those for MF fields.
     """
 
-    def __init__(self, path: Path, top: list[Node], protos: Protos) -> None:
+    def __init__(self, path: Path, top: list[WorldNode], protos: Protos) -> None:
         self.path = path
         self.protos = protos
-        self.root = Node("Group", "", 1, {"children": [*top]})
-        self.nodes: list[Node] = []
-        """Every node once, in the order of the scene tree; what was added comes last."""
-        self.left_out: list[Node] = []
-        """What stands in the file and not in the world: nodes of types that are not known here."""
-        self._ids: dict[Node, int] = {}
-        self._by_id: dict[int, Node] = {}
+        self.root = WorldNode("Group", "", 1, {"children": [*top]})
+        self.nodes: list[WorldNode] = []
+        """Every node once, in the order of the scene tree. Nodes that were added come last."""
+        self.left_out: list[WorldNode] = []
+        """Nodes of the file whose type the stand-in does not know. The world lacks them."""
+        self._ids: dict[WorldNode, int] = {}
+        self._by_id: dict[int, WorldNode] = {}
         self._next_id = 0
-        self._parents: dict[Node, Node] = {}
+        self._parents: dict[WorldNode, WorldNode] = {}
         self._register(self.root, None)
         info = next((node for node in top if node.type_name == "WorldInfo"), None)
         if info is None:
@@ -59,8 +59,8 @@ class World:
         if info.fields["coordinateSystem"] != "ENU":
             raise WorldError("the stand-in has no coordinateSystem but ENU", info.line)
 
-    def _register(self, node: Node, parent: Node | None) -> None:
-        if node in self._ids:  # a USE: stands where its DEF stands
+    def _register(self, node: WorldNode, parent: WorldNode | None) -> None:
+        if node in self._ids:  # A USE stands where its DEF stands.
             return
         if node.type_name in NODE_TYPES:
             give_types(node, NODE_TYPES[node.type_name])
@@ -75,15 +75,15 @@ class World:
         for child in children_of(node):
             self._register(child, node)
 
-    def _leave_out_unknown(self, node: Node) -> None:
+    def _leave_out_unknown(self, node: WorldNode) -> None:
         for child in [*children_of(node)]:
             if not self._is_known(child):
                 self._leave_out(child, node)
 
-    def _is_known(self, node: Node) -> bool:
+    def _is_known(self, node: WorldNode) -> bool:
         return node.type_name in NODE_TYPES or self.protos.find(node.type_name) is not None
 
-    def _leave_out(self, child: Node, parent: Node) -> None:
+    def _leave_out(self, child: WorldNode, parent: WorldNode) -> None:
         if child not in self.left_out:
             self.left_out.append(child)
             self._parents[child] = parent
@@ -96,12 +96,11 @@ class World:
                 ]
 
     def warnings(self) -> list[str]:
-        """One line for each type of node that was left out, and for what is not followed.
+        """Return one warning for each type of node that was left out, and for scaled nodes.
 
-        A line names the first node of its type in the file; what lies higher in the tree was left
-        out before it.
+        A warning names the first node of its type in the file.
         """
-        by_type: dict[str, list[Node]] = {}
+        by_type: dict[str, list[WorldNode]] = {}
         for node in sorted(self.left_out, key=lambda node: node.line):
             by_type.setdefault(node.type_name, []).append(node)
         lines = [
@@ -119,58 +118,58 @@ class World:
         return [f"WARNING: {self.path.name}, {line}" for line in lines]
 
     def why_not(self, type_name: str) -> str:
-        """Why the file of a PROTO cannot be used, in brackets; empty where there is none."""
+        """Return why the file of a PROTO cannot be used, in brackets, or an empty text."""
         why = self.protos.why_not.get(type_name)
         return f" ({why})" if why else ""
 
-    def left_out_in(self, robot: Node) -> dict[str, str]:
-        """Devices that the world gives a robot and the stand-in does not: names and node types."""
+    def left_out_in(self, robot: WorldNode) -> dict[str, str]:
+        """Return the devices of a robot that the stand-in left out: node types by names."""
         names: dict[str, str] = {}
         for node in self.left_out:
             if any(around is robot for around in self._around(node)):
                 for device in (node, *descendants_of(node)):
-                    name = device.fields.get("name", _NAME_OF_LACKING.get(device.type_name))
+                    name = device.fields.get("name", _NAME_OF_MISSING.get(device.type_name))
                     if isinstance(name, str):
                         names.setdefault(name, node.type_name)
         return names
 
-    def _around(self, node: Node) -> Iterator[Node]:
+    def _around(self, node: WorldNode) -> Iterator[WorldNode]:
         while (parent := self._parents.get(node)) is not None:
             yield parent
             node = parent
 
     @property
     def title(self) -> str:
-        """The title that WorldInfo gives, empty if none."""
+        """Return the title in WorldInfo, which may be empty."""
         return str(self.info.fields["title"])
 
-    def id_of(self, node: Node) -> int:
-        """The number that a controller knows the node by."""
+    def id_of(self, node: WorldNode) -> int:
+        """Return the number that controllers know the node by."""
         return self._ids[node]
 
-    def node(self, node_id: int) -> Node | None:
-        """The node of that number; None where it was removed."""
+    def node(self, node_id: int) -> WorldNode | None:
+        """Return the node with this number; None if it was removed."""
         return self._by_id.get(node_id)
 
-    def add(self, node: Node, parent: Node, name: str, index: int | None) -> list[str]:
-        """Put a node, as the parser gives it, into a field, or before one of its entries.
+    def add(self, node: WorldNode, parent: WorldNode, name: str, index: int | None) -> list[str]:
+        """Put a parsed node into a field, or before one of its entries.
 
         Returns:
-            The types of the nodes in it that are not known here and were left out.
+            The types of the nodes in it that the stand-in does not know and left out.
 
         Raises:
-            WorldError: It is of a type that is not known here, a value in it is of another, or it
-                is or holds a robot, perhaps within a PROTO node.
+            WorldError: The node's type is unknown, a value in it has the wrong type, or it is or
+                contains a robot, perhaps within a PROTO node.
         """
         if not self._is_known(node):
             raise WorldError(f"the stand-in has no {node.type_name} nodes")
-        there, left_out = len(self.nodes), len(self.left_out)
+        known, left_out = len(self.nodes), len(self.left_out)
         try:
             self._register(node, parent)
-            if any(added.type_name == "Robot" for added in self.nodes[there:]):
+            if any(added.type_name == "Robot" for added in self.nodes[known:]):
                 raise WorldError("the stand-in adds no robots")
         except WorldError:
-            self._forget(self.nodes[there:])
+            self._forget(self.nodes[known:])
             del self.left_out[left_out:]
             raise
         if index is None:
@@ -179,8 +178,12 @@ class World:
             parent.fields[name].insert(index, node)
         return [*dict.fromkeys(each.type_name for each in self.left_out[left_out:])]
 
-    def remove(self, node: Node) -> tuple[Node, str] | None:
-        """Take a node out of the field that it stands in, which is returned."""
+    def remove(self, node: WorldNode) -> tuple[WorldNode, str] | None:
+        """Remove a node from its field.
+
+        Returns:
+            The parent and the name of the field; None if the node has no parent.
+        """
         parent = self._parents.get(node)
         if parent is None:
             return None
@@ -196,47 +199,47 @@ class World:
             return parent, name
         return None
 
-    def _forget_all_but_used(self, node: Node) -> None:
-        """Forget a node and what is in it, but for what stands elsewhere too, by a USE."""
-        there = {self.root: None, **dict.fromkeys(descendants_of(self.root))}
-        gone = {each for each in (node, *descendants_of(node)) if each not in there}
+    def _forget_all_but_used(self, node: WorldNode) -> None:
+        """Forget a node and everything in it, except nodes that a USE keeps elsewhere."""
+        left = {self.root: None, **dict.fromkeys(descendants_of(self.root))}
+        gone = {each for each in (node, *descendants_of(node)) if each not in left}
         self._forget([*gone])
-        for parent in there:
+        for parent in left:
             for child in children_of(parent):
                 if self._parents.get(child) in gone:
                     self._parents[child] = parent
 
-    def _forget(self, nodes: list[Node]) -> None:
+    def _forget(self, nodes: list[WorldNode]) -> None:
         gone = set(nodes)
         self.nodes = [node for node in self.nodes if node not in gone]
         for node in gone & self._ids.keys():
             del self._by_id[self._ids.pop(node)]
             self._parents.pop(node, None)
 
-    def parent_of(self, node: Node) -> Node | None:
-        """The node around this one; None for the root."""
+    def parent_of(self, node: WorldNode) -> WorldNode | None:
+        """Return the parent of a node; None for the root."""
         return self._parents.get(node)
 
-    def of_type(self, type_name: str) -> list[Node]:
-        """All nodes of one type, in the order of the scene tree."""
+    def of_type(self, type_name: str) -> list[WorldNode]:
+        """Return all nodes of one type, in the order of the scene tree."""
         return [node for node in self.nodes if node.type_name == type_name]
 
-    def find(self, def_path: str) -> Node | None:
-        """The node with this DEF name; `A.B` is the B somewhere inside A."""
-        found: Node | None = self.root
+    def find(self, def_path: str) -> WorldNode | None:
+        """Return the node with this DEF name; `A.B` is the B somewhere inside A."""
+        found: WorldNode | None = self.root
         for name in def_path.split("."):
             found = next((n for n in descendants_of(found) if n.def_name == name), None)
             if found is None:
                 return None
         return found
 
-    def frame_of(self, node: Node) -> Frame | None:
-        """Where a node stands in the world; None for nodes that have no place of their own."""
+    def frame_of(self, node: WorldNode) -> CoordinateFrame | None:
+        """Return the pose of a node in the world; None for nodes without a pose."""
         return self.frame_around(node).then(own_frame(node)) if "rotation" in node.fields else None
 
-    def frame_around(self, node: Node) -> Frame:
-        """Where that stands which a node stands in."""
-        frame = Frame()
+    def frame_around(self, node: WorldNode) -> CoordinateFrame:
+        """Return the pose of a node's parent in the world."""
+        frame = CoordinateFrame()
         for parent in self._around(node):
             frame = own_frame(parent).then(frame)
         return frame
@@ -251,7 +254,7 @@ def load_world(path: str | Path) -> World:
     try:
         path = Path(path).resolve()
         text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:  # a NUL in its name, and what is not UTF-8
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name, or no UTF-8
         raise WorldError(f"cannot read the world {str(path)!r}: {error}") from error
     try:
         require_release(text)
@@ -264,28 +267,25 @@ def load_world(path: str | Path) -> World:
         raise WorldError(f"{path.name}: its PROTO nodes hold each other without an end") from None
 
 
-def own_frame(node: Node) -> Frame:
-    """Where a node stands in its parent; nodes without a place do not move what is inside."""
+def own_frame(node: WorldNode) -> CoordinateFrame:
+    """Return the pose of a node in its parent. Nodes without a pose do not move their children."""
     if "rotation" not in node.fields:
-        return Frame()
+        return CoordinateFrame()
     return frame_of(node.fields["translation"], node.fields["rotation"])
 
 
-# Nodes as text, as they would stand in a world file -----------------------------------------------
-
-
-def as_text(node: Node, protos: Protos) -> str:
-    """A node and all in it, without the fields that have their default values."""
+def as_text(node: WorldNode, protos: Protos) -> str:
+    """Return a node and everything in it as in a world file, without fields that have defaults."""
     return _node(node, protos, set())
 
 
-def _node(node: Node, protos: Protos, written: set[Node]) -> str:
+def _node(node: WorldNode, protos: Protos, written: set[WorldNode]) -> str:
     if node.def_name and node in written:
         return f"USE {node.def_name}"
     written.add(node)
     fields = [
         f"{name} {_value(node.fields[name], definition.type_name[2:], protos, written)}"
-        for name, definition in protos.shown_definitions(node).items()
+        for name, definition in protos.visible_fields(node).items()
         if node.fields[name] != _typed_default(definition.default, definition.type_name)
     ]
     name = f"DEF {node.def_name} " if node.def_name else ""
@@ -293,14 +293,14 @@ def _node(node: Node, protos: Protos, written: set[Node]) -> str:
 
 
 def _typed_default(default: Any, type_name: str) -> object:
-    """A default as the parser gives it, where numbers are always a list."""
+    """Return a parsed default with its type; the parser gives numbers as lists."""
     if isinstance(default, list) and type_name in ("SFFloat", "SFInt32"):
         return cast("list[float]", default)[0]
     return cast("object", default)
 
 
-def _value(value: Any, kind: str, protos: Protos, written: set[Node]) -> str:
-    if isinstance(value, Node):
+def _value(value: Any, kind: str, protos: Protos, written: set[WorldNode]) -> str:
+    if isinstance(value, WorldNode):
         return _node(value, protos, written)
     if isinstance(value, str):
         quoted = value.replace("\\", "\\\\").replace('"', '\\"')

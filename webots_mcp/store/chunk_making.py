@@ -33,10 +33,12 @@ from webots_mcp.store.chunks import (
     STATE_IDS,
     WALL_TIMES,
     ChunkProgress,
+    EncodedChunk,
     StateColumns,
     Statistics,
     chunks_aside,
     decoded_of,
+    is_damaged,
     pack,
     reached,
     statistics_of,
@@ -126,6 +128,25 @@ _COMPLETE: Final = Step(  # unless another process has stored these rows meanwhi
     "(SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE run_id = NEW.run_id "
     "AND is_complete = 1) <> NEW.max_state_id",
 )
+_WHOLE_GROUP: Final = (
+    "SELECT g.run_id, r.robot_id, g.row_count, g.last_state_id, coalesce((SELECT min(min) FROM "
+    f"chunk WHERE group_id = g.id AND signal_id = {STATE_IDS}), 0), g.max_state_id, "
+    "g.start_sim_time_s, g.end_sim_time_s FROM row_group g JOIN run r ON r.id = g.run_id "
+    "WHERE g.id = ? AND g.is_complete = 1 AND g.stored_row_count = g.row_count"
+)
+_CHUNKS_OF: Final = "SELECT signal_id, codec, numbers, codes, labels FROM chunk WHERE group_id = ?"
+_ROWS_OF_GROUP: Final = (
+    f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id BETWEEN ? AND ? "
+    "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s, id LIMIT ?"
+)
+_REPLACE: Final = Step(  # unless rows of the old group were deleted, or it was replaced meanwhile
+    "replace_group",
+    ("old_id", "new_id", "chunks"),
+    "UPDATE row_group SET is_complete = id = NEW.new_id WHERE id IN (NEW.old_id, NEW.new_id)",
+    unless="(SELECT count(*) FROM chunk WHERE group_id = NEW.new_id) <> NEW.chunks OR NOT EXISTS "
+    "(SELECT 1 FROM row_group WHERE id = NEW.old_id AND is_complete = 1 "
+    "AND stored_row_count = row_count)",
+)
 _LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
 _DELETE_CHUNKS: Final = (  # unless its maker has ended in the meantime what it was at
     "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = (SELECT id "
@@ -173,6 +194,7 @@ def make_chunks(
     Raises:
         sqlite3.Error: The database is locked or damaged; what was stored before stays.
     """
+    remake_reported_groups(connection, pause_s)
     _delete_left_behind(connection, pause_s)
     rows = 0
     ended = connection.execute(_ENDED).fetchall()  # one scan, however many rounds follow
@@ -287,44 +309,112 @@ class _RunChunks:
         return bool(self._connection.execute(ended, (self._run_id,)).fetchone()[0])
 
     def _store(self, columns: StateColumns, at: ChunkProgress) -> bool:
-        """Store a group; False where another process has stored some of its rows meanwhile."""
-        signals = _signals_of(self._connection, self._robot_id, columns)
-        ids = {name: each.id for name, each in signals.items() if each.id is not None}
-        chunks = list(_chunks_of(self._run_id, columns, ids))
-        self._prepare(chunks)
-        rows = len(columns)
-        group = (self._run_id, columns.times[0], columns.times[-1], columns.ids[-1])
-        lost = count_lost(columns, signals)
-        values = (*group, max(columns.ids), rows, rows, lost, *self._room_of(columns, chunks))
-        group_id = self._connection.execute(_BEGIN_GROUP, values).lastrowid
-
-        def store(first: int, last: int) -> bool:
-            return _STORE.run(self._connection, group_id, first, last)
-
-        _in_short_steps(list(map(_packed_bytes, chunks)), store, self._pause_s)
-        expected = (self._run_id, at.max_in_groups, len(chunks))
+        """Store a group; return False if another process has stored some of its rows meanwhile."""
+        owner = (self._run_id, self._robot_id)
+        group_id, chunks = store_group(self._connection, owner, columns, self._pause_s)
+        expected = (self._run_id, at.max_in_groups, chunks)
         return _COMPLETE.run(self._connection, group_id, *expected)
 
-    def _room_of(
-        self, columns: StateColumns, chunks: Sequence[tuple[Any, ...]]
-    ) -> tuple[float, int]:
-        """Bytes on the disk, with indexes: of a state row on average, and of all chunks."""
-        page_bytes = self._connection.execute("PRAGMA page_size").fetchone()[0]
-        texts = (len(text.encode()) + _STATE_BYTES for text in columns.texts)
-        packed = (_packed_bytes(chunk) + _STATISTICS_BYTES for chunk in chunks)
-        row_bytes = disk_bytes(texts, page_bytes) / len(columns) + INDEX_BYTES
-        return row_bytes, round(disk_bytes(packed, page_bytes) + _CHUNK_INDEX_BYTES * len(chunks))
 
-    def _prepare(self, chunks: Sequence[tuple[Any, ...]]) -> None:
-        """Fill the temporary table, in a transaction that locks nothing but it."""
-        self._connection.execute(_TEMPORARY)
-        self._connection.execute("BEGIN")
-        try:
-            self._connection.execute("DELETE FROM temp.new_chunk")
-            rows = ((number, *chunk) for number, chunk in enumerate(chunks))
-            self._connection.executemany(_PREPARE, rows)
-        finally:
-            self._connection.execute("COMMIT")
+def store_group(
+    connection: sqlite3.Connection, owner: tuple[int, int], columns: StateColumns, pause_s: float
+) -> tuple[int | None, int]:
+    """Store a group that readers do not see until it is marked as complete.
+
+    Args:
+        connection: Of the maintainer.
+        owner: The run and its robot.
+        columns: The rows of the group.
+        pause_s: Between two writes.
+
+    Returns:
+        The id of the group, and how many chunks it has.
+    """
+    run_id, robot_id = owner
+    signals = _signals_of(connection, robot_id, columns)
+    ids = {name: each.id for name, each in signals.items() if each.id is not None}
+    chunks = list(_chunks_of(run_id, columns, ids))
+    _prepare(connection, chunks)
+    rows = len(columns)
+    group = (run_id, columns.times[0], columns.times[-1], columns.ids[-1], max(columns.ids))
+    lost = count_lost(columns, signals)
+    values = (*group, rows, rows, lost, *_sizes_of(connection, columns, chunks))
+    group_id = connection.execute(_BEGIN_GROUP, values).lastrowid
+
+    def store(first: int, last: int) -> bool:
+        return _STORE.run(connection, group_id, first, last)
+
+    _in_short_steps(list(map(_packed_bytes, chunks)), store, pause_s)
+    return group_id, len(chunks)
+
+
+def _sizes_of(
+    connection: sqlite3.Connection, columns: StateColumns, chunks: Sequence[tuple[Any, ...]]
+) -> tuple[float, int]:
+    """Bytes on the disk, with indexes: of a state row on average, and of all chunks."""
+    page_bytes = connection.execute("PRAGMA page_size").fetchone()[0]
+    texts = (len(text.encode()) + _STATE_BYTES for text in columns.texts)
+    packed = (_packed_bytes(chunk) + _STATISTICS_BYTES for chunk in chunks)
+    row_bytes = disk_bytes(texts, page_bytes) / len(columns) + INDEX_BYTES
+    return row_bytes, round(disk_bytes(packed, page_bytes) + _CHUNK_INDEX_BYTES * len(chunks))
+
+
+def _prepare(connection: sqlite3.Connection, chunks: Sequence[tuple[Any, ...]]) -> None:
+    """Fill the temporary table, in a transaction that locks nothing but it."""
+    connection.execute(_TEMPORARY)
+    connection.execute("BEGIN")
+    try:
+        connection.execute("DELETE FROM temp.new_chunk")
+        connection.executemany(_PREPARE, ((number, *chunk) for number, chunk in enumerate(chunks)))
+    finally:
+        connection.execute("COMMIT")
+
+
+# A group of which a chunk is damaged, and whose rows are all still there, is made anew as a whole.
+# Readers cannot write: they report such a group, and the maintainer of their process remakes it.
+
+
+_reported: set[tuple[str, int]] = set()  # database file and group
+
+
+def report_damaged_group(connection: sqlite3.Connection, group_id: int) -> None:
+    """Have the next call of `make_chunks` in this process remake a group of this database."""
+    _reported.add((_file_of(connection), group_id))
+
+
+def remake_reported_groups(connection: sqlite3.Connection, pause_s: float) -> None:
+    """Remake the groups of this database that readers of this process found damaged."""
+    file = _file_of(connection)
+    for report in [each for each in _reported if each[0] == file]:
+        _reported.discard(report)
+        remake_if_damaged(connection, report[1], pause_s)
+
+
+def _file_of(connection: sqlite3.Connection) -> str:
+    query = "SELECT file FROM pragma_database_list WHERE name = 'main'"
+    return connection.execute(query).fetchone()[0] or ""
+
+
+def remake_if_damaged(connection: sqlite3.Connection, group_id: int, pause_s: float = 0.0) -> int:
+    """Make a group anew if one of its chunks is damaged and all of its rows are still there.
+
+    Returns:
+        The id of the new group; that of the old one if it stays as it is.
+    """
+    group = connection.execute(_WHOLE_GROUP, (group_id,)).fetchone()
+    if group is None:
+        return group_id
+    run_id, robot_id, count, last_state_id, *bounds = group
+    chunks = connection.execute(_CHUNKS_OF, (group_id,)).fetchall()
+    is_sound = {SIM_TIMES, WALL_TIMES, STATE_IDS} <= {signal_id for signal_id, *_ in chunks}
+    if is_sound and not any(is_damaged(EncodedChunk(*each), count) for _, *each in chunks):
+        return group_id
+    columns = _read(connection, _ROWS_OF_GROUP, (run_id, *bounds))
+    if len(columns) != count or columns.ids[-1] != last_state_id:
+        return group_id
+    new_id, made = store_group(connection, (run_id, robot_id), columns, pause_s)
+    is_replaced = _REPLACE.run(connection, group_id, new_id, made)
+    return new_id if is_replaced and new_id is not None else group_id
 
 
 def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]) -> StateColumns:

@@ -107,6 +107,10 @@ class DamagedChunkError(DatabaseError):
     """A chunk cannot be read; the text says why."""
 
 
+class UnsupportedChunkError(DamagedChunkError):
+    """A chunk is not damaged, but this installation cannot read it."""
+
+
 class EncodedChunk(NamedTuple):
     """The values of a signal as a row of the table `chunk` holds them.
 
@@ -188,13 +192,24 @@ def decode(encoded: EncodedChunk, rows: int) -> Decoded:
             return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
     except ModuleNotFoundError as error:
-        raise DamagedChunkError(
+        raise UnsupportedChunkError(
             f"chunks need {error.name}, which is missing: {_HOW_TO_INSTALL}"
         ) from None
     except DamagedChunkError:
         raise
     except Exception as error:  # whatever a library says of bytes that it did not make
         raise DamagedChunkError(f"damaged: {error}") from error
+
+
+def is_damaged(encoded: EncodedChunk, rows: int) -> bool:
+    """Return whether the bytes of a chunk are not what `encode` makes of so many rows."""
+    try:
+        decode(encoded, rows)
+    except UnsupportedChunkError:
+        return False
+    except DamagedChunkError:
+        return True
+    return False
 
 
 def _decode_coded(encoded: EncodedChunk, rows: int) -> Decoded:
@@ -296,7 +311,7 @@ def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
 
 def _decompress(encoded: EncodedChunk, into: Array) -> None:
     if encoded.codec not in (_FLOATS, _INTEGERS):
-        raise DamagedChunkError(
+        raise UnsupportedChunkError(
             f"compressed by {encoded.codec!r}, which this version of webots-mcp does not know"
         )
     if encoded.numbers is None:

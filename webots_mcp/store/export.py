@@ -40,9 +40,9 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 from webots_mcp.store.reading.frame import deleted_part
-from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.segment import kept_parts
+from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.run_rows import put_back
 from webots_mcp.store.signals import RegisteredSignal, registered
 

@@ -21,7 +21,7 @@ from typing import Any, Final
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.database.connection import LONGEST_WRITE_S, Step, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
-from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks, remake_if_damaged
 from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force
 from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, plan, rows_of
 from webots_mcp.store.run_rows import inside
@@ -256,7 +256,10 @@ class _Purge:
             elif step.table == "state" and not step.portion.group_id:
                 yield from self._in_no_group(step, step.portion)
             else:
-                yield from self._rows(step.portion, step.bound)
+                group_id = step.portion.group_id
+                if step.table == "state":  # its rows are needed to make a damaged group anew
+                    group_id = remake_if_damaged(self._connection, group_id)
+                yield from self._rows(step.portion._replace(group_id=group_id), step.bound)
 
     def _in_no_group(self, step: Going, portion: Portion) -> Iterator[Purged]:
         """States that are in no group become one first."""

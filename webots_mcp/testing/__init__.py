@@ -1,8 +1,8 @@
-"""Testing a controller: what it records, and simulations that stop where a test wants them to.
+"""Testing a controller by what it records, in simulations that a test starts and stops.
 
-The pytest plugin offers these as fixtures; they need no pytest. Only tests import this package. It
-may import the stand-in, the judgements and everything below. Its names are imported when first
-asked for, since each pytest run loads the plugin.
+The pytest plugin offers these classes as fixtures; they need no pytest. Only tests import this
+package. It may import the stand-in, `judging` and everything below. Its names are imported on first
+use, since each pytest run loads the plugin.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from webots_mcp.testing.recording import (
-        RecordedCommand,
-        RecordedSignal,
-        RobotRecording,
-    )
+    from webots_mcp.testing.recorded_command import RecordedCommand
+    from webots_mcp.testing.recorded_signal import RecordedSignal
+    from webots_mcp.testing.recording import RobotRecording
     from webots_mcp.testing.simulation import (
         RecordedSimulation,
         Rehearsal,
@@ -33,12 +31,13 @@ __all__ = [
     "SimulationFactory",
 ]
 
-_OF_SIMULATION = ("RecordedSimulation", "Rehearsal", "RobotFactory", "SimulationFactory")
+_MODULES = {"RecordedCommand": "recorded_command", "RecordedSignal": "recorded_signal",
+            "RobotRecording": "recording"}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = f"{__name__}.{'simulation' if name in _OF_SIMULATION else 'recording'}"
-    globals()[name] = value = getattr(import_module(module), name)
+    module = import_module(f"{__name__}.{_MODULES.get(name, 'simulation')}")
+    globals()[name] = value = getattr(module, name)
     return value

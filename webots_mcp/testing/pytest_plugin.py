@@ -1,7 +1,7 @@
-"""Fixtures for testing a Webots controller by what it records; see docs/testing.md.
+"""The pytest plugin: fixtures for testing a controller by what it records; see docs/testing.md.
 
-pytest loads this module whenever the package is installed: whatever costs time is imported by the
-fixtures that use it.
+pytest loads this module whenever the package is installed. Slow imports are therefore in the
+fixtures that use them.
 """
 
 from __future__ import annotations
@@ -44,14 +44,16 @@ def webots_parameters(
 
 
 def _require_declared(values: dict[str, Any], databases: Iterable[Database]) -> None:
-    """Fail a test whose marker names what no controller has declared."""
+    """Fail a test whose marker names a parameter that no controller has declared."""
     from webots_mcp.database.connection import connect
 
     declared = set[str]()
     for database in databases:
         with closing(connect(database, "reader")) as connection:
             declared |= {name for (name,) in connection.execute("SELECT name FROM parameter")}
-    named = (name for name, value in values.items() if not isinstance(value, dict))  # a robot's own
+    named = (
+        name for name, value in values.items() if not isinstance(value, dict)
+    )  # Values of one robot.
     lacking = [name for name in named if name not in declared]
     if lacking:
         pytest.fail(
@@ -146,15 +148,15 @@ def webots_simulation(
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the marker known."""
+    """Register the marker."""
     config.addinivalue_line(
         "markers", "webots_parameters(**values): start values of the controllers' parameters"
     )
 
 
 def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:
-    """Show a command's status with the reason, which pytest itself would cut off."""
-    asked = sys.modules.get("webots_mcp.testing.recording")
+    """Show a command's status with its reason, which pytest itself would cut off."""
+    asked = sys.modules.get("webots_mcp.testing.recorded_command")
     if asked is None or not isinstance(left, asked.CommandStatus):
         return None
     return [f"{left!r} {op} {right!r}"]
@@ -162,10 +164,10 @@ def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str]
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
-    """End the traceback at the test's own line where an error of this package explains a failure.
+    """End the traceback at the test's own line if an error of this package explains a failure.
 
-    Any other exception within the package is a defect of it, and keeps its frames; so does every
-    one with `--full-trace` or `--pdb`.
+    Any other exception within the package is a defect of the package, and keeps its frames. With
+    `--full-trace` or `--pdb`, every exception does.
     """
     failure = call.excinfo
     if failure is None or item.config.getoption("fulltrace") or item.config.getoption("usepdb"):
@@ -173,11 +175,11 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     error = failure.value
     own_frames = _TESTING if isinstance(error, (AssertionError, TimeoutError)) else _PACKAGE
     is_own = own_frames == _TESTING or type(error).__module__.startswith("webots_mcp.")
-    entry, line = failure.tb, failure.tb  # the newest frame, and the newest of the user's
+    entry, line = failure.tb, failure.tb  # The innermost frame, and the innermost one of the user.
     while entry.tb_next is not None:
         entry = entry.tb_next
         if not entry.tb_frame.f_code.co_filename.startswith((_PACKAGE, contextlib.__file__)):
             line = entry
     if is_own and entry.tb_frame.f_code.co_filename.startswith(own_frames):
         line.tb_next = None
-        error.__cause__, error.__suppress_context__ = None, True  # the message includes it
+        error.__cause__, error.__suppress_context__ = None, True  # The message includes it.

@@ -1,6 +1,6 @@
-"""Robots and simulations of a test: in the test's own process, or with real controller processes.
+"""Robots and simulations for tests, in the test's own process or with real controller processes.
 
-The fixtures of the pytest plugin are `RobotFactory` and `SimulationFactory`.
+The fixtures of the pytest plugin are a `RobotFactory` and a `SimulationFactory`.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from controller.session import Message
 
 HOLD_LIMIT_S: Final = 2.0
+"""How long a pause may hold a loop that nobody can resume, in wall time."""
 _CONSOLE_LINES: Final = 30
 T = TypeVar("T")
 World = str | Path | InProcessSimulation
@@ -49,8 +50,8 @@ World = str | Path | InProcessSimulation
 class Rehearsal(InProcessSimulation):
     """An `InProcessSimulation` that ends by itself, so that a whole control loop can be tested.
 
-    After `duration_s` of simulated time `step` returns -1, as when somebody closes Webots. A loop
-    that is held by a pause, with nobody left in the process who could resume it, is an error.
+    After `duration_s` of simulated time, `step` returns -1, as when a person closes Webots. A pause
+    that nothing in the process can end raises an error.
     """
 
     def __init__(self, world: str | Path = DEFAULT_WORLD, *, duration_s: float = math.inf) -> None:
@@ -58,7 +59,7 @@ class Rehearsal(InProcessSimulation):
 
         Args:
             world: A .wbt file.
-            duration_s: When it ends, in seconds of simulated time.
+            duration_s: Simulated time after which it ends.
 
         Raises:
             WorldError: The world cannot be used.
@@ -68,11 +69,11 @@ class Rehearsal(InProcessSimulation):
         self._held_since_s: float | None = None
 
     def take(self, link: Any, message: Message) -> None:
-        """As of `InProcessSimulation`.
+        """Answer a controller's request, unless time has to pass first.
 
         Raises:
-            WouldBlockError: The loop steps, and a pause has held it for 2 s of wall time; all else
-                goes through, so that its end can resume.
+            WouldBlockError: The loop calls `step`, and a pause has held it for 2 s of wall time.
+                Other requests are answered, so that the end of the test can resume.
         """
         if self.mode is not Mode.PAUSE or message[:2] == ("ask", "simulation_set_mode"):
             self._held_since_s = None
@@ -93,11 +94,11 @@ class Rehearsal(InProcessSimulation):
 
 
 class RecordedSimulation(Simulation):
-    """A `Simulation` whose controllers record into a folder of the test's.
+    """A `Simulation` whose controllers record into a folder of the test.
 
-    It begins paused, before the first step. `run_for` lets it run as fast as it can and pauses it
-    after exactly that much simulated time: what is recorded until then does not depend on how fast
-    the machine is. Its other methods are a person's hands, as of `Simulation`.
+    It begins paused, before the first step. `run_for` runs it as fast as possible and pauses it
+    after exactly that much simulated time, so that the recording does not depend on the speed of
+    the machine. Other methods are buttons of the window, as in `Simulation`.
     """
 
     def __init__(
@@ -114,11 +115,11 @@ class RecordedSimulation(Simulation):
 
         Args:
             world: A .wbt file.
-            data_dir: Where bridges that are told nothing else record.
+            data_dir: Folder that bridges record in by default.
             controllers: Controller files by robot name, instead of those that the world names.
             environment: Variables for the controllers, on top of those of this process.
-            parameters: Start values of the controllers' parameters; others begin as in the code.
-            console: Is called with each line of Webots' console.
+            parameters: Start values of the controllers' parameters, instead of those in the code.
+            console: Called with each line of Webots' console.
 
         Raises:
             WorldError: The world cannot be used.
@@ -143,22 +144,21 @@ class RecordedSimulation(Simulation):
             if not Path(file).is_file():
                 raise StandInError(f"the controller of {name!r} is missing: {Path(file).resolve()}")
         self.recording = RobotRecording(data_dir / DATABASE_NAME)
-        """What the controllers recorded; `recording.robot(name)` where there are several."""
+        """The recording of the controllers; use `recording.robot(name)` if there are several."""
 
     def run_for(self, duration_s: float, timeout_s: float = 60.0) -> None:
         """Run for that much simulated time, then pause.
 
-        It returns earlier where somebody else pauses or quits the simulation.
-
-        When it returns, every controller has published what belongs to the last step.
+        It returns earlier if a controller or another thread pauses or quits the simulation. By
+        then, every controller has published what belongs to the last step.
 
         Args:
             duration_s: Simulated time, rounded up to a multiple of the basic time step.
-            timeout_s: The longest time to wait, in seconds of wall time.
+            timeout_s: Maximum time to wait, in seconds of wall time.
 
         Raises:
-            AssertionError: A controller ended with an error; the text ends with the console.
-            TimeoutError: It took too long; the text names the controllers that hang, and ends
+            AssertionError: A controller ended with an error. The text ends with the console.
+            TimeoutError: It took too long. The text names the controllers that hang, and ends
                 with the console.
             StandInError: The simulation has been quit.
         """
@@ -173,7 +173,7 @@ class RecordedSimulation(Simulation):
                 )
 
     def wait_for(self, condition: Callable[[], T], timeout_s: float = 10.0) -> T:
-        """As of `Simulation`; the message begins with the controllers that hang."""
+        """Wait until a condition holds; the error begins with the controllers that hang."""
         try:
             return super().wait_for(condition, timeout_s)
         except TimeoutError as error:
@@ -181,7 +181,7 @@ class RecordedSimulation(Simulation):
             raise TimeoutError("\n".join([*hanging, str(error)])) from None
 
     def _why_hung(self, controller: Controller) -> str | None:
-        """Why the simulation waits for this controller; None if it does not."""
+        """Return why the simulation waits for this controller; None if it does not."""
         if controller.holds_up and not self._is_held(controller.name):
             connected = controller.connection is not None
             what = "does not come to its next step()" if connected else "has made no Robot() yet"
@@ -196,9 +196,11 @@ class RecordedSimulation(Simulation):
         )
 
     def _notice(self) -> None:
-        """Called in the simulation's thread after each physics step."""
+        """Pause at the end of `run_for`. Called in the simulation's thread after each step."""
         now_s = self.time_s
-        passed_s = now_s - self._seen_s if now_s >= self._seen_s else now_s  # less: a reset
+        passed_s = (
+            now_s - self._seen_s if now_s >= self._seen_s else now_s
+        )  # A smaller time means a reset.
         self._seen_s = now_s
         if self._ends_in_s > 0.0:
             self._ends_in_s = round(self._ends_in_s - passed_s, 9)
@@ -212,12 +214,12 @@ class RecordedSimulation(Simulation):
         return self.mode is Mode.PAUSE and not any(map(self._why_hung, self.controllers))
 
     def _is_held(self, name: str) -> bool:
-        """Whether a bridge holds the controller's loop: it asks for no step until it is resumed."""
+        """Return whether a bridge holds the controller's loop until it is resumed."""
         try:
             with closing(connect(self.recording.database, "reader")) as connection:
                 require_current(connection)
                 session = resolve_robot(connection, name, time.time()).session
-        except WebotsMCPError:  # nothing was recorded yet
+        except WebotsMCPError:  # Nothing was recorded yet.
             return False
         return session is not None and session.pause_state == PAUSED
 
@@ -226,10 +228,10 @@ class RecordedSimulation(Simulation):
 
 
 class RobotFactory:
-    """Makes robots of the stand-in, without a process."""
+    """Makes robots of the stand-in within the test's process."""
 
     def __init__(self, root: Path | None = None) -> None:
-        """Worlds that are named by a relative path lie in `root`; None for the current folder."""
+        """Find worlds with relative paths in `root`; None for the current folder."""
         self._root = root or Path()
 
     @overload
@@ -260,15 +262,15 @@ class RobotFactory:
         supervisor: bool = True,
         duration_s: float = math.inf,
     ) -> InProcessRobot:
-        """A robot of a world.
+        """Make a robot of a world.
 
         Args:
             name: The robot's name; None for the first.
-            world: A .wbt file, by its path in `root` or an absolute one; or the `simulation` of
-                another robot to share its world.
-            supervisor: Whether it is of the class `Supervisor`, else `Robot`.
-            duration_s: Of a world that is loaded for it: after so much simulated time its `step`
-                returns -1.
+            world: A .wbt file, relative to `root` or absolute; or the `simulation` of another robot
+                to share its world.
+            supervisor: Whether its class is `Supervisor` rather than `Robot`.
+            duration_s: Simulated time after which `step` returns -1. It has no effect on a shared
+                world.
 
         Raises:
             WorldError: The world cannot be used or has no such robot.
@@ -281,7 +283,7 @@ class RobotFactory:
 
 
 class SimulationFactory:
-    """Starts simulations whose controllers record into folders of the test's."""
+    """Starts simulations whose controllers record into folders of the test."""
 
     def __init__(
         self,
@@ -289,13 +291,12 @@ class SimulationFactory:
         root: Path | None = None,
         on_start: Callable[[RecordedSimulation], object] = lambda _: None,
     ) -> None:
-        """Nothing is started yet.
+        """Start nothing yet.
 
         Args:
-            folder: Each simulation gets a data folder of its own in it.
-            root: Where worlds and controllers lie that are named by a relative path; None for the
-                current folder.
-            on_start: Is called with each simulation that was started.
+            folder: Folder for the data folder of each simulation.
+            root: Folder of worlds and controllers with relative paths; None for the current one.
+            on_start: Called with each simulation that was started.
         """
         self._folder = folder
         self._root = root or Path()
@@ -304,7 +305,7 @@ class SimulationFactory:
 
     @property
     def databases(self) -> list[Path]:
-        """Those in which the simulations have recorded."""
+        """Return the databases that the simulations have recorded in."""
         asked = (each.recording.database for each in self._started)
         return [each for each in asked if isinstance(each, Path) and each.is_file()]
 
@@ -318,7 +319,7 @@ class SimulationFactory:
         parameters: Mapping[str, ParameterValue] | None = None,
         console: Callable[[str], object] | None = None,
     ) -> RecordedSimulation:
-        """A simulation that is paused before its first step; arguments and errors as there."""
+        """Start a simulation, paused before its first step; see `RecordedSimulation`."""
         files = {name: self._root / file for name, file in (controllers or {}).items()}
         simulation = RecordedSimulation(
             self._root / world,
@@ -334,6 +335,6 @@ class SimulationFactory:
         return simulation
 
     def close(self) -> None:
-        """End all that were started."""
+        """End all simulations that were started."""
         for simulation in self._started:
             simulation.close()

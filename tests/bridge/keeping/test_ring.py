@@ -18,7 +18,7 @@ from tests.bridge.conftest import STEP_MS, Recording
 from tests.bridge.keeping.conftest import State, rows
 from tests.bridge.monsters import MONSTERS, EndlessDict
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import encoding
+from webots_mcp.bridge import cleaning
 from webots_mcp.bridge.encoding import copy_or_encode, encode, encode_copy
 from webots_mcp.bridge.keeping import Ring, RingRow
 from webots_mcp.standin import InProcessSupervisor
@@ -82,7 +82,7 @@ def test_any_state_that_is_held_is_kept_as_it_would_be_recorded(state: State) ->
 def test_a_monster_that_is_held_is_kept_as_it_would_be_recorded(
     make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encoding, "LONGEST_S", math.inf)
+    monkeypatch.setattr(cleaning, "OBJECTS_BUDGET_S", math.inf)
     EndlessDict.asked = 0
     held = copy_or_encode({"monster": make()})
     kept = encode_copy(held) if isinstance(held, bytes) else held

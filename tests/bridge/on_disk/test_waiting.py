@@ -22,7 +22,7 @@ from tests.bridge.conftest import (
 )
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
-from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.recorder import ConnectionLock
 from webots_mcp.database.waiting_file import Entry, WaitingFile
 from webots_mcp.standin import InProcessSupervisor
 
@@ -217,11 +217,12 @@ def test_a_signals_handler_that_logs_in_the_middle_of_a_row_deadlocks_nothing(
     bridge: MCPBridge, robot: InProcessSupervisor, filed: Recording
 ) -> None:
     def trace(frame: object, event: str, _: object) -> object:
-        code = getattr(frame, "f_code")  # noqa: B009
-        if code is Recorder._write.__code__ and event == "call":  # pyright: ignore[reportPrivateUsage]
+        if getattr(frame, "f_code") is not ConnectionLock.acquire.__code__:  # noqa: B009
+            return None
+        if event == "return":  # from here on the row has the lock
             sys.settrace(None)
             bridge.log("from within")
-        return None
+        return trace
 
     sys.settrace(trace)  # pyright: ignore[reportArgumentType]
     try:

@@ -23,7 +23,12 @@ from tests.steering.trials.conftest import Run, command, rows
 from tests.waiting import wait_for
 from webots_mcp import __version__
 from webots_mcp.plugins.cluster import dask_cluster as cluster
-from webots_mcp.plugins.cluster.dask_cluster import Needs, digest_of, packed, what_lacks
+from webots_mcp.plugins.cluster.dask_cluster import (
+    WorkerRequirements,
+    digest_of,
+    missing_requirement,
+    packed,
+)
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.parameters import TrialResult
 
@@ -295,19 +300,19 @@ def test_a_server_that_is_no_scheduler_is_not_waited_for(
     assert said.endswith(f"answers at {address}: what listens there is something else\n")
 
 
-def needs(world: Path, **other: Any) -> Needs:
+def needs(world: Path, **other: Any) -> WorkerRequirements:
     """What a worker has to have, as its client says."""
     said: dict[str, Any] = {"version": __version__, "digest": digest_of(str(world))}
-    return Needs(world=str(world), is_stand_in=True, **(said | other))
+    return WorkerRequirements(world=str(world), is_stand_in=True, **(said | other))
 
 
 def test_a_worker_says_what_it_lacks(project: Path) -> None:
     world = project / "worlds" / "table.wbt"
 
-    assert what_lacks(needs(world)) is None
-    assert "it has webots-mcp" in (what_lacks(needs(world, version="0.1")) or "")
+    assert missing_requirement(needs(world)) is None
+    assert "it has webots-mcp" in (missing_requirement(needs(world, version="0.1")) or "")
     asked = needs(world)
     (project / "controllers" / "rover" / "rover.py").write_text("print('another')")
-    assert "are not the same there" in (what_lacks(asked) or "")
+    assert "are not the same there" in (missing_requirement(asked) or "")
     world.unlink()
-    assert f"there is no file {world}: all workers need" in (what_lacks(asked) or "")
+    assert f"there is no file {world}: all workers need" in (missing_requirement(asked) or "")

@@ -18,7 +18,7 @@ from tests.plugins.page.conftest import Server
 from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.plugins.page.page_server import MOST_CONNECTIONS, MOST_TABS
+from webots_mcp.plugins.page.page_server import LIMITS
 
 
 def answer(server: Server, path: str, **headers: str) -> tuple[int, str]:
@@ -132,9 +132,9 @@ def test_no_other_page_can_hold_it_or_is_told_its_address(told: Server) -> None:
 
 def test_only_so_many_tabs_are_open_at_once(serve: Callable[..., Server], tmp_path: Path) -> None:
     server = serve(tmp_path, "--read-only")
-    answers = [answer(server, f"look?tab={tab}") for tab in range(MOST_TABS + 1)]
-    assert [status for status, _ in answers] == [200] * MOST_TABS + [503]
-    assert f"{MOST_TABS} tabs of this page are open" in answers[-1][1]
+    answers = [answer(server, f"look?tab={tab}") for tab in range(LIMITS.tabs + 1)]
+    assert [status for status, _ in answers] == [200] * LIMITS.tabs + [503]
+    assert f"{LIMITS.tabs} tabs of this page are open" in answers[-1][1]
     assert answer(server, "look?tab=0")[0] == 200
 
 
@@ -224,7 +224,7 @@ def test_of_many_idle_connections_the_idlest_are_closed(told: Server) -> None:
         address, more = ("127.0.0.1", told.port), 20
         connections = [
             stack.enter_context(closing(socket.create_connection(address, 60)))
-            for _ in range(MOST_CONNECTIONS + more)
+            for _ in range(LIMITS.connections + more)
         ]
         assert answer(told, "")[0] == 200
         for closed in connections[:more]:

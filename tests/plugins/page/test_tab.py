@@ -15,8 +15,8 @@ from tests.recordings.long import build
 from tests.waiting import wait_for
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
-from webots_mcp.plugins.page.page_data import choice_of, draw
-from webots_mcp.plugins.page.page_server import ChunkMaker
+from webots_mcp.plugins.page.chunk_maker import ChunkMaker
+from webots_mcp.plugins.page.page_data import draw, page_request
 from webots_mcp.store.chunk_making import LEAST_ROWS
 from webots_mcp.store.chunks import watermark
 from webots_mcp.store.recording import RecordingAccess
@@ -30,7 +30,7 @@ def recording(story: Path) -> RecordingAccess:
 def drawn(recording: RecordingAccess, **asked: Any) -> dict[str, Any]:
     texts = {name: each if isinstance(each, str) else json.dumps(each)
              for name, each in asked.items()}  # fmt: skip
-    return draw(recording, choice_of({"robot": "rover", "run": "1"} | texts))
+    return draw(recording, page_request({"robot": "rover", "run": "1"} | texts))
 
 
 def values(markup: str) -> dict[str, Any]:
@@ -102,5 +102,5 @@ def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> N
 
 def test_of_a_page_without_a_recording_no_chunk_is_made(tmp_path: Path) -> None:
     chunk_maker = ChunkMaker(RecordingAccess(tmp_path / DATABASE_NAME, tmp_path, read_only=True))
-    chunk_maker.look()
+    chunk_maker.make_chunks()
     assert (chunk_maker.rounds, chunk_maker.says) == (0, "")

@@ -19,7 +19,7 @@ from tests.recordings.runs import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.plugins.pool.pool_contents import open_pool
-from webots_mcp.plugins.pool.shipping import Order, Report, ship
+from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import RecordingAccess
 
@@ -30,7 +30,7 @@ class Shipped:
     def __init__(self, folder: Path, connection: sqlite3.Connection, pool: Path) -> None:
         self.folder, self.pool, self.connection = folder, pool, connection
         recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
-        self.order = Order(recording, partial(open_pool, str(pool), ships=True))
+        self.order = ShippingJob(recording, partial(open_pool, str(pool), ships=True))
 
     @cached_property
     def recorded(self) -> Recorded:
@@ -60,8 +60,8 @@ class Shipped:
         while not make_chunks(self.connection).done:
             pass
 
-    def ship(self, **options: Any) -> Report:
-        report = Report()
+    def ship(self, **options: Any) -> ShippingReport:
+        report = ShippingReport()
         ship(replace(self.order, **options), report)
         return report
 

@@ -14,9 +14,9 @@ import pytest
 from tests.recordings.runs import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.plugins.pool.fetching import Fetched, fetch
-from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool
-from webots_mcp.plugins.pool.shipping import Order, Report, ship
+from webots_mcp.plugins.pool.fetching import FetchResult, fetch
+from webots_mcp.plugins.pool.pool_contents import RunFilter, open_pool, resolve_filter
+from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.recording import RecordingAccess
 
@@ -35,11 +35,14 @@ class Lab:
 
     def ship(self, database: Path, **options: Any) -> None:
         recording = RecordingAccess(database, database.parent, read_only=True)
-        ship(Order(recording, partial(open_pool, self.url, ships=True), **options), Report())
+        ship(
+            ShippingJob(recording, partial(open_pool, self.url, ships=True), **options),
+            ShippingReport(),
+        )
 
-    def fetch(self, **choice: Any) -> Fetched:
+    def fetch(self, **choice: Any) -> FetchResult:
         with self.opened() as connection, open_pool(self.url) as pool:
-            return fetch(pool, connection, self.here, meant(pool, Choice(**choice)))
+            return fetch(pool, connection, self.here, resolve_filter(pool, RunFilter(**choice)))
 
     def opened(self) -> closing[sqlite3.Connection]:
         return closing(connect(self.here / DATABASE_NAME, "writer"))

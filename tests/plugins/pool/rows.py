@@ -13,10 +13,10 @@ import numpy as np
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.pool_interface import (
     Batch,
-    Row,
+    PoolRow,
     Shipment,
+    ShippedTable,
     SQLValue,
-    Table,
     batches,
     table,
     tables,
@@ -32,7 +32,7 @@ def uuid_of(recording: sqlite3.Connection) -> str:
     return str(recording.execute("SELECT uuid FROM recording").fetchone()[0])
 
 
-def rows_of(recording: sqlite3.Connection, each: Table) -> list[Row]:
+def rows_of(recording: sqlite3.Connection, each: ShippedTable) -> list[PoolRow]:
     """As SQLite has them, in the order of the key."""
     columns = ", ".join(f'"{name}"' for name in each.columns)
     query = f"SELECT {columns} FROM {each.name} ORDER BY {', '.join(each.key)}"
@@ -89,7 +89,7 @@ def ship(recording: sqlite3.Connection, url: str) -> None:
 
 def pooled_rows(
     url: str | Path, uuid: str, name: str, where: Mapping[str, Collection[int]] | None = None
-) -> list[Row]:
+) -> list[PoolRow]:
     """Rows of a table as the pool gives them, in the order of the key."""
     each = table(name)
     with open_pool(str(url)) as pool:
@@ -108,7 +108,7 @@ def pooled(url: str | Path, uuid: str) -> dict[str, Any]:
     return {each.name: _comparable(each, rows) for each, rows in found.items()}
 
 
-def _comparable(each: Table, rows: Iterable[Row]) -> Any:
+def _comparable(each: ShippedTable, rows: Iterable[PoolRow]) -> Any:
     """In the order of the key; chunks by what they hold, since Parquet packs them anew."""
     if each.name == "chunk":
         return chunk_values(rows)
@@ -116,7 +116,7 @@ def _comparable(each: Table, rows: Iterable[Row]) -> Any:
     return sorted(rows, key=lambda row: [str(row[at]).rjust(20) for at in places])
 
 
-def chunk_values(rows: Iterable[Row]) -> dict[tuple[int, int], Any]:
+def chunk_values(rows: Iterable[PoolRow]) -> dict[tuple[int, int], Any]:
     """Of each group and signal what the rows of `chunk` say: statistics, and a value for each row.
 
     A row has a number, a label, or `Ellipsis` where its state lacks the signal.

@@ -262,13 +262,15 @@ REFUSED: list[tuple[str, dict[str, str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("sql", "said"), REFUSED)
-def test_anything_else_than_a_select_is_refused(
-    shipped: Place, pool: Pool, sql: str, said: dict[str, str]
+def test_anything_else_than_a_select_is_refused_and_changes_nothing(
+    shipped: Place, pool: Pool
 ) -> None:
-    if shipped.kind in said:
-        with pytest.raises(InvalidInputError, match=said[shipped.kind]):
-            pool.select(sql, 10)
+    for sql, said in REFUSED:
+        if shipped.kind in said:
+            with pytest.raises(InvalidInputError, match=said[shipped.kind]):
+                pool.select(sql, 10)
+        if shipped.kind == "postgres":  # whose connection could be left in a failed transaction
+            assert pool.select("SELECT 1", 1).rows == ((1,),)
     assert pool.select("SELECT count(*) FROM run", 1).rows == ((3,),)
 
 

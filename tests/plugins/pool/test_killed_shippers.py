@@ -20,7 +20,7 @@ from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
 from webots_mcp.database.connection import connect
 from webots_mcp.plugins.pool.pool_contents import open_pool
-from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
+from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, follow, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import RecordingAccess
 
@@ -29,9 +29,11 @@ pytestmark = pytest.mark.slow
 KILLS = {"postgresql": 20, "parquet": 8}
 
 
-def order_of(folder: Path, url: str) -> Order:
+def order_of(folder: Path, url: str) -> ShippingJob:
     recording = RecordingAccess(folder / "webots.db", folder, read_only=True)
-    return Order(recording, functools.partial(open_pool, url, ships=True), full=True, pictures=True)
+    return ShippingJob(
+        recording, functools.partial(open_pool, url, ships=True), full=True, pictures=True
+    )
 
 
 def ship_on_and_on(folder: Path, url: str, writing: Connection) -> None:
@@ -40,11 +42,11 @@ def ship_on_and_on(folder: Path, url: str, writing: Connection) -> None:
 
     opened: Callable[[], Any] = lambda: BeforeWrite(open_pool(url, ships=True), tell)  # noqa: E731
     order = replace(order_of(folder, url), open_pool=opened)
-    follow(order, Report(), lambda _: None, 0.01)
+    follow(order, ShippingReport(), lambda _: None, 0.01)
 
 
-def ship_again(folder: Path, url: str) -> Report:
-    report = Report()
+def ship_again(folder: Path, url: str) -> ShippingReport:
+    report = ShippingReport()
     ship(order_of(folder, url), report)
     return report
 

@@ -29,7 +29,8 @@ from webots_mcp.errors import (
 )
 from webots_mcp.plugins.pool.pool_contents import open_pool, pooled_runs
 from webots_mcp.plugins.pool.pool_interface import BATCH_BYTES, is_whole, table
-from webots_mcp.plugins.pool.shipping import LAST_GROUP, Order, Report, Source, follow
+from webots_mcp.plugins.pool.shipping import LAST_GROUP, ShippingJob, ShippingReport, follow
+from webots_mcp.plugins.pool.shipping_source import ShippingSource
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import RecordingAccess
@@ -270,7 +271,7 @@ def test_a_pool_that_is_away_is_tried_again_and_then_gets_everything(shipped: Sh
         with pytest.raises(PoolUnavailableError):
             shipped.ship(open_pool=away)
         with pytest.raises(KeyboardInterrupt):
-            follow(replace(shipped.order, open_pool=away, full=True), Report(), hear, 0.0)
+            follow(replace(shipped.order, open_pool=away, full=True), ShippingReport(), hear, 0.0)
     assert "does not answer: reset; trying again in 1 s" in said[0]
     shipped.ship(open_pool=away, full=True)
     assert pooled(url, shipped.uuid) == shipped.rows()
@@ -283,14 +284,14 @@ def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
     code = (
         "import functools, sys; from pathlib import Path; "
         "from webots_mcp.plugins.pool.pool_contents import open_pool; "
-        "from webots_mcp.plugins.pool.shipping import Report; "
-        "from webots_mcp.plugins.pool.shipping import Order, ship; "
+        "from webots_mcp.plugins.pool.shipping import ShippingReport; "
+        "from webots_mcp.plugins.pool.shipping import ShippingJob, ship; "
         "from webots_mcp.store.recording import RecordingAccess; "
         "folder, pool = map(Path, sys.argv[1:]); "
         "recording = RecordingAccess(folder / 'webots.db', folder, read_only=True); "
-        "report = Report(); "
+        "report = ShippingReport(); "
         "opened = functools.partial(open_pool, str(pool), ships=True); "
-        f"ship(Order(recording, opened, full={full}), report); "
+        f"ship(ShippingJob(recording, opened, full={full}), report); "
         "print(*report.notes)"
     )
     with unprivileged.unwritable(shipped.folder):
@@ -369,7 +370,7 @@ def test_more_changes_than_a_transaction_takes_are_shipped_in_several(shipped: S
 def test_a_row_group_that_is_not_complete_is_shipped_when_it_is(shipped: Shipped) -> None:
     shipped.add_run(2500)
     shipped.connection.execute("UPDATE row_group SET is_complete = 0 WHERE id > 1")
-    assert Source(shipped.connection).number(LAST_GROUP) == 1
+    assert ShippingSource(shipped.connection).number(LAST_GROUP) == 1
 
 
 def test_late_rows_are_shipped_as_a_group_of_their_own(shipped: Shipped) -> None:
@@ -437,7 +438,7 @@ def test_a_recording_that_is_not_there_yet_is_waited_for_and_one_in_its_place_is
     recording = RecordingAccess(database, database.parent, read_only=True)
     opened: Any = lambda: BeforeWrite(shipped.order.open_pool(), replace_it)  # noqa: E731
     with pytest.raises(KeyboardInterrupt):
-        follow(Order(recording, opened, full=True), Report(), hear, 0.0)
+        follow(ShippingJob(recording, opened, full=True), ShippingReport(), hear, 0.0)
     assert said[0] == f"nothing is recorded at {database} now: it is shipped as soon as it is there"
     assert f"the recording {other} stands now where {shipped.uuid} was" in said[1]
     assert shipped.pooled() == shipped.rows()
@@ -457,8 +458,8 @@ def test_what_comes_while_a_shipper_follows_is_shipped_with_all_that_it_refers_t
 
     opened: Any = lambda: BeforeWrite(shipped.order.open_pool(), record_more)  # noqa: E731
     with pytest.raises(KeyboardInterrupt):
-        order = Order(shipped.order.recording, opened, full=True)
-        follow(order, Report(), lambda _: None, 0.0)
+        order = ShippingJob(shipped.order.recording, opened, full=True)
+        follow(order, ShippingReport(), lambda _: None, 0.0)
     found = shipped.pooled()
     runs = {row[0] for row in found["run"]}
     assert len(runs) == 47

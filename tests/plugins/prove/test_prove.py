@@ -17,7 +17,7 @@ import pytest
 
 from tests.simulator.webots_program import put_on_path
 from webots_mcp.contract import host_name
-from webots_mcp.plugins.prove.bench import Bench, tried
+from webots_mcp.plugins.prove.bench import Bench, run_check
 from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED, check_launch
 from webots_mcp.simulator.installations import HOME_VARIABLE
 
@@ -69,6 +69,7 @@ def test_a_webots_that_is_as_its_sources_say_is_as_expected_in_all(prove: Prove)
     assert [*outcomes(found)] == [*CHECKS, *NOT_TRIED]
 
 
+@pytest.mark.slow
 @posix
 def test_what_is_sent_names_the_versions_and_no_place_user_or_machine(
     prove: Prove, home: Path
@@ -83,6 +84,7 @@ def test_what_is_sent_names_the_versions_and_no_place_user_or_machine(
         assert not re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text), name
 
 
+@pytest.mark.slow
 @posix
 def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_still(
     prove: Prove, home: Path
@@ -90,7 +92,7 @@ def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_st
     program = home / "webots"
     good = program.read_text("utf-8")
     obeying_always_and_ending_with_0 = (
-        "from tests.simulator import program\nlisten = program._listen\n"
+        "from tests.simulator import webots_program as program\nlisten = program._listen\n"
         "program._listen = lambda port, *, streams: listen(port + 1, streams=True)\n"
         "main(sys.argv[1:])\n"
     )
@@ -112,6 +114,7 @@ def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_st
     )
 
 
+@pytest.mark.slow
 @posix
 def test_a_webots_that_never_runs_a_controller_costs_one_start_and_not_one_for_each_check(
     prove: Prove, home: Path
@@ -127,6 +130,7 @@ def test_a_webots_that_never_runs_a_controller_costs_one_start_and_not_one_for_e
     assert "without a bridge: speaker (" in said, "an observer records"
 
 
+@pytest.mark.slow
 @posix
 def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -144,14 +148,14 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
         bench.row()
 
     try:
-        found = tried(check_launch, bench)
+        found = run_check(check_launch, bench)
         assert found["outcome"] == "as expected", found
         bench.patience_s = 1
-        found = tried(check_stuck, bench, limit_s=0.5)
+        found = run_check(check_stuck, bench, limit_s=0.5)
         assert (found["outcome"], found["seen"]) == ("otherwise", "it hung for 0.5 s")
         stuck = bench.user
         bench.patience_s = 60
-        assert tried(check_launch, bench)["outcome"] == "as expected"
+        assert run_check(check_launch, bench)["outcome"] == "as expected"
         free.set()
         stuck.join()
         assert late == ["Webots ended: True"]

@@ -78,6 +78,7 @@ speed = { choices = [1.0, 9.0] }
 """
 
 
+@pytest.mark.slow
 def test_a_search_runs_trials_and_ends_early_what_is_pruned(
     project: Path, plan: Write, run: Run
 ) -> None:
@@ -101,6 +102,7 @@ def test_a_search_runs_trials_and_ends_early_what_is_pruned(
     assert "every other parameter set was pruned" in table
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_search_that_was_killed_goes_on_as_if_it_had_not_been(
     project: Path, plan: Write, run: Run

@@ -15,6 +15,7 @@ from tests.steering.trials.conftest import Run, command, rows, wait_for_trial
 Plan = Callable[[str], Path]
 
 
+@pytest.mark.slow
 def test_sets_are_tried_scored_ranked_and_their_runs_kept(
     project: Path, plan: Plan, run: Run
 ) -> None:
@@ -54,6 +55,7 @@ def test_a_trial_ends_at_the_very_state_in_which_the_condition_holds(
     assert rows(project, "SELECT DISTINCT ended_by FROM trial") == [("until",)]
 
 
+@pytest.mark.slow
 def test_a_finished_plan_is_only_shown_and_again_begins_anew(
     project: Path, plan: Plan, run: Run
 ) -> None:
@@ -89,6 +91,7 @@ def test_a_value_that_was_not_taken_is_a_failure_and_not_a_score(plan: Plan, run
     assert "speed=11.0 was not taken (from 0.0 to 10.0)" in answer["sets"][0]["failures"][0]
 
 
+@pytest.mark.slow
 def test_two_cannot_work_on_one_set(project: Path, plan: Plan, run: Run) -> None:
     plan('score = "last(x)"\nuntil = "x > 1e6"\n[grid]\nspeed = [1.0, 2.0]')
     assert "no database" in run("--so-far").stderr
@@ -107,6 +110,7 @@ def test_two_cannot_work_on_one_set(project: Path, plan: Plan, run: Run) -> None
     assert "trial set 1, no run was recorded" in so_far.stdout
 
 
+@pytest.mark.slow
 def test_what_is_over_so_far_is_ranked_and_who_leads_is_told(
     project: Path, plan: Plan, run: Run
 ) -> None:

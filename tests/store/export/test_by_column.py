@@ -173,12 +173,15 @@ def test_the_known_recording_with_its_scans_is_the_same() -> None:
             assert_alike(connection, run_id=run_id)
 
 
-def test_a_damaged_chunk_is_read_from_its_rows(recorder: Recorder) -> None:
+def test_where_a_chunk_is_damaged_the_rows_are_exported(recorder: Recorder) -> None:
     record(recorder, range(ROWS))
     recorder.end_run("finished")
     make_chunks(recorder.connection, 10_000)
     damage = "UPDATE chunk SET numbers = x'0000000001' WHERE signal_id = 1 AND numbers IS NOT NULL"
     assert recorder.connection.execute(damage).rowcount
+    assert_alike(recorder.connection)
+    make_chunks(recorder.connection, 10_000)
+    assert is_by_column(recorder.connection), "made anew, since the export read it"
     assert_alike(recorder.connection)
 
 

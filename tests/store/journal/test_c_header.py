@@ -153,8 +153,8 @@ def test_a_state_is_what_python_would_have_recorded(start: Start, tmp_path: Path
         "range": [struct.unpack("f", struct.pack("f", 0.3))[0], third],
     }  # fmt: skip
     assert json.loads(replaced) == {
-        "n": "nan", "m.i": "-inf", "odd.*": "-inf", "nans.*": "nan", "long": "array[20001]",
-        "big": "text[120000]",
+        "n": "nan", "m.i": "-inf", "odd.*": "-inf", "nans.*": "nan", "long": "too large",
+        "big": "too large",
     }  # fmt: skip
     assert json.loads(second) == {"i": 7}
     runs = read(tmp_path, "SELECT start_reason, end_reason, world, basic_time_step_ms FROM run")
@@ -240,7 +240,6 @@ def test_a_locale_with_another_decimal_point_changes_no_number(
 READER = """
 import sys, time
 from pathlib import Path
-from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.recording import RecordingAccess
 folder = Path(sys.argv[1])
 print("ready", flush=True)
@@ -254,7 +253,7 @@ while True:
 def test_kills_lose_nothing_and_double_nothing(start: Start, tmp_path: Path) -> None:
     """With two readers, which are killed as well, and journals of several parts."""
     draw = random.Random(2)
-    for attempt in range(12):
+    for attempt in range(6):
         folder = tmp_path / str(attempt)
         writer = start("forever", "100000", folder=folder)
         command = [sys.executable, "-c", READER, str(folder)]
@@ -271,6 +270,8 @@ def test_kills_lose_nothing_and_double_nothing(start: Start, tmp_path: Path) -> 
         readers[1].kill()
         for reader in readers:
             reader.communicate()
+        while journal_parts(folder / "webots.db"):  # one answer has no time for thousands of rows
+            RecordingAccess(folder / "webots.db", folder).take_in()
         found = [
             n for (n,) in read(folder, "SELECT json_extract(data, '$.i') FROM state ORDER BY id")
         ]

@@ -101,24 +101,65 @@ def test_zones_are_what_the_values_come_to(
                 assert zones.value_count[number] == expected.value_count
 
 
-def test_a_damaged_chunk_is_read_from_its_rows_where_they_are_there(
+def test_a_damaged_chunk_costs_its_signal_in_its_segment_and_it_is_said(
     short_groups: None, empty: sqlite3.Connection
 ) -> None:
-    states = [{"a": 0.5 * step} for step in range(20)]
-    recorded(empty, states)
+    recorded(empty, [{"a": 0.5 * step, "b": step} for step in range(20)])
     make_chunks(empty, 1000)
-    empty.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id > 0")
+    empty.execute(
+        f"UPDATE chunk SET numbers = x'00' WHERE group_id = 1 AND signal_id = {id_of_a(empty)}"
+    )
     frame = framed(empty)
-    assert frame.numbers("a").tolist() == [0.5 * step for step in range(20)]
-    assert frame.unread == ()
-    segment = whole_run(empty, 1)
-    assert segment is not None
-    empty.execute("DELETE FROM state WHERE id <= 8")
-    frame = read_frame(empty, segment, Deadline(60))
     assert np.isnan(frame.numbers("a")[:8]).all()
     assert frame.numbers("a")[8:].tolist() == [0.5 * step for step in range(8, 20)]
+    assert frame.values("b") == list(range(20))
     assert [(part.start_s, part.end_s) for part in frame.unread] == [(0.0, 0.7)]
-    assert "the chunk of a is damaged" in frame.unread[0].why
+    assert frame.unread[0].why.startswith("the chunk of a is damaged")
+
+
+def id_of_a(connection: sqlite3.Connection) -> int:
+    return connection.execute("SELECT id FROM signal WHERE name = 'a'").fetchone()[0]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE chunk SET numbers = x'00' WHERE signal_id > 0",
+        "UPDATE chunk SET numbers = x'00' WHERE signal_id = 0",
+        "DELETE FROM chunk WHERE signal_id = -2",
+    ],
+)
+def test_a_damaged_group_whose_rows_are_there_is_made_anew_after_it_was_read(
+    short_groups: None, empty: sqlite3.Connection, damage: str
+) -> None:
+    recorded(empty, [{"a": 0.5 * step} for step in range(20)])
+    make_chunks(empty, 1000)
+    empty.execute(f"{damage} AND group_id = 1")
+    before = framed(empty)
+    assert len(before.times) == len(before.ids) == len(before.numbers("a"))
+    assert len(before.unread) == 1
+    make_chunks(empty, 1000)
+    frame = framed(empty)
+    assert frame.numbers("a").tolist() == [0.5 * step for step in range(20)]
+    assert frame.ids.tolist() == list(range(1, 21))
+    assert frame.unread == ()
+    kept = "SELECT count(*), sum(row_count), min(is_complete) FROM row_group"
+    assert empty.execute(kept).fetchone() == (2, 16, 1)
+    assert empty.execute("PRAGMA foreign_key_check").fetchall() == []
+
+
+def test_a_damaged_group_of_which_a_row_is_gone_stays_and_is_said(
+    short_groups: None, empty: sqlite3.Connection
+) -> None:
+    recorded(empty, [{"a": 0.5 * step} for step in range(20)])
+    make_chunks(empty, 1000)
+    empty.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id > 0 AND group_id = 1")
+    empty.execute("DELETE FROM state WHERE id = 3")
+    for _ in range(2):
+        frame = framed(empty)
+        assert np.isnan(frame.numbers("a")[:8]).all()
+        assert "the chunk of a is damaged" in frame.unread[0].why
+        make_chunks(empty, 1000)
 
 
 @pytest.mark.parametrize("loss", ["DELETE FROM chunk", "UPDATE chunk SET numbers = x'00'"])
@@ -131,13 +172,6 @@ def test_rows_whose_times_are_lost_stay_in_order_and_it_is_said(
     times, walls = before.times.tolist(), before.wall_times.tolist()
     empty.execute(f"{loss} WHERE signal_id <= 0 AND group_id = 2")
     frame = framed(empty)
-    assert (frame.times.tolist(), frame.wall_times.tolist()) == (times, walls)
-    assert frame.ids.tolist() == list(range(1, 25)) and frame.unread == ()
-
-    segment = whole_run(empty, 1)
-    assert segment is not None
-    empty.execute("DELETE FROM state")
-    frame = read_frame(empty, segment, Deadline(60))
     assert frame.times.tolist() == pytest.approx(times)
     assert frame.wall_times.tolist() == pytest.approx(walls)
     assert frame.ids[8:16].tolist() == [0] * 8
@@ -169,7 +203,7 @@ def test_what_there_was_no_time_for_is_said(empty: sqlite3.Connection) -> None:
     assert frame.unread[0].why == "time limit reached"
 
 
-def test_the_newest_rows_are_read_once_and_the_next_come_after_them(tmp_path: Path) -> None:
+def test_rows_in_no_chunk_are_in_order_whatever_came_late_or_was_deleted(tmp_path: Path) -> None:
     file = tmp_path / "webots.db"
     with closing(connect(file, "writer", create=True)) as writer:
         create_schema(writer)

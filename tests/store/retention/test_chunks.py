@@ -124,6 +124,15 @@ def test_a_state_is_deleted_only_once_it_is_in_a_chunk_also_of_a_run_that_goes_o
     assert frame.unread == ()
 
 
+def test_a_damaged_group_is_made_anew_before_its_rows_are_deleted(recorded: Recorded) -> None:
+    record(recorded, 2 * GROUP_ROWS)
+    make_chunks(recorded.connection, 10_000)
+    before = contents(recorded.connection)
+    recorded.connection.execute("UPDATE chunk SET numbers = x'00' WHERE group_id = 1")
+    recorded.prune(Retention(state=NO_STATES, outlive=0))
+    assert contents(recorded.connection) == before
+
+
 @pytest.mark.parametrize("signals", [10, 60])
 def test_what_chunks_take_is_known_within_a_twentieth_of_what_sqlite_says(
     tmp_path: Path, signals: int

@@ -14,7 +14,7 @@ from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import Motion, RunNoise, Search
 from webots_mcp.signals.conditions.compiler import Expectation
 from webots_mcp.store.reading.frame import Frame
-from webots_mcp.store.reading.frame_source import NOT_READ
+from webots_mcp.store.reading.unread import NOT_READ
 from webots_mcp.store.runs import RunInfo
 
 Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at"]

@@ -14,7 +14,7 @@ from webots_mcp.analysis.swings import LEAST_HALF_SWINGS
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.signals.naming import Value
-from webots_mcp.store.reading.frame_source import NOT_READ
+from webots_mcp.store.reading.unread import NOT_READ
 
 if TYPE_CHECKING:
     from webots_mcp.judging.detection.search import Search

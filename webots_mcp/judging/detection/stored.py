@@ -20,7 +20,6 @@ from webots_mcp.judging.detection.kinds import (
     but_for_numbers,
 )
 from webots_mcp.judging.detection.search import Search
-from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,
     Point,
@@ -29,6 +28,7 @@ from webots_mcp.store.reading.frame_summary import (
     rhythm_in,
 )
 from webots_mcp.store.reading.segment import Segment, kept_stretches
+from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.run_rows import count_kept_frames
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run

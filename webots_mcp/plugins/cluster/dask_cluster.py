@@ -1,8 +1,8 @@
-"""Trials on a Dask cluster: a worker runs a simulator, and returns its score and its recording.
+"""Trials on a Dask cluster: a worker runs a simulator, and returns a score and a recording.
 
-Workers have to have Dask's resource `simulator`: a task of ours takes one of it, so that no machine
-runs more simulators than its owner says. Dask runs a trial again whose worker died, and says when
-that happened too often. Needs the extra `cluster`.
+Workers need Dask's resource `simulator`, of which each trial takes one, so that no machine runs
+more simulators than its owner allows. Dask repeats a trial whose worker died, and gives up after
+some repetitions. Needs the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -44,33 +44,34 @@ from webots_mcp.store.parameters import TrialResult
 from webots_mcp.store.recording import RecordingAccess
 
 RESOURCE: Final = "simulator"
-MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler
+MOST_BYTES: Final = 100_000_000
+"""Size of a packed recording that a worker returns, because it passes through the scheduler."""
 _CONNECT_S: Final = 10.0
-_PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
+_PATIENCE_S: Final = 0.5  # Between two checks for a request to stop.
 _COUNT_EVERY_S: Final = 2.0
 _WITHOUT_WORKERS_S: Final = 60.0
 _SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}")
 _WITH_TLS: Final = ("tls://", "wss://")
-_TASK: Final = "webots_mcp.plugins.cluster.dask_cluster:run_here"
+_TASK: Final = "webots_mcp.plugins.cluster.dask_cluster:run_on_worker"
 _BUNDLE: Final = "recording.zip"
 _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
 _SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
 
 
-# -- on a worker ------------------------------------------------------------------------------
+# -- functions that workers run ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Needs:
-    """What a worker has to have.
+class WorkerRequirements:
+    """What a worker needs.
 
     Attributes:
-        version: Of webots-mcp.
-        world: The path of the world file.
-        digest: Of that file and the sources of the project's controllers.
-        is_stand_in: Whether the stand-in runs it, and not Webots.
-        ship_to: The URL of a pool that takes the recordings; None where they are returned.
+        version: Version of webots-mcp.
+        world: Path of the world file.
+        digest: Hash of that file and the sources of the project's controllers.
+        is_stand_in: Whether the stand-in runs the world, not Webots.
+        ship_to: URL of a pool for the recordings; None to return them.
     """
 
     version: str
@@ -81,17 +82,17 @@ class Needs:
 
     @property
     def command(self) -> CommandOfWorld:
-        """Of the simulator."""
+        """Return the command of the simulator."""
         return stand_in if self.is_stand_in else webots
 
 
-class Returned(NamedTuple):
-    """What a worker returns: what became of a trial, and what it recorded.
+class TrialReturn(NamedTuple):
+    """What a worker returns: the result of a trial and its recording.
 
     Attributes:
-        result: With the id of its run in that recording.
-        recording: Packed; None where there is none, or it was shipped.
-        shipped: The UUID of the recording, where it was shipped.
+        result: The result, with the run's id in that recording.
+        recording: The packed recording; None if there is none, or it was shipped.
+        shipped: UUID of the recording, if it was shipped.
     """
 
     result: TrialResult
@@ -99,8 +100,8 @@ class Returned(NamedTuple):
     shipped: str | None = None
 
 
-def what_lacks(needs: Needs) -> str | None:
-    """What keeps this machine from running a trial; None where nothing does."""
+def missing_requirement(needs: WorkerRequirements) -> str | None:
+    """Return why this machine cannot run a trial; None if it can."""
     if needs.version != VERSION:
         return f"it has webots-mcp {VERSION}, not {needs.version}"
     if not Path(needs.world).is_file():
@@ -117,7 +118,7 @@ def what_lacks(needs: Needs) -> str | None:
 
 
 def _require_pool(url: str) -> None:
-    """See that it can be the address of a pool, without connecting.
+    """Check that a URL can name a pool, without connecting.
 
     Raises:
         InvalidInputError: It cannot, or the packages for it are missing.
@@ -129,7 +130,7 @@ def _require_pool(url: str) -> None:
 
 
 def digest_of(world: str) -> str:
-    """Of a world and of the sources of its project's controllers."""
+    """Return the hash of a world and of the sources of its project's controllers."""
     controllers = Path(world).parent.parent / "controllers"
     sources = (each for each in controllers.rglob("*.*") if each.suffix in _SOURCES)
     digest = hashlib.sha256()
@@ -139,12 +140,12 @@ def digest_of(world: str) -> str:
     return digest.hexdigest()
 
 
-def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
-    """Run the only trial of a plan on this worker, in a scratch folder of its own.
+def run_on_worker(asked: dict[str, Any], plan_text: str) -> TrialReturn:
+    """Run the only trial of a plan on this worker, in a temporary folder.
 
     Args:
-        asked: The fields of its `Needs`.
-        plan_text: The plan.
+        asked: Fields of its `WorkerRequirements`.
+        plan_text: The plan as JSON.
 
     Raises:
         CommandRefusedError: This machine cannot run it.
@@ -152,11 +153,11 @@ def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
     """
     from distributed import get_worker
 
-    needs = Needs(**asked)
+    needs = WorkerRequirements(**asked)
     worker: Any = get_worker()
-    unwanted = _Unwanted(worker)
+    unwanted = _Cancellation(worker)
     where = f"worker {worker.address} on {host_name()}"
-    if (lack := what_lacks(needs)) is not None:
+    if (lack := missing_requirement(needs)) is not None:
         raise CommandRefusedError(f"{where}: {lack}")
     plan = WorldPlan(**json.loads(plan_text))
     try:
@@ -166,24 +167,24 @@ def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
             attempt = TrialAttempt(plan, plan.parameters[0], folder, unwanted, _note_nothing)
             result = run_attempt(attempt, needs.command)
             if result.run_id is None:
-                return Returned(result)
+                return TrialReturn(result)
             if needs.ship_to is None:
                 return packed(result, folder)
-            return Returned(result, shipped=_shipped(folder, needs.ship_to))
+            return TrialReturn(result, shipped=_shipped(folder, needs.ship_to))
     except StoppedError:
         raise unwanted.as_dask_says() from None
     except InvalidInputError:
-        raise  # no other worker could run it either
+        raise  # No other worker could run it either.
     except (OSError, WebotsMCPError) as error:
         raise CommandRefusedError(f"{where}: {error}") from error
 
 
 def _note_nothing(pid: int | None) -> None:
-    """Whoever handed the trial out cannot end a process of this machine; its keeper does."""
+    """Store no process id: the caller cannot end a process of this machine."""
 
 
-def packed(result: TrialResult, folder: Path) -> Returned:
-    """A result with its recording, unless that is too large."""
+def packed(result: TrialResult, folder: Path) -> TrialReturn:
+    """Return a result with its recording, or with an error if that is too large."""
     bundle = folder.parent / _BUNDLE
     pack(folder, bundle)
     size = bundle.stat().st_size
@@ -192,24 +193,28 @@ def packed(result: TrialResult, folder: Path) -> Returned:
             f"its recording has {size:,} bytes packed, and a worker returns at most "
             f"{MOST_BYTES:,}: --ship-to has it come through a pool instead"
         )
-        return Returned(replace(result, run_id=None, score=None, error=why, pruned=False))
-    return Returned(result, bundle.read_bytes())
+        return TrialReturn(replace(result, run_id=None, score=None, error=why, pruned=False))
+    return TrialReturn(result, bundle.read_bytes())
 
 
 def _shipped(folder: Path, url: str) -> str:
-    """The UUID of the recording, which is in the pool then."""
-    from webots_mcp.plugins.pool.shipping import Order, Report, Source, ship
+    """Ship the recording to the pool, and return its UUID."""
+    from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
+    from webots_mcp.plugins.pool.shipping_source import ShippingSource
 
     recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
-    ship(Order(recording, partial(open_pool, url, ships=True), full=True, pictures=True), Report())
+    ship(
+        ShippingJob(recording, partial(open_pool, url, ships=True), full=True, pictures=True),
+        ShippingReport(),
+    )
     with recording.reader() as connection:
-        return Source(connection).uuid()
+        return ShippingSource(connection).uuid()
 
 
-class _Unwanted:
-    """Whether nobody wants the current task any more: it was cancelled, or its worker closes.
+class _Cancellation:
+    """Tells whether the current task was cancelled, or its worker is closing.
 
-    A client that is gone, killed or not, cancels what it asked for.
+    The tasks of a client that has ended, even by being killed, are cancelled.
     """
 
     def __init__(self, worker: Any) -> None:
@@ -217,7 +222,7 @@ class _Unwanted:
         self._key = worker.get_current_task()
 
     def wait(self, timeout: float | None = None, /) -> bool:
-        """Wait for so long; returns whether nobody wants it."""
+        """Wait for a timeout; return whether the task was cancelled."""
         time.sleep(timeout or 0.0)
         task = self._worker.state.tasks.get(self._key)
         return task is None or task.state == "cancelled" or self._closes
@@ -227,27 +232,29 @@ class _Unwanted:
         return self._worker.status.name in ("closing", "closed", "failed")
 
     def as_dask_says(self) -> Exception:
-        """What tells Dask that the task is not done; one whose worker closes runs elsewhere."""
+        """Return the exception that tells Dask to run the task elsewhere, or to end it."""
         from distributed import Reschedule
 
         return Reschedule() if self._closes else StoppedError()
 
 
-# -- where the set is -------------------------------------------------------------------------
+# -- functions of the process that runs the trial set -----------------------------------------
 
 
 class ClusterSimulators:
     """The simulators of a cluster's workers.
 
     Attributes:
-        client: Dask's.
-        address: Of the scheduler.
-        needs: What each worker has to have.
-        most: How many trials run at once at most; None for as many as there are workers.
-        notes: What its owner should know.
+        client: The client of Dask.
+        address: Address of the scheduler.
+        needs: What each worker needs.
+        most: Maximum of trials at once; None for as many as there are simulators.
+        notes: Notes for the user.
     """
 
-    def __init__(self, client: Any, address: str, needs: Needs, most: int | None) -> None:
+    def __init__(
+        self, client: Any, address: str, needs: WorkerRequirements, most: int | None
+    ) -> None:
         self.notes = _other_pythons(client)
         self._client = client
         self._address = address
@@ -260,10 +267,10 @@ class ClusterSimulators:
 
     @property
     def count(self) -> int:
-        """How many can run at once, now; one where workers may come back.
+        """Return how many trials can run at once now; 1 while missing workers may come back.
 
         Raises:
-            CommandRefusedError: The scheduler is gone, or its workers for a minute.
+            CommandRefusedError: The scheduler was lost, or has had no workers for a minute.
         """
         now_s = time.monotonic()
         if now_s >= self._look_again_s:
@@ -276,10 +283,10 @@ class ClusterSimulators:
         return max(1, min(self._count, self._most or self._count))
 
     def run(self, attempt: TrialAttempt) -> TrialResult:
-        """As `Simulators.run`."""
+        """Run a trial; see `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text
-        future: Future[Returned] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
+        future: Future[TrialReturn] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
         while not wait([future], _PATIENCE_S).done:
             if attempt.stopping.wait(0):
                 future.cancel()
@@ -295,20 +302,20 @@ class ClusterSimulators:
         return returned.result
 
     def _fetched(self, result: TrialResult, recording_uuid: str, folder: Path) -> TrialResult:
-        """The result, with its runs in a recording in the folder, as if it had been returned."""
+        """Fetch a shipped recording into the folder; return the result with the run's id there."""
         from webots_mcp.plugins.pool.fetching import fetch
-        from webots_mcp.plugins.pool.pool_contents import Meant, pooled_runs
+        from webots_mcp.plugins.pool.pool_contents import ChosenRuns, pooled_runs
 
         assert self._needs.ship_to is not None
         recording = RecordingAccess(folder / DATABASE_NAME, folder)
         recording.create()
         with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
             runs = [each for each in pooled_runs(pool) if each.recording_uuid == recording_uuid]
-            ids = fetch(pool, connection, folder, Meant(runs, ())).runs
+            ids = fetch(pool, connection, folder, ChosenRuns(runs, ())).runs
         (own,) = (ids[each.uuid] for each in runs if each.run_id == result.run_id)
         return replace(result, run_id=own)
 
-    def _returned(self, future: Future[Returned]) -> Returned:
+    def _returned(self, future: Future[TrialReturn]) -> TrialReturn:
         from distributed import KilledWorker
 
         try:
@@ -318,7 +325,7 @@ class ClusterSimulators:
                 f"{error.allowed_failures + 1} workers died while they ran it, the last one "
                 f"{error.last_worker.address}: see their logs"
             )
-            return Returned(TrialResult(None, None, why))
+            return TrialReturn(TrialResult(None, None, why))
         except CancelledError as error:
             raise CommandRefusedError(_LOST.format(self._address)) from error
         except WebotsMCPError:
@@ -338,25 +345,25 @@ def cluster(
     most: int | None = None,
     ship_to: str | None = None,
 ) -> Generator[ClusterSimulators]:
-    """The simulators of a cluster, as long as the block goes on.
+    """Connect to the simulators of a cluster for the duration of the block.
 
     Args:
-        address: Of the scheduler.
-        plan: Of the trials.
-        is_stand_in: Whether the stand-in runs them, and not Webots.
-        most: How many trials run at once at most; None for as many as there are workers.
-        ship_to: The URL of a pool through which the recordings come; None for the scheduler.
+        address: Address of the scheduler.
+        plan: The plan of the trials.
+        is_stand_in: Whether the stand-in runs them, not Webots.
+        most: Maximum of trials at once; None for as many as there are simulators.
+        ship_to: URL of a pool that passes the recordings on; None for the scheduler.
 
     Raises:
-        CommandRefusedError: Nobody answers there, no worker has a simulator, or one lacks
-            something.
-        InvalidInputError: It is no address, or Dask is not installed.
+        CommandRefusedError: The scheduler does not answer, no worker has a simulator, or a worker
+            lacks something.
+        InvalidInputError: The address is invalid, or Dask is not installed.
     """
     if ship_to is not None:
         _require_pool(ship_to)
         ship_to = ship_to if "://" in ship_to else str(Path(ship_to).absolute())
     with _connected(address) as client:
-        needs = Needs(VERSION, plan.world, digest_of(plan.world), is_stand_in, ship_to)
+        needs = WorkerRequirements(VERSION, plan.world, digest_of(plan.world), is_stand_in, ship_to)
         _require_fit(client, address, needs)
         yield ClusterSimulators(client, address, needs, most)
 
@@ -367,7 +374,7 @@ def _connected(address: str) -> Generator[Any]:
         distributed: Any = import_module("distributed")
     except ImportError as error:
         raise InvalidInputError(explain_extra("a cluster of Dask", "cluster")) from error
-    # That a scheduler was lost is told by who misses it, in a sentence and not by a traceback.
+    # A lost scheduler is reported in a sentence where it is noticed, not by Dask's traceback.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if not _ADDRESS.fullmatch(address):
         raise InvalidInputError(
@@ -394,14 +401,14 @@ def _connected(address: str) -> Generator[Any]:
 
 
 async def _kind_of_server(distributed: Any, address: str) -> str:
-    """`Scheduler` or `Worker`. A `Client` waits without end for the answer of what is neither."""
+    """Return `Scheduler` or `Worker`. A `Client` would wait for ever for any other server."""
     security = distributed.Security().get_connection_args("client")
     async with distributed.rpc(address, timeout=_CONNECT_S, connection_args=security) as server:
         return (await server.identity())["type"]
 
 
-def _require_fit(client: Any, address: str, needs: Needs) -> None:
-    """See that there are workers with simulators, which have what they need.
+def _require_fit(client: Any, address: str, needs: WorkerRequirements) -> None:
+    """Check that there are workers with simulators, and that they meet all requirements.
 
     Raises:
         CommandRefusedError: There is none, or one lacks something.
@@ -411,7 +418,7 @@ def _require_fit(client: Any, address: str, needs: Needs) -> None:
         raise CommandRefusedError(_no_workers(address, "yet"))
     lacks = [*_other_versions(client, workers)]
     if not lacks:
-        found = client.run(what_lacks, needs, workers=workers)
+        found = client.run(missing_requirement, needs, workers=workers)
         lacks = [f"worker {each}: {lack}" for each, lack in found.items() if lack is not None]
     if lacks:
         more = f" (and {len(lacks) - 1} other workers)" if len(lacks) > 1 else ""
@@ -419,18 +426,18 @@ def _require_fit(client: Any, address: str, needs: Needs) -> None:
 
 
 def _other_versions(client: Any, workers: list[str]) -> Iterator[str]:
-    """Workers of which Dask tells that they cannot even be asked: ours is not what is there."""
-    told = client.get_versions(packages=["webots_mcp"])["workers"]
+    """Yield workers with another version of webots-mcp, which cannot be asked for the rest."""
+    versions = client.get_versions(packages=["webots_mcp"])["workers"]
     for each in workers:
-        version = told[each]["packages"].get("webots_mcp")
+        version = versions[each]["packages"].get("webots_mcp")
         if version != VERSION:
             has = f"webots-mcp {version}" if version else "no webots-mcp"
-            python = told[each]["host"]["python"]
+            python = versions[each]["host"]["python"]
             yield f"worker {each} (Python {python}) has {has}: here is {VERSION}"
 
 
 def _other_pythons(client: Any) -> list[str]:
-    """Notes on workers whose Python is of another minor version: scores may hang on it."""
+    """Return notes on workers with another minor version of Python, which may change scores."""
     here, workers = python_version(), client.get_versions()["workers"]
     minor = here.split(".")[:2]
     pythons = {each: str(told["host"]["python"]) for each, told in workers.items()}
@@ -442,7 +449,7 @@ def _other_pythons(client: Any) -> list[str]:
 
 
 def _simulators_of(client: Any, address: str) -> dict[str, int]:
-    """How many simulators each worker runs at once, by its address."""
+    """Return how many simulators each worker can run at once, by its address."""
     try:
         workers = client.scheduler_info(n_workers=-1)["workers"]
     except Exception as error:
@@ -462,15 +469,15 @@ def _no_workers(address: str, when: str) -> str:
 
 
 def _call(*arguments: Any) -> Callable[[str], Any]:
-    """What calls a function of that name with these arguments.
+    """Return a function that calls a function by its name with these arguments.
 
-    The scheduler unpacks what it passes on, and need not have this package: only a worker looks
-    the name up.
+    The scheduler unpickles what it passes on, and may lack this package. Only a worker resolves
+    the name.
     """
-    toolz: Any = import_module("toolz")  # a part of Dask
+    toolz: Any = import_module("toolz")  # A dependency of Dask.
     return toolz.compose(methodcaller("__call__", *arguments), resolve_name)
 
 
 def _alone(plan: WorldPlan, values: dict[str, Any]) -> WorldPlan:
-    """A plan of one trial: a worker need not know of the others."""
+    """Return a plan of one trial, as a worker needs no others."""
     return replace(plan, parameters=[values], repeats=1, ranges={}, search=None, sets=0, seed=0)

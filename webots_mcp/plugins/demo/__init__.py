@@ -1,4 +1,4 @@
-"""The main job without Webots: `webots-mcp demo` and `webots-mcp launch --stand-in`."""
+"""Running robots without Webots: `webots-mcp demo` and `webots-mcp launch --stand-in`."""
 
 from webots_mcp.extras.plugins import Plugin, PluginCommand
 

@@ -1,7 +1,7 @@
-"""`webots-mcp demo`: the main job from end to end, with nothing installed but this package.
+"""`webots-mcp demo`: a conversation about a driving robot, with only this package installed.
 
-A robot drives in the stand-in's arena (a real controller process that records into a real
-database), an MCP server runs next to it, and a real MCP client asks over stdio.
+A robot drives in the stand-in's arena: a real controller process that records into a real database.
+An MCP server runs next to it, and a real MCP client asks it over stdio.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ if TYPE_CHECKING:
 DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
 _START_TIMEOUT_S: Final = 30.0
 _ANSWER_LINES: Final = 24
-_ROWS: Final = 6  # of a table
+_ROWS: Final = 6  # Of a table.
+
 Turn = tuple[str, str, dict[str, Any]]
-# What a person would say, and the tool call that an assistant makes of it.
+# What a person would say, and the tool call that an assistant would make.
 CONVERSATION: Final[tuple[Turn, ...]] = (
     ("What is the robot doing?", "webots_get_robot_state", {}),
     ("What do its sensors say?", "webots_get_sensors", {}),
@@ -71,13 +72,13 @@ CONVERSATION: Final[tuple[Turn, ...]] = (
     ),
     ("Draw the way it took.", "webots_plot", {"kind": "trajectory"}),
     ("Start over.", "webots_simulation_control", {"command": "reset"}),
-    (  # so that the newest run is one worth looking at afterwards
+    (  # Leaves a longer run as the newest one.
         "Drive for half a minute, as fast as you can, and stop there.",
         "webots_run",
         {"for_s": 30, "then": "pause"},
     ),
 )
-_JOB: Final = "demo"  # one process at a time does it in a folder
+_JOB: Final = "demo"  # One process at a time does this job in a folder.
 
 
 def demo(
@@ -106,18 +107,18 @@ def run(
     as_json: bool = False,
     conversation: tuple[Turn, ...] = CONVERSATION,
 ) -> None:
-    """Run the demo; prints each question with its answer.
+    """Run the demo, and print each question with its answer.
 
     Args:
-        data_dir: Where the database and the pictures go.
-        keep: Leave the robot running until Ctrl-C, so that another client can connect.
-        as_json: Print this to stderr, and to stdout one JSON object of the answers.
-        conversation: What is asked.
+        data_dir: Folder of the database and the pictures.
+        keep: Whether to keep the robot running until Ctrl-C, for other clients.
+        as_json: Whether to print this to stderr, and one JSON object of the answers to stdout.
+        conversation: The questions with their tool calls.
 
     Raises:
-        CommandRefusedError: A demo is running there.
-        DatabaseError: Nothing can be recorded there.
-        NothingRecordedError: The controller did not come up.
+        CommandRefusedError: A demo is running in this folder.
+        DatabaseError: The folder cannot be recorded in.
+        NothingRecordedError: The controller recorded nothing.
         WebotsMCPError: The server answered with an error.
     """
     import anyio
@@ -126,7 +127,7 @@ def run(
     from webots_mcp.standin.in_process import DEFAULT_WORLD
 
     recording = RecordingAccess(data_dir / DATABASE_NAME, data_dir)
-    recording.create()  # a robot only waits for a bad folder
+    recording.create()  # Raises for an unusable folder, for which a robot would only wait.
     shown = contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout)
     environment = {DATA_DIR_VARIABLE: str(data_dir)}
     with _alone(recording), Simulation(DEFAULT_WORLD, environment=environment) as simulation:
@@ -146,10 +147,10 @@ def run(
 
 @contextlib.contextmanager
 def _alone(recording: RecordingAccess) -> Generator[None]:
-    """Let no other demo record in the same folder meanwhile: its answers would be of both robots.
+    """Prevent a second demo in the same folder, whose robot would mix with this one.
 
     Raises:
-        CommandRefusedError: One does already.
+        CommandRefusedError: A demo is running in this folder.
     """
     lease = lease_of(_JOB)
     with recording.writer() as connection:
@@ -169,13 +170,17 @@ def _alone(recording: RecordingAccess) -> Generator[None]:
 
 
 def _was_killed(holder: str) -> bool:
-    """Whether the process that took the lease is known to be gone."""
+    """Return whether the process that took the lease is known to have ended."""
     host, pid, _ = holder.rsplit(" ", 2)
     return host == host_name() and not process_alive(int(pid), None, time.time())
 
 
 def _wait_for_rows(simulation: Simulation, data_dir: Path) -> None:
-    """Until the controller that was just started has published and saved a picture."""
+    """Wait until the started controller has published and saved a picture.
+
+    Raises:
+        NothingRecordedError: It has not in time.
+    """
     before = _newest_image(data_dir)
     try:
         simulation.wait_for(lambda: _newest_image(data_dir) > before, _START_TIMEOUT_S)
@@ -194,10 +199,10 @@ def _newest_image(data_dir: Path) -> int:
 
 
 async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> list[dict[str, Any]]:
-    """Ask everything, and print it; returns each question with its call and its answer.
+    """Ask all questions and print the answers; return each question with its call and answer.
 
     Raises:
-        WebotsMCPError: An answer is an error.
+        WebotsMCPError: The server answered with an error.
     """
     answers: list[dict[str, Any]] = []
     async with _client(data_dir) as client:
@@ -225,13 +230,13 @@ async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> list[dict[
                 _save_plot(result, data_dir / f"{arguments.get('kind', 'signals')}.png")
         else:
             return answers
-    # only here: what is raised before the client has ended comes out as a group of exceptions
+    # Raised after the client has ended: before, it would become a group of exceptions.
     raise WebotsMCPError("the demo's server answered with an error, see above")
 
 
 @contextlib.asynccontextmanager
 async def _client(data_dir: Path) -> AsyncGenerator[Client, None]:
-    """A client on a server of its own; what the server warns of appears on stderr."""
+    """Connect a client to its own server, whose warnings appear on stderr."""
     from mcp import Client, StdioServerParameters
 
     server = StdioServerParameters(
@@ -252,7 +257,7 @@ def _clear_progress() -> None:
 
 
 def _show(result: CallToolResult) -> None:
-    """The answer as a person reads it; the assistant gets the same as JSON."""
+    """Print an answer for a person. An assistant gets the same as JSON."""
     if data := _data_of(result):
         return _show_answer(data)
     for text in _texts_of(result):
@@ -263,7 +268,7 @@ def _show(result: CallToolResult) -> None:
 
 
 def _data_of(result: CallToolResult) -> dict[str, Any] | None:
-    """What it answers as data; None where it is pictures with captions, or an error."""
+    """Return the data of an answer; None for pictures with captions, or an error."""
     if result.is_error or result.structured_content is not None:
         return None if result.is_error else result.structured_content
     found = (json.loads(text) for text in _texts_of(result) if text.startswith("{"))
@@ -275,7 +280,7 @@ def _texts_of(result: CallToolResult) -> list[str]:
 
 
 def _show_answer(answer: Mapping[str, Any]) -> None:
-    """Its first lines, and how many more there are."""
+    """Print the first lines of an answer, and the number of further lines."""
     lines = list(answer_lines(answer, most_rows=_ROWS))
     for line in lines[:_ANSWER_LINES]:
         _say(f"    {line}")
@@ -284,7 +289,7 @@ def _show_answer(answer: Mapping[str, Any]) -> None:
 
 
 def _save_plot(result: CallToolResult, file: Path) -> None:
-    """A plot is in its answer alone; what cameras saw and screenshots lie in files already."""
+    """Save a plot. Unlike camera images and screenshots, it is in no file yet."""
     (image,) = (block for block in result.content if block.type == "image")
     with whole_file(file) as aside:
         aside.write_bytes(_bytes(image))
@@ -311,7 +316,7 @@ def _show_database(data_dir: Path) -> None:
 
 
 def _show_connections(data_dir: Path) -> None:
-    """As docs/clients.md says it, with this environment's full paths."""
+    """Print the entries of docs/clients.md with the full paths of this environment."""
     command = server_command(data_dir)
     entry = {"mcpServers": {"webots": {"command": command[0], "args": command[1:]}}}
     _say("\nConnect an assistant to this recording. Claude Code by one line:")
@@ -332,7 +337,7 @@ def _show_next_steps(data_dir: Path, *, keep: bool) -> None:
 
 
 def _typed(command: str, data_dir: Path) -> str:
-    """A command on this recording, to be typed whatever the PATH is."""
+    """Return a command on this recording that works with any PATH."""
     program = server_command(data_dir)
     place = program.index("serve")
     return quoted([*program[:place], command, *program[place + 1 :]])

@@ -1,4 +1,4 @@
-"""All that a range holds, as the formats of viewers take it: not its states alone."""
+"""Everything that a time range holds, for the formats of viewers: states, logs, events and more."""
 
 from __future__ import annotations
 
@@ -7,30 +7,20 @@ import math
 import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
-from importlib import import_module
-from itertools import islice
+from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
-from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.extras.requirements import install_line
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import Motion, find_motion
 from webots_mcp.signals.naming import FARTHEST_M, metres_in
-from webots_mcp.store.chunk_table import ColumnCells
 from webots_mcp.store.export import (
     CHUNK_ROWS,
-    Column,
-    ColumnKind,
-    ExportTable,
-    FlatRow,
     Progress,
     Recorded,
     StateTable,
-    as_text,
 )
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.catalogue import known_signals
@@ -39,11 +29,11 @@ from webots_mcp.store.reading.segment import Segment
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, EventRecord, StoredImage, columns_of
 from webots_mcp.store.signals import RegisteredSignal
 
-# What there is to count, in the order in which it is told.
+# What is counted, in the order in which it is reported.
 KINDS: Final = (
     "states", "log lines", "events", "commands", "pictures", "pictures that are gone",
 )  # fmt: skip
-_WAY_POSES: Final = 1000  # of a run at least, in its way
+_PATH_POSES: Final = 1000  # Minimum of poses in the path of a longer run.
 _IN_SEGMENT: Final = (
     "sim_time_s >= :start_s AND sim_time_s < :end_s "
     "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
@@ -52,8 +42,8 @@ _PAGE: Final = (
     f"SELECT {{columns}} FROM {{table}} WHERE run_id = :run_id AND {_IN_SEGMENT} "
     "AND (sim_time_s > :start_s OR id > :after_id) ORDER BY sim_time_s, id LIMIT :limit"
 )
-# A command belongs to the run of its robot that went on when it was claimed, else created. One that
-# nobody claimed stands at the newest state before it.
+# A command belongs to the run of its robot during which it was claimed, else created. A command
+# that was never claimed gets the time of the newest state before it.
 _COMMANDS: Final = (
     "WITH own AS (SELECT id AS run_id, robot_id, started_sim_time_s, started_wall_time_s, "
     "coalesce((SELECT min(n.started_wall_time_s) FROM run n WHERE n.robot_id = r.robot_id "
@@ -73,12 +63,11 @@ _RUN: Final = (
     "FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?"
 )
 _PARAMETERS: Final = "SELECT name, value FROM parameter_value WHERE run_id = ? ORDER BY id"
-_GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
 
 
 @dataclass(frozen=True)
 class PlacedCommand:
-    """A command and its fate, with its run and when it was claimed, or else created."""
+    """A command and its outcome, with its run and the time it was claimed, else created."""
 
     id: int
     run_id: int
@@ -95,7 +84,7 @@ class PlacedCommand:
 
 
 class Pose(NamedTuple):
-    """Where a robot is, and where it looks (0 where nothing tells)."""
+    """Position and heading of a robot; 0 for what is unknown."""
 
     x_m: float
     y_m: float
@@ -103,8 +92,8 @@ class Pose(NamedTuple):
     yaw_rad: float
 
 
-class Way:
-    """Poses of a run, as many as a viewer draws at once: every second one goes when it is full."""
+class SampledPath:
+    """A sample of the poses of a run. When it is full, every second pose is removed."""
 
     def __init__(self) -> None:
         self.poses: list[Pose] = []
@@ -112,14 +101,14 @@ class Way:
         self._every = 1
         self._seen = 0
 
-    def see(self, recorded: Recorded, pose: Pose) -> None:
-        """Take in the pose of a state, if it is its turn."""
+    def add(self, recorded: Recorded, pose: Pose) -> None:
+        """Add the pose of a state, if it is due."""
         self._seen += 1
         if self._seen % self._every:
             return
         self.first = self.first or recorded
         self.poses.append(pose)
-        if len(self.poses) == 2 * _WAY_POSES:
+        if len(self.poses) == 2 * _PATH_POSES:
             del self.poses[::2]
             self._every *= 2
 
@@ -130,7 +119,7 @@ _Row = TypeVar("_Row", LogLine, EventRecord, StoredImage)
 
 @dataclass(frozen=True)
 class Contents:
-    """A range with all that was recorded in it; everything can be read more than once."""
+    """A time range with everything that was recorded in it. All of it can be read repeatedly."""
 
     connection: sqlite3.Connection
     data_dir: Path
@@ -146,27 +135,27 @@ class Contents:
         passes: int,
         progress: Progress | None,
     ) -> Contents:
-        """What the range has now, of which the states will be read `passes` times."""
+        """Return the contents of a range, whose states will be read `passes` times."""
         source = StateTable.of(connection, wanted.segments, passes, progress)
         return cls(connection, data_dir, wanted, source)
 
     @property
     def run_ids(self) -> list[int]:
-        """The runs, in order."""
+        """Return the ids of the runs, in order."""
         return [segment.run_id for segment in self.wanted.segments]
 
     @cached_property
     def signals(self) -> dict[str, RegisteredSignal]:
-        """All of the robot, by name."""
+        """Return all signals of the robot, by name."""
         return known_signals(self.connection, self.wanted)
 
     @cached_property
     def motion(self) -> Motion:
-        """Which of them tell how the robot moves."""
+        """Return the signals that describe how the robot moves."""
         return find_motion(self.signals, EventOptions())
 
     def items(self, pass_number: int) -> Iterator[Item]:
-        """Everything, run by run, in the order of simulation time."""
+        """Yield everything, run by run, in the order of simulation time."""
         streams = (
             self.source.recorded(pass_number),
             self.log_lines(),
@@ -177,26 +166,26 @@ class Contents:
         return heapq.merge(*streams, key=attrgetter("run_id", "sim_time_s"))
 
     def log_lines(self) -> Iterator[LogLine]:
-        """What was logged in the runs themselves."""
+        """Yield the log lines of the runs."""
         return self._pages("log", LogLine)
 
     def events(self) -> Iterator[EventRecord]:
-        """What the bridge noticed."""
+        """Yield the events that the bridge stored."""
         return self._pages("event", EventRecord)
 
     def images(self) -> Iterator[StoredImage]:
-        """Rows of pictures, whether or not their files are still there."""
+        """Yield the rows of pictures, whether or not their files still exist."""
         return self._pages("image", StoredImage)
 
     def commands(self) -> Iterator[PlacedCommand]:
-        """What was asked of the robot."""
+        """Yield the commands to the robot."""
         query = _COMMANDS.format(columns=columns_of(PlacedCommand))
         for segment in self.wanted.segments:
             for row in self.connection.execute(query, _bounds(segment)).fetchall():
                 yield PlacedCommand(*row)
 
     def picture(self, image: StoredImage) -> bytes | None:
-        """The file; None where it is gone, or is none that is opened."""
+        """Return the file of a picture; None if it is missing or not allowed."""
         try:
             file = image.file(self.data_dir)
             return file.read_bytes() if file.stat().st_size <= MAX_FILE_BYTES else None
@@ -204,7 +193,7 @@ class Contents:
             return None
 
     def pose(self, value_of: Callable[[str], Any]) -> Pose | None:
-        """The pose in a state, of which `value_of` gives values by name; None without one."""
+        """Return the pose in a state, whose values `value_of` returns by name; None without one."""
         if self.motion.position is None:
             return None
         x_m, y_m = (_metres(value_of, signal) for signal in self.motion.position)
@@ -215,14 +204,14 @@ class Contents:
         return Pose(x_m, y_m, z_m or 0.0, _radians(value_of, heading) if heading else 0.0)
 
     def about(self, run_id: int) -> dict[str, str]:
-        """Which run it is: uuid, robot, world, code, parameters; what is not known is left out."""
+        """Return the known facts of a run: uuid, robot, world, code, parameters."""
         cursor = self.connection.execute(_RUN, (run_id,))
         names = [column[0] for column in cursor.description]
-        told: dict[str, Any] = {"run_id": run_id, "robot": self.wanted.robot}
-        told |= dict(zip(names, cursor.fetchone(), strict=True))
+        facts: dict[str, Any] = {"run_id": run_id, "robot": self.wanted.robot}
+        facts |= dict(zip(names, cursor.fetchone(), strict=True))
         for name, value in self.connection.execute(_PARAMETERS, (run_id,)):
-            told[f"parameter {name}"] = value  # the last one that it had
-        return {name: str(value) for name, value in told.items() if value is not None}
+            facts[f"parameter {name}"] = value  # The last value.
+        return {name: str(value) for name, value in facts.items() if value is not None}
 
     def _pages(self, table: str, row: type[_Row]) -> Iterator[_Row]:
         query = _PAGE.format(columns=columns_of(row), table=table)
@@ -258,71 +247,3 @@ def _metres(value_of: Callable[[str], Any], signal: RegisteredSignal) -> float |
 
 def _radians(value_of: Callable[[str], Any], heading: RegisteredSignal) -> float:
     return _number(value_of, heading, math.tau / (heading.turn or math.tau)) or 0.0
-
-
-# Rows as Parquet, through the extra `parquet` (pyarrow).
-
-
-def write_parquet(source: ExportTable, sink: BinaryIO) -> None:
-    """One column per dotted name: int64, double (NaN where a value was not a number), bool, text.
-
-    A long array of numbers is a list of doubles; a column of several kinds is text.
-
-    Raises:
-        InvalidInputError: pyarrow is not installed.
-    """
-    arrow, parquet = _pyarrow()
-    by_column = source.by_column() if isinstance(source, StateTable) else None
-    columns = [each for _, each in by_column.columns] if by_column else source.columns()
-    types = {
-        "null": arrow.null(), "bool": arrow.bool_(), "int": arrow.int64(),
-        "num": arrow.float64(), "text": arrow.string(), "numbers": arrow.list_(arrow.float64()),
-    }  # fmt: skip
-    schema = arrow.schema(
-        [(column.name, types[column.kind]) for column in (*source.head, *columns)]
-    )
-    with parquet.ParquetWriter(sink, schema, compression="zstd") as writer:
-        if by_column is not None:
-            for head, cells in by_column.slices(_GROUP_ROWS):
-                arrays = [*head, *map(partial(_array, arrow), cells, columns)]
-                writer.write_table(arrow.table(arrays, schema=schema))
-            return
-        rows = source.rows(pass_number=2)
-        while group := list(islice(rows, _GROUP_ROWS)):
-            arrays = [*zip(*(row.head for row in group), strict=True)]
-            arrays += [_values(group, column) for column in columns]
-            writer.write_table(arrow.table(arrays, schema=schema))
-
-
-def _pyarrow() -> tuple[Any, Any]:
-    try:
-        return import_module("pyarrow"), import_module("pyarrow.parquet")
-    except ImportError as error:
-        raise InvalidInputError(
-            f"a Parquet file needs pyarrow: {install_line(['pyarrow'])}; or export as csv or jsonl"
-        ) from error
-
-
-def _array(arrow: Any, cells: ColumnCells, column: Column) -> Any:
-    """The cells of a column as Arrow has them."""
-    if column.kind == "null":
-        return arrow.nulls(len(cells.is_null))
-    if column.kind == "text":
-        texts = arrow.array(cells.labels or [""], arrow.string())
-        places = arrow.array(cells.values.astype(np.int32), mask=cells.is_null)
-        return arrow.DictionaryArray.from_arrays(places, texts).cast(arrow.string())
-    return arrow.array(cells.values, mask=cells.is_null)
-
-
-def _values(group: list[FlatRow], column: Column) -> list[Any]:
-    convert = _CONVERSIONS.get(column.kind)
-    values = [row.values.get(column.name) for row in group]
-    return values if convert is None else [v if v is None else convert(v) for v in values]
-
-
-# Arrow refuses an integer that a double cannot hold exactly.
-_CONVERSIONS: Final[dict[ColumnKind, Callable[[Any], object]]] = {
-    "text": as_text,
-    "num": float,
-    "numbers": lambda items: [*map(float, items)],
-}

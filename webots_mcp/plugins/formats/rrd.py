@@ -1,6 +1,6 @@
-"""A range as a recording of Rerun's, through the extra `rerun` (rerun-sdk 0.24 or newer).
+"""A time range as a recording of Rerun, through the extra `rerun` (rerun-sdk 0.24 or newer).
 
-Everything stands on two timelines: `sim_time`, a duration, and `wall_time`, a timestamp.
+Everything has two timelines: `sim_time`, a duration, and `wall_time`, a timestamp.
 """
 
 from __future__ import annotations
@@ -26,8 +26,15 @@ from webots_mcp.analysis.arrays import np
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import explain_extra
-from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way
-from webots_mcp.plugins.formats.mcap import main_signals
+from webots_mcp.plugins.formats.contents import (
+    KINDS,
+    Contents,
+    Item,
+    PlacedCommand,
+    Pose,
+    SampledPath,
+)
+from webots_mcp.plugins.formats.mcap_layout import main_signals
 from webots_mcp.store.export import (
     Exported,
     FlatRow,
@@ -42,8 +49,8 @@ from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import EventRecord
 
 _COPY_BYTES: Final = 1 << 16
-_GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
-_LEVELS: Final = {"warning": "WARN"}  # Rerun's other names are ours in capitals
+_GROUP_ROWS: Final = 10_000  # About 10 MB of rows in memory at a time.
+_LEVELS: Final = {"warning": "WARN"}  # Rerun's other names are ours in capitals.
 _MEDIA_TYPES: Final = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg"}
 _WORLD: Final = "world"
 _Item = TypeVar("_Item", bound=Item)
@@ -56,33 +63,33 @@ def export_rrd(
     file: Path,
     progress: Progress | None = None,
 ) -> Exported:
-    """As `export_for_viewers`."""
+    """Export a range; see `export_for_viewers`."""
     with placed(file) as aside:
         contents = Contents.of(connection, data_dir, wanted, 1, progress)
         return Exported(write_rrd(contents, aside), notes=contents.source.notes)
 
 
 def write_rrd(contents: Contents, file: Path) -> Counter[str]:
-    """Everything of a range, in columns.
+    """Write everything of a range, in columns.
 
-    Each number and flag of the states is scalars of an entity of its own (flags are 0 and 1, a long
-    array is several scalars at a time), each text its changes; null is nothing. The entities are
-    /ROBOT/state/..., /ROBOT/camera/DEVICE, /ROBOT/screenshot, /ROBOT/log, /ROBOT/events,
-    /ROBOT/commands and /world/ROBOT, of several runs below /run_ID each.
+    Each number and flag of the states is an entity of scalars: flags are 0 and 1, a long array is
+    several scalars at a time. A text is an entity of its changes; null is left out. The entities
+    are /ROBOT/state/..., /ROBOT/camera/DEVICE, /ROBOT/screenshot, /ROBOT/log, /ROBOT/events,
+    /ROBOT/commands and /world/ROBOT. If there are several runs, all begin with /run_ID.
 
     Returns:
-        How many there are of each kind.
+        The number of items of each kind.
 
     Raises:
         InvalidInputError: The library is not installed, or is switched off.
-        OSError: The file takes no more.
+        OSError: The file cannot be written, such as on a full disk.
     """
     rerun = _library()
     with warnings.catch_warnings():
         warnings.simplefilter("error", rerun.error_utils.RerunWarning)
         stream = rerun.RecordingStream("webots_mcp", recording_id=_recording_id(contents))
-        with _Saved(file) as saved:
-            writing = _Writing(contents, rerun, stream, saved)
+        with _PipedFile(file) as saved:
+            writing = _RerunWriter(contents, rerun, stream, saved)
             stream.save(str(saved.path), default_blueprint=writing.blueprint())
             saved.begin()
             try:
@@ -94,11 +101,11 @@ def write_rrd(contents: Contents, file: Path) -> Counter[str]:
     return writing.counts
 
 
-class _Saved:
-    """A pipe for Rerun to save to, of which a thread of ours writes the bytes to the file.
+class _PipedFile:
+    """A pipe that Rerun saves to, and a thread that copies it to the file.
 
-    Rerun's own thread stops at the first byte that a full disk refuses, and whoever flushes then
-    waits for it for ever. A pipe takes everything; `check` raises what the file has refused.
+    On a full disk Rerun's own thread stops, and a flush then waits for it for ever. The pipe
+    accepts everything, and `check` raises the error of the file.
     """
 
     def __init__(self, file: Path) -> None:
@@ -109,13 +116,15 @@ class _Saved:
         self._error: OSError | None = None
         self._thread = Thread(target=self._copy, name="rrd")
 
-    def __enter__(self) -> _Saved:
-        if sys.platform != "win32":  # has no pipes among its files: Rerun writes the file itself
+    def __enter__(self) -> _PipedFile:
+        if sys.platform != "win32":  # Windows has no named pipes in folders: Rerun writes the file.
             self._folder = TemporaryDirectory()
             self.path = Path(self._folder.name, "pipe")
             try:
                 os.mkfifo(self.path)
-                self._end = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # no writer yet
+                self._end = os.open(
+                    self.path, os.O_RDONLY | os.O_NONBLOCK
+                )  # Does not wait for a writer.
                 os.set_blocking(self._end, True)
             except OSError:
                 self._folder.cleanup()
@@ -123,12 +132,12 @@ class _Saved:
         return self
 
     def begin(self) -> None:
-        """Write from here on: Rerun has opened the pipe."""
+        """Start the copy, once Rerun has opened the pipe."""
         if self._folder:
             self._thread.start()
 
     def check(self) -> None:
-        """Raise the OSError of the file, if it takes no more."""
+        """Raise the OSError of the file, if there was one."""
         if self._error:
             raise self._error
 
@@ -148,7 +157,7 @@ class _Saved:
         except OSError as error:
             self._error = error
         finally:
-            while os.read(self._end, _COPY_BYTES):  # Rerun waits until all of it has been taken
+            while os.read(self._end, _COPY_BYTES):  # Rerun waits until everything was read.
                 pass
 
 
@@ -163,33 +172,33 @@ def _library() -> Any:
 
 
 def _recording_id(contents: Contents) -> str:
-    """The same for the same runs: a viewer shows one that is opened again as the same."""
+    """Return an id that is the same for the same runs, so that viewers recognize them."""
     names = [contents.about(run_id).get("uuid", f"{run_id}") for run_id in contents.run_ids]
     return names[0] if len(names) == 1 else str(uuid5(NAMESPACE_URL, " ".join(names)))
 
 
 class _Times(NamedTuple):
-    """Of the items of a group, as NumPy has durations and timestamps."""
+    """Simulation and wall times of a group of items, as NumPy arrays."""
 
     sim: Any
     wall: Any
 
 
-class _Writing:
-    """A recording that is being written."""
+class _RerunWriter:
+    """Writes a recording of Rerun."""
 
-    def __init__(self, contents: Contents, rerun: Any, stream: Any, saved: _Saved) -> None:
+    def __init__(self, contents: Contents, rerun: Any, stream: Any, saved: _PipedFile) -> None:
         self.counts: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
         self._contents = contents
         self._rerun = rerun
         self._stream = stream
         self._saved = saved
-        self._text_type = getattr(rerun, "StateChange", None)  # Rerun 0.33 and newer
+        self._text_type = getattr(rerun, "StateChange", None)  # In Rerun 0.33 and newer.
         self._last_texts: dict[tuple[int, str], str | None] = {}
         self._several = len(contents.run_ids) > 1
 
     def blueprint(self) -> Any:
-        """Views of the main signals, the way, the pictures and the log."""
+        """Return a layout of the main signals, the path, the pictures and the log."""
         views, run_id = self._rerun.blueprint, self._contents.run_ids[-1]
         shown = [
             self._path(each, "state", *signal.name.split("."))
@@ -206,7 +215,7 @@ class _Writing:
         return views.Blueprint(views.Grid(*parts), collapse_panels=False)
 
     def write(self) -> None:
-        """All of it."""
+        """Write everything."""
         contents = self._contents
         for run_id in contents.run_ids:
             about = self._rerun.AnyValues(**_identifiers(contents.about(run_id)))
@@ -220,17 +229,17 @@ class _Writing:
     def _write_states(self) -> None:
         recorded = self._contents.source.recorded()
         for run_id, rows in groupby(recorded, attrgetter("run_id")):
-            way = Way()
+            path = SampledPath()
             for group in _groups(rows):
                 self.counts["states"] += len(group)
-                self._write_group(run_id, group, [flat_row(each) for each in group], way)
-            if way.poses:
-                points = [[pose.x_m, pose.y_m, pose.z_m] for pose in way.poses]
+                self._write_group(run_id, group, [flat_row(each) for each in group], path)
+            if path.poses:
+                points = [[pose.x_m, pose.y_m, pose.z_m] for pose in path.poses]
                 line = self._rerun.LineStrips3D([points])
                 self._stream.log(f"{self._frame(run_id)}_way", line, static=True)
 
     def _write_group(
-        self, run_id: int, group: Sequence[Recorded], rows: Sequence[FlatRow], way: Way
+        self, run_id: int, group: Sequence[Recorded], rows: Sequence[FlatRow], path: SampledPath
     ) -> None:
         numbers, texts = dict[str, list[tuple[int, Any]]](), dict[str, list[tuple[int, str]]]()
         poses: list[tuple[int, Pose]] = []
@@ -240,7 +249,7 @@ class _Writing:
             pose = self._contents.pose(row.values.get)
             if pose is not None:
                 poses.append((index, pose))
-                way.see(group[index], pose)
+                path.add(group[index], pose)
         times = _times(group)
         for name, pairs in numbers.items():
             self._send(self._signal(run_id, name), times, pairs, self._scalars(pairs))
@@ -292,11 +301,11 @@ class _Writing:
             quaternion=[[0.0, 0.0, math.sin(half), math.cos(half)] for half in halves],
         )
 
-    def _write_lines(self, kind: str, name: str, items: Iterable[Any], told: Any) -> None:
+    def _write_lines(self, kind: str, name: str, items: Iterable[Any], text_of: Any) -> None:
         for run_id, rows in groupby(items, attrgetter("run_id")):
             for group in _groups(rows):
                 self.counts[kind] += len(group)
-                texts, levels = zip(*map(told, group), strict=True)
+                texts, levels = zip(*map(text_of, group), strict=True)
                 lines = self._rerun.TextLog.columns(text=texts, level=levels)
                 self._send(self._path(run_id, name), _times(group), [*enumerate(texts)], lines)
 
@@ -313,7 +322,7 @@ class _Writing:
     def _send(
         self, path: str, times: _Times, pairs: Sequence[tuple[int, Any]], columns: Any
     ) -> None:
-        """Columns for those items of a group that `pairs` names, with their times."""
+        """Send columns of the items of a group whose indices are in `pairs`, with their times."""
         chosen = [index for index, _ in pairs]
         column = self._rerun.TimeColumn
         indexes = [
@@ -365,6 +374,6 @@ def _event_text(event: EventRecord) -> tuple[str, str]:
 
 
 def _command_text(command: PlacedCommand) -> tuple[str, str]:
-    fate = command.error or command.result
-    told = f"{command.action} {command.params}: {command.status}"
-    return f"{told} {fate}" if fate else told, "ERROR" if command.error else "INFO"
+    outcome = command.error or command.result
+    text = f"{command.action} {command.params}: {command.status}"
+    return f"{text} {outcome}" if outcome else text, "ERROR" if command.error else "INFO"

@@ -1,7 +1,7 @@
 """A live page of a recording in the browser: `webots-mcp view`.
 
-A server on loopback. It asks the same questions as the tools, on connections that cannot
-write; what a button does goes the way that the tools' commands go.
+A server on loopback answers the page with the same questions as the tools, on connections that
+cannot write. Its buttons send the same commands as the tools.
 """
 
 from webots_mcp.extras.plugins import Plugin, PluginCommand

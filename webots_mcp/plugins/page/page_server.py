@@ -1,7 +1,7 @@
-"""The server of the page: on loopback only, for who was told its address.
+"""The HTTP server of the live page, which listens on loopback only.
 
-Everything lies below a key that is made from the user's access token and is part of the address:
-other users of this computer, and web sites that a browser here shows, do not know it.
+All paths begin with a key that is made from the user's access token. Other users of this computer,
+and web sites in a browser on it, do not know the key.
 """
 
 from __future__ import annotations
@@ -16,39 +16,45 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import parse_qsl
 
-import anyio
-
-from webots_mcp.answers.models import CommandAnswer
-from webots_mcp.contract import VERSION
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
-from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
-from webots_mcp.questions.parameters import set_parameters
+from webots_mcp.plugins.page.chunk_maker import ChunkMaker
+from webots_mcp.plugins.page.page_data import draw, page_request, picture, problem, robot_status
+from webots_mcp.plugins.page.steering import steer, tune
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
-from webots_mcp.signals.parameter import Value
-from webots_mcp.simulator.orders import Order
-from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.steering.routes import Attempt
-from webots_mcp.store.chunk_making import make_missing_chunks
 from webots_mcp.store.recording import RecordingAccess
-from webots_mcp.store.requests import OpenRequest, Requester
+
+
+@dataclass(frozen=True)
+class PageLimits:
+    """Limits of the server of the page."""
+
+    tabs: int = 20
+    """Open tabs; each reads the recording five times a second."""
+    tab_s: float = 15.0
+    """How long a tab counts as open after its last request."""
+    connections: int = 160
+    """Connections; browsers make at most 6 for each tab."""
+    idle_s: float = 60.0
+    """Waiting time for the next request of a connection, and for writing an answer."""
+    request_s: float = 10.0
+    """Time from the first byte of a request to its last."""
+    request_bytes: int = 100_000
+    """Bytes of the body of a request."""
+    length_digits: int = 9
+    """Digits that are read of a Content-Length; a longer number is too large anyway."""
+
+
+LIMITS: Final = PageLimits()
 
 HOST: Final = LOOPBACK[0]
-MOST_TABS: Final = 20  # each reads the recording five times a second
 ORDERS: Final = ("pause", "resume", "step", "reset")
-_TAB_S: Final = 15.0  # for so long a tab counts as open after it asked
-MOST_CONNECTIONS: Final = 160  # a browser has at most 6 for each of the tabs
-_IDLE_S: Final = 60.0  # for the next request of a connection, and to write an answer
-_REQUEST_S: Final = 10.0  # from the first byte of a request to its last
-_MOST_BYTES: Final = 100_000  # of a request
-_MOST_DIGITS: Final = 9  # that are read of a length, which is too large with so many
 _log: Final = logging.getLogger(__name__)
 _PARTS: Final = Path(__file__).parent / "parts"
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
@@ -62,10 +68,11 @@ _UNTOLD: Final = (
 )
 _CLOSED: Final = "There is no valid token: 'webots-mcp token' says what is wrong.\n"
 _FULL: Final = (
-    f"{MOST_TABS} tabs of this page are open: close one, wait a quarter of a minute, and open this "
-    "one again.\n"
+    f"{LIMITS.tabs} tabs of this page are open: close one, wait a quarter of a minute, and open "
+    "this one again.\n"
 )
-_HEADERS: Final = {  # no other page may show it, or be told its address; it loads its own parts
+# No other page may embed the page or learn its address. It loads only its own files.
+_HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; "
     "style-src 'self' 'unsafe-inline'; img-src data:; connect-src 'self'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'",
@@ -74,16 +81,14 @@ _HEADERS: Final = {  # no other page may show it, or be told its address; it loa
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-_PERIOD_S: Final = 1.0
-_WAIT_S: Final = 10.0
-_BY_PAGE: Final = Requester("webots-mcp view", VERSION, "page")
 
 
 class PageServer(ThreadingHTTPServer):
     """A server that listens; `run` serves until it is interrupted.
 
     Attributes:
-        recording: What is shown; commands go through it unless `read_only`.
+        recording: The recording to show.
+        steered: The same recording, through which commands are sent.
     """
 
     daemon_threads = True
@@ -93,21 +98,21 @@ class PageServer(ThreadingHTTPServer):
         self.recording, self.read_only = recording, read_only
         self.steered = replace(recording, read_only=False)
         self.chunk_maker = ChunkMaker(recording)
-        self._tabs: dict[str, float] = {}  # when each has asked last, on the monotonic clock
-        self._said: set[str] = set()
-        self._waiting: dict[socket.socket, float] = {}  # since when each has asked for nothing
+        self._tabs: dict[str, float] = {}  # Monotonic time of the last request of each tab.
+        self._logged: set[str] = set()
+        self._waiting: dict[socket.socket, float] = {}  # Since when each waits for a request.
         self._open = 0
         self._lock = threading.Lock()
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Return the address of the page."""
         return f"http://{HOST}:{self.server_port}/{page_key()}/"
 
     def run(self, ready: Callable[[str], object]) -> None:
-        """Serve, and tell `ready` the address as soon as a browser may ask."""
+        """Serve, and call `ready` with the address as soon as browsers can connect."""
         self.chunk_maker.start()
-        ready(self.url)  # what asks now waits until it is served
+        ready(self.url)  # A request from now on waits until it is served.
         try:
             self.serve_forever(poll_interval=0.1)
         finally:
@@ -115,22 +120,22 @@ class PageServer(ThreadingHTTPServer):
             self.server_close()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread of its own; above the limit, the idlest one is closed."""
+        """Serve a connection in its own thread; above the limit, close the idlest connection."""
         with self._lock:
             self._open += 1
             idlest = min(self._waiting, key=self._waiting.__getitem__, default=None)
-            if self._open <= MOST_CONNECTIONS or idlest is None:
+            if self._open <= LIMITS.connections or idlest is None:
                 idlest = None
             else:
                 del self._waiting[idlest]
-            is_refused = self._open > MOST_CONNECTIONS and idlest is None
+            is_refused = self._open > LIMITS.connections and idlest is None
             self._waiting[request] = time.monotonic()
-        if is_refused:  # all are being answered
+        if is_refused:  # All connections are being answered.
             self.shutdown_request(request)
             return
         if idlest is not None:
-            with suppress(OSError):  # it was closed meanwhile
-                idlest.shutdown(socket.SHUT_RDWR)  # its thread ends
+            with suppress(OSError):  # It was closed meanwhile.
+                idlest.shutdown(socket.SHUT_RDWR)  # This ends its thread.
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
@@ -140,35 +145,35 @@ class PageServer(ThreadingHTTPServer):
             self._waiting.pop(request, None)
         super().shutdown_request(request)
 
-    def waits(self, connection: socket.socket, *, is_idle: bool) -> None:
-        """A connection waits for a request from now on, or is being answered."""
+    def set_idle(self, connection: socket.socket, *, is_idle: bool) -> None:
+        """Mark a connection as waiting for a request, or as being answered."""
         with self._lock:
             if is_idle:
                 self._waiting[connection] = time.monotonic()
             else:
                 self._waiting.pop(connection, None)
 
-    def has_room_for(self, tab: str) -> bool:
-        """Whether a tab is one of those that are open, or may be opened."""
+    def admit_tab(self, tab: str) -> bool:
+        """Return whether a tab is open or can be opened, and count it as open."""
         now_s = time.monotonic()
         with self._lock:
-            self._tabs = {each: at for each, at in self._tabs.items() if now_s - at < _TAB_S}
-            if tab not in self._tabs and len(self._tabs) >= MOST_TABS:
+            self._tabs = {each: at for each, at in self._tabs.items() if now_s - at < LIMITS.tab_s}
+            if tab not in self._tabs and len(self._tabs) >= LIMITS.tabs:
                 return False
             self._tabs[tab] = now_s
             return True
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A tab that was closed is no news."""
+        """Log unexpected errors; a tab that was closed is none."""
         error = sys.exc_info()[1]
         if isinstance(error, Exception) and not isinstance(error, OSError):
             self.log_once(error)
 
     def log_once(self, error: Exception) -> None:
-        """Write more about an error that nobody foresaw: once, not at each look."""
+        """Log the traceback of an unexpected error once, not with each request."""
         with self._lock:
-            is_new = repr(error) not in self._said
-            self._said.add(repr(error))
+            is_new = repr(error) not in self._logged
+            self._logged.add(repr(error))
         if is_new:
             _log.error("the page cannot show all", exc_info=error)
 
@@ -176,12 +181,12 @@ class PageServer(ThreadingHTTPServer):
 def create_page_server(
     recording: RecordingAccess, port: int, *, read_only: bool = False
 ) -> PageServer:
-    """A server of the page of a recording, which need not be there yet.
+    """Make a server of the page of a recording, which need not exist yet.
 
     Args:
-        recording: What is shown; commands go through it unless `read_only`.
-        port: 0 for any that is free.
-        read_only: Without buttons and inputs.
+        recording: The recording to show. Commands are sent through it unless `read_only`.
+        port: Port on loopback; 0 for any free port.
+        read_only: Whether the page has no buttons and inputs.
 
     Raises:
         InvalidInputError: The port is taken.
@@ -196,9 +201,9 @@ def create_page_server(
 
 
 class _TimedReader(io.RawIOBase):
-    """What a browser sends: a request that has begun comes within `_REQUEST_S`, or not at all.
+    """The bytes that a browser sends, with a time limit for each whole request.
 
-    A timeout of the socket alone begins anew with each byte.
+    The timeout of a socket begins anew with each byte, so it cannot limit a request.
     """
 
     def __init__(self, connection: socket.socket, idle_s: float) -> None:
@@ -211,14 +216,14 @@ class _TimedReader(io.RawIOBase):
         self._until_s = None
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Read what has come.
+        """Read the bytes that have arrived.
 
         Raises:
-            TimeoutError: The time is over.
+            TimeoutError: The time limit is over.
         """
         left_s = self._idle_s if self._until_s is None else self._until_s - time.monotonic()
         if left_s <= 0:
@@ -226,7 +231,7 @@ class _TimedReader(io.RawIOBase):
         self._connection.settimeout(left_s)
         count = self._connection.recv_into(buffer)
         if self._until_s is None:
-            self._until_s = time.monotonic() + _REQUEST_S
+            self._until_s = time.monotonic() + LIMITS.request_s
         return count
 
 
@@ -235,35 +240,37 @@ class _Request(BaseHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
     server_version = "webots-mcp"
-    timeout = _IDLE_S
+    timeout = LIMITS.idle_s
 
     def setup(self) -> None:
-        """Read within bounds of time."""
+        """Read with time limits."""
         super().setup()
-        self._reading = _TimedReader(self.connection, _IDLE_S)
+        self._reading = _TimedReader(self.connection, LIMITS.idle_s)
         self.rfile.close()
         self.rfile = io.BufferedReader(self._reading)
 
     def handle_one_request(self) -> None:
-        """Wait for a request; once it has begun, all of it has to come soon."""
-        self._page.waits(self.connection, is_idle=True)
+        """Wait for a request. Once it has begun, it has to arrive within the time limit."""
+        self._page.set_idle(self.connection, is_idle=True)
         self._reading.begin()
         super().handle_one_request()
 
     def parse_request(self) -> bool:
-        """Read the headers; what has a body of no certain length is refused."""
+        """Read the headers; refuse a body without a definite length."""
         if not super().parse_request():
             return False
-        self._page.waits(self.connection, is_idle=False)
-        self.connection.settimeout(self.timeout)  # again, to write the answer
+        self._page.set_idle(self.connection, is_idle=False)
+        self.connection.settimeout(self.timeout)  # For writing the answer.
         lengths = self.headers.get_all("Content-Length") or ["0"]
         is_sure = len(lengths) == 1 and lengths[0].isascii() and lengths[0].isdecimal()
         if not is_sure or "Transfer-Encoding" in self.headers:
             self._refuse(400, "A request needs one Content-Length, in digits.\n")
             return False
-        self._length = int(lengths[0][:_MOST_DIGITS])
-        if self._length > (_MOST_BYTES if self.command == "POST" else 0):
-            self._refuse(413, f"A request has at most {_MOST_BYTES:,} bytes, as an order only.\n")
+        self._length = int(lengths[0][: LIMITS.length_digits])
+        if self._length > (LIMITS.request_bytes if self.command == "POST" else 0):
+            self._refuse(
+                413, f"A request has at most {LIMITS.request_bytes:,} bytes, as an order only.\n"
+            )
             return False
         return True
 
@@ -282,7 +289,7 @@ class _Request(BaseHTTPRequestHandler):
             self._refuse(404, "There is no such page.\n")
 
     def do_POST(self) -> None:
-        """Steer: what the page itself sends, which no form of another page can."""
+        """Steer the robot. Only the page itself can send this, no form of another page."""
         if (path := self._path()) is None:
             return
         if path != "steer" or self._page.read_only:
@@ -306,7 +313,7 @@ class _Request(BaseHTTPRequestHandler):
         return self.server
 
     def _path(self) -> str | None:
-        """The path below the key; None where the request was refused."""
+        """Return the path after the key; None if the request was refused."""
         hosts = self.headers.get_all("Host") or [""]
         if len(hosts) != 1 or named_host(hosts[0]) not in LOOPBACK:
             return self._refuse(403, _FOREIGN)
@@ -321,13 +328,13 @@ class _Request(BaseHTTPRequestHandler):
 
     def _ask(self, question: Callable[[PageServer, dict[str, str]], dict[str, Any]]) -> None:
         asked = dict(parse_qsl(self.path.partition("?")[2]))
-        if not self._page.has_room_for(asked.get("tab", "")):
+        if not self._page.admit_tab(asked.get("tab", "")):
             return self._refuse(503, _FULL)
         try:
             answer = question(self._page, asked)
         except WebotsMCPError as error:
             answer = problem(error)
-        except Exception as error:  # noqa: BLE001  (the page would stand still without a word)
+        except Exception as error:  # noqa: BLE001 - Otherwise the page would silently stop.
             self._page.log_once(error)
             answer = problem(error)
         self._answer(200, json.dumps(answer).encode(), "application/json")
@@ -345,28 +352,28 @@ class _Request(BaseHTTPRequestHandler):
         self.end_headers()
         try:
             self.wfile.write(body)
-        except OSError:  # a tab that was closed is no news
+        except OSError:  # The tab was closed.
             self.close_connection = True
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Say nothing: the terminal is for what a person must know."""
+        """Log nothing: the terminal is for messages that a person needs."""
 
 
-def _look(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
-    found = look(server.recording, choice_of(asked), steers=not server.read_only)
+def _answer_status(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    found = robot_status(server.recording, page_request(asked), steers=not server.read_only)
     orders = () if server.read_only else ORDERS
     return found | {"orders": orders, "rounds": server.chunk_maker.rounds}
 
 
-def _draw(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
-    drawn = draw(server.recording, choice_of(asked))
+def _answer_figures(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    drawn = draw(server.recording, page_request(asked))
     if drawn.get("is_cut") and server.chunk_maker.says:
         drawn["notes"].insert(0, server.chunk_maker.says)
     return drawn
 
 
-def _picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
-    return picture(server.recording, choice_of(asked))
+def _answer_picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return picture(server.recording, page_request(asked))
 
 
 def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
@@ -382,89 +389,4 @@ def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> d
     return tune(server.steered, robot, name, body["value"])
 
 
-_QUESTIONS: Final = {"look": _look, "draw": _draw, "picture": _picture}
-
-
-# Making chunks while the page is served, where no server does: what is long is drawn whole.
-
-
-class ChunkMaker(threading.Thread):
-    """Looks once a second whether there is something to put into chunks.
-
-    Attributes:
-        says: How far it has come, or why it does not go on; "" where nothing is left.
-        rounds: How often it put all that there was into chunks.
-    """
-
-    def __init__(self, recording: RecordingAccess) -> None:
-        super().__init__(name="webots-mcp page", daemon=True)
-        self._recording = recording
-        self._ending = threading.Event()
-        self.says = ""
-        self.rounds = 0
-
-    def run(self) -> None:
-        """Look until stopped."""
-        while not self._ending.is_set():
-            self.look()
-            self._ending.wait(_PERIOD_S)
-
-    def look(self) -> None:
-        """Put what there is into chunks."""
-        worked = False
-
-        def note(done: int, of: int) -> None:
-            nonlocal worked
-            worked = True
-            self.says = f"making chunks of what was recorded: {100 * done // max(of, 1)} %"
-
-        try:
-            self.says = make_missing_chunks(self._recording, note, called_off=self._ending.is_set)
-        except WebotsMCPError:  # the tabs say what it is
-            self.says = ""
-        self.rounds += worked
-
-    def stop(self) -> None:
-        """End it within an instant."""
-        self._ending.set()
-        self.join(timeout=2)
-
-
-# What the buttons and inputs of the page do: the way that the tools' own commands go.
-
-
-def steer(recording: RecordingAccess, robot: str, order: Order) -> dict[str, Any]:
-    """Give an order to the simulation of a robot; answers in words what came of it."""
-    params = {"steps": 1} if order == "step" else {}
-    dispatcher = Dispatcher(recording, _silent)
-    attempt = Attempt(recording, dispatcher, robot, _WAIT_S, order, params)
-    asked = {"command": order, "robot": robot}
-    request = OpenRequest(recording, _BY_PAGE, ["webots_simulation_control"], asked)
-    return _told(order, attempt.steer, request)
-
-
-def tune(recording: RecordingAccess, robot: str, name: str, value: Value) -> dict[str, Any]:
-    """Set one parameter of a robot's controller, and say what came of it."""
-    setting = partial(
-        set_parameters, recording, _silent, {name: value}, robot=robot, timeout_s=_WAIT_S
-    )
-    asked = {"values": {name: value}, "robot": robot}
-    request = OpenRequest(recording, _BY_PAGE, ["webots_set_parameters"], asked)
-    return _told(f"{name} = {value!r}", setting, request)
-
-
-def _told(what: str, ask: Any, request: OpenRequest) -> dict[str, Any]:
-    try:
-        with request:
-            answer: CommandAnswer = anyio.run(ask)
-            request.outcome = answer.outcome or ""
-    except WebotsMCPError as error:
-        return {"text": f"{what}: {error}", "is_done": False}
-    if answer.outcome == "done":
-        return {"text": f"{what}: done", "is_done": True}
-    why = answer.error or answer.hint or "no answer in time"
-    return {"text": f"{what}: not done ({answer.outcome}): {why}", "is_done": False}
-
-
-async def _silent(waited_s: float, of_s: float | None, text: str) -> None:
-    """The page says that it waits by the button itself."""
+_QUESTIONS: Final = {"look": _answer_status, "draw": _answer_figures, "picture": _answer_picture}

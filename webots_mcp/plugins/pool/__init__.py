@@ -1,9 +1,8 @@
-"""Many recordings in one store: shipping recordings to a pool, and reading it.
+"""Pools: many recordings in one store, shipped by the machines that recorded them.
 
-A pool is a PostgreSQL database or a dataset of Parquet files that other people's engines read.
-Each row is keyed by its recording's UUID and the key that it has there. `pool_interface` says what
-a pool can do; `pool_contents` opens one of the two kinds, which are `postgres_pool` and
-`parquet_pool`.
+A pool is a PostgreSQL database, or a dataset of Parquet files that other engines can read. The key
+of a row is the UUID of its recording plus its key there. `pool_interface` defines what a pool can
+do; `pool_contents` opens one of the two kinds, `postgres_pool` and `parquet_pool`.
 """
 
 from webots_mcp.extras.plugins import Plugin, PluginCommand

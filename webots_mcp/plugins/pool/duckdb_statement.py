@@ -1,10 +1,9 @@
-"""One SELECT over a pool of Parquet files, by DuckDB; and the limits of any answer of a pool.
+"""One SELECT over a pool of Parquet files by DuckDB, and the limits of answers of any pool.
 
-Each table is a view of its name, with `recording_uuid` before its columns. What keeps a statement
-harmless: it is one SELECT, DuckDB may open files below the root of the pool only and write none,
-and it has the limits of `query_sql` on what it answers. It runs in a process of its own, which is
-ended at the deadline and when it takes too much memory: one call of a function may take any time
-and room, and DuckDB's own limit does not count the values that it builds.
+Each table is a view of its name, with `recording_uuid` before its columns. A statement cannot do
+harm: it is one SELECT, DuckDB can only read files below the root of the pool, and answers have the
+limits of `query_sql`. It runs in its own process, which is killed at the deadline or when it takes
+too much memory. DuckDB's own limits do not suffice: one function call may take any time and memory.
 """
 
 from __future__ import annotations
@@ -21,8 +20,9 @@ from typing import Any, Final
 import psutil
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.parquet_files import CHUNK, Storage, files_of, name_of, package
-from webots_mcp.plugins.pool.pool_interface import Table, tables
+from webots_mcp.plugins.pool.parquet_files import CHUNK, files_of, name_of
+from webots_mcp.plugins.pool.pool_interface import ShippedTable, tables
+from webots_mcp.plugins.pool.storage import Storage, package
 from webots_mcp.store.sql import (
     FOLDER,
     MAX_BYTES,
@@ -38,12 +38,18 @@ from webots_mcp.store.sql import (
     require_max_rows,
 )
 
-DEADLINE_S: Final = 20.0  # from before the process starts: the command ends within 30 s
-_MEMORY: Final = "800MB"  # what DuckDB counts itself
-_MOST_RESIDENT_BYTES: Final = 1_100_000_000  # of the process: DuckDB counts not all that it takes
-_MOST_MORE_BYTES: Final = 1_000_000_000  # that a statement may allocate, where a system limits it
-_MOST_THREADS: Final = 4  # each has buffers of its own
-_LOOK_S: Final = 0.02  # a machine fills some 50 MB in that time
+DEADLINE_S: Final = 20.0
+"""Time limit, including the start of the process: the command ends within 30 s."""
+_MEMORY: Final = "800MB"
+"""Memory limit of DuckDB, which counts only a part of what it takes."""
+_MOST_RESIDENT_BYTES: Final = 1_100_000_000
+"""Limit of the resident memory of the process."""
+_MOST_MORE_BYTES: Final = 1_000_000_000
+"""Limit of what a statement can allocate, where the system supports it."""
+_MOST_THREADS: Final = 4
+"""Each thread has its own buffers."""
+_POLL_S: Final = 0.02
+"""Time between two checks of the memory. A machine fills about 50 MB in that time."""
 _TOO_LARGE: Final = (
     f"more than {_MOST_MORE_BYTES / 1e9:g} GB of memory would be needed: narrow it by "
     "recording_uuid and by day, and make shorter values"
@@ -54,7 +60,7 @@ _TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR", bytes: "BLOB"}
 
 
 def ask(url: str, sql: str, max_rows: int) -> SqlResult:
-    """The first rows of one SELECT over the pool.
+    """Return the first rows of one SELECT over the pool.
 
     Raises:
         InvalidInputError: It is no single SELECT, is wrong, or takes too long or too much memory.
@@ -72,34 +78,34 @@ def ask(url: str, sql: str, max_rows: int) -> SqlResult:
         try:
             while True:
                 try:
-                    answer, _ = process.communicate(request, timeout=_LOOK_S)
+                    answer, _ = process.communicate(request, timeout=_POLL_S)
                     return decode(answer, process.returncode, asked, slow)
                 except subprocess.TimeoutExpired:
-                    request = None  # it is sent on by itself
+                    request = None  # The rest is sent by the next call.
                 if time.monotonic() > end_s:
                     raise InvalidInputError(slow)
                 if _resident_bytes(process.pid) > _MOST_RESIDENT_BYTES:
                     raise InvalidInputError(_TOO_LARGE)
         finally:
-            process.kill()  # nothing, if it has ended
+            process.kill()  # Does nothing if it has ended.
 
 
 def _resident_bytes(pid: int) -> int:
     try:
         return int(psutil.Process(pid).memory_info().rss)
-    except psutil.Error:  # it has just ended
+    except psutil.Error:  # The process has just ended.
         return 0
 
 
 def select(storage: Storage, sql: str, max_rows: int) -> SqlResult:
-    """As `ask`, in this process, without a deadline."""
+    """Return the same as `ask`, within this process and without a deadline."""
     duckdb = package("duckdb")
     threads = min(_MOST_THREADS, os.cpu_count() or 1)
     with closing(duckdb.connect(config={"threads": threads})) as connection:
         _prepare(connection, storage, sql)
         try:
-            # Relations, which need no text of SQL, keep the interpreter's lock while they look at
-            # files: a file system of Python's could never answer.
+            # Relations of DuckDB hold the interpreter's lock while they read files, so that a
+            # filesystem written in Python could never answer. SQL does not.
             asked = f"FROM ({_only_select(duckdb, connection, sql)}\n)"
             columns = connection.execute(f"DESCRIBE {asked}").fetchall()
             shown = ", ".join(_shown(at, kind) for at, (_, kind, *_) in enumerate(columns, 1))
@@ -112,16 +118,15 @@ def select(storage: Storage, sql: str, max_rows: int) -> SqlResult:
 
 
 def answered(names: Sequence[str], rows: Sequence[Sequence[Any]], max_rows: int) -> SqlResult:
-    """The first of the rows, with long values cut.
+    """Return the first rows, with long values cut.
 
     Args:
-        names: Of the columns.
-        rows: One more than `max_rows`, where there are as many; values that are no numbers and no
-            bytes are texts.
-        max_rows: The most to answer with.
+        names: Names of the columns.
+        rows: Up to `max_rows` + 1 rows. Values are numbers, bytes or texts.
+        max_rows: Maximum of returned rows.
 
     Raises:
-        InvalidInputError: The columns are too many.
+        InvalidInputError: There are too many columns.
     """
     if len(names) > MAX_COLUMNS:
         raise InvalidInputError(
@@ -140,7 +145,7 @@ def _cut(value: Any) -> Any:
 
 
 def _prepare(connection: Any, storage: Storage, sql: str) -> None:
-    """The views, and then the bounds, which nothing takes back."""
+    """Create the views, and set the limits, which cannot be changed afterwards."""
     if not storage.is_local:
         connection.register_filesystem(storage.files)
     for table in tables():
@@ -148,7 +153,7 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
         paths = storage.find(files_of(table)) if is_named else []
         connection.execute(_view(table, [storage.url_of(path) for path in paths]))
     connection.execute(f"SET memory_limit = '{_MEMORY}'")
-    connection.execute("SET temp_directory = ''")  # nothing is spilled to the disk
+    connection.execute("SET temp_directory = ''")  # Never spill to the disk.
     connection.execute("SET TimeZone = 'UTC'")
     connection.execute(f"SET allowed_directories = [{_quoted(storage.url_of('') + '/')}]")
     connection.execute("SET enable_external_access = false")
@@ -156,17 +161,17 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
 
 
 def _shown(at: int, kind: str) -> str:
-    """A column, the first is 1, as a number, as bytes, or as a text."""
+    """Return the expression of a column (the first is 1) as a number, bytes or text."""
     if kind.startswith("DECIMAL"):
         return f"CAST(#{at} AS DOUBLE) AS c{at}"
     return f"#{at} AS c{at}" if _AS_THEY_ARE.fullmatch(kind) else f"CAST(#{at} AS VARCHAR) AS c{at}"
 
 
-def _view(table: Table, paths: list[str]) -> str:
-    """A table over its files; without any, a table without rows."""
+def _view(table: ShippedTable, paths: list[str]) -> str:
+    """Return the statement of a view over the files of a table; without files it has no rows."""
     columns = dict(zip(table.columns, (_TYPES[kind] for kind in table.types), strict=True))
     shown, cut = ", ".join(f'"{name}"' for name in columns), ""
-    if table.name == CHUNK:  # a column for each signal, of any run
+    if table.name == CHUNK:  # A column for each signal of any run.
         columns = {"run_id": "BIGINT", "sim_time_s": "DOUBLE", "wall_time_s": "DOUBLE"}
         shown, cut = 'run AS run_id, * EXCLUDE (recording, run, "table")', ", 'run': BIGINT"
     elif table.time_column:
@@ -190,7 +195,11 @@ def _quoted(text: str) -> str:
 
 
 def _only_select(duckdb: Any, connection: Any, sql: str) -> str:
-    """The statement, without what ends it."""
+    """Return the statement without its semicolon.
+
+    Raises:
+        InvalidInputError: It is not one SELECT.
+    """
     statements = connection.extract_statements(sql)
     kinds = [statement.type for statement in statements]
     if kinds != [duckdb.StatementType.SELECT]:
@@ -202,12 +211,12 @@ def _only_select(duckdb: Any, connection: Any, sql: str) -> str:
 
 
 def _ask(asked: Statement) -> SqlResult:
-    package("duckdb")  # what it takes to load counts as taken
+    package("duckdb")  # Its own memory does not count.
     if sys.platform == "linux":
         import resource
 
         most = psutil.Process().memory_info().data + _MOST_MORE_BYTES
-        with suppress(ValueError, OSError):  # a narrower limit is set
+        with suppress(ValueError, OSError):  # A lower limit is set.
             resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     return select(Storage(asked.database), asked.sql, asked.max_rows)
 

@@ -1,8 +1,8 @@
-"""Bringing runs of a pool back into a local recording, where every question can be asked of them.
+"""Fetching runs of a pool into a local recording, where every question can be asked about them.
 
-What the pool holds of some runs is written into a small recording with the same ids, and that is
-merged like any other: by UUIDs, each run whole or not at all. So fetching may be killed anywhere,
-and repeated. Of a run without all its rows what is left comes: it is one whose rows are purged.
+The runs are written into a temporary recording with the same ids, which is merged like any other:
+by UUIDs, each run completely or not at all. Fetching can therefore be killed at any time, and
+repeated. A run that lacks rows comes as one whose rows were purged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Final
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.liveness import process_alive
-from webots_mcp.plugins.pool.pool_contents import Meant, PooledRun
+from webots_mcp.plugins.pool.pool_contents import ChosenRuns, PooledRun
 from webots_mcp.plugins.pool.pool_interface import Pool, is_whole, table
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.chunks import STATE_IDS
@@ -31,12 +31,12 @@ from webots_mcp.store.merging import END_SESSIONS, merge, small_recording
 from webots_mcp.store.run_rows import PICTURES
 
 _FOLDER: Final = ".fetch-"
-_MOST_RUNS: Final = 100  # that are written into one small recording,
-_MOST_ROWS: Final = 200_000  # unless one of them has more rows by itself
-_PAUSE_S: Final = 0.002  # between two short writes, for robots that record here
+_MOST_RUNS: Final = 100  # In one temporary recording.
+_MOST_ROWS: Final = 200_000  # In one temporary recording, unless a single run has more.
+_PAUSE_S: Final = 0.002  # Between two short writes, for robots that record here.
 _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value", "image")
-_HERE: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
-# What retention moved there may have been shipped before that as well.
+_LOCAL_RUNS: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
+# States that retention moved to kept_state may have been shipped before that as well.
 _DROP_MOVED: Final = (
     "DELETE FROM kept_state WHERE call IS NULL AND EXISTS (SELECT 1 FROM state s "
     "WHERE s.run_id = kept_state.run_id AND s.sim_time_s = kept_state.sim_time_s "
@@ -68,22 +68,22 @@ _COUNT_ROOM: Final = (
     f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {_LEFT}), 0), chunk_bytes = coalesce(("
     "SELECT sum(coalesce(length(numbers), 0) + coalesce(length(codes), 0) "
     "+ coalesce(length(labels), 0)) "
-    "FROM chunk WHERE group_id = row_group.id), 0)"  # none came of one whose times are damaged
+    "FROM chunk WHERE group_id = row_group.id), 0)"  # A group with damaged times has no chunks.
 )
 _IN_CHUNKS: Final = "SELECT coalesce(sum(row_count), 0) FROM row_group WHERE run_id = ?"
 
 
 @dataclass
-class Fetched:
-    """What became of the runs that were meant, by their UUIDs.
+class FetchResult:
+    """The outcome of fetching runs, by their UUIDs.
 
     Attributes:
-        runs: The ids here of those that are here now.
-        known: Of them, those that were here before.
-        only_chunks: Of those that came now, the ones of which the pool has no rows.
-        going_on: Those that are not over.
-        arriving: Those that are over, and not yet wholly shipped.
-        unchunked: Of those in `only_chunks`, how many rows are in chunks, where not all are.
+        runs: Local ids of the runs that are in the recording now.
+        known: Runs that were in the recording before.
+        only_chunks: Fetched runs of which the pool has no rows.
+        going_on: Runs that have not ended.
+        arriving: Runs that have ended but are not completely shipped.
+        unchunked: Number of rows in chunks, for runs of `only_chunks` of which not all are.
     """
 
     runs: dict[str, int] = field(default_factory=dict[str, int])
@@ -95,7 +95,7 @@ class Fetched:
 
     @property
     def come(self) -> list[int]:
-        """The ids of those that came now."""
+        """Return the local ids of the fetched runs."""
         return [self.runs[uuid] for uuid in self.runs if uuid not in self.known]
 
 
@@ -103,23 +103,23 @@ def fetch(
     pool: Pool,
     connection: sqlite3.Connection,
     data_dir: Path,
-    meant: Meant,
+    meant: ChosenRuns,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> Fetched:
-    """Bring the runs that are meant, with their sessions, commands and trials.
+) -> FetchResult:
+    """Fetch runs with their sessions, commands and trials.
 
     Args:
-        pool: Opened.
-        connection: To the local recording, in the role "writer".
-        data_dir: The folder of its pictures.
-        meant: What is to come.
-        progress: Called with how many states came of how many that the runs had.
+        pool: The pool, opened.
+        connection: Connection to the local recording, in the role "writer".
+        data_dir: Folder of its pictures.
+        meant: The runs and trial sets to fetch.
+        progress: Called with the number of fetched states and of all.
 
     Raises:
         PoolError: The pool cannot be read.
     """
     _sweep(data_dir)
-    found, here = Fetched(), _here(connection)
+    found, here = FetchResult(), _local_run_ids(connection)
     found.known = [run.uuid for run in meant.runs if run.uuid in here]
     new = [run for run in meant.runs if run.uuid and run.uuid not in here]
     found.going_on = [run.uuid for run in new if run.end_reason is None]
@@ -134,17 +134,17 @@ def fetch(
         done += sum(run.row_count for run in part)
         progress(done, of)
     fetcher.take_trials(meant)
-    here = _here(connection)
+    here = _local_run_ids(connection)
     found.runs = {run.uuid: here[run.uuid] for run in meant.runs if run.uuid in here}
     return found
 
 
-def _here(connection: sqlite3.Connection) -> dict[str, int]:
-    return dict(connection.execute(_HERE).fetchall())
+def _local_run_ids(connection: sqlite3.Connection) -> dict[str, int]:
+    return dict(connection.execute(_LOCAL_RUNS).fetchall())
 
 
 def _parts(runs: Sequence[PooledRun]) -> Iterator[list[PooledRun]]:
-    """Runs of one recording that are fetched together, in the order in which they began."""
+    """Yield runs of one recording that are fetched together, in the order of their start."""
     for _, group in groupby(runs, lambda run: run.recording_uuid):
         part, rows = list[PooledRun](), 0
         for run in group:
@@ -157,20 +157,20 @@ def _parts(runs: Sequence[PooledRun]) -> Iterator[list[PooledRun]]:
 
 
 class _Fetcher:
-    """Small recordings of what a pool holds, merged one by one."""
+    """Makes temporary recordings of what a pool holds, and merges them one by one."""
 
     def __init__(
-        self, pool: Pool, connection: sqlite3.Connection, data_dir: Path, found: Fetched
+        self, pool: Pool, connection: sqlite3.Connection, data_dir: Path, found: FetchResult
     ) -> None:
         self._pool, self._connection, self._data_dir = pool, connection, data_dir
         self._found = found
 
     def take(self, runs: Sequence[PooledRun], copied: Callable[[int], None]) -> None:
-        """Take in runs of one recording that are over, but for those that are still shipped.
+        """Fetch ended runs of one recording, except those that are still being shipped.
 
         Args:
-            runs: Which.
-            copied: Called with how many of their states are here.
+            runs: The runs.
+            copied: Called with the number of copied states.
         """
         ids = [run.run_id for run in runs]
         with _folder(self._data_dir) as folder:
@@ -182,7 +182,9 @@ class _Fetcher:
                 copy.rows("state", "run_id", ids, copied)
                 copy.pictures(folder)
                 lacking = self._settle(small, runs)
-                copy.rows("row_group", "run_id", lacking)  # of the others they are made here
+                copy.rows(
+                    "row_group", "run_id", lacking
+                )  # For the other runs they are made locally.
                 copy.rows("chunk", "run_id", lacking)
                 small.execute(_COUNT_ROOM)
                 for run in runs:
@@ -193,9 +195,9 @@ class _Fetcher:
         for run_id in here.values():
             chunk_whole_run(self._connection, run_id, _PAUSE_S)
 
-    def take_trials(self, meant: Meant) -> None:
-        """Take in the trials of runs that are here by now, and others of a set that is meant."""
-        here = _here(self._connection)
+    def take_trials(self, meant: ChosenRuns) -> None:
+        """Fetch the trials of fetched runs, and all other trials of the chosen sets."""
+        here = _local_run_ids(self._connection)
         wanted = defaultdict[str, tuple[set[int], set[int]]](lambda: (set(), set()))
         for run in meant.runs:
             if run.uuid in here:
@@ -211,7 +213,7 @@ class _Fetcher:
                 merge(self._connection, self._data_dir, folder / DATABASE_NAME)
 
     def _settle(self, small: sqlite3.Connection, runs: Sequence[PooledRun]) -> list[int]:
-        """Say of each run how many of its rows are gone; a run whose rows still come is dropped.
+        """Store the number of missing rows of each run, and drop runs that are still shipped.
 
         Returns:
             The runs that lack rows.
@@ -238,14 +240,14 @@ class _Fetcher:
 
 
 class _Copy:
-    """Rows of a recording in a pool, written into a small one."""
+    """Copies rows of a recording in a pool into a temporary recording."""
 
     def __init__(self, pool: Pool, recording_uuid: str, small: sqlite3.Connection) -> None:
         self._pool, self._recording_uuid, self._small = pool, recording_uuid, small
-        small.execute("PRAGMA foreign_keys=OFF")  # a pool keeps what refers to what it lacks
+        small.execute("PRAGMA foreign_keys=OFF")  # A pool may lack rows that others refer to.
 
     def context(self, run_ids: Collection[int]) -> None:
-        """The runs, whose they are, and what belongs to their sessions."""
+        """Copy the runs, their robots and signals, and what belongs to their sessions."""
         self.rows("run", "id", run_ids)
         sessions, robots = self._ids("session_id", "run"), self._ids("robot_id", "run")
         self.rows("session", "id", sessions)
@@ -255,7 +257,10 @@ class _Copy:
         self.rows("parameter", "session_id", sessions)
 
     def trials(self, run_ids: Collection[int], set_ids: Collection[int]) -> bool:
-        """The trials of these runs and sets, but those of other runs; whether there are any."""
+        """Copy the trials of runs and sets, without those of other runs.
+
+        Return whether there are any.
+        """
         self.rows("trial", "run_id", run_ids)
         self.rows("trial", "trial_set_id", set_ids)
         others = {*self._ids("run_id", "trial")} - {*run_ids}
@@ -273,7 +278,7 @@ class _Copy:
         values: Collection[int],
         copied: Callable[[int], None] = lambda count: None,
     ) -> None:
-        """Copy the rows whose column has one of these values; tell how many there are so far."""
+        """Copy the rows whose column has one of some values; report the number of rows so far."""
         if not values:
             return
         columns, local = table(name).columns, _OF_GROUP if name == "row_group" else {}
@@ -288,7 +293,7 @@ class _Copy:
             copied(count)
 
     def pictures(self, folder: Path) -> None:
-        """The files that the rows of pictures name, where they were shipped."""
+        """Copy the picture files that were shipped."""
         for (path,) in self._small.execute("SELECT DISTINCT path FROM image").fetchall():
             file = folder / path
             is_ours = file.resolve().is_relative_to(folder.resolve())
@@ -305,13 +310,13 @@ class _Copy:
 
 @contextmanager
 def _folder(data_dir: Path) -> Generator[Path]:
-    """A folder beside the recording, for as long as the block goes on."""
+    """Make a folder next to the recording, which is removed after the block."""
     with tempfile.TemporaryDirectory(prefix=f"{_FOLDER}{os.getpid()}-", dir=data_dir) as name:
         yield Path(name)
 
 
 def _sweep(data_dir: Path) -> None:
-    """Remove the folders of those that were killed while they fetched."""
+    """Remove the folders of processes that were killed while they fetched."""
     for each in data_dir.glob(f"{_FOLDER}*"):
         pid = each.name.removeprefix(_FOLDER).partition("-")[0]
         if pid.isdigit() and not process_alive(int(pid), None, time.time()):

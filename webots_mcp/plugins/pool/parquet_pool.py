@@ -1,39 +1,34 @@
 """A pool of Parquet files: shipping to it, and reading it.
 
-A `write` places files, and the progress after them: with that its rows count. Whoever is killed
-between leaves rows that do not count. The next shipper takes those that never change out again
-before it writes any, and those that change are replaced by themselves.
+A `write` places files and then the progress, which makes their rows count. A shipper that is killed
+in between leaves rows that do not count. The next one removes such rows of tables that never change
+before it writes; rows that change are simply replaced.
 """
 
 from __future__ import annotations
 
-import io
 import time
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
 from itertools import chain
 from typing import Any, Final
 
-from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError, PoolUnavailableError
+from webots_mcp.plugins.pool.arrow_tables import as_arrow, encoded, matching_rows, whole_table
 from webots_mcp.plugins.pool.duckdb_statement import ask
 from webots_mcp.plugins.pool.parquet_files import (
     CHUNK,
     PROGRESS,
     RUNS,
-    Lease,
-    Part,
-    Progress,
-    Storage,
+    OpenPart,
+    ShippedProgress,
     by_block,
     by_folder,
     decoded_progress,
     files_of,
     folder_of,
     is_cut,
-    package,
     part_file,
     picture_file,
     place_progress,
@@ -42,43 +37,48 @@ from webots_mcp.plugins.pool.parquet_files import (
     run_of,
     uuid_in,
 )
-from webots_mcp.plugins.pool.pool_interface import LISTED, Batch, Row, Table, batches, table, tables
+from webots_mcp.plugins.pool.pool_interface import (
+    LISTED,
+    Batch,
+    PoolRow,
+    ShippedTable,
+    batches,
+    table,
+    tables,
+)
+from webots_mcp.plugins.pool.shipping_lease import ShippingLease
+from webots_mcp.plugins.pool.storage import Storage, package
 from webots_mcp.plugins.pool.value_columns import NameAndKind, chunks_of, columns_of
-from webots_mcp.signals.naming import unit_in
 from webots_mcp.store.sql import SqlResult
 
-# A part is over when its file is so large, or its rows in memory are, or when what comes at a time
-# is so little beside it that it would be written again for almost nothing.
+# A part is closed when its file or its rows in memory are large, or when additions are so small in
+# comparison that rewriting the file costs too much.
 PART_BYTES: Final = 8_000_000
 _PART_MEMORY_BYTES: Final = 64_000_000
 _SMALL_PART_BYTES: Final = 1_000_000
 _MOST_TIMES: Final = 16
 _HALF_WRITTEN_S: Final = 3600.0
-_APPENDED_GROUP_ROWS: Final = 20_000
-_CHANGING_GROUP_ROWS: Final = 4_000  # those of many files are read side by side
-_VALUES_LEVEL: Final = 9  # of zstd: 97 bytes a row of 39 numbers instead of 128, in 6 us
-_ROWS_AT_ONCE: Final = 1000
 
 
 class ParquetShipment:
-    """One recording's part of the pool."""
+    """The part of the pool of one recording; see `Shipment`."""
 
-    def __init__(self, storage: Storage, recording_uuid: str, lease: Lease) -> None:
+    def __init__(self, storage: Storage, recording_uuid: str, lease: ShippingLease) -> None:
         self._storage = storage
         self._uuid = recording_uuid
         self._lease = lease
         self._progress = read_progress(storage, recording_uuid)
         self._is_settled = False
         self._own_runs: set[str] = set()
-        self._damaged = Counter[str]()  # in one `write`
+        self._damaged = Counter[str]()  # Damaged chunks of one `write`.
         self._named: dict[int, NameAndKind] = {}
 
     def progress(self) -> dict[str, int]:
-        """The numbers that `write` left."""
+        """Return the numbers that `write` stored."""
         return dict(self._progress.numbers)
 
     def foreign_runs(self, run_uuids: Collection[str]) -> dict[str, str]:
-        """Of these runs, those that another recording has shipped, with that one's UUID."""
+        """Return the runs that another recording has shipped, with its UUID."""
         asked = {f"{RUNS}/{uuid}": uuid for uuid in {*run_uuids} - self._own_runs}
         found = self._storage.read_all(asked)
         owners = {asked[path]: owner.decode("utf-8", "replace") for path, owner in found}
@@ -86,15 +86,15 @@ class ParquetShipment:
         return {uuid: owner for uuid, owner in owners.items() if owner not in ("", self._uuid)}
 
     def write_picture(self, path: str, content: bytes) -> None:
-        """Keep a picture under the path that its row names."""
+        """Store a picture under the path that its row names."""
         self._place(self._path(picture_file(path)), content)
 
     def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> Counter[str]:
-        """Write rows, and then these numbers of the progress; returns how many chunks are damaged.
+        """Write rows and then numbers of the progress; return the number of damaged chunks.
 
         Raises:
-            PoolUnavailableError: Worth trying again; rows that were placed do not count.
-            PoolError: It will not be better by itself.
+            PoolUnavailableError: A retry may succeed. Rows that were placed do not count.
+            PoolError: A retry will not help.
         """
         self._lease.renew()
         self._damaged = Counter[str]()
@@ -102,7 +102,7 @@ class ParquetShipment:
             self._settle()
         self._is_settled = False
         before = self._progress
-        after = Progress({**before.numbers, **progress}, before.parts, before.listed)
+        after = ShippedProgress({**before.numbers, **progress}, before.parts, before.listed)
         for each, rows in _by_table(batches):
             if each.name == "run":
                 self._claim(each, rows)
@@ -117,8 +117,8 @@ class ParquetShipment:
         self._is_settled = True
         return self._damaged
 
-    def _append(self, table: Table, rows: Iterable[Row]) -> Part:
-        """Add rows to the open part of a table; what it is then."""
+    def _append(self, table: ShippedTable, rows: Iterable[PoolRow]) -> OpenPart:
+        """Add rows to the open part of a table, and return the part after that."""
         part = self._progress.part(table.name)
         counts, is_over = dict(part.rows), False
         for folder, added in by_folder(table, rows).items():
@@ -134,10 +134,10 @@ class ParquetShipment:
             self._place(path, content)
             is_over |= _is_over(content, whole, counts.get(folder, 0))
             counts[folder] = whole.num_rows
-        return Part(part.number + 1) if is_over else Part(part.number, counts)
+        return OpenPart(part.number + 1) if is_over else OpenPart(part.number, counts)
 
-    def _signals(self, chunks: Iterable[Row]) -> Mapping[int, NameAndKind]:
-        """How the signals of chunks are called, which were shipped before them."""
+    def _signals(self, chunks: Iterable[PoolRow]) -> Mapping[int, NameAndKind]:
+        """Return names and kinds of the signals of chunks, which were shipped before."""
         at = table(CHUNK).columns.index("signal_id")
         if not self._named.keys() >= {row[at] for row in chunks if int(str(row[at])) > 0}:
             signals = table("signal")
@@ -147,8 +147,10 @@ class ParquetShipment:
                     self._named[row["id"]] = (row["name"], row["kind"])
         return self._named
 
-    def _replace(self, table: Table, rows: Iterable[Row], after: Progress) -> Progress:
-        """Put rows that change in the place of those of their keys."""
+    def _replace(
+        self, table: ShippedTable, rows: Iterable[PoolRow], after: ShippedProgress
+    ) -> ShippedProgress:
+        """Replace the rows that have changed."""
         for name, changed in by_block(table, rows).items():
             path = self._path(name)
             held = self._held(path)
@@ -163,14 +165,14 @@ class ParquetShipment:
 
     def _held(self, path: str) -> Any | None:
         content = self._storage.read(path)
-        return None if content is None else _whole(content, path)
+        return None if content is None else whole_table(content, path)
 
     def _place(self, path: str, content: bytes) -> None:
         self._lease.renew()
         self._storage.place(path, content)
 
     def _settle(self) -> None:
-        """Take out what was placed and never counted."""
+        """Remove rows that were placed but do not count."""
         for each in filter(is_cut, tables()):
             part = self._progress.part(each.name)
             for path in self._storage.find(self._path(part_file(each, "*", part.number))):
@@ -181,8 +183,12 @@ class ParquetShipment:
                 elif held.num_rows > count:
                     self._place(path, encoded(each, held.slice(0, count)))
 
-    def _claim(self, table: Table, rows: Iterable[Row]) -> None:
-        """Say that the runs are this recording's, before any row of them is there."""
+    def _claim(self, table: ShippedTable, rows: Iterable[PoolRow]) -> None:
+        """Claim runs for this recording, before any of their rows are written.
+
+        Raises:
+            PoolError: A run belongs to another recording.
+        """
         at = table.columns.index("uuid")
         for uuid in {str(row[at]) for row in rows if row[at]} - self._own_runs:
             path, mine = f"{RUNS}/{uuid}", self._uuid.encode()
@@ -200,10 +206,10 @@ class ParquetShipment:
 
 
 class ParquetPool:
-    """A folder, or a place on a filesystem of fsspec, as a pool; see `Pool`.
+    """A folder on a disk or on a filesystem of fsspec as a pool; see `Pool`.
 
     Attributes:
-        address: Without secrets.
+        address: The URL without secrets.
     """
 
     def __init__(self, url: str, *, ships: bool = False) -> None:
@@ -211,7 +217,7 @@ class ParquetPool:
         self._storage, self._ships = Storage(url), ships
         self._url = self._storage.root if self._storage.is_local else url
         self.address = self._storage.address
-        self._all: dict[str, Progress] | None = None
+        self._all: dict[str, ShippedProgress] | None = None
 
     def __enter__(self) -> ParquetPool:
         require_pool(self._storage, make=self._ships)
@@ -224,21 +230,21 @@ class ParquetPool:
 
     @contextmanager
     def shipment(self, recording_uuid: str) -> Generator[ParquetShipment]:
-        """Be the one who ships this recording.
+        """Be the only shipper of a recording.
 
         Raises:
-            PoolBusyError: Another does.
+            PoolBusyError: Another process ships it.
         """
-        lease = Lease(self._storage, recording_uuid)
+        lease = ShippingLease(self._storage, recording_uuid)
         lease.take()
         try:
             yield ParquetShipment(self._storage, recording_uuid, lease)
         finally:
-            with suppress(PoolUnavailableError):  # it runs out by itself
+            with suppress(PoolUnavailableError):  # The lease ends by itself.
                 lease.give_back()
 
     def rows_of(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
-        """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""
+        """Yield the UUID of the recording and the columns `LISTED` of each row of a table."""
         if self._all is None:
             folders = [each for each in self._storage.names() if each.startswith("recording=")]
             contents = self._storage.read_all(f"{folder}/{PROGRESS}" for folder in folders)
@@ -250,149 +256,51 @@ class ParquetPool:
             yield from ((uuid, row) for row in progress.listed.get(name, {}).values())
 
     def progress(self, recording_uuid: str) -> dict[str, int]:
-        """How far the recording was shipped."""
+        """Return how far the recording was shipped."""
         return dict(read_progress(self._storage, recording_uuid).numbers)
 
     def rows(
-        self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
+        self, recording_uuid: str, table: ShippedTable, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
-        """Rows whose columns have one of these values; a file is held, and a few rows of it."""
+        """Yield rows whose columns have one of some values, with one file in memory."""
         part = read_progress(self._storage, recording_uuid).part(table.name)
         for path in self._storage.find(files_of(table, recording_uuid)):
             counted, run_id = part.counted(path) if is_cut(table) else None, run_of(path)
             if counted == 0 or run_id not in (None, *where.get("run_id", (run_id,))):
                 continue
-            content = self._storage.read(path)  # whole: it may be replaced by a larger one
+            content = self._storage.read(path)  # At once: a larger file may replace it.
             if content is None:
                 raise PoolUnavailableError(f"{path} is gone from {self.address}: ask again")
             if table.name == CHUNK:
-                held = _whole(content, path)
+                held = whole_table(content, path)
                 counted = held.num_rows if counted is None else counted
                 yield from batches(table, chunks_of(held.slice(0, counted), run_id))
             else:
-                yield from batches(table, _rows(table, content, path, counted, where))
+                yield from batches(table, matching_rows(table, content, path, counted, where))
 
     def picture(self, recording_uuid: str, path: str) -> bytes | None:
-        """A picture that was shipped, by the path in its row."""
+        """Return a picture by the path in its row; None if it was not shipped."""
         return self._storage.read(f"{folder_of(recording_uuid)}/{picture_file(path)}")
 
     def select(self, sql: str, max_rows: int) -> SqlResult:
-        """The first rows of one SELECT of DuckDB.
+        """Return the first rows of one SELECT of DuckDB.
 
         Raises:
-            InvalidInputError: As `ask`.
+            InvalidInputError: It is no single SELECT, is wrong, or takes too much time or memory.
             PoolError: DuckDB is not installed.
         """
         return ask(self._url, sql, max_rows)
 
 
-# -- rows as Arrow, and as files --------------------------------------------------------------
+def _replaced(table: ShippedTable, held: Any | None, rows: Iterable[PoolRow]) -> list[PoolRow]:
+    """Return all rows of a table after some of them have changed, in the order of the key.
 
-
-@cache
-def schema_of(table: Table) -> Any:
-    """The Arrow schema of a table: what its columns mean, and their units, is in the fields.
-
-    A column without a value has its type in each file, so that engines can put files together.
-    """
-    from webots_mcp.store.models import SQLModel
-
-    arrow = package("pyarrow")
-    types = {int: arrow.int64(), float: arrow.float64(), str: arrow.string(), bytes: arrow.binary()}
-    columns = SQLModel.metadata.tables[table.name].columns
-    fields: list[Any] = []
-    for name, kind in zip(table.columns, table.types, strict=True):
-        unit = unit_in(name) if kind is float else None
-        holds = "json" if name in table.json_columns else None
-        about = {"comment": columns[name].comment, "unit": unit, "holds": holds}
-        metadata = {key: str(text) for key, text in about.items() if text}
-        nullable = name not in table.key
-        fields.append(arrow.field(name, types[kind], nullable=nullable, metadata=metadata))
-    about = {"webots_mcp.table": table.name, "webots_mcp.schema": str(SCHEMA_VERSION)}
-    return arrow.schema(fields, metadata=about)
-
-
-def as_arrow(table: Table, rows: Sequence[Row]) -> Any:
-    """Fitted rows as an Arrow table."""
-    arrow, schema = package("pyarrow"), schema_of(table)
-    columns = [*zip(*rows, strict=True)] or [()] * len(table.columns)
-    arrays = [arrow.array(each, field.type) for each, field in zip(columns, schema, strict=True)]
-    return arrow.table(arrays, schema=schema)
-
-
-def encoded(table: Table, arrow_table: Any) -> bytes:
-    """The rows as one file of Parquet.
-
-    JSON differs from row to row, and so do measured values: a dictionary is no use for either.
-    """
-    sink = io.BytesIO()
-    options: dict[str, Any] = {"use_dictionary": False, "compression_level": _VALUES_LEVEL}
-    if table.name != CHUNK:
-        alike = [name for name in table.columns if name not in table.json_columns]
-        group_rows = _APPENDED_GROUP_ROWS if table.time_column else _CHANGING_GROUP_ROWS
-        options = {"use_dictionary": alike, "row_group_size": group_rows}
-    package("pyarrow.parquet").write_table(arrow_table, sink, compression="zstd", **options)
-    return sink.getvalue()
-
-
-def _whole(content: bytes, path: str) -> Any:
-    """All rows of a file.
-
-    Raises:
-        PoolError: The file is none, or is damaged.
-    """
-    with _clear_damage(path):
-        buffer = package("pyarrow").BufferReader(content)
-        return package("pyarrow.parquet").ParquetFile(buffer).read()
-
-
-def _rows(
-    table: Table,
-    content: bytes,
-    path: str,
-    count: int | None,
-    where: Mapping[str, Collection[int]],
-) -> Iterator[Row]:
-    """Of the first rows of a file, or of all, those whose columns have one of these values.
-
-    Raises:
-        PoolError: As `_whole`.
-    """
-    arrow, dataset = package("pyarrow"), package("pyarrow.dataset")
-    chosen = dataset.scalar(True)
-    for name, values in where.items():
-        chosen &= dataset.field(name).isin(arrow.array(values, arrow.int64()))
-    with _clear_damage(path):
-        fragment = dataset.ParquetFileFormat().make_fragment(arrow.BufferReader(content))
-        options = {"batch_size": _ROWS_AT_ONCE, "filter": chosen if count is None else None}
-        for batch in fragment.to_batches(schema=schema_of(table), **options):
-            piece = arrow.Table.from_batches([batch])
-            if count is not None:
-                piece, count = piece.slice(0, count), max(0, count - piece.num_rows)
-                piece = piece.filter(chosen)
-            columns = [piece.column(name).to_pylist() for name in table.columns]
-            yield from zip(*columns, strict=True)
-            if count == 0:
-                return
-
-
-@contextmanager
-def _clear_damage(path: str) -> Generator[None]:
-    try:
-        yield
-    except package("pyarrow").ArrowException as error:
-        raise PoolError(f"{path} is damaged ({error}): restore or remove it") from error
-
-
-def _replaced(table: Table, held: Any | None, rows: Iterable[Row]) -> list[Row]:
-    """What a table that changes holds when these rows have come, in the order of its key.
-
-    A row replaces the one of its key, but a null of `Table.lasting` does not replace a value.
+    A row replaces the row of its key, but null never replaces a value in `ShippedTable.lasting`.
     """
     key = [table.columns.index(name) for name in table.key]
     lasting = [name in table.lasting for name in table.columns]
     before = [] if held is None else [held.column(name).to_pylist() for name in table.columns]
-    found: dict[Any, Row] = {}
+    found: dict[Any, PoolRow] = {}
     for row in chain(zip(*before, strict=True), rows):
         named = tuple(row[at] for at in key)
         old = found.get(named, row)
@@ -402,16 +310,16 @@ def _replaced(table: Table, held: Any | None, rows: Iterable[Row]) -> list[Row]:
 
 
 def _is_over(content: bytes, whole: Any, rows_before: int) -> bool:
-    """Whether the part that a file is in is over; so many rows were in the file before."""
+    """Return whether the part of a file that had `rows_before` rows has to be closed."""
     added_share = 1 - rows_before / max(1, whole.num_rows)
     is_seldom_more = len(content) > _SMALL_PART_BYTES and added_share * _MOST_TIMES < 1
     return len(content) > PART_BYTES or whole.nbytes > _PART_MEMORY_BYTES or is_seldom_more
 
 
-def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[Table, list[Row]]]:
-    """The rows of each table, in the order in which the tables come."""
-    found: dict[Table, list[Row]] = {}
+def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[ShippedTable, list[PoolRow]]]:
+    """Return the rows of each table, in the order of the batches, with chunks last."""
+    found: dict[ShippedTable, list[PoolRow]] = {}
     for batch in batches:
         found.setdefault(batch.table, []).extend(batch.rows)
-    # Chunks at last: their columns are called as the signals, which are there then.
+    # Columns of chunks are named after signals, which have to be written before.
     return sorted(found.items(), key=lambda each: each[0].name == CHUNK)

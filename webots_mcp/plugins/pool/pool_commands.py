@@ -1,4 +1,4 @@
-"""Commands about a pool: what is in it, a recording shipped to it, runs of it brought back."""
+"""The commands of pools: `pool` lists or queries, `ship` writes and `fetch` reads back."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from webots_mcp.cli.streams import shown_progress
 from webots_mcp.cli.terminal import clock_text, id_ranges, print_json, print_notes, print_table
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plugins.pool.pool_contents import (
-    Choice,
+    RunFilter,
     chosen_runs,
     chosen_trial_sets,
-    meant,
+    resolve_filter,
     robots,
 )
 
 if TYPE_CHECKING:
-    from webots_mcp.plugins.pool.fetching import Fetched
+    from webots_mcp.plugins.pool.fetching import FetchResult
     from webots_mcp.plugins.pool.pool_interface import Pool
-    from webots_mcp.plugins.pool.shipping import Report
+    from webots_mcp.plugins.pool.shipping import ShippingReport
     from webots_mcp.store.sql import SqlResult
 
 _MOST_NAMED: Final = 3
-_SHORT: Final = 8  # of a UUID: as much of it as tells one from the others
-_ALL: Final = Choice()
+_SHORT: Final = 8  # Characters of a UUID that tell it from others.
+_ALL: Final = RunFilter()
 
 
 def fetch(
@@ -43,7 +43,7 @@ def fetch(
             help="The pool: postgresql://HOST/DATABASE, a folder, s3://BUCKET/PREFIX, ...",
         ),
     ],
-    choice: Choice = _ALL,
+    choice: RunFilter = _ALL,
     recorded: Where = HERE,
     json: Json = False,
 ) -> int:
@@ -58,7 +58,7 @@ def fetch(
     from webots_mcp.plugins.pool.pool_contents import open_pool
 
     with open_pool(url) as pool:
-        wanted = meant(pool, choice)  # first: no database is made for nothing
+        wanted = resolve_filter(pool, choice)  # First, so that no database is made in vain.
         with (
             recorded.writer("fetch", create=True) as (here, connection),
             shown_progress("fetching") as progress,
@@ -71,8 +71,8 @@ def fetch(
     return 0 if found.runs else 1
 
 
-def _as_data(found: Fetched) -> dict[str, Any]:
-    """The ids of the runs that are here, and what was not taken, by its UUIDs."""
+def _as_data(found: FetchResult) -> dict[str, Any]:
+    """Return the ids of fetched runs, and the UUIDs of runs that were not fetched."""
     return {
         "fetched_run_ids": found.come,
         "known_run_ids": [found.runs[uuid] for uuid in found.known],
@@ -85,7 +85,7 @@ def _as_data(found: Fetched) -> dict[str, Any]:
     }
 
 
-def _print_fetched(found: Fetched, address: str) -> None:
+def _print_fetched(found: FetchResult, address: str) -> None:
     def ids(uuids: Iterable[str]) -> str | None:
         return id_ranges([found.runs[uuid] for uuid in uuids])
 
@@ -135,7 +135,7 @@ def pool(
         Count,
         Parameter("-n", metavar="N", help="The newest N, or N rows (20); of a SELECT up to 1000."),
     ] = 20,
-    choice: Choice = _ALL,
+    choice: RunFilter = _ALL,
     json: Json = False,
 ) -> None:
     """List what is in a pool, or ask it one SELECT; nothing is changed.
@@ -164,7 +164,7 @@ def pool(
 
 
 class _List(NamedTuple):
-    """What a pool holds of a kind, as it is called in JSON; and as rows of a table."""
+    """A list of what a pool holds: its name in JSON, its items, and its table."""
 
     key: str
     found: Sequence[object]
@@ -172,7 +172,7 @@ class _List(NamedTuple):
     rows: Sequence[list[Any]]
 
 
-def _listed(pool: Pool, part: str, choice: Choice) -> _List:
+def _listed(pool: Pool, part: str, choice: RunFilter) -> _List:
     if part == "robots":
         found = robots(chosen_runs(pool, choice))
         columns = ("robot", "recordings", "runs", "rows", "first", "last")
@@ -264,7 +264,7 @@ def ship(
     """
     from webots_mcp.plugins.pool.pool_contents import is_postgres, open_pool
     from webots_mcp.plugins.pool.pool_interface import redacted
-    from webots_mcp.plugins.pool.shipping import Order, Report
+    from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport
     from webots_mcp.plugins.pool.shipping import follow as follow_recording
     from webots_mcp.plugins.pool.shipping import ship as ship_once
 
@@ -277,19 +277,21 @@ def ship(
         raise InvalidInputError("--every is for --follow: without it, everything is shipped once")
     (url,) = urls
     connect = functools.partial(open_pool, url, ships=True)
-    order = Order(recorded.recording(), connect, full, pictures)
-    report, is_done = Report(), False
+    order = ShippingJob(recorded.recording(), connect, full, pictures)
+    report, is_done = ShippingReport(), False
     try:
         if follow:
             _say(f"shipping to {redacted(url)} until Ctrl-C")
-            default_s = 2.0 if is_postgres(url) else 60.0  # of small files there are soon many
+            default_s = (
+                2.0 if is_postgres(url) else 60.0
+            )  # Shorter pauses would make many small files.
             follow_recording(order, report, _say, pause_s or default_s)
         else:
             ship_once(order, report)
             is_done = True
     finally:
-        is_told = json and isinstance(sys.exc_info()[1], WebotsMCPError)  # as the only object
-        if not is_told:
+        is_reported = json and isinstance(sys.exc_info()[1], WebotsMCPError)  # As the only object.
+        if not is_reported:
             _show_report(redacted(url), report, is_done=is_done, as_json=json)
 
 
@@ -297,7 +299,7 @@ def _say(text: str) -> None:
     print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
 
 
-def _show_report(address: str, report: Report, *, is_done: bool, as_json: bool) -> None:
+def _show_report(address: str, report: ShippingReport, *, is_done: bool, as_json: bool) -> None:
     notes = [*_notes(report), *report.notes]
     if as_json:
         return print_json({"pool": address, "complete": is_done, **vars(report), "notes": notes})
@@ -310,7 +312,7 @@ def _show_report(address: str, report: Report, *, is_done: bool, as_json: bool) 
     print_notes(notes)
 
 
-def _notes(report: Report) -> list[str]:
+def _notes(report: ShippingReport) -> list[str]:
     notes: list[str] = []
     if lost := [f"{table} {rows}" for table, rows in sorted(report.lost.items()) if rows]:
         notes.append(f"rows deleted before they could be shipped: {', '.join(lost)}")

@@ -1,8 +1,8 @@
-"""What pools there are, what is in one, and which of its runs are meant.
+"""Opening a pool by its URL, listing what it holds, and choosing some of its runs.
 
 `postgresql://[USER@]HOST[:PORT]/DATABASE` and `postgresql:///?service=NAME` are PostgreSQL; a
 folder, `file:///FOLDER` and any other URL that fsspec knows are a dataset of Parquet files.
-Passwords come from PGPASSWORD, ~/.pgpass or a service file: in a URL, every process would see them.
+Passwords come from PGPASSWORD, ~/.pgpass or a service file: every process could see them in a URL.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from webots_mcp.signals.naming import nearest_first
 from webots_mcp.store.reading.ranges import parse_wall_time
 
 _MOST_OFFERED: Final = 3
-_MOST_COMPARED: Final = 2000  # names or UUIDs, with one that is not there
+_MOST_COMPARED: Final = 2000  # Names or UUIDs to search for similar ones.
 _CONNECTION_STRING: Final = re.compile(
     r"(^|\s)(host|hostaddr|dbname|user|password|passfile|service)\s*=", re.IGNORECASE
 )
@@ -32,11 +32,11 @@ _NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 
 
 def open_pool(url: str, *, ships: bool = False) -> Pool:
-    """The pool of a URL, not yet connected. What it needs is imported only here.
+    """Return the pool of a URL, not yet connected. Its packages are imported on this call.
 
     Args:
-        url: Of PostgreSQL, or of files.
-        ships: To ship to it, and not only to read it.
+        url: URL of PostgreSQL or of files.
+        ships: Whether to ship to it, and not only read it.
 
     Raises:
         InvalidInputError: The URL names no pool, or holds a secret.
@@ -45,7 +45,7 @@ def open_pool(url: str, *, ships: bool = False) -> Pool:
     if is_postgres(url):
         try:
             import_module("psycopg")
-        except ImportError as missing:  # psycopg itself, or a libpq for it
+        except ImportError as missing:  # Of psycopg itself, or of a libpq for it.
             raise PoolError(explain_extra("a pool in PostgreSQL", "postgres")) from missing
         from webots_mcp.plugins.pool.postgres_pool import PostgresPool
 
@@ -56,10 +56,10 @@ def open_pool(url: str, *, ships: bool = False) -> Pool:
 
 
 def is_postgres(url: str) -> bool:
-    """Whether it is PostgreSQL rather than files.
+    """Return whether a URL names PostgreSQL rather than files.
 
     Raises:
-        InvalidInputError: It holds a secret, or is no URL and no folder.
+        InvalidInputError: It contains a secret, or is neither a URL nor a folder.
     """
     if not url.strip():
         raise InvalidInputError("the URL is empty: give postgresql://HOST/DATABASE or a folder")
@@ -80,15 +80,9 @@ def is_postgres(url: str) -> bool:
     return False
 
 
-# -- what is there ----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class PooledRun:
-    """A run in a pool, with what is needed to choose it and to fetch it.
-
-    The UUID is empty where an old version recorded it.
-    """
+    """A run in a pool. Its UUID is empty if an old version recorded it."""
 
     recording_uuid: str
     run_id: int
@@ -106,7 +100,7 @@ class PooledRun:
 
 @dataclass(frozen=True)
 class PooledTrialSet:
-    """A trial set in a pool; `runs` are those of its trials, as (recording's UUID, run's id)."""
+    """A trial set in a pool. `runs` are those of its trials: UUID of the recording and run id."""
 
     recording_uuid: str
     trial_set_id: int
@@ -118,7 +112,7 @@ class PooledTrialSet:
 
 @dataclass(frozen=True)
 class PooledRobot:
-    """A robot name in a pool, and what all its runs come to."""
+    """A robot name in a pool, with totals of its runs."""
 
     robot: str
     recordings: int
@@ -129,7 +123,7 @@ class PooledRobot:
 
 
 def pooled_runs(pool: Pool) -> list[PooledRun]:
-    """All runs, by when they began."""
+    """Return all runs, by start time."""
     robots = {(owner, robot_id): name for owner, (robot_id, name) in pool.rows_of("robot")}
     found: list[PooledRun] = []
     for owner, (run_id, robot_id, uuid, *others) in pool.rows_of("run"):
@@ -140,7 +134,7 @@ def pooled_runs(pool: Pool) -> list[PooledRun]:
 
 
 def pooled_trial_sets(pool: Pool) -> list[PooledTrialSet]:
-    """All trial sets, by when they were made."""
+    """Return all trial sets, by creation time."""
     trials = defaultdict[tuple[str, int], list[int | None]](list)
     for owner, (_, set_id, run_id) in pool.rows_of("trial"):
         trials[owner, set_id].append(run_id)
@@ -153,7 +147,7 @@ def pooled_trial_sets(pool: Pool) -> list[PooledTrialSet]:
 
 
 def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
-    """The robots of some runs, those that recorded last first."""
+    """Return the robots of some runs, the one that recorded last first."""
     by_name: dict[str, list[PooledRun]] = {}
     for run in runs:
         by_name.setdefault(run.robot, []).append(run)
@@ -171,17 +165,14 @@ def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
     return sorted(found, key=lambda robot: -robot.last_wall_time_s)
 
 
-# -- which are meant --------------------------------------------------------------------------
-
-
 def _option(name: str, metavar: str, text: str) -> Parameter:
     return Parameter(name, metavar=metavar, help=text)
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Choice:
-    """Which runs are meant: those of which all that is given is true."""
+class RunFilter:
+    """Options that choose runs: those to which all given options apply."""
 
     run_uuid: Annotated[
         str | None, _option("--run", "UUID", "The run of that UUID, or that begins so.")
@@ -212,23 +203,23 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Meant:
-    """What a choice means in a pool.
+class ChosenRuns:
+    """The runs and trial sets that a filter chooses.
 
     Attributes:
-        runs: By when they began.
-        trial_sets: The set of which all trials are meant, as each recording has it.
+        runs: Runs by start time.
+        trial_sets: The chosen trial set, once for each recording that has it.
     """
 
     runs: Sequence[PooledRun]
     trial_sets: Sequence[PooledTrialSet]
 
 
-def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
-    """The runs that are meant, by when they began.
+def chosen_runs(pool: Pool, choice: RunFilter) -> list[PooledRun]:
+    """Return the chosen runs, by start time.
 
     Raises:
-        InvalidInputError: There is none; the text names what comes nearest.
+        InvalidInputError: There is none. The text names similar ones.
     """
     runs = pooled_runs(pool)
     if not runs:
@@ -263,23 +254,23 @@ def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
     return found
 
 
-def meant(pool: Pool, choice: Choice) -> Meant:
-    """What is to be fetched.
+def resolve_filter(pool: Pool, choice: RunFilter) -> ChosenRuns:
+    """Return the runs and trial sets to fetch.
 
     Raises:
-        InvalidInputError: That is nothing, or nothing is given that says what.
+        InvalidInputError: Nothing is chosen, or no option is given.
     """
-    if choice == Choice():
+    if choice == RunFilter():
         raise InvalidInputError(
             "which runs? Give --run, --label, --trials, --robot, --since or --until; "
             f"'webots-mcp pool {pool.address} runs' lists them"
         )
     sets = chosen_trial_sets(pool, choice) if choice.trials is not None else []
-    return Meant(chosen_runs(pool, choice), sets)
+    return ChosenRuns(chosen_runs(pool, choice), sets)
 
 
-def chosen_trial_sets(pool: Pool, choice: Choice) -> list[PooledTrialSet]:
-    """The trial sets that are meant: all, or the one of that UUID, as each recording has it."""
+def chosen_trial_sets(pool: Pool, choice: RunFilter) -> list[PooledTrialSet]:
+    """Return all trial sets, or the one with the chosen UUID from each recording that has it."""
     sets = pooled_trial_sets(pool)
     if choice.trials is None:
         return sets
@@ -290,16 +281,16 @@ def chosen_trial_sets(pool: Pool, choice: Choice) -> list[PooledTrialSet]:
 
 
 def _named(what: str, asked: str, uuids: Sequence[str]) -> str:
-    """The only UUID that begins so.
+    """Return the only UUID that begins with a text.
 
     Raises:
         InvalidInputError: None does, or several do.
     """
-    meant = asked.strip().lower()
-    found = sorted({uuid for uuid in uuids if uuid.lower().startswith(meant)})
+    resolve_filter = asked.strip().lower()
+    found = sorted({uuid for uuid in uuids if uuid.lower().startswith(resolve_filter)})
     if len(found) == 1:
         return found[0]
-    if found and meant:
+    if found and resolve_filter:
         raise InvalidInputError(
             f"{len(found)} of the {what}s have a UUID that begins with {asked!r} "
             f"({', '.join(found[:_MOST_OFFERED])}, ...): give more of it"

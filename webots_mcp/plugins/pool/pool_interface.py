@@ -1,6 +1,6 @@
-"""What is shipped to a pool, and what the two kinds of pools do: tables, batches, protocols.
+"""The interface of pools: the tables that are shipped, batches of rows and protocols.
 
-Each row is keyed by its recording's UUID and the key that it has there.
+The key of a row is the UUID of its recording plus its key there.
 """
 
 from __future__ import annotations
@@ -21,28 +21,29 @@ if TYPE_CHECKING:
     from webots_mcp.store.sql import SqlResult
 
 SQLValue: TypeAlias = "int | float | str | bytes | None"
-Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
-Row = tuple[SQLValue, ...]
+ValueType: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
+PoolRow = tuple[SQLValue, ...]
 
 BATCH_BYTES: Final = 4_000_000
 BATCH_ROWS: Final = 20_000
 _VALUE_BYTES: Final = 8
 _DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
 CHUNKS: Final = ("row_group", "chunk")
-# Of one machine or one moment: who maintains it, what is kept there, console lines that wait to
-# become log lines, and who asked for what.
+# Tables of one machine or moment, which are not shipped: leases, retention, console lines that wait
+# to become log lines, and requests.
 _LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "request")
-# How many rows wait for chunks there, how many of a group are left, and what they take on the disk.
+# Columns that are not shipped: about ids, rows that wait for chunks and space on the disk.
 _LOCAL_COLUMNS: Final = {
+    "recording": ("reserved_state_id",),
     "run": ("is_chunked",),
     "command": ("request_id",),
     "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
 }
 _OF_TRIALS: Final = ("trial_set", "trial")
-_TYPES: Final[dict[str, Kind]] = {
+_TYPES: Final[dict[str, ValueType]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
 }  # fmt: skip
-# What is needed to list the runs and trial sets of a pool: of few tables few columns.
+# The columns that are needed to list the runs and trial sets of a pool.
 LISTED: Final[dict[str, tuple[str, ...]]] = {
     "robot": ("id", "name"),
     "run": (
@@ -52,7 +53,7 @@ LISTED: Final[dict[str, tuple[str, ...]]] = {
     "trial_set": ("id", "uuid", "created_wall_time_s"),
     "trial": ("id", "trial_set_id", "run_id"),
 }  # fmt: skip
-_WHOLE: Final = "run.whole:{}"  # a bit for each of so many runs
+_WHOLE: Final = "run.whole:{}"  # A bit for each of `_RUNS_IN_NUMBER` runs.
 _RUNS_IN_NUMBER: Final = 60
 _SECRET: Final = re.compile(
     "password|passwd|secret|token|credential|signature|authorization|(access|api|account)[_-]?key|"
@@ -61,35 +62,31 @@ _SECRET: Final = re.compile(
 )
 
 
-# -- what is shipped --------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
-class Table:
-    """A table that is shipped; its columns in the order in which a batch has their values.
+class ShippedTable:
+    """A table that is shipped.
 
     Attributes:
-        key: Its primary key in a recording; in a pool the recording's UUID stands before it.
-        columns: Those of the key and all others that are shipped, by their names in the recording.
-        types: Of the columns, as the model declares them; SQLite may hold others.
-        json_columns: Those that hold JSON as text.
-        json_values: Of them, those in which a text is as good as an object.
-        nullable: Those that may be null.
-        lasting: References that retention sets to null where it deletes what they name: a null
-            does not replace the value that the pool has.
-        is_appended: Rows come with rising ids and never change; otherwise a row replaces the one
-            of the same key.
-        time_column: The wall time by which a pool may cut it into parts, of appended tables but
-            row groups and chunks.
-        run_column: The column that names the row's run, where it belongs to one.
-        session_column: The column that names its session.
-        outlasts_runs: It stays where the run or session that it names is not shipped.
+        key: Primary key in a recording. In a pool, the UUID of the recording precedes it.
+        columns: All shipped columns by their names in the recording, in the order of batches.
+        types: Types of the columns in the model. SQLite may hold values of other types.
+        json_columns: Columns that hold JSON as text.
+        json_values: JSON columns whose value may be any JSON value, not only an object.
+        nullable: Columns that may be null.
+        lasting: References that retention sets to null when it deletes their target. Null does not
+            replace a value in the pool.
+        is_appended: Whether rows have rising ids and never change. Otherwise a row replaces the
+            row of its key.
+        time_column: Column of the wall time by which a pool may divide an appended table.
+        run_column: Column with the id of the row's run, if any.
+        session_column: Column with the id of the row's session, if any.
+        outlasts_runs: Whether rows are shipped even if their run or session is not.
     """
 
     name: str
     key: tuple[str, ...]
     columns: tuple[str, ...]
-    types: tuple[Kind, ...]
+    types: tuple[ValueType, ...]
     json_columns: frozenset[str]
     json_values: frozenset[str]
     nullable: frozenset[str]
@@ -102,24 +99,24 @@ class Table:
 
 
 @cache
-def tables() -> tuple[Table, ...]:
-    """All that are shipped, each after those that it refers to. Importing the models costs."""
+def tables() -> tuple[ShippedTable, ...]:
+    """Return all shipped tables, each after the tables it refers to. Importing models is slow."""
     from webots_mcp.store import models
 
     ordered: list[Any] = cast("Any", models).SQLModel.metadata.sorted_tables
     return tuple(_table(each) for each in ordered if each.name not in _LOCAL)
 
 
-def table(name: str) -> Table:
-    """The table of that name.
+def table(name: str) -> ShippedTable:
+    """Return the shipped table with this name.
 
     Raises:
-        KeyError: None of that name is shipped.
+        KeyError: There is none.
     """
     return {each.name: each for each in tables()}[name]
 
 
-def _table(model: Any) -> Table:
+def _table(model: Any) -> ShippedTable:
     name: str = model.name
     local = _LOCAL_COLUMNS.get(name, ())
     shipped: list[Any] = [column for column in model.columns if column.name not in local]
@@ -130,7 +127,7 @@ def _table(model: Any) -> Table:
         named = "id" if name == owner else f"{owner}_id"
         return named if named in columns else None
 
-    return Table(
+    return ShippedTable(
         name=name,
         key=tuple(column.name for column in model.primary_key.columns),
         columns=columns,
@@ -155,15 +152,15 @@ def _table(model: Any) -> Table:
 
 @dataclass(frozen=True)
 class Batch:
-    """Rows in the order of the table's columns: JSON is text, a flag 0 or 1."""
+    """Rows with values in the order of the table's columns: JSON is text, a flag 0 or 1."""
 
-    table: Table
-    rows: Sequence[Row]
+    table: ShippedTable
+    rows: Sequence[PoolRow]
 
 
-def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
-    """Rows as batches of bounded size; a row that is larger by itself is a batch of its own."""
-    held: list[Row] = []
+def batches(table: ShippedTable, rows: Iterable[PoolRow]) -> Iterator[Batch]:
+    """Yield rows in batches of limited size. A row that exceeds it is a batch of its own."""
+    held: list[PoolRow] = []
     size = 0
     for row in rows:
         added = row_bytes(row)
@@ -176,18 +173,18 @@ def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
         yield Batch(table, held)
 
 
-def row_bytes(row: Row) -> int:
-    """About how many bytes of memory a row's values take."""
+def row_bytes(row: PoolRow) -> int:
+    """Return about the bytes of memory that a row's values take."""
     sized = sum([len(value) for value in row if isinstance(value, (str, bytes))])
     return sized + _VALUE_BYTES * len(row)
 
 
 def fitted(batch: Batch, replaced: Counter[str]) -> Batch:
-    """The rows with values of the types of their columns, where SQLite may hold any.
+    """Convert the values of rows to the types of their columns. SQLite may hold any type.
 
     Args:
-        batch: As it was read.
-        replaced: Counts by column (`log.message`) the values in whose place is what comes nearest.
+        batch: The rows as they were read.
+        replaced: Counts the values that were converted, by column (`log.message`).
     """
     columns: list[Sequence[SQLValue]] = [*zip(*batch.rows, strict=True)]
     described = zip(batch.table.columns, batch.table.types, columns, strict=True)
@@ -204,29 +201,26 @@ def fitted(batch: Batch, replaced: Counter[str]) -> Batch:
     return Batch(batch.table, [*zip(*columns, strict=True)]) if others else batch
 
 
-def _nearest(value: SQLValue, kind: Kind, *, nullable: bool) -> SQLValue:
-    """The value of a type that comes nearest to one that SQLite holds."""
-    least = None if nullable else kind()
+def _nearest(value: SQLValue, kind: ValueType, *, nullable: bool) -> SQLValue:
+    """Return the value of a type that is nearest to a value of SQLite."""
+    empty = None if nullable else kind()
     if value is None or isinstance(value, kind):
         return value
     if kind is str:
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
     if kind is bytes:
-        return least
+        return empty
     try:
         number = float(value)
     except ValueError:
-        return least
+        return empty
     if kind is float:
         return number
-    return int(number) if math.isfinite(number) and abs(number) < 2**63 else least
-
-
-# -- how far ----------------------------------------------------------------------------------
+    return int(number) if math.isfinite(number) and abs(number) < 2**63 else empty
 
 
 def whole_runs(run_ids: Iterable[int]) -> dict[str, int]:
-    """Numbers of the progress that say of these runs: they are over, and all of them is there."""
+    """Return numbers of the progress that mark runs as ended and completely shipped."""
     numbers: dict[str, int] = {}
     for run_id in run_ids:
         name = _WHOLE.format(run_id // _RUNS_IN_NUMBER)
@@ -235,111 +229,108 @@ def whole_runs(run_ids: Iterable[int]) -> dict[str, int]:
 
 
 def is_whole(progress: Mapping[str, int], run_id: int) -> bool:
-    """Whether the progress says so of a run."""
+    """Return whether the progress marks a run as ended and completely shipped."""
     number = progress.get(_WHOLE.format(run_id // _RUNS_IN_NUMBER), 0)
     return bool(number >> run_id % _RUNS_IN_NUMBER & 1)
 
 
-# -- what an engine does ----------------------------------------------------------------------
-
-
 class Shipment(Protocol):
-    """One recording's part of a pool, which one shipper at a time writes."""
+    """The part of a pool of one recording, which one shipper at a time writes."""
 
     def progress(self) -> dict[str, int]:
-        """The numbers that `write` left, by names that the shipper chose; empty at first."""
+        """Return the numbers that `write` stored, by names that the shipper chose.
+
+        Empty at first.
+        """
         ...
 
     def foreign_runs(self, run_uuids: Collection[str]) -> dict[str, str]:
-        """Of these runs, those that another recording has shipped, with that one's UUID."""
+        """Return the runs that another recording has shipped, with its UUID."""
         ...
 
     def write_picture(self, path: str, content: bytes) -> None:
-        """Keep a picture under the path that its row in `image` names, in the place of another.
+        """Store a picture under the path of its row in `image`, replacing another.
 
-        It is whole and there, at the latest, when the `write` that follows has returned.
+        It is completely stored, at the latest, when the next `write` has returned.
         """
         ...
 
     def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> Mapping[str, int]:
-        """Write fitted rows, and change these numbers of the progress: all of it or nothing.
+        """Write fitted rows and numbers of the progress: all or nothing.
 
-        Rows of appended tables come once. A row of the others replaces the one of its key, but
-        where a column of `Table.lasting` is null, the value stays; rows that are not in the batch
-        stay too, since retention at the edge deletes what a pool keeps. Batches may name a table
-        twice; what a row refers to comes before it.
+        Rows of appended tables come once. A row of another table replaces the row of its key, but
+        where a column of `ShippedTable.lasting` is null, the value stays. Rows that are missing
+        from the batch stay too, since retention at the edge deletes what a pool keeps. Batches may
+        name a table twice; what a row refers to comes before it.
 
         Returns:
-            By column (`log.message`), how many values the pool cannot hold as they are: it has what
-            comes nearest, or null.
+            The number of values that the pool cannot hold, by column (`log.message`). It stores the
+            nearest value, or null.
 
         Raises:
-            PoolUnavailableError: Worth trying again; nothing was written.
-            PoolError: It will not be better by itself.
+            PoolUnavailableError: A retry may succeed. Nothing was written.
+            PoolError: A retry will not help.
         """
         ...
 
 
 class Pool(Protocol):
-    """A pool, shipped to or read; a context manager, connected as long as it is open.
+    """A pool to ship to or to read: a context manager, connected as long as it is open.
 
-    `run.purged_rows` is as the edge last said it: how many states a pool lacks is counted.
+    `run.purged_rows` is the last value of the recording. How many states a pool lacks is counted.
 
     Attributes:
-        address: Its URL without secrets: for messages, logs and the file of what was shipped.
+        address: The URL without secrets, for messages and logs.
     """
 
     address: str
 
     def __enter__(self) -> Pool:
-        """Connect; who ships makes the tables where there are none.
+        """Connect. To ship, create the tables if there are none.
 
         Raises:
-            PoolUnavailableError: Nobody answers there now.
-            PoolError: It is no pool that can be used, or of another version.
+            PoolUnavailableError: The pool does not answer.
+            PoolError: The pool cannot be used, or has another version.
         """
         ...
 
     def __exit__(self, *exception: object) -> None:
-        """Disconnect; what was not written is gone."""
+        """Disconnect. Data that was not written is lost."""
         ...
 
     def shipment(self, recording_uuid: str) -> AbstractContextManager[Shipment]:
-        """Be the one who ships this recording, to a pool that was opened for it.
+        """Be the only shipper of a recording, to a pool that was opened for shipping.
 
         Raises:
-            PoolBusyError: Another does.
+            PoolBusyError: Another process ships it.
         """
         ...
 
     def rows_of(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
-        """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""
+        """Yield the UUID of the recording and the columns `LISTED` of each row of a table."""
         ...
 
     def progress(self, recording_uuid: str) -> dict[str, int]:
-        """How far the recording was shipped, as `Shipment.progress` tells it."""
+        """Return how far the recording was shipped, like `Shipment.progress`."""
         ...
 
     def rows(
-        self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
+        self, recording_uuid: str, table: ShippedTable, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
-        """Rows whose columns have one of these values, in any order."""
+        """Yield rows whose columns have one of some values, in any order."""
         ...
 
     def picture(self, recording_uuid: str, path: str) -> bytes | None:
-        """A picture that was shipped, by the path in its row."""
+        """Return a picture by the path in its row; None if it was not shipped."""
         ...
 
     def select(self, sql: str, max_rows: int) -> SqlResult:
-        """The first rows of one SELECT, which cannot write, before a deadline; see `query_sql`."""
+        """Return the first rows of one SELECT, which cannot write and has a deadline."""
         ...
 
 
-# -- what may be shown of a URL ---------------------------------------------------------------
-
-
 def redacted(url: str) -> str:
-    """A URL as it may be shown: without a password and without whatever looks like a secret."""
+    """Return a URL without a password and without parameters that look like secrets."""
     scheme, sign, rest = url.partition("://")
     if not sign:
         return url
@@ -353,17 +344,17 @@ def redacted(url: str) -> str:
 
 
 def _place_and_query(rest: str) -> tuple[str, str, str]:
-    """What comes before and after the question mark, which is not the one of a password."""
+    """Split at the question mark of the query, which is not one in a password."""
     user, at, _ = rest.partition("@")
     end = rest.find("?", len(user) if at and "/" not in user else 0)
     return (rest, "", "") if end < 0 else (rest[:end], "?", rest[end + 1 :])
 
 
 def require_no_secret(url: str) -> None:
-    """Refuse a URL with a password or a key in it.
+    """Refuse a URL that contains a password or a key.
 
     Raises:
-        InvalidInputError: It holds one.
+        InvalidInputError: It contains one.
     """
     place, _, query = _place_and_query(url.partition("://")[2])
     user, _, _ = place.rpartition("@")

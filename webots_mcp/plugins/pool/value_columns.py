@@ -1,10 +1,9 @@
-"""The chunks of a run as columns of Parquet, a row for each state, and chunks again.
+"""The chunks of a run as Parquet columns with a row for each state, and the way back.
 
-Each signal has a column of its name, of one type, that of most of its values: double, boolean or
-string. What else it held in a row (null, a text among numbers, what JSON cannot hold) stands in the
-column `others`, as JSON by the name of the column: an array says what was replaced, as in
-`chunk.labels`. A signal that is called as one of the columns that every file has has its id behind
-its name.
+Each signal has a column with its name and the type of most of its values: double, boolean or
+string. Other values of a row (null, a text among numbers, what JSON cannot hold) are in the column
+`others`, as a JSON object by the name of the column. An array in it says what was replaced, as in
+`chunk.labels`. If a signal has the name of a fixed column, its id is appended to the name.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, TypeAlias
 
 from webots_mcp.analysis.arrays import np
-from webots_mcp.plugins.pool.parquet_files import package
-from webots_mcp.plugins.pool.pool_interface import Row, table
+from webots_mcp.plugins.pool.pool_interface import PoolRow, table
+from webots_mcp.plugins.pool.storage import package
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import (
     FIRST_LABEL,
@@ -37,7 +36,7 @@ from webots_mcp.store.chunks import (
 _PLACES: Final = {"state_id": STATE_IDS, "sim_time_s": SIM_TIMES, "wall_time_s": WALL_TIMES}
 _FIXED: Final = frozenset({"group_id", "others", *_PLACES, "recording", "recording_uuid", "run",
                            "run_id", "table"})  # fmt: skip
-_TYPES: Final = {"bool": "bool", "text": "string"}  # of kinds of signals; the others are doubles
+_TYPES: Final = {"bool": "bool", "text": "string"}  # By kind of signal; others are doubles.
 _HELD: Final[Mapping[str, type]] = {"bool": bool, "string": str}
 
 
@@ -45,18 +44,18 @@ NameAndKind: TypeAlias = "tuple[str, str]"
 
 
 def columns_of(
-    chunks: Iterable[Row],
+    chunks: Iterable[PoolRow],
     signals: Mapping[int, NameAndKind],
     altered: Counter[str],
     held: Any | None = None,
 ) -> Any:
-    """The chunks of one run as an Arrow table, group after group.
+    """Return the chunks of one run as an Arrow table, group after group.
 
     Args:
-        chunks: Rows of the table `chunk`: of each group all.
-        signals: Their names and kinds by their ids.
+        chunks: Rows of the table `chunk`, with all chunks of each group.
+        signals: Names and kinds of signals by id.
         altered: Counts chunks that cannot be read.
-        held: Columns that these are put behind, with the types that they have there.
+        held: Table that the rows are appended to, whose types they take.
     """
     arrow = package("pyarrow")
     types = {} if held is None else {_signal_of(field): field.type for field in held.schema}
@@ -69,13 +68,13 @@ def columns_of(
     ]
     for group_id, of_group in groups.items():
         values = _decoded(of_group, altered)
-        if values.keys() >= set(_PLACES.values()):  # else nobody knows of when the others are
+        if values.keys() >= set(_PLACES.values()):  # Without times, the others are of no use.
             made.append(_group(group_id, values, signals, types))
     return arrow.concat_tables(made, promote_options="default")
 
 
 def _decoded(chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]) -> dict[int, Decoded]:
-    """The values of a group by signals; those that cannot be read are told as replaced."""
+    """Return the values of a group by signal; unreadable values become replaced ones."""
     rows = int(chunks[SIM_TIMES]["row_count"]) if SIM_TIMES in chunks else 0
 
     def values_of(chunk: Mapping[str, Any]) -> Decoded | None:
@@ -107,7 +106,7 @@ def _group(
         arrays.append(arrow.array(decoded.pop(signal_id).numbers).cast(fields[-1].type))
     others: dict[int, dict[str, Any]] = defaultdict(dict)
     for signal_id, values in sorted(decoded.items()):
-        if signal_id in signals:  # else another program deleted it
+        if signal_id in signals:  # Another program may have deleted it.
             name, kind = signals[signal_id]
             types.setdefault(signal_id, _type_of(values, kind))
             name = f"{name} ({signal_id})" if name.lower() in _FIXED else name
@@ -121,7 +120,7 @@ def _group(
 
 
 def _type_of(values: Decoded, kind: str) -> Any:
-    """The type that most values have; where there is none, the one of the signal's kind."""
+    """Return the type of most values; without values, the type of the signal's kind."""
     codes = np.zeros(len(values.numbers), np.intp) if values.codes is None else values.codes
     counts = np.bincount(codes, minlength=len(values.labels) + FIRST_LABEL).tolist()
     found = Counter({"double": counts[IS_NUMBER]})
@@ -132,7 +131,7 @@ def _type_of(values: Decoded, kind: str) -> Any:
 
 
 def _array(values: Decoded, name: str, kind: Any, others: dict[int, dict[str, Any]]) -> Any:
-    """A column; what it cannot hold goes to the others."""
+    """Return a column, and add values that it cannot hold to `others`."""
     arrow = package("pyarrow")
     held = _HELD.get(str(kind))
     codes = np.zeros(len(values.numbers), np.intp) if values.codes is None else values.codes
@@ -149,8 +148,8 @@ def _array(values: Decoded, name: str, kind: Any, others: dict[int, dict[str, An
     return arrow.array(fitting, kind).take(arrow.array(codes))
 
 
-def chunks_of(held: Any, run_id: int | None) -> Iterator[Row]:
-    """The rows of the table `chunk` that columns were made of, without ids of their own."""
+def chunks_of(held: Any, run_id: int | None) -> Iterator[PoolRow]:
+    """Yield the rows of the table `chunk` that columns were made of, without ids."""
     names = table("chunk").columns
     groups = held.column("group_id").to_numpy()
     starts = [0, *(np.flatnonzero(np.diff(groups)) + 1).tolist()] if len(groups) else []
@@ -172,12 +171,12 @@ def _signal_of(field: Any) -> int | None:
     if field.name in _PLACES:
         return _PLACES[field.name]
     metadata: Mapping[bytes, bytes] = field.metadata or {}
-    told = metadata.get(b"signal_id")
-    return None if told is None else int(told)
+    signal_id = metadata.get(b"signal_id")
+    return None if signal_id is None else int(signal_id)
 
 
 def _values(column: Any, name: str, others: Mapping[int, Mapping[str, Any]]) -> Decoded:
-    """The values of a column; whole numbers as integers, which are smaller."""
+    """Return the values of a column, whole numbers as integers, which take less space."""
     known: dict[tuple[type, Value | Replaced], int] = {}
 
     def code_of(label: Value | Replaced) -> int:
@@ -201,7 +200,7 @@ def _values(column: Any, name: str, others: Mapping[int, Mapping[str, Any]]) -> 
         if isinstance(label, bool):
             numbers[codes == code] = label
     held = numbers[codes == IS_NUMBER]
-    signs = np.signbit(held[held == 0])  # an integer has no -0.0
+    signs = np.signbit(held[held == 0])  # An integer has no -0.0.
     is_whole = bool((np.trunc(held) == held).all() and not signs.any()) and (
         np.abs(held).max(initial=0) < 2.0**53
     )

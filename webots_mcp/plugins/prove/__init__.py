@@ -1,4 +1,4 @@
-"""What is known of Webots from its sources alone, tried on a real one: `webots-mcp prove`."""
+"""Checks of a real Webots for what is known from its sources only: `webots-mcp prove`."""
 
 from webots_mcp.extras.plugins import Plugin, PluginCommand
 

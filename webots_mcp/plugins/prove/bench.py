@@ -1,4 +1,4 @@
-"""A Webots that checks are made on: started on a world of ours, asked, looked at, ended."""
+"""A Webots for checks, which runs a world of this package and can be steered and read."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ T = TypeVar("T")
 ROVER: Final = "rover"
 SPEAKER: Final = "speaker"
 SOON_S: Final = 10.0
-REAL_TIME: Final = 1  # of simulationGetMode
-_LOOK_EVERY_S: Final = 0.03
-_LIMIT_S: Final = 300.0  # of a check, beside a start
-_LONGEST: Final = 500
-_USUAL: Final = {"robot": ROVER, "timeout_wall_s": SOON_S}
+REAL_TIME: Final = 1  # Value of simulationGetMode.
+_POLL_S: Final = 0.03
+_LIMIT_S: Final = 300.0  # Of a check, in addition to the start of Webots.
+_LONGEST: Final = 500  # Characters of a result.
+_DEFAULTS: Final = {"robot": ROVER, "timeout_wall_s": SOON_S}
 _FOLDER: Final = re.compile(
     r"""(?<![\w/\\])(?:[A-Za-z]:(?:[/\\][^/\\:*?"<>|\n]+)*|(?:~|[A-Z]{4,})?(?:/[^\s/:'"]+)+)[/\\]"""
 )
@@ -49,25 +49,25 @@ _NEWEST: Final = (
 
 
 class OtherwiseError(Exception):
-    """Webots did not do what its sources say; the text is what was seen."""
+    """Webots did not do what its sources say. The text is what was observed."""
 
 
 class NotTriedError(Exception):
-    """Nothing can be said of it here; the text is why."""
+    """A check could not be made. The text is the reason."""
 
 
 def require(holds: object, seen: str) -> None:
-    """Fail with what was seen where something does not hold.
+    """Check a condition.
 
     Raises:
-        OtherwiseError: It does not.
+        OtherwiseError: It does not hold. The text is `seen`.
     """
     if not holds:
         raise OtherwiseError(seen)
 
 
-class Moment(NamedTuple):
-    """The newest row of a robot, with the run and the process that it is of."""
+class RobotRow(NamedTuple):
+    """The newest row of a robot, with its run and its process."""
 
     session_id: int
     pid: int
@@ -78,21 +78,21 @@ class Moment(NamedTuple):
 
 
 class Bench:
-    """Webots on a project of ours, and the recording that its controllers make.
+    """Webots with the project of this package, and the recording that its controllers make.
 
-    One check at a time uses it, in the thread `user`. Another, of a check that hung, may go on: its
-    calls fail.
+    One check at a time uses it, in the thread `user`. Calls from the thread of a check that hung
+    fail.
 
     Args:
-        folder: Of the project, which is written.
-        patience_s: How long a start of Webots may take until the first row.
+        folder: Folder in which the project is written.
+        patience_s: Maximum time from a start of Webots to the first row.
 
     Attributes:
         world: The world file.
-        before: The newest row of the rover when the check began.
+        before: The newest row of the rover at the start of the check.
     """
 
-    before: Moment
+    before: RobotRow
     user: threading.Thread
 
     def __init__(self, folder: Path, patience_s: float) -> None:
@@ -102,18 +102,18 @@ class Bench:
         self.recording = self.where.recording(read_only=False)
         self._launch: WebotsLaunch | None = None
         self._never = set[tuple[bool, Mode | None]]()
-        self._last_row = 0  # before Webots was started
+        self._last_row = 0  # The newest row before the start of Webots.
 
     # -- Webots --
 
     def webots(
         self, *, stream: bool = False, mode: Mode = "realtime", port: int | None = None
     ) -> LaunchedWebots:
-        """The Webots that runs so already, or a new one, once the rover has recorded.
+        """Return a Webots that runs like this, started if needed, once the rover has recorded.
 
         Raises:
-            OtherwiseError: It has not.
-            NotTriedError: It has not before either.
+            OtherwiseError: The rover does not record.
+            NotTriedError: It did not record after an earlier start like this.
         """
         launch = self._launch
         runs: tuple[bool, Mode | None] = stream, mode
@@ -134,11 +134,11 @@ class Bench:
                 why = launch.silence()
                 self.end()
                 raise OtherwiseError(f"the rover records nothing after the start: {why}")
-            time.sleep(_LOOK_EVERY_S)
+            time.sleep(_POLL_S)
         return launch.webots
 
     def running(self, *, stream: bool) -> None:
-        """Webots whose time goes on in real time."""
+        """Make sure that Webots runs in real time."""
         self.webots(stream=stream)
         if not self.moves(2.0) or self.row().state["mode"] != REAL_TIME:
             self.control("resume")
@@ -146,7 +146,7 @@ class Bench:
         self.before = self.row()
 
     def address(self) -> WebotsAddress:
-        """Where it listens, as far as the system shows that."""
+        """Return the address where it listens, as far as the system shows it."""
         assert self._launch is not None
         asked = WebotsAddress("127.0.0.1", self._launch.start.port)
         return self._launch.webots.address_now() or asked
@@ -157,19 +157,19 @@ class Bench:
         if launch is not None:
             launch.webots.end()
 
-    # -- what it records --
+    # -- reading its recording --
 
-    def newest(self, robot: str = ROVER) -> Moment | None:
-        """The newest row of a robot since Webots was started; None where it has none."""
+    def newest(self, robot: str = ROVER) -> RobotRow | None:
+        """Return the newest row of a robot since Webots was started; None if there is none."""
         found = self.rows(_NEWEST, robot, self._last_row)
-        return Moment._make((*found[0][:-1], json.loads(found[0][-1]))) if found else None
+        return RobotRow._make((*found[0][:-1], json.loads(found[0][-1]))) if found else None
 
-    def row(self, robot: str = ROVER) -> Moment:
-        """The newest row of a robot, as soon as it has one since Webots was started."""
+    def row(self, robot: str = ROVER) -> RobotRow:
+        """Wait for a row of a robot since Webots was started; return the newest."""
         return self.until(lambda: self.newest(robot), f"{robot} records nothing")
 
     def rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
-        """Of the recording; none before there is one."""
+        """Return rows of the recording; none before it exists."""
         require(threading.current_thread() is self.user, "another check is made now")
         try:
             with self.recording.reader() as connection:
@@ -178,7 +178,7 @@ class Bench:
             return []
 
     def moves(self, within_s: float) -> bool:
-        """Whether the rover's simulation time goes on within that wall time."""
+        """Return whether the rover's simulation time advances within some wall time."""
         before = self.row()
         with suppress(OtherwiseError):
             self.until(lambda: self.row()[2:5:2] != before[2:5:2], "", within_s)  # run and time
@@ -186,38 +186,38 @@ class Bench:
         return False
 
     def goes_on(self, what: str) -> None:
-        """Fail where simulation time stands still after something."""
+        """Require that simulation time advances after something."""
         require(self.moves(SOON_S), f"{what}, and simulation time stands still")
 
     def stands(self, what: str) -> None:
-        """Fail where simulation time goes on after something; what is under way may end first."""
+        """Require that simulation time stops after something; a step under way may end first."""
         self.until(lambda: not self.moves(0.5), f"{what}, and simulation time goes on")
 
-    def until(self, look: Callable[[], T | None], otherwise: str, within_s: float = SOON_S) -> T:
-        """What a look finds, as soon as it is something.
+    def until(self, find: Callable[[], T | None], otherwise: str, within_s: float = SOON_S) -> T:
+        """Wait until `find` returns something, and return that.
 
         Raises:
-            OtherwiseError: It never was, in that time.
+            OtherwiseError: It found nothing in time. The text is `otherwise`.
         """
         until_s = time.monotonic() + within_s
-        while not (found := look()):
+        while not (found := find()):
             require(time.monotonic() < until_s, f"{otherwise} (waited {within_s:g} s)")
-            time.sleep(_LOOK_EVERY_S)
+            time.sleep(_POLL_S)
         return found
 
     # -- asking --
 
     def ask(self, question: Question, **given: Any) -> Any:
-        """The answer to a question of the rover: its data, or captions with pictures.
+        """Return the answer to a question about the rover: its data, or captions with pictures.
 
         Raises:
-            OtherwiseError: It was refused, or failed.
+            OtherwiseError: The question was refused, or failed.
         """
         require(threading.current_thread() is self.user, "another check is made now")
         names = {each.name for each in question.parameters}
-        usual = {name: value for name, value in _USUAL.items() if name in names}
+        defaults = {name: value for name, value in _DEFAULTS.items() if name in names}
         try:
-            data, shown = ask(question, usual | given, self.where)
+            data, shown = ask(question, defaults | given, self.where)
         except WebotsMCPError as error:
             raise OtherwiseError(str(error)) from error
         if data is None:
@@ -227,24 +227,24 @@ class Bench:
         return data
 
     def control(self, command: str, **given: Any) -> None:
-        """Steer, and require that it is done."""
+        """Steer the simulation, and require that it is done."""
         answer = self.ask(webots_simulation_control, command=command, **given)
         require(answer["outcome"] == "done", f"{command} is {answer['outcome']}")
 
     def refuses(self, question: Question, **given: Any) -> bool:
-        """Whether a question is refused, or fails."""
+        """Return whether a question is refused, or fails."""
         with suppress(OtherwiseError):
             self.ask(question, **given)
             return False
         return True
 
     def send(self, action: str, waits_s: float = SOON_S, **params: Any) -> None:
-        """Send the rover a command of its own; it may be under way afterwards."""
+        """Send the rover a registered command, which may still be running afterwards."""
         self.ask(webots_send_command, action=action, params=params, timeout_wall_s=waits_s)
 
 
 def _write_project(folder: Path) -> Path:
-    """The world with an observer, twice, and the controllers with the Python that runs this."""
+    """Write two worlds with an observer, and controllers that use this Python."""
     shutil.copytree(Path(__file__).parent / "project", folder)
     world = folder / "worlds/proving.wbt"
     header, _, nodes = DEFAULT_WORLD.read_text("utf-8").partition("\n")
@@ -259,34 +259,36 @@ def _write_project(folder: Path) -> Path:
     return world
 
 
-def tried(
+def run_check(
     check: Callable[[Bench], object], bench: Bench, limit_s: float = _LIMIT_S
 ) -> dict[str, Any]:
-    """What came of a check: where it hangs, Webots is ended and its thread left alone.
+    """Run a check and return its outcome. If it hangs, end Webots and abandon its thread.
 
     Args:
-        check: One of `checks.CHECKS`.
-        bench: Its Webots.
-        limit_s: In so much time it is over, besides that of a start.
+        check: A function of `checks.CHECKS`.
+        bench: Webots for the check.
+        limit_s: Time limit, in addition to the start of Webots.
     """
-    came = list[tuple[str, object]]()
+    outcomes = list[tuple[str, object]]()
     kind = check.__name__.partition("_")[0]
 
     def work() -> None:
         try:
             if kind != "check":
                 bench.running(stream=kind == "streaming")
-            came.append(("as expected", check(bench)))
-        except Exception as error:  # noqa: BLE001 - what an unknown Webots answers can be anything
+            outcomes.append(("as expected", check(bench)))
+        except Exception as error:  # noqa: BLE001 - An unknown Webots can answer anything.
             is_tried = not isinstance(error, NotTriedError)
-            came.append(("otherwise" if is_tried else "not tried", error or type(error).__name__))
+            outcomes.append(
+                ("otherwise" if is_tried else "not tried", error or type(error).__name__)
+            )
 
     began_s = time.monotonic()
     bench.user = threading.Thread(target=work, daemon=True)
     bench.user.start()
     bench.user.join(limit_s + bench.patience_s)
-    outcome, seen = (came or [("otherwise", f"it hung for {limit_s:g} s")])[0]
-    if not came:
+    outcome, seen = (outcomes or [("otherwise", f"it hung for {limit_s:g} s")])[0]
+    if not outcomes:
         bench.end()
     answer = {"outcome": outcome, "seen": None if seen is None else _anonymous(str(seen))}
     if outcome == "otherwise":
@@ -296,9 +298,9 @@ def tried(
 
 
 def _anonymous(text: str) -> str:
-    """Without the folder of any file, and the names of the user and the machine; cut if long."""
+    """Remove folders and the names of user and machine from a text, and cut it if it is long."""
     names = {sys.prefix: "PYTHON", str(Path(__file__).parents[3]): "PACKAGE", host_name(): "HOST"}
-    with suppress(OSError, KeyError, RuntimeError):  # a user without a name or a home
+    with suppress(OSError, KeyError, RuntimeError):  # The user may have no name or home.
         names |= {str(Path.home()): "~", getpass.getuser(): "USER"}
     for name in sorted(names, key=len, reverse=True):
         text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", names[name], text)

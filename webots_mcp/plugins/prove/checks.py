@@ -1,10 +1,10 @@
-"""What is known of Webots from its sources alone, each as a check of a Webots that runs.
+"""Checks of a running Webots, one for each fact that is known from its sources only.
 
-docs/webots.md names for each of its statements the check that would confirm it. The docstring of a
-check says what the sources say, and what works still where that is not so. A check returns what it
-measured, or fails with what it saw. `running_NAME` is called with Webots in real time, of which the
-newest row of the rover is `bench.before`; `streaming_NAME` the same with --stream, and `check_NAME`
-starts what it needs.
+docs/webots.md names the check of each of its statements. The docstring of a check is printed: what
+the sources say, and after "otherwise" what still works if that is wrong. A check returns what it
+measured, or fails with what it observed. `running_NAME` is called with Webots in real time, after
+the rover has recorded `bench.before`; `streaming_NAME` the same with --stream. `check_NAME` starts
+Webots itself.
 """
 
 from __future__ import annotations
@@ -26,13 +26,8 @@ from PIL import Image
 from webots_mcp.answers.models import ShownPicture
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, Moment, require
-from webots_mcp.questions import (
-    breakpoints,
-    control_simulation,
-    edit_scene,
-    show_pictures,
-)
+from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, RobotRow, require
+from webots_mcp.questions import breakpoints, control_simulation, edit_scene, show_pictures
 from webots_mcp.simulator import orders
 from webots_mcp.simulator.installations import find_webots
 from webots_mcp.simulator.instances import PORTS_TRIED
@@ -47,7 +42,7 @@ NOT_TRIED: Final = {
 }
 _STEP_S: Final = 0.016
 _SAME: Final = 1e-6
-_LOAD_S: Final = 40.0  # until a world is there again
+_LOAD_S: Final = 40.0  # Until a world is loaded again.
 _STALL_S: Final = 6.0
 _STATUS: Final = 7
 _MASS: Final = "BALL.physics.mass"
@@ -146,7 +141,7 @@ def running_pause(bench: Bench) -> None:
     bench.goes_on("resume was done")
 
 
-def _paused(bench: Bench) -> Moment:
+def _paused(bench: Bench) -> RobotRow:
     bench.control("pause")
     bench.stands("pause was done")
     return bench.row()
@@ -159,7 +154,7 @@ def running_steps(bench: Bench) -> None:
     _require_rounds(bench, before, 3)
 
 
-def _require_rounds(bench: Bench, before: Moment, rounds: int) -> None:
+def _require_rounds(bench: Bench, before: RobotRow, rounds: int) -> None:
     bench.stands(f"{rounds} rounds were to be made")
     now = bench.row()
     made, went_s = now.state["rounds"] - before.state["rounds"], now.sim_time_s - before.sim_time_s
@@ -261,7 +256,7 @@ def running_reset(bench: Bench) -> None:
     require(abs(place[0] + 0.3) < 0.05, f"the crate, which began at x = -0.3 m, is at {place}")
 
 
-def _after_reset(bench: Bench) -> Moment:
+def _after_reset(bench: Bench) -> RobotRow:
     before = bench.row()
     bench.control("reset")
     bench.until(lambda: bench.row().run_id > before.run_id, "no new run began")
@@ -360,7 +355,7 @@ def running_reload(bench: Bench) -> None:
     _require_ended(bench, "reload")
 
 
-def _began_after(bench: Bench, before: Moment) -> Moment:
+def _began_after(bench: Bench, before: RobotRow) -> RobotRow:
     id_before = before.session_id
     bench.until(lambda: bench.row().session_id > id_before, "no controller began anew", _LOAD_S)
     return bench.row()

@@ -1,4 +1,4 @@
-"""The command that tries on a real Webots what is known of it from its sources alone."""
+"""The command that checks a real Webots for what is known from its sources only."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from webots_mcp.cli.options import Json, Parameter, whole_number
 from webots_mcp.cli.terminal import print_json, printable
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
-_SAID: Final = ("expected", "seen", "works still")
+_PRINTED: Final = ("expected", "seen", "works still")
 _OUTCOMES: Final = ("as expected", "otherwise", "not tried")
 
 
@@ -49,8 +49,7 @@ def prove(
     anything is otherwise.
     """
     from webots_mcp.contract import VERSION
-    from webots_mcp.plugins.prove.bench import Bench, tried
-    from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
+    from webots_mcp.plugins.prove.checks import CHECKS
     from webots_mcp.simulator.installations import find_webots
     from webots_mcp.simulator.starting import Start
 
@@ -60,25 +59,15 @@ def prove(
     if webots is not None:
         _choose(webots)
     for name in [each for each in os.environ if each.startswith("WEBOTS_MCP_")]:
-        del os.environ[name]  # what would change how its controllers record
-    Start(Path(), None, headless=True, streams=False, port=0).command_line()  # there is one
-    found = list[dict[str, Any]]()
-    with tempfile.TemporaryDirectory(prefix="webots-mcp-", ignore_cleanup_errors=True) as folder:
-        bench = Bench(Path(folder) / "project", patience_s)
-        try:
-            for name in only or [*CHECKS, *NOT_TRIED]:
-                answer: dict[str, Any] = {"outcome": "not tried", "seen": NOT_TRIED.get(name)}
-                answer = tried(CHECKS[name], bench) if name in CHECKS else answer
-                parts = [f"{name}: {answer['outcome']}"]
-                parts += [f"{key}: {answer[key]}" for key in _SAID if answer.get(key)]
-                found.append({"check": name, **answer})
-                print(printable("; ".join(parts)), file=sys.stderr if as_json else None, flush=True)
-        finally:
-            bench.end()
+        del os.environ[name]  # It could change how the controllers record.
+    Start(
+        Path(), None, headless=True, streams=False, port=0
+    ).command_line()  # Raises if there is no Webots.
+    found = _run_checks(only, patience_s, as_json=as_json)
     counts = {each: sum(one["outcome"] == each for one in found) for each in _OUTCOMES}
     if as_json:
         system = {"system": f"{platform.system()} {platform.release()}"}
-        with suppress(OSError):  # rather than of a kernel, whose name may be that of a machine
+        with suppress(OSError):  # The name of a kernel may contain that of the machine.
             system["system"] = platform.freedesktop_os_release()["PRETTY_NAME"]
         system |= {"machine": platform.machine(), "python": platform.python_version()}
         versions = {"webots": find_webots().version, "webots_mcp": VERSION}
@@ -88,11 +77,32 @@ def prove(
     return int(counts["otherwise"] > 0)
 
 
+def _run_checks(only: list[str] | None, patience_s: int, *, as_json: bool) -> list[dict[str, Any]]:
+    """Run the checks, print each outcome in a line, and return the outcomes."""
+    from webots_mcp.plugins.prove.bench import Bench, run_check
+    from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
+
+    found = list[dict[str, Any]]()
+    with tempfile.TemporaryDirectory(prefix="webots-mcp-", ignore_cleanup_errors=True) as folder:
+        bench = Bench(Path(folder) / "project", patience_s)
+        try:
+            for name in only or [*CHECKS, *NOT_TRIED]:
+                answer: dict[str, Any] = {"outcome": "not tried", "seen": NOT_TRIED.get(name)}
+                answer = run_check(CHECKS[name], bench) if name in CHECKS else answer
+                parts = [f"{name}: {answer['outcome']}"]
+                parts += [f"{key}: {answer[key]}" for key in _PRINTED if answer.get(key)]
+                found.append({"check": name, **answer})
+                print(printable("; ".join(parts)), file=sys.stderr if as_json else None, flush=True)
+        finally:
+            bench.end()
+    return found
+
+
 def _choose(path: Path) -> None:
-    """Let that Webots be the one that is found.
+    """Set the environment so that this Webots is found.
 
     Raises:
-        CommandRefusedError: There is none.
+        CommandRefusedError: It is no Webots.
     """
     from webots_mcp.simulator.installations import HOME_VARIABLE, installations
 

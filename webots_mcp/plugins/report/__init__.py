@@ -1,4 +1,4 @@
-"""Reports: one or two runs as one HTML file that needs nothing else, to read and to send.
+"""Reports: one or two runs as one self-contained HTML file, to read and to send.
 
 Jinja2 is imported with the first report.
 """

@@ -1,4 +1,4 @@
-"""What a report tells of one run: what ran, what happened, and what was recorded of it in texts."""
+"""The chapter of a report about one run: what ran, what happened and what was recorded."""
 
 from __future__ import annotations
 
@@ -15,21 +15,20 @@ from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.events import KINDS, Found, choose, search_events, stored_kinds
 from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
+from webots_mcp.plugins.report.grid import Grid, GridRow
 from webots_mcp.plugins.report.words import (
-    Grid,
-    Row,
     clock,
     counted,
     cut,
+    describe_event,
+    format_named_values,
+    format_signal_values,
+    format_value,
     length,
-    listed,
     number,
-    paced,
+    pace_text,
     share,
-    spelled,
     time_at,
-    told,
-    valued,
 )
 from webots_mcp.signals.naming import find_mode
 from webots_mcp.store.logs import (
@@ -47,25 +46,40 @@ from webots_mcp.store.robots import SessionRecord, fetch_session
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_info
 
-MOST_EVENTS: Final = 200
-MOST_ENTRIES: Final = 500  # of the timeline
-MOST_LINES: Final = 2_000  # of the log
-MOST_MOMENTS: Final = 6  # events that are shown with the seconds around them
-AROUND_S: Final = 5.0  # before and after
-MOST_SHOWN_S: Final = 30.0  # of the event itself
-_LINES_AROUND: Final = 12
-_MOST_VALUES: Final = 20  # of a mode
-_ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)  # that the bridge notices
+
+@dataclass(frozen=True)
+class _ChapterLimits:
+    """Limits of the texts of a run."""
+
+    events: int = 200
+    timeline_entries: int = 500
+    log_lines: int = 2_000
+    event_contexts: int = 6
+    """Events that are shown with the seconds around them."""
+    around_s: float = 5.0
+    """Time that is shown before and after such an event."""
+    event_s: float = 30.0
+    """Time that is shown of the event itself."""
+    context_lines: int = 12
+    """Entries of the timeline around an event."""
+    mode_values: int = 20
+    """Values of a mode."""
+
+
+_LIMITS: Final = _ChapterLimits()
+
+_ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)
+"""Events of the bridge that need no context."""
 _MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
-# Where the room for texts goes; what one table leaves, the next ones have.
+# Fractions of the bytes of texts. What a table leaves unused goes to the next ones.
 _SHARES: Final = {
     "checks": 0.05, "parameters": 0.05, "moments": 0.1, "events": 0.15, "trends": 0.15,
     "commands": 0.1, "timeline": 0.2, "log": 0.2,
 }  # fmt: skip
 
 
-class Held(NamedTuple):
-    """For how long a mode had a value."""
+class ModeShare(NamedTuple):
+    """How long a mode had a value: the value, its time and its percentage."""
 
     value: str
     time: str
@@ -73,12 +87,12 @@ class Held(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Moment:
+class EventContext:
     """An event with the seconds around it.
 
     Attributes:
-        values: What a few signals were when it began.
-        lines: What else happened around it.
+        values: Values of a few signals at its start.
+        lines: Entries of the timeline around it.
     """
 
     event: Event
@@ -89,27 +103,27 @@ class Moment:
 
     @property
     def start_s(self) -> float:
-        """Where the seconds around it begin."""
-        return self.event.start_s - AROUND_S
+        """Return the start of the shown time."""
+        return self.event.start_s - _LIMITS.around_s
 
     @property
     def end_s(self) -> float:
-        """Where they end; of a long event its begin is shown."""
-        return min(self.event.end_s, self.event.start_s + MOST_SHOWN_S) + AROUND_S
+        """Return the end of the shown time. Of a long event only the start is shown."""
+        return min(self.event.end_s, self.event.start_s + _LIMITS.event_s) + _LIMITS.around_s
 
 
 @dataclass(frozen=True)
 class Chapter:
-    """One run; a table that would be empty is None.
+    """One run. A table that would be empty is None.
 
     Attributes:
-        range: The whole run; None where it has no state row.
-        numbers: How many numeric signals have values.
-        changed_most: Those that changed, what changed most first.
-        found: What was found in the values and in what was noted, each event by itself.
-        images: The pictures.
-        findings: What was found, and what was not.
-        unsearched: What was not looked for, or not everywhere, and why.
+        range: The whole run; None if it has no state row.
+        numbers: Number of numeric signals with values.
+        changed_most: Names of signals that changed, the largest change first.
+        found: Events in values and stored events, one by one.
+        images: Events of pictures.
+        findings: Sentences on what was found, and what was not.
+        unsearched: Notes on what was not searched, or not everywhere, and why.
     """
 
     info: RunInfo
@@ -120,8 +134,8 @@ class Chapter:
     findings: Sequence[str] = ()
     unsearched: Sequence[str] = ()
     mode: str = ""
-    held: Sequence[Held] = ()
-    moments: Sequence[Moment] = ()
+    held: Sequence[ModeShare] = ()
+    moments: Sequence[EventContext] = ()
     checks: Grid | None = None
     parameters: Grid | None = None
     events: Grid | None = None
@@ -137,7 +151,7 @@ class Chapter:
 
     @property
     def grids(self) -> dict[str, Grid]:
-        """The tables that can lack rows, by what their rows are called."""
+        """Return the tables that may lack rows, by what their rows are called."""
         named = {
             "checks": self.checks, "parameters": self.parameters, "events": self.events,
             "trends": self.trends,
@@ -147,57 +161,57 @@ class Chapter:
         return {name: grid for name, grid in named.items() if grid is not None}
 
 
-class _Room:
-    """Bytes for the texts of a run, shared out in order."""
+class _TextBudget:
+    """The bytes for the texts of a run, which its tables share in order."""
 
-    def __init__(self, room_bytes: float) -> None:
-        self._room_bytes, self._spare_bytes = room_bytes, 0.0
+    def __init__(self, budget_bytes: float) -> None:
+        self._budget_bytes, self._spare_bytes = budget_bytes, 0.0
 
     def fit(self, name: str, grid: Grid, *, newest: bool = False) -> Grid | None:
-        """The table with as many rows as have room; None without any."""
-        room_bytes = _SHARES[name] * self._room_bytes + self._spare_bytes
-        fitted = grid.within(room_bytes, newest=newest)
-        self._spare_bytes = room_bytes - sum(row.size_bytes for row in fitted.rows)
+        """Return a table with as many rows as fit; None if it is empty."""
+        budget_bytes = _SHARES[name] * self._budget_bytes + self._spare_bytes
+        fitted = grid.within(budget_bytes, newest=newest)
+        self._spare_bytes = budget_bytes - sum(row.size_bytes for row in fitted.rows)
         return fitted if fitted.rows or fitted.left_out else None
 
 
 def chapter_of(
-    connection: sqlite3.Connection, run_id: int, room_bytes: float, deadline_s: float
+    connection: sqlite3.Connection, run_id: int, budget_bytes: float, deadline_s: float
 ) -> Chapter:
-    """What there is to tell of a run.
+    """Make the chapter of a run.
 
     Args:
-        connection: Any.
-        run_id: The run.
-        room_bytes: About what its texts may take.
-        deadline_s: For how long events are looked for in its values; what is read besides has a
-            third of that each. What was not looked at by then is said.
+        connection: Connection to the recording.
+        run_id: Id of the run.
+        budget_bytes: Approximate size of its texts.
+        deadline_s: Time limit of the search for events in values. Trends and stored events have a
+            third of it each. The chapter says what was not searched in time.
 
     Raises:
-        UnknownRunError: No run has that id.
+        UnknownRunError: The run does not exist.
     """
     run, info = fetch_run(connection, run_id), run_info(connection, run_id)
     session = fetch_session(connection, run.session_id)
-    room = _Room(room_bytes)
+    budget = _TextBudget(budget_bytes)
     facts = _facts(info, session, run.basic_time_step_ms)
     title = f"Run {run_id} of {info.robot}" + (f": {info.label}" if info.label else "")
     try:
         whole = find_range(connection, Scope(run_id=run_id))
-    except NothingRecordedError as error:
-        checks = room.fit("checks", _checks(connection, run_id, deadline_s))
-        parameters = room.fit("parameters", _parameters(connection, run_id))
-        log = room.fit("log", _log(connection, run_id), newest=True)
+    except NothingRecordedError as error:  # The run has no state row.
+        checks = budget.fit("checks", _checks(connection, run_id, deadline_s))
+        parameters = budget.fit("parameters", _parameters(connection, run_id))
+        log = budget.fit("log", _log(connection, run_id), newest=True)
         return Chapter(info, None, title, f"{_first_words(info)} {error}.", facts,
                        checks=checks, parameters=parameters, log=log)  # fmt: skip
     each_alone = _found(connection, whole, deadline_s)
-    checks = room.fit("checks", _checks(connection, run_id, deadline_s, each_alone))
-    parameters = room.fit("parameters", _parameters(connection, run_id))
+    checks = budget.fit("checks", _checks(connection, run_id, deadline_s, each_alone))
+    parameters = budget.fit("parameters", _parameters(connection, run_id))
     found = each_alone.in_groups(known_signals(connection, whole))
     stored = _stored(connection, whole, deadline_s / 3)
     moments = [_moment(each, stored) for each in _outstanding(connection, found)]
     course = trends(connection, whole, limit=500, deadline_s=deadline_s / 3)
-    (told_trends,) = course.runs
-    mode = _mode(told_trends)
+    (run_trends,) = course.runs
+    mode = _mode(run_trends)
     travelled, why_not = _travelled(connection, run_id)
     return Chapter(
         info, whole, title,
@@ -206,27 +220,27 @@ def chapter_of(
         findings=[*travelled, *_findings(found.verdicts)],
         unsearched=[f"{kinds}: {why}" for kinds, why in found.verdicts.gaps.items()],
         mode=mode.name if mode else "",
-        held=_held(mode) if mode else (),
-        moments=[e for e in moments if room.fit("moments", e.lines) or not e.lines.rows],
+        held=_mode_shares(mode) if mode else (),
+        moments=[e for e in moments if budget.fit("moments", e.lines) or not e.lines.rows],
         checks=checks,
         parameters=parameters,
-        events=room.fit("events", _events(connection, found)),
-        trends=room.fit("trends", _trends(told_trends)),
-        commands=room.fit("commands", _commands(connection, stored), newest=True),
-        timeline=room.fit("timeline", _timeline(connection, stored), newest=True),
-        log=room.fit("log", _log(connection, run_id), newest=True),
-        numbers=told_trends.total,
-        changed_most=[each.name for each in told_trends.numbers if each.shape != "constant"],
+        events=budget.fit("events", _events(connection, found)),
+        trends=budget.fit("trends", _trends(run_trends)),
+        commands=budget.fit("commands", _commands(connection, stored), newest=True),
+        timeline=budget.fit("timeline", _timeline(connection, stored), newest=True),
+        log=budget.fit("log", _log(connection, run_id), newest=True),
+        numbers=run_trends.total,
+        changed_most=[each.name for each in run_trends.numbers if each.shape != "constant"],
         found=each_alone,
         images=[each for each in stored.events if each.kind == "image"],
         notes=tuple(
-            dict.fromkeys((*found.notes, *course.notes, *_unread(told_trends), *why_not))
+            dict.fromkeys((*found.notes, *course.notes, *_unread(run_trends), *why_not))
         ),
     )  # fmt: skip
 
 
 def _unread(course: RunTrends) -> list[str]:
-    """That what is told of modes and trends is not told of all rows."""
+    """Return a note if modes and trends are not those of all rows."""
     if course.cut_at_s is None:
         return []
     since = time_at(course.cut_at_s)
@@ -237,7 +251,7 @@ def _first_words(info: RunInfo) -> str:
     world = f" in {_file(info.world)}" if info.world else ""
     ended = f"It ended: {info.end_reason}." if info.end_reason else "It goes on."
     pace = info.real_time_factor
-    how_fast = f", {paced(pace)}" if pace is not None else ""
+    how_fast = f", {pace_text(pace)}" if pace is not None else ""
     return (
         f"{info.robot} ran for {length(info.duration_s)} of simulation time{world}, from "
         f"{clock(info.started_wall_time_s)} on{how_fast}. {ended}"
@@ -245,7 +259,7 @@ def _first_words(info: RunInfo) -> str:
 
 
 def _facts(info: RunInfo, session: SessionRecord | None, step_ms: float | None) -> dict[str, str]:
-    """As recorded in the rows of run and session, without what is not known."""
+    """Return facts in the rows of run and session, without unknown ones."""
     facts: dict[str, object] = {
         "robot": info.robot,
         "run": f"{info.run_id} (session {info.session_id})",
@@ -263,13 +277,13 @@ def _facts(info: RunInfo, session: SessionRecord | None, step_ms: float | None) 
         + (f", of which {length(info.held_s)} paused by a command" if info.held_s else ""),
         "rows": f"{info.row_count:,}"
         + (f" ({info.purged_rows:,} of them purged since)" if info.purged_rows else ""),
-        "needs attention": listed(info.notable) or None,
+        "needs attention": format_named_values(info.notable) or None,
     }
     if session is not None:
         facts |= {
             "host": session.host,
             "supervisor": "yes" if session.supervisor else "no",
-            "versions": valued(session.versions) or None,
+            "versions": format_signal_values(session.versions) or None,
             "end of the controller": session.end_reason,
             "newest error of the recorder": session.last_error,
             "rows dropped": session.rows_dropped or None,
@@ -280,27 +294,27 @@ def _facts(info: RunInfo, session: SessionRecord | None, step_ms: float | None) 
 def _checks(
     connection: sqlite3.Connection, run_id: int, deadline_s: float, found: Found | None = None
 ) -> Grid:
-    """Each check, the worst first."""
+    """Return each check, the worst first."""
     checked = check_run(connection, run_id, found=found, deadline_s=deadline_s / 2)
-    rows: list[Row] = []
+    rows: list[GridRow] = []
     for each in checked.worst_first:
         since = "" if each.since_s is None else time_at(each.since_s)
         cells = [each.name, each.outcome, each.evidence, since, str(each.often or "")]
-        rows.append(Row(cells, {"fail": "error", "warn": "warning"}.get(each.outcome, "")))
+        rows.append(GridRow(cells, {"fail": "error", "warn": "warning"}.get(each.outcome, "")))
     return Grid(("check", "outcome", "evidence", "since [s]", "times"), rows)
 
 
 def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:
     columns = ("name", "value", "unit", "default", "set_by", "since_s", "doc")
     rows = [
-        Row([_text(each[column]) for column in columns])
+        GridRow([_text(each[column]) for column in columns])
         for each in described(connection, fetch_run(connection, run_id))
     ]
     return Grid(("parameter", "value", "unit", "default", "set by", "since [s]", "what"), rows)
 
 
 def _found(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) -> Found:
-    """What stands out: all kinds that are looked for unless asked, but for what is routine."""
+    """Search the kinds of events that are searched by default, except routine ones."""
     usual = EventOptions()
     kinds = tuple(
         kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine
@@ -310,13 +324,13 @@ def _found(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) 
 
 
 def _stored(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) -> Found:
-    """What was noted when it happened, one by one."""
+    """Return the events that were stored when they happened, one by one."""
     options = EventOptions(kinds=stored_kinds(), log_level="info")
     return search_events(connection, whole, options, around=(), group=False, deadline_s=deadline_s)
 
 
 def _findings(verdicts: Verdicts) -> list[str]:
-    """What there is of each kind that was looked for, and what there is none of."""
+    """Return sentences on the kinds of events that were found, and that were not."""
     found = [f"{kind} ({count})" for kind, count in verdicts.found.items()]
     said = [f"Found: {', '.join(found)}."] if found else []
     said += [f"Looked for and not found: {', '.join(verdicts.far)}."] if verdicts.far else []
@@ -325,12 +339,12 @@ def _findings(verdicts: Verdicts) -> list[str]:
 
 
 def _events(connection: sqlite3.Connection, found: Found) -> Grid:
-    """What stands out; commands that were done have a table of their own."""
+    """Return events. Commands that were done have their own table."""
     matter = [each for each in found.events if each.kind != "command" or _mark(each)]
-    answer = found.only(matter).told(connection, MOST_EVENTS)
+    answer = found.only(matter).told(connection, _LIMITS.events)
     rows = [
-        Row(
-            [time_at(each.start_s), _lasted(each), each.kind, told(each), _around(each)],
+        GridRow(
+            [time_at(each.start_s), _lasted(each), each.kind, describe_event(each), _around(each)],
             _mark(each),
         )
         for each in answer.events
@@ -341,39 +355,46 @@ def _events(connection: sqlite3.Connection, found: Found) -> Grid:
 
 
 def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
-    """The few whose surroundings are shown: what was found in the values, else in the log."""
+    """Return the few events that are shown with their context: in values, else in the log."""
     matter = [each for each in found.events if each.kind not in ("kept_stretch", "command", "log")]
     matter = [each for each in matter if each.details.get("what") not in _ORDINARY]
     failed = [each for each in found.events if _mark(each)]
-    chosen = choose(matter, MOST_MOMENTS) or choose(failed, MOST_MOMENTS)
-    return list(found.only(chosen).told(connection, MOST_MOMENTS).events)
+    chosen = choose(matter, _LIMITS.event_contexts) or choose(failed, _LIMITS.event_contexts)
+    return list(found.only(chosen).told(connection, _LIMITS.event_contexts).events)
 
 
-def _moment(event: Event, stored: Found) -> Moment:
+def _moment(event: Event, stored: Found) -> EventContext:
     many = f", the first of {event.count}" if event.count > 1 else ""
     lasted = f", for {length(event.duration_s)}" if event.duration_s and not many else ""
     title = f"{event.kind} at {time_at(event.start_s)} s{lasted}{many}"
     columns = ("at [s]", "kind", "what")
-    moment = Moment(event, title, told(event), _around(event), Grid(columns, ()))
+    moment = EventContext(event, title, describe_event(event), _around(event), Grid(columns, ()))
     around = [
         each for each in stored.events
         if moment.start_s <= each.start_s <= moment.end_s and each.kind != "image"
     ]  # fmt: skip
-    nearest = sorted(around, key=lambda each: abs(each.start_s - event.start_s))[:_LINES_AROUND]
+    nearest = sorted(around, key=lambda each: abs(each.start_s - event.start_s))[
+        : _LIMITS.context_lines
+    ]
     shown = [each for each in around if any(each is near for near in nearest)]
-    rows = [Row([time_at(each.start_s), each.kind, told(each)], _mark(each)) for each in shown]
+    rows = [
+        GridRow([time_at(each.start_s), each.kind, describe_event(each)], _mark(each))
+        for each in shown
+    ]
     return replace(moment, lines=Grid(columns, rows, left_out=len(around) - len(shown)))
 
 
 def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
-    """What was noted, in order; of a long run the log alone has what needs no attention."""
+    """Return stored events in order. Of a long run, ordinary log lines are in the log only."""
     notes: list[str] = []
-    if len(stored.events) > MOST_ENTRIES:
+    if len(stored.events) > _LIMITS.timeline_entries:
         stored = stored.only([e for e in stored.events if e.kind != "log" or _mark(e)])
         notes = ["Of the log only warnings and errors stand here."]
-    answer = stored.told(connection, MOST_ENTRIES)
+    answer = stored.told(connection, _LIMITS.timeline_entries)
     rows = [
-        Row([time_at(each.start_s), _lasted(each), each.kind, told(each)], _mark(each))
+        GridRow(
+            [time_at(each.start_s), _lasted(each), each.kind, describe_event(each)], _mark(each)
+        )
         for each in answer.events
     ]
     left_out = sum(each.count for each in answer.left_out.values())
@@ -382,14 +403,14 @@ def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
 
 def _commands(connection: sqlite3.Connection, stored: Found) -> Grid:
     commands = stored.only([each for each in stored.events if each.kind == "command"])
-    answer = commands.told(connection, MOST_EVENTS)
+    answer = commands.told(connection, _LIMITS.events)
     rows = [
-        Row([
+        GridRow([
             time_at(each.start_s), str(each.details.get("id", "")), each.name or "",
-            valued(each.details.get("params") or {}), each.details["status"],
+            format_signal_values(each.details.get("params") or {}), each.details["status"],
             number(each.details.get("took_wall_s")),
             cut(str(each.details.get("error") or each.details.get("rule")
-                    or spelled(each.details.get("result", "")))),
+                    or format_value(each.details.get("result", "")))),
         ], _mark(each))
         for each in answer.events
     ]  # fmt: skip
@@ -400,7 +421,7 @@ def _commands(connection: sqlite3.Connection, stored: Found) -> Grid:
 def _log(connection: sqlite3.Connection, run_id: int) -> Grid:
     robot_id = fetch_run(connection, run_id).robot_id
     asked = LogFilter(run_id, LogWindow(-math.inf, math.inf), robot_id=robot_id)
-    lines = newest_lines(connection, asked, MOST_LINES)
+    lines = newest_lines(connection, asked, _LIMITS.log_lines)
     count = count_lines(connection, asked)
     return Grid(
         ("at [s]", "level", "from", "line"),
@@ -410,39 +431,40 @@ def _log(connection: sqlite3.Connection, run_id: int) -> Grid:
     )
 
 
-def _line(line: LogLine) -> Row:
+def _line(line: LogLine) -> GridRow:
     cells = [time_at(line.sim_time_s), line.level, line.source, cut(line.message, 2_000)]
-    return Row(cells, _MARKS.get(line.level, ""))
+    return GridRow(cells, _MARKS.get(line.level, ""))
 
 
 def _trends(run: RunTrends) -> Grid:
-    """Numbers, what changed most first; then texts and flags."""
+    """Return trends of numbers, the largest change first, then of texts and flags."""
     rows = [
-        Row([trend.name, trend.unit or "", trend.says, *_figures(trend)]) for trend in run.numbers
+        GridRow([trend.name, trend.unit or "", trend.says, *_figures(trend)])
+        for trend in run.numbers
     ]
-    rows += [Row([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
+    rows += [GridRow([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
     notes = [f"Without a value: {', '.join(run.without_value[:50])}."] if run.without_value else []
     columns = ("signal", "unit", "what it did", "mean", "deviation", "least", "greatest")
     return Grid(columns, rows, notes, left_out=run.total - len(run.numbers))
 
 
 def _figures(trend: Trend) -> list[str]:
-    """Mean, deviation, least and greatest value."""
-    least, greatest = trend.summary.min, trend.summary.max
-    span = 0.0 if least is None or greatest is None else greatest - least
-    return [number(each, span) for each in (trend.mean, trend.deviation, least, greatest)]
+    """Return mean, deviation, minimum and maximum."""
+    low, high = trend.summary.min, trend.summary.max
+    span = 0.0 if low is None or high is None else high - low
+    return [number(each, span) for each in (trend.mean, trend.deviation, low, high)]
 
 
 def _course(state: StateTrend) -> str:
     if state.changes == 0:
-        return f"always {spelled(state.last)}"
+        return f"always {format_value(state.last)}"
     since = "" if state.since_s is None else f" since {time_at(state.since_s)} s"
     times = ", ".join(
         f"{cut(value, 40)} {length(held_s)}"
-        for value, held_s in list(state.time_by_value_s.items())[:_MOST_VALUES]
+        for value, held_s in list(state.time_by_value_s.items())[: _LIMITS.mode_values]
     )
     changed = counted(state.changes, "change")
-    return f"{changed}, {spelled(state.last)}{since}; {times}"
+    return f"{changed}, {format_value(state.last)}{since}; {times}"
 
 
 def _mode(run: RunTrends) -> StateTrend | None:
@@ -450,20 +472,20 @@ def _mode(run: RunTrends) -> StateTrend | None:
     return next((state for state in run.states if state.name == name), None)
 
 
-def _held(mode: StateTrend) -> list[Held]:
+def _mode_shares(mode: StateTrend) -> list[ModeShare]:
     whole_s = sum(mode.time_by_value_s.values())
     return [
-        Held(
+        ModeShare(
             cut(value, 60),
             f"{length(held_s)}, {share(held_s, whole_s)}",
             100 * held_s / whole_s if whole_s else 0.0,
         )
-        for value, held_s in list(mode.time_by_value_s.items())[:_MOST_VALUES]
+        for value, held_s in list(mode.time_by_value_s.items())[: _LIMITS.mode_values]
     ]
 
 
 def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], list[str]]:
-    """How far it went, in words, and why that is not known."""
+    """Return how far the robot went, in words, or why that is unknown."""
     nothing_else = EventOptions(kinds=("bridge_event",))
     found = compare_runs(connection, [run_id], options=nothing_else)
     known = {each.name: each.spread[0] for each in found.measures}
@@ -480,9 +502,9 @@ def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], 
 
 
 def _around(event: Event) -> str:
-    """Values when it began; nothing where those rows are gone."""
+    """Return values at the start of an event; an empty text if those rows were removed."""
     known = any(value is not None for value in event.around.values())
-    return valued(event.around) if known else ""
+    return format_signal_values(event.around) if known else ""
 
 
 def _mark(event: Event) -> str:
@@ -497,7 +519,7 @@ def _lasted(event: Event) -> str:
 
 
 def _text(value: object) -> str:
-    return "" if value is None else spelled(value)
+    return "" if value is None else format_value(value)
 
 
 def _file(path: str) -> str:

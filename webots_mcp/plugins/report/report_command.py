@@ -1,4 +1,4 @@
-"""The command that writes a report, to any file; an assistant's question is in `making`."""
+"""The command that writes a report to any file; the question of assistants is in `making`."""
 
 from __future__ import annotations
 

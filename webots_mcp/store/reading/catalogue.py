@@ -15,7 +15,6 @@ from webots_mcp.signals.naming import REDUCTIONS, Value, nearest_first
 from webots_mcp.signals.register import MAX_SIGNALS, Kind
 from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.frame_source import has_few_new_rows, rows_in_no_chunk
 from webots_mcp.store.reading.observed_pose import with_observed_pose
 from webots_mcp.store.reading.ranges import TimeRange, find_subject
 from webots_mcp.store.reading.segment import (
@@ -25,6 +24,7 @@ from webots_mcp.store.reading.segment import (
     Subject,
     in_one_snapshot,
 )
+from webots_mcp.store.reading.unchunked_rows import has_few_new_rows, rows_in_no_chunk
 from webots_mcp.store.signals import RegisteredSignal, cleaned, registered, seen_with
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
@@ -103,7 +103,7 @@ def _signals_in(
 
 
 def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
-    """A run's rows in no chunk; of more than are kept between questions the oldest and newest."""
+    """Return a run's rows in no chunk; if they are many, the oldest and newest of them."""
     at = reached(connection, run_id)
     if has_few_new_rows(connection, run_id, at):
         return rows_in_no_chunk(connection, run_id, (-math.inf, math.inf), at, Deadline())[0]

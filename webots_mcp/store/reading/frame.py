@@ -36,16 +36,11 @@ from webots_mcp.store.chunks import (
     reached,
     statistics_of,
 )
-from webots_mcp.store.reading.frame_source import (
-    Column,
-    FrameSource,
-    Unread,
-    nothing,
-    read_rows,
-    rows_in_no_chunk,
-)
+from webots_mcp.store.reading.frame_source import Column, FrameSource, no_statistics
 from webots_mcp.store.reading.observed_pose import MARGIN_S, Derived, find_observed, poses_of
 from webots_mcp.store.reading.segment import HAS_LOST_ROWS, MOST_ROWS, Deadline, Segment, kept_parts
+from webots_mcp.store.reading.unchunked_rows import read_rows, rows_in_no_chunk
+from webots_mcp.store.reading.unread import Unread
 
 _FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
 
@@ -379,7 +374,7 @@ class Frame:
             whole = np.diff(source.first_rows[parts.start : parts.stop + 1])
             cut = np.flatnonzero(np.diff(edges) < whole)
         else:
-            table = nothing(len(edges) - 1)
+            table = no_statistics(len(edges) - 1)
             starts_s, ends_s = self.times[edges[:-1]], self.times[edges[1:] - 1]
             cut = np.arange(len(table))
         for at in cut.tolist():

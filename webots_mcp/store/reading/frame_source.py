@@ -1,22 +1,22 @@
-"""Where the values of a frame come from: the chunks of some groups, and rows that are in none."""
+"""The values of a frame before a range and an order are laid over them, part by part.
+
+A row group is one part, and so are 1,024 rows that are in no chunk. A chunk that cannot be read
+costs its part of the range, which is noted by the name of the signal.
+"""
 
 from __future__ import annotations
 
-import math
 import sqlite3
-import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunks import (
     SIM_TIMES,
-    STATE_COLUMNS,
     STATE_IDS,
     WALL_TIMES,
-    ChunkProgress,
     DamagedChunkError,
     Decoded,
     StateColumns,
@@ -28,75 +28,29 @@ from webots_mcp.store.chunks import (
     values_in,
 )
 from webots_mcp.store.reading.observed_pose import Derived
-from webots_mcp.store.reading.segment import Deadline
-from webots_mcp.store.run_rows import reading_texts
+from webots_mcp.store.reading.unread import Unread
 
-_MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
-NOT_READ: Final = "not read from"  # how what says that a part is not in a frame begins
-MOST_CACHED_BYTES: Final = 80_000_000  # of values that a frame caches
-Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
-T = TypeVar("T")
-
+MOST_CACHED_BYTES: Final = 80_000_000  # of arrays that one frame keeps
+_MOST_GROUP_ROWS: Final = 2**20  # far more than any maker puts into a group
 _NAMES: Final[dict[Column, str]] = {
     SIM_TIMES: "simulation times",
     WALL_TIMES: "wall times",
     STATE_IDS: "row ids",
 }
-_ROWS_OF: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s, id"
-)
-ROWS_AT_ONCE: Final = 1024  # between two looks at the deadline
-MOST_ROWS_CACHED: Final = 4096  # of one run; more are there only where nobody makes chunks
-MOST_RUNS_CACHED: Final = 16
-_IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
-_NEWEST: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "ORDER BY sim_time_s, id"
-)
-_NEWEST_IN: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND {_IN} AND (sim_time_s, id) > (?, ?) "
-    "ORDER BY sim_time_s, id"
-)
-_LATE: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
-    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
-)
-_FEWER_THAN: Final = (
-    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "LIMIT ?)"
-)
-_ONE_BETWEEN: Final = (  # came late into what was parsed before
-    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "AND (sim_time_s, id) < (?, ?) AND id > ?)"
-)
-_RUN: Final = "SELECT uuid FROM run WHERE id = ?"
-_FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
-_SHADOWED: Final = "SELECT EXISTS (SELECT 1 FROM temp.sqlite_master WHERE name = 'state')"
 
-
-class Unread(NamedTuple):
-    """A part of what was asked for that is not in a frame: [start_s, end_s], and why."""
-
-    start_s: float
-    end_s: float
-    why: str
-
-    def __str__(self) -> str:
-        return f"{NOT_READ} {self.start_s:.3f} to {self.end_s:.3f} s: {self.why}"
+Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
+T = TypeVar("T")
 
 
 class FrameSource:
-    """Rows of groups, then rows that are in none, before a range and an order are laid over them.
-
-    They are in parts: each group is one, and so are 1,024 of the others.
+    """Rows of groups, followed by rows that are in no group.
 
     Attributes:
         columns: The rows that are in no group.
-        first_rows: Of each part, and how many rows there are in all.
+        first_rows: The first row of each part, followed by the number of all rows.
         starts_s: Simulation time of the first row of each part; `ends_s` of the last one.
-        order: The rows in order of time; None where they are.
-        unread: What could not be read so far, each of which column: None of all.
+        order: The rows in order of time; None if they are.
+        unread: What could not be read so far, each with its column: None for all of them.
         derived: Signals that no row holds, by name: their values at some times.
     """
 
@@ -115,10 +69,8 @@ class FrameSource:
         self.unread: dict[Unread, Column | None] = {}
         self.derived: Derived = {}
         self.order: Indexes | None = None
-        sound = (groups[:, 3] >= 1) & (groups[:, 3] <= _MOST_ROWS) & (groups[:, 1] <= groups[:, 2])
-        for _, start_s, end_s, *_ in groups[~sound].tolist():
-            self.unread[Unread(start_s, end_s, "its row group is damaged")] = None
-        groups = groups[sound]
+        self._cache = _ArrayCache()
+        groups = self._sound(groups)
         self._group_ids: Indexes = groups[:, 0].astype(np.intp)
         new = np.arange(0, len(columns), chunk_making.GROUP_ROWS)
         ends = np.minimum(new + chunk_making.GROUP_ROWS, len(columns))
@@ -132,33 +84,39 @@ class FrameSource:
         self.is_in_order = bool(
             (self.starts_s[1:] >= self.ends_s[:-1]).all()
             and ((steps > 0) | rising).all()
-            and not (  # what came late has greater ids than what stood there before
+            and not (  # rows that arrived late have greater ids than those before them
                 (groups[1:, 1] == groups[:-1, 2]) & (groups[1:, 4] < groups[:-1, 4])
             ).any()
         )
-        self._cache: OrderedDict[object, Any] = OrderedDict()
-        self._cached_bytes = 0
+
+    def _sound(self, groups: Array) -> Array:
+        """Return the groups whose row says something possible; the others are noted as unread."""
+        counts, starts_s, ends_s = groups[:, 3], groups[:, 1], groups[:, 2]
+        sound = (counts >= 1) & (counts <= _MOST_GROUP_ROWS) & (starts_s <= ends_s)
+        for _, start_s, end_s, *_ in groups[~sound].tolist():
+            self.unread[Unread(start_s, end_s, "its row group is damaged")] = None
+        return groups[sound]
 
     @property
     def rows(self) -> int:
-        """How many there are."""
+        """The number of rows."""
         return int(self.first_rows[-1])
 
     def parts(self, start: int, stop: int) -> slice:
-        """The parts that have rows in [start, stop)."""
+        """Return the parts that have rows in [start, stop)."""
         first = int(np.searchsorted(self.first_rows, start, "right")) - 1
         return slice(first, int(np.searchsorted(self.first_rows, stop)) if start < stop else first)
 
     def values(
         self, column: Column, start: int, stop: int, wanted: Indexes | None = None
     ) -> Iterator[tuple[int, Decoded]]:
-        """The values in rows [start, stop), a part at a time, each with its place from start on.
+        """Yield the values in rows [start, stop), a part at a time, each with its first row.
 
         Args:
-            column: What values.
-            start: The first row.
-            stop: The row behind the last.
-            wanted: Which of the parts; None for all. Those that have no values are left out.
+            column: Which values.
+            start: The first row, from which places are counted.
+            stop: The row after the last.
+            wanted: Which of the parts; None for all. Parts without values are left out.
         """
         parts = self.parts(start, stop)
         places = range(parts.start, parts.stop)
@@ -166,8 +124,11 @@ class FrameSource:
             first, behind = self.first_rows[place : place + 2].tolist()
             if start <= first and behind <= stop:
                 yield first - start, values
-            else:
-                yield max(0, first - start), _cut(values, max(0, start - first), stop - first)
+                continue
+            inside = slice(max(0, start - first), stop - first)
+            codes = None if values.codes is None else values.codes[inside]
+            part = Decoded(values.numbers[inside], codes, values.labels, values.is_whole)
+            yield max(0, first - start), part
 
     def _of_parts(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
         if isinstance(column, str) and column in self.derived:
@@ -175,50 +136,54 @@ class FrameSource:
                 yield place, self.derived[column](times.numbers)
             return
         groups = len(self._group_ids)
-        of_group = {int(self._group_ids[place]): place for place in places if place < groups}
-        signal_id, connection = self._signal_id(column), self.connection
-        if signal_id is not None and of_group:
-            sizes = np.diff(self.first_rows)
-            wanted = {group_id: int(sizes[place]) for group_id, place in of_group.items()}
-            found = values_in(connection, self.run_id, signal_id, wanted)
-            if signal_id <= SIM_TIMES:  # each group has times and ids
-                found = _with_missing(found, wanted)
-            for group_id, values in found:
-                place = of_group[group_id]
-                if isinstance(values, DamagedChunkError):
-                    values = self._from_rows(connection, place, column, values)
-                if values is not None:
-                    yield place, values
+        yield from self._of_groups(column, [place for place in places if place < groups])
         rows = _of_rows(self.columns, column) or ()
         for place in (each for each in places if each >= groups and len(rows)):
             first = (place - groups) * chunk_making.GROUP_ROWS
             yield place, decoded_of(rows[first : first + chunk_making.GROUP_ROWS])
 
+    def _of_groups(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
+        """Yield the values that the chunks of some groups hold."""
+        signal_id = self._signal_id(column)
+        if signal_id is None or not places:
+            return
+        of_group = {int(self._group_ids[place]): place for place in places}
+        sizes = np.diff(self.first_rows)
+        wanted = {group_id: int(sizes[place]) for group_id, place in of_group.items()}
+        missing = dict(of_group) if signal_id <= SIM_TIMES else {}  # each group has times and ids
+        for group_id, values in values_in(self.connection, self.run_id, signal_id, wanted):
+            missing.pop(group_id, None)
+            place = of_group[group_id]
+            if isinstance(values, Decoded):
+                yield place, values
+            elif (instead := self._without_chunk(place, column, values)) is not None:
+                yield place, instead
+        for place in missing.values():
+            instead = self._without_chunk(place, column, DamagedChunkError("missing"))
+            if instead is not None:
+                yield place, instead
+
     def _signal_id(self, column: Column) -> int | None:
         return self.ids.get(column) if isinstance(column, str) else column
 
-    def _from_rows(
-        self, connection: sqlite3.Connection, place: int, column: Column, error: DamagedChunkError
+    def _without_chunk(
+        self, place: int, column: Column, error: DamagedChunkError
     ) -> Decoded | None:
-        """What the rows of a damaged chunk say, where they are all there; else it is not read."""
-        columns, span = StateColumns(), (float(self.starts_s[place]), float(self.ends_s[place]))
-        columns.add(connection.execute(_ROWS_OF, (self.run_id, *span)).fetchall())
+        """Note a chunk that cannot be read; of times and ids return what keeps rows in order."""
+        span = (float(self.starts_s[place]), float(self.ends_s[place]))
+        why = f"the chunk of {_NAMES.get(column, column)} is {error}"
+        self.unread[Unread(*span, why)] = column
+        chunk_making.report_damaged_group(self.connection, int(self._group_ids[place]))
         rows = int(self.first_rows[place + 1] - self.first_rows[place])
-        if len(columns) == rows:
-            values = _of_rows(columns, column)
-            if values is not None:
-                return decoded_of(values)
-        said = _NAMES.get(column, column)
-        self.unread[Unread(*span, f"the chunk of {said} is {error}")] = column
         evenly: Array = np.linspace(*span, rows)
-        if column == SIM_TIMES:  # so they keep the rows in order
+        if column == SIM_TIMES:
             return Decoded(evenly, None, ())
         if column == WALL_TIMES:
             return Decoded(np.interp(evenly, *self._known_walls()), None, ())
         return Decoded(np.zeros(rows), None, ()) if column == STATE_IDS else None
 
     def _known_walls(self) -> tuple[Array, Array]:
-        """Simulation and wall times of the first and last rows of parts, by their statistics."""
+        """Return simulation and wall times of the ends of parts, as far as statistics have them."""
         table = self.statistics(WALL_TIMES)
         first, last = (Statistics._fields.index(end) for end in ("first", "last"))
         walls: Array = np.append(table[:, first], table[:, last])
@@ -229,11 +194,11 @@ class FrameSource:
         return times[~np.isnan(walls)][order], walls[~np.isnan(walls)][order]
 
     def statistics(self, column: Column) -> Array:
-        """What a signal comes to: a row for each part, a column for each field of `Statistics`."""
+        """Return the statistics of a signal: a row per part, a column per field of `Statistics`."""
         return self.cached(("statistics", column), lambda: self._statistics(column))
 
     def _statistics(self, column: Column) -> Array:
-        table = nothing(len(self.starts_s))
+        table = no_statistics(len(self.starts_s))
         if column in self.derived:
             for place, part in self._of_parts(column, range(len(table))):
                 table[place] = statistics_of(part)
@@ -250,7 +215,7 @@ class FrameSource:
         return table
 
     def with_long_steps(self, longer_s: float) -> Flags:
-        """In which parts two rows that follow each other are further apart in simulation time."""
+        """Return in which parts two successive rows are further apart in simulation time."""
         between = self.starts_s[1:] - self.ends_s[:-1] > longer_s
         found = np.append(between, False) | np.append(False, between)
         found[len(self._group_ids) :] = True
@@ -265,7 +230,7 @@ class FrameSource:
         return int(self._group_ids.min()), int(self._group_ids.max())
 
     def _places_of(self, group_ids: Array) -> tuple[Indexes, Flags]:
-        """The places of groups, and which of the groups have one."""
+        """Return the places of groups, and which of the groups have one."""
         order = np.argsort(self._group_ids, kind="stable")
         ids = self._group_ids[order]
         at = np.searchsorted(ids, group_ids)
@@ -273,170 +238,54 @@ class FrameSource:
         return order[at[known]], known
 
     def forget(self) -> None:
-        """Forget what was made."""
-        self._cache.clear()
-        self._cached_bytes = 0
+        """Drop the arrays that were made so far."""
+        self._cache = _ArrayCache()
 
     def cached(self, key: object, make: Callable[[], T]) -> T:
-        """What was made before, or is made now; what was used longest ago makes room for it."""
-        if key in self._cache:
-            self._cache.move_to_end(key)
-            return self._cache[key][0]
+        """Return what was made under this key before, or make it now."""
+        return self._cache.get(key, make)
+
+
+class _ArrayCache:
+    """Arrays by key, up to `MOST_CACHED_BYTES`; the least recently used are dropped."""
+
+    def __init__(self) -> None:
+        self._made: OrderedDict[object, tuple[Any, int]] = OrderedDict()
+        self._bytes = 0
+
+    def get(self, key: object, make: Callable[[], T]) -> T:
+        """Return what is cached under a key, or make and cache it."""
+        if key in self._made:
+            self._made.move_to_end(key)
+            return self._made[key][0]
         made = make()
-        self._cache[key] = made, (size := _bytes_of(made))
-        self._cached_bytes += size
-        while self._cached_bytes > MOST_CACHED_BYTES and len(self._cache) > 1:
-            _, (_, freed) = self._cache.popitem(last=False)
-            self._cached_bytes -= freed
+        size = _bytes_of(made)
+        self._made[key] = made, size
+        self._bytes += size
+        while self._bytes > MOST_CACHED_BYTES and len(self._made) > 1:
+            _, (_, freed) = self._made.popitem(last=False)
+            self._bytes -= freed
         return made
 
 
 def _bytes_of(made: object) -> int:
-    """Of an array, or of those that make it up."""
+    """Return the size of an array, or of the arrays that make up a tuple or an object."""
     if isinstance(made, np.ndarray):
         return int(made.nbytes)
     parts = cast("Sequence[object]", made) if isinstance(made, tuple) else vars(made).values()
     return sum(int(getattr(part, "nbytes", 0)) for part in parts)
 
 
-def nothing(parts: int) -> Array:
-    """The statistics of a signal that is in none of so many parts."""
+def no_statistics(parts: int) -> Array:
+    """Return the statistics of a signal that none of these parts has."""
     table: Array = np.full((parts, len(Statistics._fields)), np.nan)
     table[:] = np.array(Statistics(0, 0), np.float64)
     return table
 
 
-def _with_missing(
-    found: Iterator[tuple[int, Decoded | DamagedChunkError]], wanted: Mapping[int, int]
-) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
-    """What was found in some groups, and an error of each in which nothing was."""
-    missing = dict.fromkeys(wanted)
-    for group_id, values in found:
-        missing.pop(group_id, None)
-        yield group_id, values
-    for group_id in missing:
-        yield group_id, DamagedChunkError("missing")
-
-
 def _of_rows(columns: StateColumns, column: Column) -> Sequence[Any] | None:
-    """The values of rows that are in no chunk; None where none of them has one."""
+    """Return the values of rows that are in no chunk; None if none of them has one."""
     if isinstance(column, str):
         return columns.values.get(column)
     of_row = {SIM_TIMES: columns.times, WALL_TIMES: columns.wall_times, STATE_IDS: columns.ids}
     return of_row[column] if len(columns) else None
-
-
-def _cut(values: Decoded, start: int, stop: int) -> Decoded:
-    codes = None if values.codes is None else values.codes[start:stop]
-    return Decoded(values.numbers[start:stop], codes, values.labels, values.is_whole)
-
-
-# -- rows in no chunk: the newest ones, and those that came late -----------------------------------
-#
-# Parsing them is what a question about a running robot costs, so that the newest are cached
-# between questions, and only what has come since is read.
-
-
-Read = tuple[StateColumns, "float | None"]
-
-
-class _Cached(NamedTuple):
-    place: tuple[float, int]  # after which the rows begin
-    columns: StateColumns
-
-
-_cache: OrderedDict[tuple[str, str], _Cached] = OrderedDict()
-_lock = threading.Lock()
-
-
-def rows_in_no_chunk(
-    connection: sqlite3.Connection,
-    run_id: int,
-    span: tuple[float, float],
-    at: ChunkProgress,
-    deadline: Deadline,
-) -> Read:
-    """Rows of a run that are in no chunk, in order: all in [start, end), and maybe newer ones.
-
-    Args:
-        connection: Any.
-        run_id: The run.
-        span: Start and end, simulation times in s.
-        at: Up to where the run is in chunks.
-        deadline: For all reading.
-
-    Returns:
-        The rows, and the time of the last one where the deadline passed before all were read.
-    """
-    place = (at.end_s, at.last_state_id)
-    columns, cut_s = StateColumns(), None
-    if at.end_s != -math.inf:  # else nothing came late, and all rows of the file would be read
-        late = (run_id, at.max_state_id, *span, *place)
-        cut_s = read_rows(connection, _LATE, late, columns, deadline)
-    if cut_s is not None or span[1] < at.end_s:
-        return columns, cut_s
-    key = _key(connection, run_id) if has_few_new_rows(connection, run_id, at) else None
-    if key is None or len(columns):
-        # SQLite would go through all rows from the start of the range rather than from the place.
-        after = (max(span[0], at.end_s), span[1])
-        cut_s = read_rows(connection, _NEWEST_IN, (run_id, *after, *place), columns, deadline)
-        return columns, cut_s
-    with _lock:
-        return _cached_rows(connection, run_id, key, place, deadline)
-
-
-def has_few_new_rows(connection: sqlite3.Connection, run_id: int, at: ChunkProgress) -> bool:
-    """Whether a run has so few rows after those in chunks that they are cached."""
-    asked = (run_id, at.end_s, at.last_state_id, MOST_ROWS_CACHED + 1)
-    return bool(connection.execute(_FEWER_THAN, asked).fetchone()[0] <= MOST_ROWS_CACHED)
-
-
-def _cached_rows(
-    connection: sqlite3.Connection,
-    run_id: int,
-    key: tuple[str, str],
-    place: tuple[float, int],
-    deadline: Deadline,
-) -> Read:
-    """The newest rows: those that were parsed before, and those that have come since."""
-    cached = _cache.pop(key, None)
-    columns = StateColumns()
-    if cached is not None and cached.place == place and len(cached.columns):
-        last = (cached.columns.times[-1], cached.columns.ids[-1])
-        asked = (run_id, *place, *last, max(cached.columns.ids))
-        if not connection.execute(_ONE_BETWEEN, asked).fetchone()[0]:
-            columns = cached.columns
-    after = (columns.times[-1], columns.ids[-1]) if len(columns) else place
-    cut_s = read_rows(connection, _NEWEST, (run_id, *after), columns, deadline)
-    _cache[key] = _Cached(place, columns)
-    while len(_cache) > MOST_RUNS_CACHED:
-        _cache.popitem(last=False)
-    return columns.part(0, len(columns)), cut_s
-
-
-def read_rows(
-    connection: sqlite3.Connection,
-    query: str,
-    values: tuple[object, ...],
-    columns: StateColumns,
-    deadline: Deadline,
-) -> float | None:
-    """Add the rows of a query; the time of the last one where the deadline passed before its end.
-
-    Without a row it is minus infinity. The first of the values is the run.
-    """
-    with reading_texts(connection):
-        cursor = connection.execute(query, values)
-        while rows := cursor.fetchmany(ROWS_AT_ONCE):
-            if deadline.passed:
-                return columns.times[-1] if len(columns) else float("-inf")
-            columns.add(rows, f"run {values[0]}: ")
-    return None
-
-
-def _key(connection: sqlite3.Connection, run_id: int) -> tuple[str, str] | None:
-    """Which run of which file it is; None where what is read now is not what others will read."""
-    file, run = connection.execute(_FILE).fetchone(), connection.execute(_RUN, (run_id,)).fetchone()
-    if not file or not file[0] or not run or not isinstance(run[0], str):
-        return None
-    return None if connection.execute(_SHADOWED).fetchone()[0] else (file[0], run[0])

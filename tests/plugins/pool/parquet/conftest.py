@@ -15,11 +15,11 @@ from tests.plugins.pool.parquet import bucket
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.pool_contents import open_pool
-from webots_mcp.plugins.pool.shipping import Order, Report, ship
+from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import RecordingAccess
 
-RECORDINGS: Final = 50
+RECORDINGS: Final = 30
 STARTED_S: Final = 1_700_000_000.0  # 2023-11-14, 22:13 in UTC: later recordings begin the next day
 
 
@@ -63,6 +63,8 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Many:
     url = bucket.empty()  # a disk would have to be waited for a thousand times
     for database in databases:
         recording = RecordingAccess(database, database.parent, read_only=True)
-        ship(Order(recording, partial(open_pool, url, ships=True), full=True), Report())
+        ship(
+            ShippingJob(recording, partial(open_pool, url, ships=True), full=True), ShippingReport()
+        )
     bucket.copy_to(folder / "pool")
     return Many(folder / "pool", tuple(databases))

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from webots_mcp.errors import PoolError
-from webots_mcp.plugins.pool.parquet_files import package
+from webots_mcp.plugins.pool.storage import package
 
 
 @pytest.mark.parametrize(

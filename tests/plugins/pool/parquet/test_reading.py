@@ -1,4 +1,4 @@
-"""A pool of fifty recordings, asked by SQL, answers as the tools do of each recording."""
+"""A pool of thirty recordings, asked by SQL, answers as the tools do of each recording."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.trends import trends
 from webots_mcp.plugins.pool import duckdb_statement as asking
-from webots_mcp.plugins.pool.parquet_files import Storage
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_contents import pooled_runs
+from webots_mcp.plugins.pool.storage import Storage
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.runs import list_runs
 from webots_mcp.store.sql import FOLDER
 
+pytestmark = pytest.mark.slow
 COUNTS = "SELECT recording_uuid, count(*) FROM state GROUP BY recording_uuid"
 MEANS = """
     SELECT recording_uuid, avg(CAST(data ->> '$.front_m' AS DOUBLE)) FROM state
@@ -174,21 +175,23 @@ GREEDY = {
 }
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the memory of a process has no limit there")
 @pytest.mark.parametrize("sql", GREEDY.values(), ids=GREEDY.keys())
-@pytest.mark.parametrize("is_limited", [True, False], ids=["limited", "only watched"])
-def test_a_statement_has_so_much_memory_and_no_more(
-    pool: ParquetPool, monkeypatch: pytest.MonkeyPatch, sql: str, is_limited: bool
-) -> None:
-    if is_limited and sys.platform != "linux":
-        pytest.skip("no such limit there")
-    if not is_limited:  # as where a system has no such limit
-        pytest.importorskip("resource")
-        unlimited = "import resource, runpy; resource.setrlimit = lambda *_: None; "
-        unlimited += f"runpy.run_module({asking.__name__!r}, run_name='__main__')"
-        monkeypatch.setattr(asking, "_LINE", (sys.executable, "-c", unlimited))
-        monkeypatch.setattr(asking, "_MOST_RESIDENT_BYTES", 300_000_000)
+def test_a_statement_has_so_much_memory_and_no_more(pool: ParquetPool, sql: str) -> None:
     with pytest.raises(InvalidInputError, match=r"of memory would be needed"):
         pool.select(sql, 1)
+
+
+def test_a_statement_is_watched_where_a_system_has_no_limit(
+    pool: ParquetPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("resource")
+    unlimited = "import resource, runpy; resource.setrlimit = lambda *_: None; "
+    unlimited += f"runpy.run_module({asking.__name__!r}, run_name='__main__')"
+    monkeypatch.setattr(asking, "_LINE", (sys.executable, "-c", unlimited))
+    monkeypatch.setattr(asking, "_MOST_RESIDENT_BYTES", 300_000_000)
+    with pytest.raises(InvalidInputError, match=r"of memory would be needed"):
+        pool.select(GREEDY["rows of long texts"], 1)
 
 
 def test_a_statement_has_half_a_minute_with_all_that_is_around_it() -> None:

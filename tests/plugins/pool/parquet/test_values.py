@@ -17,7 +17,7 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_interface import Batch, table
-from webots_mcp.plugins.pool.shipping import Order, Report, ship
+from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.recording import RecordingAccess
 
@@ -47,11 +47,11 @@ def database(tmp_path: Path) -> Iterator[Recorded]:
         yield recorded
 
 
-def shipped(pool: Path) -> Report:
+def shipped(pool: Path) -> ShippingReport:
     folder = pool.parent / "there"
     recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
-    report = Report()
-    ship(Order(recording, lambda: ParquetPool(str(pool), ships=True)), report)
+    report = ShippingReport()
+    ship(ShippingJob(recording, lambda: ParquetPool(str(pool), ships=True)), report)
     return report
 
 

@@ -38,9 +38,9 @@ from tests.plugins.pool.rows import (
     uuid_of,
 )
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.parquet_files import LEASE_S
 from webots_mcp.plugins.pool.parquet_pool import PART_BYTES, ParquetPool
-from webots_mcp.plugins.pool.pool_interface import Batch, Row, SQLValue, table
+from webots_mcp.plugins.pool.pool_interface import Batch, PoolRow, SQLValue, table
+from webots_mcp.plugins.pool.shipping_lease import LEASE_S
 
 DAY_S = 86_400.0
 MIDNIGHT_S = 19_700 * DAY_S
@@ -56,7 +56,7 @@ with open_pool(sys.argv[1], ships=True) as pool:
 """
 
 
-def ids(rows: Sequence[Row]) -> list[SQLValue]:
+def ids(rows: Sequence[PoolRow]) -> list[SQLValue]:
     return [row[0] for row in rows]
 
 

@@ -37,8 +37,8 @@ from tests.recordings.rover import record_rover
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.pool_contents import open_pool
-from webots_mcp.plugins.pool.pool_interface import Batch, Row, Table, table, tables
-from webots_mcp.plugins.pool.postgres_pool import prepare, views
+from webots_mcp.plugins.pool.pool_interface import Batch, PoolRow, ShippedTable, table, tables
+from webots_mcp.plugins.pool.postgres_schema import prepare, views
 from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.slow
@@ -103,7 +103,7 @@ def refusal(url: str) -> str:
 
 @pytest.mark.parametrize("table", tables(), ids=lambda table: table.name)
 def test_a_pool_has_the_columns_of_a_recording_behind_the_recordings_uuid(
-    postgres: Server, pool_template: str, table: Table
+    postgres: Server, pool_template: str, table: ShippedTable
 ) -> None:
     found = postgres.execute(pool_template, COLUMNS, table.name)
     wanted = [
@@ -345,14 +345,14 @@ def test_a_recording_is_deleted_as_the_page_says_and_shipped_anew(
     assert pooled(url, uuid_of(rover)) == recorded(rover)
 
 
-class Interrupted(list[Row]):
+class Interrupted(list[PoolRow]):
     """Rows amid which something happens, once."""
 
-    def __init__(self, rows: Sequence[Row], at: int, happens: Callable[[], object]) -> None:
+    def __init__(self, rows: Sequence[PoolRow], at: int, happens: Callable[[], object]) -> None:
         super().__init__(rows)
         self._at, self._happens = at, happens
 
-    def __iter__(self) -> Iterator[Row]:
+    def __iter__(self) -> Iterator[PoolRow]:
         for number, row in enumerate(super().__iter__()):
             if number == self._at:
                 self._happens()

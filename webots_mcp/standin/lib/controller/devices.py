@@ -1,6 +1,6 @@
-"""The devices of a robot.
+"""The devices of a robot, as controllers use them.
 
-A device's getters of constants are those of the fields of its node, which the simulator sends.
+Getters of constants return the fields of the device's node, which the simulator sends.
 """
 
 # ruff: noqa: N802, N815 - the names are those of Webots
@@ -20,7 +20,7 @@ from . import session as library
 from .surface import Completed, integer, lacking, number, say, text, type_number
 
 _MEMORY: Final = [0.4375, -0.0625, 1.2890625, 0.734375]
-"""What stands in the memory that Webots reads before an InertialUnit's first value: any numbers."""
+"""What Webots reads from memory before an InertialUnit's first value: any numbers."""
 _UNKNOWN: Final = [nan, nan, nan]
 _NO_GPS: Final = [_UNKNOWN, _UNKNOWN]
 _DISTANCE_SENSOR_TYPES: Final = ("generic", "infra-red", "sonar", "laser")
@@ -28,7 +28,7 @@ _TOUCH_SENSOR_TYPES: Final = ("bumper", "force", "force-3d")
 
 
 def _field(name: str, default: Any = None) -> Callable[[Any], Any]:
-    """A getter of a field of the device's node."""
+    """Return a getter for a field of the device's node."""
 
     def get(self: Any) -> Any:
         with self._session.lock:
@@ -40,11 +40,11 @@ def _field(name: str, default: Any = None) -> Callable[[Any], Any]:
 class Device(Completed):
     """A device of the robot.
 
-    `GPS("gps")` finds the device by name; the robot itself makes its devices by tag.
+    `GPS("gps")` finds a device by its name. The robot itself makes its devices by tag.
     """
 
     _c_name = "device"
-    """As in the names of the C functions, for messages."""
+    """Name of the device in the C functions, for messages."""
 
     def __init__(self, name: int | str) -> None:
         session = library.current
@@ -69,21 +69,21 @@ class Device(Completed):
     getModel = _field("model", "")
 
     def getNodeType(self) -> int:
-        """The number of the node type, to compare with `Node.GPS` and the like."""
+        """Return the number of the node type, to compare with `Node.GPS` and the like."""
         return type_number("Node", self._description.get("node_type", ""))
 
 
 class Sensor(Device):
-    """A device that measures something every so often, once it is enabled."""
+    """A device that measures periodically, once it is enabled."""
 
     def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
         super().__init__(name)
-        if isinstance(name, str):  # by name: enables, as the real package does
+        if isinstance(name, str):  # As in the real package, a device made by name is enabled.
             basic_ms = int(self._session.robot["basic_time_step"])
             self.enable(basic_ms if sampling_period is None else sampling_period)
 
     def enable(self, p: int) -> None:
-        """Measure every so many milliseconds, from the next step on; 0 disables."""
+        """Measure once in `p` milliseconds, from the next step on; 0 disables."""
         if integer(p, position=2) < 0:
             self._complain("enable", " called with negative sampling period.")
         elif not self._tag:
@@ -92,11 +92,11 @@ class Sensor(Device):
             self._session.enable(self._tag, p)
 
     def disable(self) -> None:
-        """Measure no longer; the last value stays."""
+        """Stop measuring; the last value stays."""
         self.enable(0)
 
     def getSamplingPeriod(self) -> int:
-        """The sampling period in milliseconds, 0 if disabled."""
+        """Return the sampling period in milliseconds, 0 if disabled."""
         with self._session.lock:
             return self._session.periods_ms.get(self._tag, 0)
 
@@ -108,143 +108,146 @@ class Sensor(Device):
 
 
 class _NumberSensor(Sensor):
-    """A sensor that gives one number; NaN before the first one."""
+    """A sensor of one number."""
 
     def getValue(self) -> float:
-        """The measured value; NaN before the first one."""
+        """Return the measured value; NaN before the first one."""
         return self._value(nan)
 
 
 class _LookupTable(Sensor):
-    """A sensor that translates what it measures by a lookup table."""
+    """A sensor that converts its measurement by a lookup table."""
 
     def getLookupTable(self) -> list[float]:
-        """What is measured, the value that comes of it, and the noise, one after the other."""
+        """Return measurement, value and noise of each row, one after the other."""
         return [value for row in self._fields["lookupTable"] for value in row]
 
 
 class _VectorSensor(_LookupTable):
-    """A sensor that gives three numbers along its own axes."""
+    """A sensor of a vector along its own axes."""
 
     def getValues(self) -> list[float]:
-        """Along x, y and z of the sensor; NaN before the first value."""
+        """Return the vector along x, y and z of the sensor; NaN before the first value."""
         return [*self._value(_UNKNOWN, "get_values")]
 
 
 class Accelerometer(_VectorSensor):
-    """Acceleration in metres a second squared; standing still it shows g, upwards."""
+    """Measures acceleration in metres per second squared; at rest g, upwards."""
 
     _c_name = "accelerometer"
 
 
 class Gyro(_VectorSensor):
-    """Turning speed in radians a second."""
+    """Measures angular velocity in radians per second."""
 
     _c_name = "gyro"
 
 
 class Compass(_VectorSensor):
-    """The direction of north, which is the world's y axis."""
+    """Measures the direction of north, which is the world's y axis."""
 
     _c_name = "compass"
 
 
 class LightSensor(_NumberSensor, _LookupTable):
-    """How much light falls on it, translated by the lookup table."""
+    """Measures irradiance, converted by the lookup table."""
 
     _c_name = "light_sensor"
 
 
 class DistanceSensor(_NumberSensor, _LookupTable):
-    """The distance to the next obstacle, translated by the lookup table."""
+    """Measures the distance to the next obstacle, converted by the lookup table."""
 
     _c_name = "distance_sensor"
 
-    getAperture = _field("aperture")  # radians; the stand-in looks along one ray
+    getAperture = _field("aperture")  # Radians. The stand-in measures along one ray.
 
     def getMaxValue(self) -> float:
-        """The largest value of the lookup table."""
+        """Return the largest value of the lookup table."""
         return max((row[1] for row in self._fields["lookupTable"]), default=0.0)
 
     def getMinValue(self) -> float:
-        """The smallest value of the lookup table."""
+        """Return the smallest value of the lookup table."""
         return min((row[1] for row in self._fields["lookupTable"]), default=0.0)
 
     def getType(self) -> int:
-        """The `type` field, as `DistanceSensor.SONAR`."""
-        return _place(self._fields["type"], _DISTANCE_SENSOR_TYPES)
+        """Return the `type` field, such as `DistanceSensor.SONAR`."""
+        return _index_of(self._fields["type"], _DISTANCE_SENSOR_TYPES)
 
 
 class TouchSensor(_NumberSensor, _LookupTable):
-    """Whether the robot runs into something where the sensor is."""
+    """Detects contact of the robot where the sensor is."""
 
     _c_name = "touch_sensor"
     BUMPER, FORCE, FORCE3D = range(3)
 
     def getValue(self) -> float:
-        """1 or 0; NaN before the first one."""
+        """Return 1 or 0; NaN before the first value."""
         if self.getType() != self.BUMPER:
             raise lacking(f"TouchSensor of type {self._fields['type']!r}")
         return super().getValue()
 
     def getType(self) -> int:
-        """`TouchSensor.BUMPER`, `FORCE` or `FORCE3D`."""
-        return _place(self._fields["type"], _TOUCH_SENSOR_TYPES)
+        """Return `TouchSensor.BUMPER`, `FORCE` or `FORCE3D`."""
+        return _index_of(self._fields["type"], _TOUCH_SENSOR_TYPES)
 
 
 class PositionSensor(_NumberSensor):
-    """How far a joint has turned, in radians, or slid, in metres."""
+    """Measures how far a joint has turned, in radians, or slid, in metres."""
 
     _c_name = "position_sensor"
     ROTATIONAL = 0
 
     def getType(self) -> int:
-        """`PositionSensor.ROTATIONAL`."""
+        """Return `PositionSensor.ROTATIONAL`."""
         return self.ROTATIONAL
 
 
 class GPS(Sensor):
-    """Where the sensor is: metres and metres a second; NaN before the first value."""
+    """Measures position and velocity in metres and metres per second.
+
+    NaN before the first value.
+    """
 
     _c_name = "gps"
     LOCAL = 0
 
     def getValues(self) -> list[float]:
-        """x, y and z."""
+        """Return x, y and z."""
         return [*self._value(_NO_GPS, "get_values")[0]]
 
     def getSpeedVector(self) -> list[float]:
-        """Velocity since the last sample."""
+        """Return the velocity since the last sample."""
         return [*self._value(_NO_GPS, "get_speed_vector")[1]]
 
     def getSpeed(self) -> float:
-        """Speed since the last sample."""
+        """Return the speed since the last sample."""
         return hypot(*self._value(_NO_GPS, "get_speed")[1])
 
     def getCoordinateSystem(self) -> int:
-        """`GPS.LOCAL`."""
+        """Return `GPS.LOCAL`."""
         return self.LOCAL
 
 
 class InertialUnit(Sensor):
-    """Which way the sensor is turned; before the first value plausible, wrong numbers."""
+    """Measures orientation. Before the first value it returns plausible but wrong numbers."""
 
     _c_name = "inertial_unit"
 
-    getNoise = _field("noise")  # the stand-in measures exactly all the same
+    getNoise = _field("noise")  # The stand-in measures without noise.
 
     def getRollPitchYaw(self) -> list[float]:
-        """Roll, pitch and yaw in radians."""
+        """Return roll, pitch and yaw in radians."""
         return [*self._value(_MEMORY[:3], "get_roll_pitch_yaw")]
 
     def getQuaternion(self) -> list[float]:
-        """x, y, z and w."""
+        """Return x, y, z and w."""
         angles = self._value(None, "get_quaternion")
         return [*_MEMORY] if angles is None else _quaternion(*angles)
 
 
 class LED(Device):
-    """A lamp; it is not rendered, but it stores its value."""
+    """A lamp. It is not rendered, but stores its value."""
 
     _c_name = "led"
 
@@ -253,28 +256,28 @@ class LED(Device):
         self._state = 0
 
     def set(self, v: int) -> None:
-        """Switch on, with 1 or the number or RGB value of a color, or off with 0."""
+        """Switch the lamp on, with 1 or the index or RGB value of a color, or off with 0."""
         self._state = integer(v, position=2)
 
     def get(self) -> int:
-        """The value that was set last."""
+        """Return the value that was set last."""
         return self._state
 
 
 class Motor(Device):
-    """Turns a joint, or slides it. The getters give what was commanded, not what is measured.
+    """Turns or slides a joint. The getters return what was commanded, not what is measured.
 
-    Positions in radians or metres, speeds and accelerations by seconds.
+    Positions are in radians or metres, speeds and accelerations per second.
     """
 
     _c_name = "motor"
     ROTATIONAL, LINEAR = range(2)
 
     getMaxVelocity = _field("maxVelocity", 0.0)
-    getMinPosition = _field("minPosition")  # 0 like getMaxPosition(): no limits
+    getMinPosition = _field("minPosition")  # Both 0: no limits.
     getMaxPosition = _field("maxPosition")
     getMaxTorque = _field("maxTorque", 0.0)
-    getMultiplier = _field("multiplier")  # the stand-in couples no motors
+    getMultiplier = _field("multiplier")  # The stand-in couples no motors.
 
     def __init__(self, name: int | str) -> None:
         super().__init__(name)
@@ -283,7 +286,7 @@ class Motor(Device):
         self._acceleration: float = self._fields.get("acceleration", -1.0)
 
     def setPosition(self, position: float) -> None:
-        """Turn there; inf lets the motor run with `setVelocity`."""
+        """Set the target position; inf lets the motor run with the speed of `setVelocity`."""
         if isnan(position := number(position)):
             self._complain("set_position", " called with an invalid 'position' argument (NaN).")
             return
@@ -291,7 +294,7 @@ class Motor(Device):
         self._session.change(self._tag, "position", position)
 
     def setVelocity(self, velocity: float) -> None:
-        """Set the speed; the motor keeps within its `maxVelocity`."""
+        """Set the speed, which `maxVelocity` limits."""
         if isnan(velocity := number(velocity)):
             self._complain("set_velocity", " called with an invalid 'velocity' argument.(NaN)")
         elif velocity < 0.0 and not isinf(self._position):
@@ -305,7 +308,7 @@ class Motor(Device):
             self._session.change(self._tag, "velocity", velocity)
 
     def setAcceleration(self, acceleration: float) -> None:
-        """Limit how fast the speed changes; -1: no limit."""
+        """Limit the acceleration; -1 for no limit."""
         if isnan(acceleration := number(acceleration)):
             self._complain("set_acceleration", " called with an invalid argument (NaN).")
             return
@@ -313,31 +316,31 @@ class Motor(Device):
         self._session.change(self._tag, "acceleration", acceleration)
 
     def getTargetPosition(self) -> float:
-        """The commanded position."""
+        """Return the commanded position."""
         return self._position
 
     def getVelocity(self) -> float:
-        """The commanded speed."""
+        """Return the commanded speed."""
         return self._velocity
 
     def getAcceleration(self) -> float:
-        """The commanded limit of acceleration; -1: none."""
+        """Return the commanded limit of acceleration; -1 for none."""
         return self._acceleration
 
     def getForceFeedbackSamplingPeriod(self) -> int:
-        """0: the stand-in measures no force, so that is never enabled."""
+        """Return 0: the stand-in measures no force."""
         return 0
 
     def getTorqueFeedbackSamplingPeriod(self) -> int:
-        """0: the stand-in measures no torque, so that is never enabled."""
+        """Return 0: the stand-in measures no torque."""
         return 0
 
     def getType(self) -> int:
-        """`Motor.ROTATIONAL` or `Motor.LINEAR`."""
+        """Return `Motor.ROTATIONAL` or `Motor.LINEAR`."""
         return int(self._description["node_type"] == "LinearMotor")
 
     def getPositionSensor(self) -> PositionSensor | None:
-        """The sensor of the same joint; None if there is none."""
+        """Return the position sensor of the same joint; None if there is none."""
         joint = self._description["joint"]
         tags = (
             other["tag"]
@@ -346,12 +349,12 @@ class Motor(Device):
             and other["joint"] == joint
             and other["node_type"] == "PositionSensor"
         )
-        tag = self._session.answered_here(("position sensor", self._tag), next(tags, None))
+        tag = self._session.answer_locally(("position sensor", self._tag), next(tags, None))
         return None if tag is None else PositionSensor(tag)
 
 
 class Camera(Sensor):
-    """Takes pictures: four bytes a pixel in the order blue, green, red, alpha."""
+    """Takes pictures of four bytes a pixel, in the order blue, green, red, alpha."""
 
     _c_name = "camera"
 
@@ -361,7 +364,7 @@ class Camera(Sensor):
     getFov = _field("fieldOfView")
 
     def getImage(self) -> bytes:
-        """The last picture, rows from the top left.
+        """Return the last picture, in rows from the top left.
 
         Raises:
             ValueError: The camera is disabled or has not taken a picture yet.
@@ -372,42 +375,42 @@ class Camera(Sensor):
         return picture
 
     def getImageArray(self) -> list[list[list[int]]]:
-        """Red, green and blue by pixel, cut as Webots cuts it: `width` lists of `height` pixels."""
+        """Return red, green and blue of each pixel, cut as by Webots: `width` lists of `height`."""
         image, width, height = self.getImage(), self.getWidth(), self.getHeight()
         pixels = [[image[i + 2], image[i + 1], image[i]] for i in range(0, len(image), 4)]
         return [pixels[x * height : (x + 1) * height] for x in range(width)]
 
     @staticmethod
     def imageGetRed(image: bytes, width: int, x: int, y: int) -> int:
-        """Red of one pixel, 0 to 255."""
+        """Return red of one pixel, 0 to 255."""
         return image[4 * (y * width + x) + 2]
 
     @staticmethod
     def imageGetGreen(image: bytes, width: int, x: int, y: int) -> int:
-        """Green of one pixel, 0 to 255."""
+        """Return green of one pixel, 0 to 255."""
         return image[4 * (y * width + x) + 1]
 
     @staticmethod
     def imageGetBlue(image: bytes, width: int, x: int, y: int) -> int:
-        """Blue of one pixel, 0 to 255."""
+        """Return blue of one pixel, 0 to 255."""
         return image[4 * (y * width + x)]
 
     @staticmethod
     def imageGetGray(image: bytes, width: int, x: int, y: int) -> float:
-        """The mean of the three colors of one pixel."""
+        """Return the mean of the three colors of one pixel."""
         start = 4 * (y * width + x)
         return sum(image[start : start + 3]) / 3.0
 
     def getFocalLength(self) -> float:
-        """The focal length in pixels."""
+        """Return the focal length in pixels."""
         return self.getWidth() / 2.0 / tan(self.getFov() / 2.0)
 
     def hasRecognition(self) -> bool:
-        """False: cameras of the stand-in recognize nothing."""
+        """Return False: cameras of the stand-in recognize nothing."""
         return False
 
     def saveImage(self, filename: str, quality: int) -> int:
-        """Write the last picture to a .png or .jpg file: 0, or -1 if that fails."""
+        """Write the last picture to a .png or .jpg file; return 0, or -1 if that fails."""
         path, quality = Path(text(filename)), integer(quality, position=3)
         if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
             return -1
@@ -425,7 +428,7 @@ class Camera(Sensor):
 
 
 class Lidar(Sensor):
-    """Measures a fan of distances from left to right, layer after layer; all layers are level."""
+    """Measures a fan of distances from left to right in each layer. All layers are level."""
 
     _c_name = "lidar"
 
@@ -440,10 +443,10 @@ class Lidar(Sensor):
     getMaxFrequency = _field("maxFrequency")
 
     def getRangeImage(self) -> list[float]:
-        """Distances in metres, inf where nothing is in range.
+        """Return distances in metres, inf where nothing is in range.
 
         Raises:
-            ValueError: There is no scan yet. In Webots this can also be a segmentation fault.
+            ValueError: There is no scan yet. In Webots this may be a segmentation fault.
         """
         ranges = self._ranges()
         if ranges is None:
@@ -455,7 +458,7 @@ class Lidar(Sensor):
 
     @property
     def range_image(self) -> Any:
-        """The distances as a raw `ctypes` pointer, which is false while there is no scan."""
+        """Return the distances as a raw `ctypes` pointer, which is false before the first scan."""
         ranges = self._ranges()
         if ranges is None:
             return ctypes.POINTER(ctypes.c_float)()
@@ -463,17 +466,17 @@ class Lidar(Sensor):
         return ctypes.cast(array, ctypes.POINTER(ctypes.c_float))
 
     def getLayerRangeImage(self, layer: int) -> list[float]:
-        """Layer 0 whatever is asked for, as in Webots."""
+        """Return layer 0, whatever the argument, as Webots does."""
         return self.getRangeImage()[: self.getHorizontalResolution()]
 
 
 class _Radio(Device):
-    """A device of messages on channels."""
+    """A device that sends or receives packets on channels."""
 
     getChannel = _field("channel", -1)
 
     def setChannel(self, channel: int) -> None:
-        """Use this channel; `Emitter.CHANNEL_BROADCAST` reaches, or listens to, all."""
+        """Use this channel; `Emitter.CHANNEL_BROADCAST` means all channels."""
         if not self._tag:
             self._complain("set_channel", ": invalid device tag.")
         elif integer(channel, position=2) < -1:
@@ -493,24 +496,24 @@ class _Radio(Device):
 
 
 class Emitter(_Radio):
-    """Sends packets to the receivers of other robots; they arrive with the next basic time step."""
+    """Sends packets to receivers of other robots, which get them with the next basic time step."""
 
     _c_name = "emitter"
 
-    getBufferSize = _field("bufferSize", -1)  # bytes; -1: no limit
-    getRange = _field("range", nan)  # metres; -1: everywhere
+    getBufferSize = _field("bufferSize", -1)  # Bytes; -1 for no limit.
+    getRange = _field("range", nan)  # Metres; -1 for everywhere.
 
     def send(self, message: Any, length: int | None = None) -> None:
-        """Send a packet with the next step, on the channel and to the range of this moment.
+        """Send a packet with the next step, with the present channel and range.
 
         Args:
-            message: Text, bytes, or a list of numbers: floats if the first one is, else integers.
-            length: How many of the bytes; None: all.
+            message: Text, bytes or a list of numbers, all of the type of the first number.
+            length: Number of bytes to send; None for all.
         """
         if isinstance(message, bytes):
             packet = message if length is None else message[: max(length, 0)]
         elif isinstance(message, str):
-            packet = message.encode()[: len(message)]  # as in Webots, which counts characters
+            packet = message.encode()[: len(message)]  # As in Webots, which counts characters.
         elif isinstance(message, (list, tuple)):
             values = cast("list[Any]", message)
             if not values:
@@ -536,7 +539,7 @@ class Emitter(_Radio):
         print(f"Emitter.send(): {why}", file=sys.stderr)  # noqa: T201 - as Webots does
 
     def setRange(self, range: float) -> None:  # noqa: A002 - Webots' name
-        """Reach only receivers so near, in metres, at most `maxRange`; -1 reaches that far."""
+        """Set the range in metres, up to `maxRange`; -1 for `maxRange`."""
         wanted, most = number(range), self._fields.get("maxRange", -1.0)
         if not self._tag:
             self._complain("set_range", ": invalid device tag.")
@@ -549,7 +552,7 @@ class Emitter(_Radio):
 
 
 class Receiver(_Radio, Sensor):
-    """Queues the packets of other robots' emitters; the first one is read until `nextPacket`."""
+    """Queues packets of other robots' emitters. Getters read the first until `nextPacket`."""
 
     _c_name = "receiver"
 
@@ -558,30 +561,30 @@ class Receiver(_Radio, Sensor):
         self._queue = self._session.received.get(self._tag, deque[Any]())
 
     def getQueueLength(self) -> int:
-        """How many packets have arrived and are not read yet."""
+        """Return the number of packets in the queue."""
         if not self.getSamplingPeriod():
             use = "Please use: wb_receiver_enable()."
             self._complain("get_queue_length", f" called for a disabled device! {use}")
         return len(self._queue)
 
-    def _head(self, what: str, place: int, default: Any = None) -> Any:
-        """A part of the packet that is read: its bytes, the emitter's direction, the strength."""
+    def _head(self, what: str, part: int, default: Any = None) -> Any:
+        """Return a part of the first packet: its bytes, the emitter's direction or the strength."""
         if self._queue:
-            return self._queue[0][place]
+            return self._queue[0][part]
         self._complain(what, ": the receiver queue is empty.")
         return default
 
     def nextPacket(self) -> None:
-        """Done with the first packet: the next one is read."""
+        """Remove the first packet from the queue."""
         if self._queue:
             self._queue.popleft()
 
     def getBytes(self) -> bytes:
-        """The packet; without one a line on stderr and no bytes."""
+        """Return the packet; without one print an error and return no bytes."""
         return self._head("get_data", 0, b"")
 
     def getString(self) -> str:
-        """The packet as text.
+        """Return the packet as text.
 
         Raises:
             ValueError: There is no packet. In Webots this is a segmentation fault.
@@ -589,28 +592,28 @@ class Receiver(_Radio, Sensor):
         return _existing(self._head("get_data", 0)).decode()
 
     def getDataSize(self) -> int:
-        """Bytes of the packet; -1 without one."""
+        """Return the number of bytes of the packet; -1 without one."""
         packet = self._head("get_data_size", 0)
         return -1 if packet is None else len(packet)
 
     def getFloats(self) -> tuple[float, ...]:
-        """The packet as numbers of eight bytes."""
+        """Return the packet as numbers of eight bytes."""
         return struct.unpack(f"{int(self.getDataSize() / 8)}d", self.getBytes())
 
     def getInts(self) -> tuple[int, ...]:
-        """The packet as integers of four bytes."""
+        """Return the packet as integers of four bytes."""
         return struct.unpack(f"{int(self.getDataSize() / 4)}i", self.getBytes())
 
     def getBools(self) -> tuple[bool, ...]:
-        """The packet as flags, one a byte."""
+        """Return the packet as flags of one byte."""
         return struct.unpack(f"{self.getDataSize()}?", self.getBytes())
 
     def getSignalStrength(self) -> float:
-        """One by the square of the emitter's distance in metres."""
+        """Return 1 divided by the square of the emitter's distance in metres."""
         return self._head("get_signal_strength", 2, nan)
 
     def getEmitterDirection(self) -> list[float]:
-        """A unit vector to where the emitter was, seen from the receiver.
+        """Return a unit vector to the position of the emitter, seen from the receiver.
 
         Raises:
             ValueError: There is no packet.
@@ -618,7 +621,7 @@ class Receiver(_Radio, Sensor):
         return [*_existing(self._head("get_emitter_direction", 1))]
 
     def setChannel(self, channel: int) -> None:
-        """Listen to this channel; -1 listens to all."""
+        """Listen to this channel; -1 for all channels."""
         super().setChannel(channel)
         self._session.change(self._tag, "channel", self._fields["channel"])
 
@@ -629,7 +632,7 @@ def _existing(value: Any) -> Any:
     return value
 
 
-def _place(name: str, names: tuple[str, ...]) -> int:
+def _index_of(name: str, names: tuple[str, ...]) -> int:
     return names.index(name) if name in names else 0
 
 
@@ -653,4 +656,4 @@ CLASS_OF: Final[dict[str, type[Device]]] = {
         )
     },
 }
-"""The classes of devices by node type."""
+"""Classes of devices by node type."""

@@ -1,4 +1,4 @@
-"""The robot: stepping, devices, what the world says about it; the supervisor that may change it."""
+"""The classes of a controller's robot: `Robot`, `Supervisor` and `Keyboard`."""
 
 # ruff: noqa: N802 - the names are those of Webots
 
@@ -14,15 +14,17 @@ from typing import Any, ClassVar, Final
 from . import session as library
 from .devices import CLASS_OF, Device
 from .scene import Node, node_of
-from .session import Link, NodeFacts, Session, SocketLink
+from .session import ControllerSession, NodeFacts, SimulatorLink, SocketLink
 from .surface import Completed, integer, lacking, number, say, text
 
 _NULL_NODE: Final = (0, "", "", "", -1)
 _DEADLY_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+_MAX_CUSTOM_DATA_BYTES: Final = 65_534
+"""Webots' library sends the length in 16 bits, and takes the rest of a longer text for messages."""
 
 
 def _deprecated(getter: str) -> Callable[[Robot, str], Any]:
-    """The old way to a device, as `getGPS`."""
+    """Return a deprecated getter of a device, such as `getGPS`."""
 
     def get(self: Robot, name: str) -> Any:
         use = "please use Robot.getDevice instead."
@@ -33,26 +35,26 @@ def _deprecated(getter: str) -> Callable[[Robot, str], Any]:
 
 
 class Keyboard(Completed):
-    """A keyboard without a person: no key is ever pressed."""
+    """A keyboard on which no key is ever pressed."""
 
     def __init__(self, sampling_period: int | None = None) -> None:
         self._period_ms = 0
         self.enable(sampling_period or 0)
 
     def enable(self, p: int) -> None:
-        """Look at the keyboard every so many milliseconds; 0 disables."""
+        """Read the keyboard once in `p` milliseconds; 0 disables."""
         self._period_ms = integer(p)
 
     def disable(self) -> None:
-        """Look at the keyboard no longer."""
+        """Stop reading the keyboard."""
         self.enable(0)
 
     def getSamplingPeriod(self) -> int:
-        """The sampling period in milliseconds, 0 if disabled."""
+        """Return the sampling period in milliseconds, 0 if disabled."""
         return self._period_ms
 
     def getKey(self) -> int:
-        """-1: no key is pressed."""
+        """Return -1: no key is pressed."""
         if not self._period_ms:
             say(
                 "Error: wb_keyboard_get_key() called for a disabled device! "
@@ -61,21 +63,17 @@ class Keyboard(Completed):
         return -1
 
     def getKeyCode(self) -> int:
-        """-1: no key is pressed."""
+        """Return -1: no key is pressed."""
         return self.getKey()
 
 
-# Webots' library tells a text's length in 16 bits: the rest of a longer one is taken for messages.
-_MOST_CUSTOM_DATA_BYTES: Final = 65_534
-
-
 class Robot(Completed):
-    """The robot that this process controls; a process has one."""
+    """The robot that this process controls. A process has only one."""
 
     created: ClassVar[Robot | None] = None
-    """The first robot that was made."""
+    """The first robot that was constructed."""
 
-    _session: Session
+    _session: ControllerSession
     devices: dict[str, Device]
     """All devices by name."""
     keyboard: Keyboard
@@ -85,13 +83,13 @@ class Robot(Completed):
         if link is None:
             return
         Robot.created = self
-        self._session = library.current = Session(link)
+        self._session = library.current = ControllerSession(link)
         described = self._session.robot["devices"]
         self._by_tag = {d["tag"]: CLASS_OF[d["node_type"]](d["tag"]) for d in described}
         self.keyboard = Keyboard()
         self.devices = {device.name: device for device in self._by_tag.values()}
 
-    def _connect(self) -> Link | None:
+    def _connect(self) -> SimulatorLink | None:
         if Robot.created is not None:
             say("Error: Only one instance of the Robot class should be created.")
             self._session = Robot.created._session
@@ -110,40 +108,40 @@ class Robot(Completed):
 
         Args:
             time_step: Milliseconds of simulated time, rounded up to a multiple of the basic time
-                step. None: one basic time step. 0 only exchanges values, also while paused.
+                step; None for one basic time step. 0 only exchanges values, even while paused.
 
         Returns:
-            0; -1 once the simulation ends this controller. More than 0 for a robot without
-            synchronization that asked too late: by how many milliseconds.
+            0, or -1 once the simulation ends this controller. For a robot without synchronization
+            that was late, the delay in milliseconds.
         """
         return self._session.step(self._duration_ms(time_step))
 
     def stepBegin(self, time_step: int | None = None) -> int:
-        """The first half of `step`: asks for time to pass and returns at once; -1 at the end."""
+        """Do the first half of `step`: request that time passes. Returns at once; -1 at the end."""
         return self._session.begin_step(self._duration_ms(time_step))
 
     def stepEnd(self) -> int:
-        """The second half of `step`: waits until time has passed."""
+        """Do the second half of `step`: wait until time has passed."""
         return self._session.end_step()
 
     def _duration_ms(self, time_step: int | None) -> int:
         return int(self.getBasicTimeStep()) if time_step is None else integer(time_step)
 
     def getTime(self) -> float:
-        """Simulated time in seconds, as of the last step."""
+        """Return simulated time in seconds, as of the last step."""
         return self._session.time_s
 
     def getBasicTimeStep(self) -> float:
-        """The world's `basicTimeStep` in milliseconds: a float, so `step(int(...))`."""
+        """Return the world's `basicTimeStep` in milliseconds, a float: use `step(int(...))`."""
         return float(self._session.robot["basic_time_step"])
 
     # Devices -------------------------------------------------------------------------------------
 
     def getDevice(self, name: str) -> Any:
-        """The device with this name; None and a line on stderr if there is none.
+        """Return the device with this name; print an error and return None if there is none.
 
         Raises:
-            NotInStandInError: The world gives the robot such a device, the stand-in has none.
+            NotInStandInError: The robot has such a device in the world, but the stand-in lacks it.
         """
         device = self.devices.get(name)
         left_out: dict[str, str] = self._session.robot["left_out"]
@@ -154,18 +152,18 @@ class Robot(Completed):
         return device
 
     def getKeyboard(self) -> Keyboard:
-        """The keyboard, on which no keys are pressed."""
+        """Return the keyboard, on which no key is ever pressed."""
         return self.keyboard
 
     def getNumberOfDevices(self) -> int:
-        """How many devices the robot has."""
+        """Return the number of devices of the robot."""
         return len(self._by_tag)
 
     def getDeviceByIndex(self, index: int) -> Any:
-        """The device at a place in the scene tree's order.
+        """Return a device by its index in the order of the scene tree.
 
         Raises:
-            KeyError: There is none; a line on stderr says so as well.
+            KeyError: There is none; an error is printed as well.
         """
         tags = [*self._by_tag]
         if not 0 <= integer(index) < len(tags):
@@ -173,56 +171,58 @@ class Robot(Completed):
             raise KeyError(self.getName())
         return self._by_tag[tags[index]]
 
-    # What the world says -------------------------------------------------------------------------
+    # Fields of the robot's node and of the world --------------------------------------------------
 
     def getName(self) -> str:
-        """The `name` field."""
+        """Return the `name` field."""
         return self._session.robot["name"]
 
     def getModel(self) -> str:
-        """The `model` field."""
+        """Return the `model` field."""
         return self._session.robot["model"]
 
     def getCustomData(self) -> str:
-        """The `customData` field."""
+        """Return the `customData` field."""
         return self._session.custom_data
 
     def setCustomData(self, data: str) -> None:
         """Set the `customData` field with the next step."""
-        if len(text(data).encode()) > _MOST_CUSTOM_DATA_BYTES:
-            raise lacking(f"customData of over {_MOST_CUSTOM_DATA_BYTES:,} bytes: what Webots does")
+        if len(text(data).encode()) > _MAX_CUSTOM_DATA_BYTES:
+            raise lacking(f"customData of over {_MAX_CUSTOM_DATA_BYTES:,} bytes: what Webots does")
         self._session.set_custom_data(text(data))
 
     def getSupervisor(self) -> bool:
-        """Whether the world gives this robot a supervisor's rights."""
+        """Return whether the world gives this robot a supervisor's rights."""
         return self._session.robot["supervisor"]
 
     def getSynchronization(self) -> bool:
-        """Whether the world waits for this controller."""
+        """Return whether the world waits for this controller."""
         return self._session.robot["synchronization"]
 
     def getWorldPath(self) -> str:
-        """The world file."""
+        """Return the path of the world file."""
         return self._session.robot["world_path"]
 
     def getProjectPath(self) -> str:
-        """The folder that holds `worlds` and `controllers`."""
+        """Return the folder that contains `worlds` and `controllers`."""
         return self._session.robot["project_path"]
 
     def getMode(self) -> int:
-        """0: simulation. This is about remote control, not about pause."""
+        """Return 0, simulation. The mode is about remote control, not about pause."""
         return 0
 
 
 def _restore_signals() -> None:
-    """Signals end the process at once, without KeyboardInterrupt, `finally` or atexit."""
+    """Let signals end the process at once, without KeyboardInterrupt, `finally` or atexit."""
     numbers = [getattr(signal, name) for name in _DEADLY_SIGNALS if hasattr(signal, name)]
-    if os.name == "posix":  # as in Webots C's handler is set: `signal.getsignal` knows nothing
+    if (
+        os.name == "posix"
+    ):  # As in Webots, set the handler of C, which `signal.getsignal` cannot see.
         c_signal = ctypes.CDLL(None).signal
         c_signal.argtypes, c_signal.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
         for number in numbers:
             c_signal(number, None)  # SIG_DFL
-    elif threading.current_thread() is threading.main_thread():  # Python lets no other do this
+    elif threading.current_thread() is threading.main_thread():  # Python allows it only there.
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)
 
@@ -232,7 +232,7 @@ for _device in {*CLASS_OF.values()}:
 
 
 class Supervisor(Robot):
-    """A robot with more methods; the world decides whether it may use them."""
+    """A robot with more methods. The world decides whether it may use them."""
 
     SIMULATION_MODE_PAUSE = 0
     SIMULATION_MODE_REAL_TIME = 1
@@ -241,47 +241,47 @@ class Supervisor(Robot):
     # Nodes ---------------------------------------------------------------------------------------
 
     def getRoot(self) -> Node:
-        """The node around everything; its `children` are the top of the scene tree."""
+        """Return the root node, whose `children` are the top of the scene tree."""
         return self._known("root")
 
     def getSelf(self) -> Node:
-        """The robot's own node."""
+        """Return the robot's own node."""
         return self._known("self")
 
     def _known(self, which: str) -> Node:
-        """A node that the simulator has described when the controller connected."""
+        """Return a node that the simulator described when the controller connected."""
         is_allowed = self._session.is_supervisor(f"wb_supervisor_node_get_{which}()")
         return node_of(self._session, self._session.robot[which] if is_allowed else _NULL_NODE)
 
     def getFromDef(self, d: str) -> Node | None:
-        """The node with this DEF name (`A.B`: B inside A); None if there is none."""
+        """Return the node with this DEF name (`A.B`: B inside A); None if there is none."""
         name = text(d).rpartition(".")[2]
         return self._node("node_get_from_def", d, lambda node: node[3] == name)
 
     def getFromId(self, id: int) -> Node | None:  # noqa: A002 - Webots' name
-        """The node with this number; None if there is none."""
+        """Return the node with this number; None if there is none."""
         return self._node("node_get_from_id", integer(id), lambda node: node[0] == id)
 
     def _node(
-        self, operation: str, argument: Any, is_it: Callable[[NodeFacts], bool]
+        self, operation: str, argument: Any, matches: Callable[[NodeFacts], bool]
     ) -> Node | None:
-        found = self._session.find_node(operation, argument, is_it)
+        found = self._session.find_node(operation, argument, matches)
         return None if found is None else node_of(self._session, found)
 
     # The simulation ------------------------------------------------------------------------------
 
     def simulationGetMode(self) -> int:
-        """The mode as of the last answer of the simulator."""
+        """Return the mode as of the last answer of the simulator."""
         return self._session.mode
 
     def simulationSetMode(self, mode: int) -> None:
-        """Pause, run in real time or run fast; any other number pauses."""
+        """Pause, run in real time or run fast. Any other number pauses."""
         self._session.ask("simulation_set_mode", integer(mode))
         if self._session.is_quitting:
             self._session.mode = mode
 
     def simulationReset(self) -> None:
-        """Reset the world at the end of the next physics step; controllers go on."""
+        """Reset the world at the end of the next physics step. Controllers keep running."""
         self._session.ask("simulation_reset")
 
     def simulationQuit(self, status: int) -> None:
@@ -289,7 +289,7 @@ class Supervisor(Robot):
         self._session.ask("simulation_quit", integer(status))
 
     def worldReload(self) -> None:
-        """Read the world from its file again; the next step returns -1."""
+        """Reload the world from its file. The next step returns -1."""
         self._session.ask("world_reload")
 
     def worldLoad(self, filename: str) -> None:
@@ -299,7 +299,7 @@ class Supervisor(Robot):
     # Pictures ------------------------------------------------------------------------------------
 
     def exportImage(self, filename: str, quality: int) -> None:
-        """Have the simulator write a .png or .jpg picture, with the next rendering."""
+        """Let the simulator write a .png or .jpg picture with the next rendering."""
         filename, quality = text(filename), integer(quality)
         if not 1 <= quality <= 100:
             say(f"Error: wb_supervisor_export_image(): quality {quality} is not between 1 and 100.")
@@ -317,7 +317,7 @@ class Supervisor(Robot):
         transparency: float = 0.0,
         font: str = "Arial",
     ) -> None:
-        """Write a text over the picture; ids are 0 to 99; x, y and size from 0 to 1."""
+        """Show a text over the picture. Ids are 0 to 99; x, y and size range from 0 to 1."""
         number(transparency)
         text(font)
         place = (number(x), number(y), number(size))

@@ -9,7 +9,7 @@ from functools import partial
 from math import nan
 from typing import Any, Final, cast
 
-from .session import NodeFacts, Session
+from .session import ControllerSession, NodeFacts
 from .surface import Completed, integer, lacking, number, numbers, say, text, type_number
 
 _LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
@@ -19,7 +19,7 @@ _UNREAD: Final[dict[str, Any]] = {
     **{"Bool": False, "Int32": 0, "Float": 0.0},
     **{kind: [0.0] * length for kind, length in _LENGTHS.items()},
 }
-"""What is in a field, by its kind, that was not read before the simulation ended."""
+"""Values at the end, by kind of field, of fields that were never read before."""
 _BEYOND_THE_END: Final[dict[str, Any]] = {
     **{"Bool": False, "Int32": 0, "Float": nan, "String": "", "Node": None},
     **{kind: [nan] * length for kind, length in _LENGTHS.items()},
@@ -27,14 +27,14 @@ _BEYOND_THE_END: Final[dict[str, Any]] = {
 
 
 class Field(Completed):
-    """A field of a node. Reads are answered at once, writes go out with the next step.
+    """A field of a node. Reads are answered at once, writes are sent with the next step.
 
-    `getSF...`, `setSF...`, `getMF...`, `setMF...` and `insertMF...` are made for all types below.
+    `getSF...`, `setSF...`, `getMF...`, `setMF...` and `insertMF...` are added below for all types.
     """
 
     type: int | None
-    """The number of the type, as `Field.SF_VEC3F`."""
-    _session: Session
+    """The number of the type, such as `Field.SF_VEC3F`."""
+    _session: ControllerSession
     _key: tuple[int, str]
     _type_name: str
     _is_inner: bool
@@ -45,7 +45,7 @@ class Field(Completed):
     @classmethod
     def _of(
         cls,
-        session: Session,
+        session: ControllerSession,
         node_id: int,
         name: str,
         found: Sequence[Any],
@@ -60,19 +60,19 @@ class Field(Completed):
         return field
 
     def getName(self) -> str:
-        """The name of the field."""
+        """Return the name of the field."""
         return self._key[1]
 
     def getType(self) -> int | None:
-        """The number of the type, as `Field.SF_VEC3F`."""
+        """Return the number of the type, such as `Field.SF_VEC3F`."""
         return self.type
 
     def getTypeName(self) -> str:
-        """The type as text, as `SFVec3f`."""
+        """Return the type as text, such as `SFVec3f`."""
         return self._type_name
 
     def getCount(self) -> int:
-        """The number of entries; -1 for a single field."""
+        """Return the number of entries; -1 for a single field."""
         return self._count
 
     @property
@@ -83,7 +83,7 @@ class Field(Completed):
 
     @property
     def value(self) -> Any:
-        """The value of a single field; None for a field with entries."""
+        """Return the value of a single field; None for a field with entries."""
         if self._count >= 0:
             return None
         return self._read(None)
@@ -98,17 +98,17 @@ class Field(Completed):
             self._session.set_field(self._key, None, _as_sent(value))
 
     def enableSFTracking(self, samplingPeriod: int) -> None:
-        """Have the value of a single field sent with the steps: reading it is no request then."""
+        """Receive the value of a single field with the steps, so that reading it is no request."""
         self._session.track(self._key, integer(samplingPeriod, position=2))
 
     def disableSFTracking(self) -> None:
-        """Have it sent no more."""
+        """Stop that."""
         self._session.track(self._key, 0)
 
     def _read(self, index: int | None) -> Any:
         kind = self._type_name[2:]
         if kind == "Node" and index is not None:
-            unread = self._session.robot["root"]  # its number is 0, as of nothing
+            unread = self._session.robot["root"]  # Its number is 0, which stands for no node.
         else:
             unread = _UNREAD.get(kind)
         value = self._session.read_field(self._key, index, unread)
@@ -152,13 +152,13 @@ class Field(Completed):
             return False
         return self._is_within(function, index, -self._count, self._count - 1)
 
-    def _is_within(self, function: str, index: int, least: int, most: int) -> bool:
-        if not least <= index <= most:
-            bounds = f"(should be between {least} and {most})"
+    def _is_within(self, function: str, index: int, low: int, high: int) -> bool:
+        if not low <= index <= high:
+            bounds = f"(should be between {low} and {high})"
             say(f"{function} called with an out-of-bound index: {index} {bounds}.")
-        return least <= index <= most
+        return low <= index <= high
 
-    # More and fewer entries: at once, after the changes that were not sent yet -------------------
+    # Adding and removing entries, at once and after the changes that wait -------------------------
 
     def _insert(self, kind: str, index: int, value: Any) -> None:
         function = f"Error: wb_supervisor_field_insert_mf_{kind.lower()}()"
@@ -175,7 +175,7 @@ class Field(Completed):
             self._session.counts[self._key] = count
 
     def removeMF(self, index: int) -> None:
-        """Remove an entry; of a field of nodes the node."""
+        """Remove an entry; in a field of nodes, the node."""
         function = "Error: wb_supervisor_field_remove_mf()"
         if self._is_inner:
             say(_READ_ONLY)
@@ -196,7 +196,7 @@ class Field(Completed):
             self._change("field_remove", None)
 
     def importMFNodeFromString(self, position: int, nodeString: str) -> None:
-        """Add a node that is written as in a world file; -1 adds it at the end."""
+        """Add a node that is written as in a world file; at -1, add it at the end."""
         function = "Error: wb_supervisor_field_import_mf_node_from_string()"
         if self._may_import(function, "MFNode", text(nodeString)) and self._is_within(
             function, integer(position, 2), -self._count - 1, self._count
@@ -204,7 +204,7 @@ class Field(Completed):
             self._change("field_import", position, nodeString)
 
     def importSFNodeFromString(self, nodeString: str) -> None:
-        """Put a node that is written as in a world file into a field that is NULL."""
+        """Set a field that is NULL to a node that is written as in a world file."""
         function = "Error: wb_supervisor_field_import_sf_node_from_string()"
         if self._may_import(function, "SFNode", text(nodeString)):
             if self.value is not None:
@@ -225,7 +225,7 @@ class Field(Completed):
 
 
 def _nothing_to_decode() -> AttributeError:
-    """What Webots' package raises where the C library has no text."""
+    """Return the error that Webots' package raises where the C library has no text."""
     return AttributeError("'NoneType' object has no attribute 'decode'")
 
 
@@ -242,8 +242,8 @@ def _fits(kind: str, value: Any) -> bool:
     return kind in _TYPES and isinstance(value, _TYPES[kind])
 
 
-# As in Webots, each getSF... gives the value, of whatever type it is, and a setter of another type
-# refuses with a line on stderr. Entries count from 0, or from the end with negative numbers.
+# As in Webots, each getSF... returns the value, whatever its type, and a setter of another type
+# prints an error. Indices count from 0, negative ones from the end.
 
 _ENTRY_OF: Final[dict[str, Callable[[Any], Any]]] = {
     "Bool": bool,
@@ -252,11 +252,11 @@ _ENTRY_OF: Final[dict[str, Callable[[Any], Any]]] = {
     "String": text,
     **{kind: partial(numbers, count=length) for kind, length in _LENGTHS.items()},
 }
-"""What an entry is made of, by the kind of its field."""
+"""Functions that convert an argument to an entry, by kind of field."""
 
 
 def _add_accessors(kind: str) -> None:
-    """Give Field the methods that get values of one kind."""
+    """Add the methods to Field that get values of one kind."""
 
     def get_single(self: Any) -> Any:
         return self.value
@@ -270,7 +270,7 @@ def _add_accessors(kind: str) -> None:
 
 
 def _add_setters(kind: str, entry_of: Callable[[Any], Any]) -> None:
-    """Give Field the methods that set and insert values of one kind."""
+    """Add the methods to Field that set and insert values of one kind."""
 
     def set_single(self: Any, value: Any) -> None:
         if kind in _LENGTHS:
@@ -295,20 +295,20 @@ for _kind, _entry_of in _ENTRY_OF.items():
     _add_setters(_kind, _entry_of)
 
 field_of = Field._of  # pyright: ignore[reportPrivateUsage]
-"""Makes the object for a field that the simulator has described."""
+"""Make the object of a field that the simulator has described."""
 
 
 _NO_POSE: Final = ([nan] * 9, [nan] * 3)
 
 
 class Node(Completed):
-    """A node of the scene tree; a null node (no rights) answers with defaults.
+    """A node of the scene tree. A null node (without rights) answers with defaults.
 
-    As in Webots, each call that gives a node makes another object, equal to no other: compare
+    As in Webots, each call that returns a node makes a new object, which equals no other: compare
     `getId()`.
     """
 
-    _session: Session
+    _session: ControllerSession
     _id: int
     _found: tuple[str, str, str]
     _parent_id: int
@@ -324,7 +324,7 @@ class Node(Completed):
         raise lacking("Node(...); ask the supervisor for nodes")
 
     @classmethod
-    def _of(cls, session: Session, found: NodeFacts) -> Node:
+    def _of(cls, session: ControllerSession, found: NodeFacts) -> Node:
         node = cls.__new__(cls)
         node._session, node._id = session, found[0]
         node._found = (found[1], found[2], found[3])
@@ -334,45 +334,45 @@ class Node(Completed):
         return node
 
     def getId(self) -> int:
-        """A number that no other node has."""
+        """Return the number of the node, which is unique."""
         return self._id
 
     def getType(self) -> int:
-        """The number of the node type, to compare with `Node.ROBOT` and the like."""
+        """Return the number of the node type, to compare with `Node.ROBOT` and the like."""
         return type_number("Node", self.getBaseTypeName())
 
     def getTypeName(self) -> str:
-        """The node type, as `Robot`; of a PROTO node its own name, as `WoodenBox`."""
+        """Return the node type, such as `Robot`; of a PROTO node its name, such as `WoodenBox`."""
         return self._found[0]
 
     def getBaseTypeName(self) -> str:
-        """The node type; of a PROTO node what it is made of, as `Solid`."""
+        """Return the node type; of a PROTO node the type of its base node, such as `Solid`."""
         return self._found[1]
 
     def isProto(self) -> bool:
-        """Whether it is a PROTO node."""
+        """Return whether it is a PROTO node."""
         return self._found[0] != self._found[1]
 
     def getDef(self) -> str:
-        """The DEF name, empty if there is none."""
+        """Return the DEF name, empty if there is none."""
         return self._found[2]
 
     def getParentNode(self) -> Node | None:
-        """The node around this one; None for the root."""
+        """Return the parent; None for the root."""
         found = self._session.find_node(
             "node_get_parent_node", self._id, lambda node: node[0] == self._parent_id
         )
         return None if found is None else node_of(self._session, found)
 
     def exportString(self) -> str:
-        """The node and all in it, as written in a world file."""
+        """Return the node and everything in it, as written in a world file."""
         written = self._session.ask("node_export_string", self._id, kept_as=("text", self._id))
         if written is None and self._session.is_quitting:
             raise _nothing_to_decode()
         return written or ""
 
     def remove(self) -> None:
-        """Take the node, and all in it, out of the world."""
+        """Remove the node, and everything in it, from the world."""
         found = self._session.ask("node_remove", self._id)
         if found is not None:
             node_id, name, count = found
@@ -382,20 +382,20 @@ class Node(Completed):
     # Fields --------------------------------------------------------------------------------------
 
     def getField(self, fieldName: str) -> Field | None:
-        """A field by name; None if the node has no such field."""
+        """Return a field by name; None if the node has no such field."""
         return self._field("node_get_field", fieldName)
 
     def getNumberOfFields(self) -> int:
-        """How many fields the node has; -1 for none."""
+        """Return the number of fields; -1 for none."""
         return len(self._session.ask("node_get_field_names", self._id, default=[])) or -1
 
     def getFieldByIndex(self, index: int) -> Field | None:
-        """A field by its place; None beyond the last."""
+        """Return a field by its index; None beyond the last."""
         name = self._session.find_field_name(self._id, integer(index, 2))
         return None if name is None else self.getField(name)
 
     def getBaseNodeField(self, fieldName: str) -> Field | None:
-        """A field of the node that a PROTO node is made of, to be read only."""
+        """Return a field of the base node of a PROTO node, which is read-only."""
         if not self.isProto():
             say("Error: getBaseNodeField() called with a node that is no PROTO node.")
             return None
@@ -408,27 +408,27 @@ class Node(Completed):
         (node_id, name), *described = found
         return field_of(self._session, node_id, name, described, is_inner=is_inner)
 
-    # Places --------------------------------------------------------------------------------------
+    # Poses and velocities ------------------------------------------------------------------------
 
     def getPosition(self) -> list[float]:
-        """x, y and z in the world, metres; NaN for a node that has no place."""
+        """Return x, y and z in the world in metres; NaN for a node without a pose."""
         return [*self._pose("position")[1]]
 
     def getOrientation(self) -> list[float]:
-        """The rotation matrix in the world by rows: nine numbers."""
+        """Return the rotation matrix in the world by rows: nine numbers."""
         return [*self._pose("orientation")[0]]
 
     def getPose(self, fromNode: Node | None = None) -> list[float]:
-        """The 4 x 4 matrix by rows, in the world or in another node: sixteen numbers.
+        """Return the 4 x 4 matrix by rows, in the world or in another node: sixteen numbers.
 
-        As in Webots only this one is answered from the last step, where the pose is tracked.
+        As in Webots, only this getter uses the pose of the last step if the pose is tracked.
         """
         seen_from_id = fromNode._id if fromNode else None
         pose = self._session.tracked((self._id, seen_from_id)) or self._session.ask(
             "node_get_pose",
             self._id,
             seen_from_id,
-            kept_as="pose",  # of whatever node
+            kept_as="pose",  # One for all nodes.
         )
         if pose is None and self._session.is_quitting:
             return [0.0] * 16
@@ -440,29 +440,29 @@ class Node(Completed):
         return self._session.ask("node_get_pose", self._id, None, kept_as=kept_as, default=_NO_POSE)
 
     def getVelocity(self) -> list[float]:
-        """Linear (metres a second) and angular (radians a second) velocity: six numbers."""
+        """Return linear (m/s) and angular (rad/s) velocity: six numbers."""
         return [*self._session.ask("node_get_velocity", self._id, default=[nan] * 6)]
 
     def setVelocity(self, velocity: list[float]) -> None:
-        """Let a body slide: linear and angular velocity, of which x, y and the turn about z count.
+        """Let a body slide with a linear and angular velocity, of which x, y and yaw count.
 
-        A robot keeps to its wheels.
+        A robot follows its wheels instead.
         """
         self._session.ask("node_set_velocity", self._id, numbers(velocity, 6))
 
     def enablePoseTracking(self, samplingPeriod: int, fromNode: Node | None = None) -> None:
-        """Have the pose sent with the steps, so that `getPose` need not ask for it."""
+        """Receive the pose with the steps, so that `getPose` is no request."""
         period_ms = integer(samplingPeriod, position=2)
         self._session.track((self._id, fromNode._id if fromNode else None), period_ms)
 
     def disablePoseTracking(self, fromNode: Node | None = None) -> None:
-        """Have it sent no more."""
+        """Stop that."""
         self._session.track((self._id, fromNode._id if fromNode else None), 0)
 
     def resetPhysics(self) -> None:
-        """Take the node's speed away."""
+        """Set the node's velocity to 0."""
         self._session.ask("node_reset_physics", self._id)
 
 
 node_of = Node._of  # pyright: ignore[reportPrivateUsage]
-"""Makes the object for a node that the simulator has described."""
+"""Make the object of a node that the simulator has described."""

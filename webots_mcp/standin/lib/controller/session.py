@@ -1,8 +1,8 @@
-"""How a controller talks to the simulator: messages, the socket, and what it knows meanwhile.
+"""The connection of a controller to the simulator, and what the library knows between requests.
 
-A message is a length and a marshalled value. `marshal` rather than JSON because pictures are bytes
-and ranges are hundreds of floats; version 2 because every Python 3 reads it. It is read only from a
-peer that has shown the simulation's token.
+A message is a length and a marshalled value: `marshal` rather than JSON because pictures are bytes
+and ranges are hundreds of floats, version 2 because every Python 3 reads it. It is read only from a
+peer that has presented the simulation's token.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from .surface import say
 
 Message: TypeAlias = tuple[Any, ...]
 NodeFacts: TypeAlias = tuple[int, str, str, str, int]
-"""What is known of a node: id, type, base type, DEF name and id of the node around it."""
+"""A node: id, type, base type, DEF name and the id of its parent."""
 FieldKey: TypeAlias = tuple[int, str]
-"""The id of a node and the name of its field."""
+"""A field: the id of its node and its name."""
 
 ADDRESS_FILE: Final = "address"
-"""File in the instance folder: the port on this machine, a space, the token."""
+"""File in the instance folder that holds the port on this machine, a space and the token."""
 
 _LENGTH: Final = struct.Struct("!I")
 CUSTOM_DATA_TAG: Final = 0
-"""Stands for the robot itself where devices have their tags."""
+"""Tag of the robot itself among the tags of its devices."""
 TrackedKey = tuple[int, int | str | None]
-"""The ids of a node and of the one that it is seen from; None is the world."""
+"""A field: node id and name. A pose: node id and the id it is seen from, None for the world."""
 
 
 def pack(message: Message) -> bytes:
-    """A message as it goes over the wire."""
+    """Return a message as bytes."""
     body = marshal.dumps(message, 2)
     return _LENGTH.pack(len(body)) + body
 
 
 class Inbox:
-    """Puts messages together from what arrives."""
+    """Assembles messages from the bytes that arrive."""
 
     def __init__(self) -> None:
         self._arrived = bytearray()
 
     def feed(self, data: bytes) -> None:
-        """Take what the socket gave."""
+        """Add bytes from the socket."""
         self._arrived += data
 
     def take(self) -> Message | None:
-        """The next whole message; None if it has not arrived yet."""
+        """Return the next complete message; None if it has not arrived yet."""
         if len(self._arrived) < _LENGTH.size:
             return None
         end = _LENGTH.size + _LENGTH.unpack_from(self._arrived)[0]
@@ -64,13 +64,13 @@ class Inbox:
 
 
 def connect(port: int) -> socket.socket:
-    """A connection to the simulator on this machine."""
+    """Connect to the simulator on this machine."""
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection
 
 
-class Link(Protocol):
+class SimulatorLink(Protocol):
     """A connection to a simulator, through a socket or within one process."""
 
     description: dict[str, Any]
@@ -85,21 +85,21 @@ class Link(Protocol):
         ...
 
     def exit(self) -> NoReturn:
-        """What a request after the end of the simulation comes to."""
+        """End the controller, which made a request after the end of the simulation."""
         ...
 
     def close(self) -> None:
-        """Say farewell."""
+        """Disconnect."""
         ...
 
 
 def exit_process(status: int) -> NoReturn:
-    """End the process as C `exit` ends it: no exception, no `finally`, no atexit, no flush."""
+    """End the process like C `exit`: no exception, no `finally`, no atexit, no flush."""
     os._exit(status)
 
 
 class SocketLink:
-    """Talks to the simulator that the `WEBOTS_...` environment variables name."""
+    """A socket to the simulator that the `WEBOTS_...` environment variables name."""
 
     def __init__(self) -> None:
         port, token, robot_name = _address()
@@ -112,14 +112,14 @@ class SocketLink:
         self.description: dict[str, Any] = answer
 
     def send(self, message: Message) -> None:
-        """Send a request; if the simulator is gone, so is this process."""
+        """Send a request. If the simulator has ended, end this process."""
         try:
             self._socket.sendall(pack(message))
         except OSError:
             exit_process(1)
 
     def receive(self) -> Message:
-        """Wait for an answer; if the simulator goes away meanwhile, so does this process."""
+        """Wait for an answer. If the simulator ends meanwhile, end this process."""
         while (message := self._inbox.take()) is None:
             try:
                 data = self._socket.recv(1 << 20)
@@ -131,16 +131,16 @@ class SocketLink:
         return message
 
     def exit(self) -> NoReturn:
-        """The API was used after the end."""
+        """End the process: the API was used after the end."""
         exit_process(0)
 
     def close(self) -> None:
-        """Let the simulator know that this controller is done."""
+        """Disconnect: this controller has finished."""
         self._socket.close()
 
 
 def _address() -> tuple[int, str, str]:
-    """Port, token and robot name; the real library looks in this order, too."""
+    """Return port, token and robot name, searched in the order of the real library."""
     name, folder = os.environ.get("WEBOTS_ROBOT_NAME"), os.environ.get("WEBOTS_INSTANCE_PATH")
     if name and folder:
         port, token = (Path(folder) / ADDRESS_FILE).read_text(encoding="utf-8").split()
@@ -155,9 +155,9 @@ def _address() -> tuple[int, str, str]:
 
 
 class SentPackets:
-    """The packets of an emitter that its controller has sent, until a step takes them along.
+    """The packets that a controller has sent by an emitter, until the next step takes them.
 
-    As in Webots, the channel and the range of a packet are those at the moment when it was sent.
+    As in Webots, channel and range of a packet are those at the moment it was sent.
     """
 
     def __init__(self, fields: dict[str, Any]) -> None:
@@ -166,7 +166,7 @@ class SentPackets:
         self._bytes_due = 0.0
 
     def put(self, packet: bytes) -> None:
-        """Queue a packet, unless the emitter's buffer has no space for it."""
+        """Queue a packet, unless the emitter's buffer is full."""
         used = sum(len(queued) for queued, *_ in self._packets)
         if not 0 <= self._fields["bufferSize"] < used + len(packet):
             self._bytes_due = self._bytes_due if self._packets else 0.0
@@ -187,35 +187,35 @@ class SentPackets:
 
 
 class ReceivedPackets(deque[Any]):
-    """Bytes, direction and strength of each packet that a receiver has, the oldest first."""
+    """Bytes, direction and strength of each packet of a receiver, the oldest first."""
 
     def __init__(self, fields: dict[str, Any]) -> None:
         super().__init__()
         self._fields = fields
 
     def put(self, packets: Iterable[Any]) -> None:
-        """Queue packets; those for which the receiver's buffer has no space are lost."""
+        """Queue packets. If the receiver's buffer is full, further packets are lost."""
         for packet in packets:
             used = sum(len(queued) for queued, *_ in self)
             if not 0 <= self._fields["bufferSize"] < used + len(packet[0]):
                 self.append(packet)
 
 
-class Session:
-    """What the library knows between two requests.
+class ControllerSession:
+    """The state of the library between two requests.
 
-    As in the real library one recursive lock guards it, held during the whole of `step`: other
-    threads that want a sensor value or a request wait until the step is over.
+    As in the real library, one recursive lock guards it and is held during the whole of `step`.
+    Other threads that read a sensor value or make a request wait until the step is over.
     """
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: SimulatorLink) -> None:
         self.link = link
         self.robot: dict[str, Any] = link.description
         self.time_s: float = self.robot["time"]
         self.mode: int = self.robot["mode"]
         self.custom_data: str = self.robot["custom_data"]
         self.periods_ms: dict[int, int] = {}
-        """Sampling periods by device tag; a device without one is disabled."""
+        """Sampling periods by device tag. A device without one is disabled."""
         self.lock = threading.RLock()
         self._values: dict[Any, Any] = {}
         self._changes: dict[tuple[Any, str], Any] = {}
@@ -224,13 +224,13 @@ class Session:
         self.sent = {
             tag: SentPackets(of) for (kind, tag), of in fields.items() if kind == "Emitter"
         }
-        """What emitters are still to send, by tag."""
+        """Packets that wait to be sent, by tag of the emitter."""
         self.received = {
             tag: ReceivedPackets(of) for (kind, tag), of in fields.items() if kind == "Receiver"
         }
-        """What receivers have, by tag."""
+        """Packets that have arrived, by tag of the receiver."""
         self.counts: dict[FieldKey, int] = {}
-        """The number of entries of each field that was asked for, by node and name."""
+        """Number of entries of each field that was requested."""
         self._nodes: dict[int, NodeFacts] = {}
         for node in (self.robot["root"], self.robot["self"]):
             self.know(node)
@@ -249,12 +249,12 @@ class Session:
     # Between requests ----------------------------------------------------------------------------
 
     def change(self, tag: int, setting: str, value: Any) -> None:
-        """Note a setting or a command that goes out with the next step."""
+        """Store a setting or command, which is sent with the next step."""
         with self.lock:
             self._changes[tag, setting] = value
 
     def set_custom_data(self, data: str) -> None:
-        """Like `change`, but without the lock: this does not wait for a step to end."""
+        """Set the custom data without the lock, so that it does not wait for a step to end."""
         self.custom_data = self._changes[CUSTOM_DATA_TAG, "customData"] = data
 
     def enable(self, tag: int, period_ms: int) -> None:
@@ -263,24 +263,24 @@ class Session:
         self.periods_ms[tag] = period_ms
 
     def track(self, what: TrackedKey, period_ms: int) -> None:
-        """Have a pose or field sent with the steps, once in a period; 0 ends that."""
+        """Request a pose or field with the steps, once a period; 0 ends that."""
         with self.lock:
             self._changes[what, "track"] = period_ms
             self._values.pop(what, None)
             (self._tracked.add if period_ms else self._tracked.discard)(what)
 
     def tracked(self, what: TrackedKey) -> Any:
-        """What is tracked as it came last; None where it has to be asked for."""
+        """Return the last value of a tracked pose or field; None if it has to be requested."""
         with self.lock:
             return self._values.get(what) if what in self._tracked else None
 
     def value(self, tag: int, default: Any) -> Any:
-        """The last value of a sensor."""
+        """Return the last value of a sensor."""
         with self.lock:
             return self._values.get(tag, default)
 
     def set_field(self, field: tuple[int, str], index: int | None, value: Any) -> None:
-        """Note a field change that goes out with the next step or field read."""
+        """Store a field change, which is sent with the next step or field read."""
         with self.lock:
             self._field_sets[field, index] = value
             self._values.pop(field, None)
@@ -288,7 +288,7 @@ class Session:
     # Requests ------------------------------------------------------------------------------------
 
     def begin_step(self, duration_ms: int) -> int:
-        """Ask the simulator to let time pass: 0, or -1 if it has ended the controller."""
+        """Request that time passes; return 0, or -1 if the simulator has ended the controller."""
         with self.lock:
             self._exit_if_over()
             if self._quitting:
@@ -302,7 +302,7 @@ class Session:
             return 0
 
     def end_step(self) -> int:
-        """Wait until that time has passed; -1 if the simulator ends the controller."""
+        """Wait until the time has passed; return -1 if the simulator ends the controller."""
         with self.lock:
             reply: Message = ("quit",) if self._quitting else self._stepped or self.link.receive()
             self._stepped, self._in_step = None, False
@@ -317,7 +317,7 @@ class Session:
             return delay_ms
 
     def step(self, duration_ms: int) -> int:
-        """Both halves of a step, without another thread in between."""
+        """Do both halves of a step, with no other thread in between."""
         with self.lock:
             self.begin_step(duration_ms)
             try:
@@ -325,13 +325,13 @@ class Session:
             finally:
                 self._in_step = False
 
-    # Once the simulator has ended the controller, nothing can be asked any more. As in Webots' C
-    # library, until `step` has returned -1 each getter gives what it gave before; after that only
-    # those that make no request for what they know, and the others end the process.
+    # Once the simulator has ended the controller, no request is answered any more. As in Webots' C
+    # library, each getter returns its last value until `step` has returned -1. After that, only
+    # getters that need no request return their values; all others end the process.
 
     @property
     def is_quitting(self) -> bool:
-        """Whether the simulator has ended the controller: the next step returns -1, or one has."""
+        """Return whether the simulator has ended the controller: the next step returns -1."""
         return self._quitting
 
     def ask(self, operation: str, *arguments: Any, kept_as: Any = None, default: Any = None) -> Any:
@@ -339,9 +339,9 @@ class Session:
 
         Args:
             operation: The name of the request.
-            arguments: What it needs.
-            kept_as: Under what the answer is remembered for the end; None: it is not.
-            default: What is returned where there is no answer.
+            arguments: Arguments of the request.
+            kept_as: Key under which the answer is stored for the end; None to store nothing.
+            default: Returned if there is no answer.
         """
         with self.lock:
             answer = self._ask(operation, arguments, [])
@@ -351,8 +351,8 @@ class Session:
                 self._kept[kept_as] = answer
             return default if answer is None else answer
 
-    def answered_here(self, what: Any, value: Any) -> Any:
-        """Give what Webots' library asks for and the stand-in knows; at the end as if asked."""
+    def answer_locally(self, what: Any, value: Any) -> Any:
+        """Return a known value that Webots' library would request; at the end the last one."""
         with self.lock:
             self._exit_if_over()
             if not self._quitting:
@@ -360,33 +360,33 @@ class Session:
             return self._kept.get(what)
 
     def know(self, node: NodeFacts) -> None:
-        """Remember a node that the simulator has described."""
+        """Store a node that the simulator has described."""
         self._nodes[node[0]] = node
 
     def forget(self, node_id: int) -> None:
-        """Remember a node no longer: it was removed."""
+        """Forget a node that was removed."""
         self._nodes.pop(node_id, None)
 
     def find_node(
-        self, operation: str, argument: Any, is_it: Callable[[NodeFacts], bool]
+        self, operation: str, argument: Any, matches: Callable[[NodeFacts], bool]
     ) -> NodeFacts | None:
-        """Ask for a node; at the end it is found among those that are known."""
+        """Request a node; at the end search the known nodes."""
         with self.lock:
             if not self._quitting:
                 found = self._ask(operation, (argument,), [])
                 if not self._quitting:
                     if found is None and not self._in_step:
-                        self._nodes = {n[0]: n for n in self._nodes.values() if not is_it(n)}
+                        self._nodes = {n[0]: n for n in self._nodes.values() if not matches(n)}
                     return found
-            known = next((node for node in reversed(self._nodes.values()) if is_it(node)), None)
+            known = next((node for node in reversed(self._nodes.values()) if matches(node)), None)
             if known is None:
                 self._exit_if_over()
             return known
 
     def find_field(self, operation: str, key: FieldKey) -> tuple[FieldKey, str, int] | None:
-        """Ask for a field: where it is, its type and the number of its entries.
+        """Request a field: its key, its type and the number of its entries.
 
-        At the end a field that is not known is, as in Webots, the one that was found last.
+        As in Webots, at the end an unknown field is the field that was found last.
         """
         with self.lock:
             if not self._quitting:
@@ -402,7 +402,7 @@ class Session:
             return known and (known[1], self._fields[known], self.counts[known[1]])
 
     def find_field_name(self, node_id: int, index: int) -> str | None:
-        """The name of a field by its place in the node; at the end, if it was asked for before."""
+        """Return the name of a field by its index; at the end only if it was requested before."""
         with self.lock:
             if not self._quitting:
                 names: list[str] = self._ask("node_get_field_names", (node_id,), []) or []
@@ -416,12 +416,12 @@ class Session:
             return name
 
     def read_field(self, field: FieldKey, index: int | None, unread: Any) -> Any:
-        """Read a field; changes that were not sent yet go first.
+        """Read a field, after sending the changes that wait.
 
         Args:
             field: The field.
-            index: Of the entry; None for a single field.
-            unread: What is in a field that has not been read before the end.
+            index: Index of the entry; None for a single field.
+            unread: Returned at the end for a field that was not read before.
         """
         with self.lock:
             read_s, last = self._reads.get(field, (-1.0, unread))
@@ -441,14 +441,14 @@ class Session:
             return value
 
     def change_field(self, operation: str, field: tuple[int, str], *arguments: Any) -> Any:
-        """Add or remove entries at once; changes that were not sent yet go first."""
+        """Add or remove entries at once, after sending the changes that wait."""
         with self.lock:
             return self._ask(operation, (field, *arguments), self._take_field_sets())
 
     def fetch(self, tag: int) -> Any:
-        """The picture or scan that belongs to a sensor's last sample; None before the first.
+        """Return the picture or scan of a sensor's last sample; None before the first.
 
-        The simulator gives it also while it ends the controller.
+        The simulator also sends it while it ends the controller.
         """
         with self.lock:
             sample = self._values.get(tag)
@@ -457,7 +457,7 @@ class Session:
                 return known[1] if known else None
             self.link.send(("fetch", tag))
             while (reply := self.link.receive())[0] != "fetched":
-                if self._in_step:  # the answer to a step that was begun came first
+                if self._in_step:  # The answer to a begun step came first.
                     self._stepped = reply
                 else:
                     self._quitting = True
@@ -478,7 +478,7 @@ class Session:
             return value
 
     def is_supervisor(self, function: str) -> bool:
-        """Whether the robot has a supervisor's rights; without them a line on stderr says so."""
+        """Return whether the robot has a supervisor's rights; print an error if it lacks them."""
         if not self.robot["supervisor"]:
             say(f"Error: ignoring illegal call to {function} in a 'Robot' controller.")
             say("Error: this function can only be used in a 'Supervisor' controller.")
@@ -503,5 +503,5 @@ class Session:
             self.link.exit()
 
 
-current: Session | None = None
-"""The session of the process's one robot; devices made by name belong to it."""
+current: ControllerSession | None = None
+"""Session of the process's only robot. Devices that are made by name belong to it."""

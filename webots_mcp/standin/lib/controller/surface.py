@@ -1,7 +1,7 @@
-"""What Webots' own package has: its classes and names, what its C functions take and print.
+"""The names of Webots' own package, and how its C functions take arguments and print errors.
 
-`surface.txt` is the table of the real package. What the stand-in does not define itself comes from
-it: constants, properties of getters that are there, and refusals of everything else.
+`surface.txt` is the table of the real package. Names that the stand-in does not define itself come
+from it: constants, properties for existing getters, and errors for everything else.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ _ACCESSORS: Final = {
     "sampling_period": ("getSamplingPeriod", "enable"),
     "simulation_mode": ("simulationGetMode", "simulationSetMode"),
 }
-"""Properties that are not named like their methods."""
+"""Getters and setters of properties that are not named like their methods."""
+_WITHOUT_CONSTANT: Final = {"POSE": 26}
+"""Numbers of node types that the table has no constant for."""
 
 
 if TYPE_CHECKING:
@@ -29,20 +31,23 @@ if TYPE_CHECKING:
         def __getattr__(cls, name: str) -> Any: ...
 
     class Completed(metaclass=_Names):
-        """A class that has names from the table, which a type checker cannot know."""
+        """A class with names from the table, which a type checker cannot know."""
 
         def __getattr__(self, name: str) -> Any: ...
         def __setattr__(self, name: str, value: Any) -> None: ...
 else:
-    Completed = object  # classes have no base but those of Webots
+    Completed = object  # Classes must have only the bases that they have in Webots.
 
 
 class NotInStandInError(AttributeError, NotImplementedError):
-    """Webots has it, the stand-in has not; `hasattr` is false, as for any missing attribute."""
+    """Webots has it, but the stand-in lacks it.
+
+    `hasattr` is false, as for any missing attribute.
+    """
 
 
 def lacking(what: str) -> NotInStandInError:
-    """The error for something that Webots has and the stand-in has not."""
+    """Return the error for something that Webots has and the stand-in lacks."""
     return NotInStandInError(f"the stand-in has no {what}; see docs/standin.md for what it has")
 
 
@@ -60,7 +65,7 @@ class Lacking:
 
 
 class _LackingClass(type):
-    """The type of classes that can be imported and nothing else."""
+    """The type of classes that can only be imported."""
 
     def __call__(cls, *arguments: Any, **named: Any) -> NoReturn:
         raise lacking(cls.__name__)
@@ -70,7 +75,7 @@ class _LackingClass(type):
 
 
 def lacking_class(name: str) -> type:
-    """A class that can only be imported: a controller may import more than it uses."""
+    """Return a class that can only be imported: controllers may import more than they use."""
     return _LackingClass(name, (), {"__doc__": "In Webots, but not in the stand-in."})
 
 
@@ -89,16 +94,15 @@ def _members_by_class() -> dict[str, dict[str, str]]:
 
 
 MEMBERS: Final = _members_by_class()
-"""The table: by class and name what a member is, as `(self, index)`, `property` or `= 3`."""
-_WITHOUT_CONSTANT: Final = {"POSE": 26}
+"""Description of each member by class and name: `(self, index)`, `property` or `= 3`."""
 
 
 def type_number(owner: str, type_name: str) -> int:
-    """The number of a type of nodes or fields by its name in world files; 0 for others.
+    """Return the number of a node type or field type by its name in world files; 0 if unknown.
 
     Args:
-        owner: The class that has the constants, `Node` or `Field`.
-        type_name: As `DistanceSensor` or `SFVec3f`.
+        owner: The class with the constants, `Node` or `Field`.
+        type_name: Such as `DistanceSensor` or `SFVec3f`.
     """
     return _NUMBERS[owner].get(type_name.upper(), 0)
 
@@ -115,7 +119,7 @@ _NUMBERS: Final = {
 
 
 def complete(owner: type) -> None:
-    """Give a class of the stand-in every name of its namesake in Webots."""
+    """Give a class of the stand-in every name of the same class in Webots."""
     for name, kind in MEMBERS[owner.__name__].items():
         if hasattr(owner, name) or name in _annotated(owner):
             continue
@@ -132,7 +136,7 @@ def _annotated(owner: type) -> set[str]:
 
 
 def _property(owner: type, name: str, *, is_writable: bool) -> property | None:
-    """A property of the methods that it is named after; None if the getter is not there."""
+    """Return a property of the methods that it is named after; None without a getter."""
     methods = {method.lower(): method for method in dir(owner) if hasattr(owner, method)}
     accessors = [*_accessors(name)]
     found = [(methods[get.lower()], set_) for get, set_ in accessors if get.lower() in methods]
@@ -152,7 +156,7 @@ def _property(owner: type, name: str, *, is_writable: bool) -> property | None:
 
 
 def _accessors(name: str) -> Iterator[tuple[str, str]]:
-    """The methods that may stand behind a property, the likeliest first."""
+    """Yield names of getters and setters that may belong to a property, the likeliest first."""
     if name in _ACCESSORS:
         yield _ACCESSORS[name]
     plain = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
@@ -162,15 +166,15 @@ def _accessors(name: str) -> Iterator[tuple[str, str]]:
         yield "get", "set"
 
 
-# What ctypes makes of arguments in the real package ----------------------------------------------
+# Arguments, as ctypes converts them in the real package -------------------------------------------
 
 
 def integer(value: Any, position: int = 1) -> int:
-    """An `int` argument; everything else is refused, `32.0` too.
+    """Return an `int` argument; anything else is refused, even `32.0`.
 
     Args:
-        value: What was given.
-        position: Which argument of the C function it is, for the message.
+        value: The argument.
+        position: Its position in the C function, for the message.
     """
     if not isinstance(value, int):
         raise ctypes.ArgumentError(
@@ -180,21 +184,21 @@ def integer(value: Any, position: int = 1) -> int:
 
 
 def number(value: Any) -> float:
-    """A `double` argument: any number, no text."""
+    """Return a `double` argument: any number, no text."""
     return ctypes.c_double(value).value
 
 
 def numbers(values: Any, count: int) -> list[float]:
-    """A `double` array argument: so many numbers at most, the rest are zeros."""
+    """Return a `double` array argument of at most `count` numbers, filled up with zeros."""
     return [*(ctypes.c_double * count)(*values)]
 
 
 def text(value: Any) -> str:
-    """A `char *` argument: `str` only, no path objects, no None."""
+    """Return a `char *` argument: `str` only, no path objects, no None."""
     str.encode(value)
     return value
 
 
 def say(line: str) -> None:
-    """Write one line to the C stderr, as the real library does, past Python's `sys.stderr`."""
+    """Write a line to the C stderr as the real library does, bypassing Python's `sys.stderr`."""
     os.write(2, f"{line}\n".encode())

@@ -1,1 +1,0 @@
-"""What the pages promise, and what shows each promise: `promises.toml`, beside this file."""

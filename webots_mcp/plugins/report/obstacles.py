@@ -1,0 +1,98 @@
+"""What stands in the world of a run, for its map.
+
+It is read from the world file where that is possible, else from what an observer recorded.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from webots_mcp.plotting.trajectory import Obstacle
+from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.robots import world_seen
+from webots_mcp.store.run_rows import RunRecord, fetch_run
+
+if TYPE_CHECKING:
+    from webots_mcp.standin.arena import Body
+    from webots_mcp.standin.geometry import Shape
+
+
+_MAX_WORLD_BYTES: Final = 1_000_000  # Reading a larger world file would take seconds.
+_CORNERS: Final = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+_SIDES: Final = 24  # Of the polygon that a circle is drawn as.
+
+
+def obstacles_of(
+    connection: sqlite3.Connection, ranges: Sequence[TimeRange]
+) -> tuple[Obstacle, ...]:
+    """Return the obstacles in the world of the last run of some ranges.
+
+    They are the fixed bodies of the world file, of types that the stand-in knows. Movable bodies
+    are left out, since the file has only their start. Without a world file they are the solids that
+    an observer recorded.
+    """
+    run = fetch_run(connection, ranges[-1].segments[-1].run_id)
+    return _of_file(run) or _seen(connection, run)
+
+
+def _of_file(run: RunRecord) -> tuple[Obstacle, ...]:
+    file = Path(run.world or "")
+    try:
+        status = file.stat()
+    except (OSError, ValueError):
+        return ()
+    if file.suffix != ".wbt" or not file.is_file() or status.st_size > _MAX_WORLD_BYTES:
+        return ()
+    return _standing(file, status.st_mtime_ns)
+
+
+@lru_cache(maxsize=8)
+def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
+    from webots_mcp.standin.arena import Arena
+    from webots_mcp.standin.errors import WorldError
+    from webots_mcp.standin.world import load_world
+
+    try:
+        bodies = Arena(load_world(file)).bodies
+    except (WorldError, OSError):
+        return ()  # The path is drawn without them.
+    return tuple(each for body in bodies for each in _outlines(body))
+
+
+def _outlines(body: Body) -> Iterator[Obstacle]:
+    if body.node.type_name == "Robot" or body.is_movable:
+        return
+    for shape in body.solid_shapes:
+        yield Obstacle(body.name, shape.x, shape.y, _corners(shape))
+
+
+def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
+    from webots_mcp.standin.geometry import Disc
+
+    if isinstance(shape, Disc):
+        angles = [math.tau * side / _SIDES for side in range(_SIDES)]
+        radius_m = shape.radius_m
+        return tuple(
+            (shape.x + radius_m * math.cos(angle), shape.y + radius_m * math.sin(angle))
+            for angle in angles
+        )
+    halves = [(a * shape.half_x_m, b * shape.half_y_m) for a, b in _CORNERS]
+    cos, sin = shape.cos_yaw, shape.sin_yaw
+    return tuple((shape.x + cos * u - sin * v, shape.y + sin * u + cos * v) for u, v in halves)
+
+
+def _seen(connection: sqlite3.Connection, run: RunRecord) -> tuple[Obstacle, ...]:
+    world = world_seen(connection, run)
+    solids = world.told.get("solids", ()) if world else ()
+    places = world.places if world else {}
+    told = [(each["key"], each | places.get(each["key"], {})) for each in solids]
+    return tuple(
+        Obstacle(str(key), float(body["x_m"]), float(body["y_m"]))
+        for key, body in told
+        if body.get("x_m") is not None and body.get("y_m") is not None
+    )

@@ -1,0 +1,96 @@
+"""State rows that are in no chunk: the newest of a run, and those that arrived late.
+
+They are parsed for each question. A maintainer puts rows into chunks in groups of 1,024, so that
+there are few of them while it works.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Final
+
+from webots_mcp.store.chunks import STATE_COLUMNS, ChunkProgress, StateColumns
+from webots_mcp.store.reading.segment import Deadline
+from webots_mcp.store.run_rows import reading_texts
+
+FEW_ROWS: Final = 4096  # without a maintainer there may be more; those are sampled for new names
+ROWS_AT_ONCE: Final = 1024  # between two checks of the deadline
+_IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
+_NEWEST_IN: Final = (
+    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND {_IN} AND (sim_time_s, id) > (?, ?) "
+    "ORDER BY sim_time_s, id"
+)
+_LATE: Final = (
+    f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
+    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
+)
+_FEWER_THAN: Final = (
+    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "LIMIT ?)"
+)
+
+
+def rows_in_no_chunk(
+    connection: sqlite3.Connection,
+    run_id: int,
+    span: tuple[float, float],
+    at: ChunkProgress,
+    deadline: Deadline,
+) -> tuple[StateColumns, float | None]:
+    """Read the rows of a run in [start, end) that are in no chunk, in order of time.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        span: Start and end, simulation times in s.
+        at: Up to where the run is in chunks.
+        deadline: For all reading.
+
+    Returns:
+        The rows, and the time of the last one if the deadline passed before all were read.
+    """
+    place = (at.end_s, at.last_state_id)
+    columns, cut_s = StateColumns(), None
+    if at.end_s != float("-inf"):  # without a chunk no row is late, and this would read the file
+        late = (run_id, at.max_state_id, *span, *place)
+        cut_s = read_rows(connection, _LATE, late, columns, deadline)
+    if cut_s is None and span[1] >= at.end_s:
+        # SQLite would go through all rows from the start of the range rather than from the place.
+        after = (max(span[0], at.end_s), span[1])
+        cut_s = read_rows(connection, _NEWEST_IN, (run_id, *after, *place), columns, deadline)
+    return columns, cut_s
+
+
+def has_few_new_rows(connection: sqlite3.Connection, run_id: int, at: ChunkProgress) -> bool:
+    """Return whether few rows of a run follow those in chunks, so that all of them can be read."""
+    asked = (run_id, at.end_s, at.last_state_id, FEW_ROWS + 1)
+    return bool(connection.execute(_FEWER_THAN, asked).fetchone()[0] <= FEW_ROWS)
+
+
+def read_rows(
+    connection: sqlite3.Connection,
+    query: str,
+    values: tuple[object, ...],
+    columns: StateColumns,
+    deadline: Deadline,
+) -> float | None:
+    """Add the rows of a query to some columns.
+
+    Args:
+        connection: Any.
+        query: Selects `STATE_COLUMNS`.
+        values: Of the query; the first is the run.
+        columns: To which the rows are added.
+        deadline: Checked after every 1,024 rows.
+
+    Returns:
+        None if all rows were read. Otherwise the time of the last one that was, which is minus
+        infinity if there was none.
+    """
+    with reading_texts(connection):
+        cursor = connection.execute(query, values)
+        while rows := cursor.fetchmany(ROWS_AT_ONCE):
+            if deadline.passed:
+                return columns.times[-1] if len(columns) else float("-inf")
+            columns.add(rows, f"run {values[0]}: ")
+    return None

@@ -112,7 +112,7 @@ def webots_list_signals(
 
 
 def _signal_row(info: SignalInfo, rows: int) -> list[Any]:
-    """A signal of a run of that many rows, as a row under `SIGNAL_COLUMNS`."""
+    """Return a signal of a run of that many rows, as a row under `SIGNAL_COLUMNS`."""
     return [
         short_name(info.name),
         info.kind,
@@ -287,7 +287,7 @@ def _run_series(run: RunHistory) -> RunSeries:
 
 
 def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
-    """How many values the buckets of most signals have."""
+    """Return how many values the buckets of most signals have."""
     counts = Counter(tuple(columns.count) for columns in numbers)
     return list(counts.most_common(1)[0][0]) if counts else None
 
@@ -324,7 +324,7 @@ def _number_series(
 
 
 def _change_series(columns: ChangeColumns) -> ChangeSeries:
-    """A text or a flag as columns."""
+    """Return a text or a flag as columns."""
     times_s = [seconds(point.sim_time_s) for point in columns.points]
     if columns.since_before and columns.total == len(times_s):
         times_s[:1] = [None]
@@ -373,7 +373,7 @@ def _no_rows(page: StatePage, rows: int, after_id: int) -> str | None:
 
 
 def _most(tokens: Callable[[int], int], page: StatePage, budget_tokens: int) -> int:
-    """How many of the page's first rows fit the budget; at least one."""
+    """Return how many of the page's first rows fit the budget; at least one."""
     rows = len(page.ids)
     while rows > 1 and (now := tokens(rows)) > budget_tokens:
         rows = max(1, min(rows - 1, int(rows * budget_tokens / now)))
@@ -381,7 +381,7 @@ def _most(tokens: Callable[[int], int], page: StatePage, budget_tokens: int) -> 
 
 
 def _row_columns(page: StatePage, rows: int, view: RobotView) -> RowColumns:
-    """The first rows; numbers as they were recorded."""
+    """Return the first rows; numbers as they were recorded."""
     run_ids = page.run_ids[:rows]
     here = view.run.id if view.run else None
     return RowColumns(

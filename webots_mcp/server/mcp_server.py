@@ -74,7 +74,7 @@ def create_server(
     output_schemas: bool = False,
     limits: Asked | None = None,
 ) -> MCPServer:
-    """An MCP server over a recording; it starts whether or not anything was recorded yet.
+    """Return an MCP server over a recording; it starts whether or not anything was recorded yet.
 
     Args:
         database: A file, or a database in memory that a bridge in this process shares.
@@ -195,7 +195,7 @@ def add_resources(mcp: MCPServer, recording: RecordingAccess) -> None:
 
 
 def _schema_to_come() -> str:
-    """What the database will have when something is recorded."""
+    """Return what the database will have when something is recorded."""
     database = MemoryDatabase()
     with closing(connect(database, "writer")) as connection:
         create_schema(connection)
@@ -255,7 +255,7 @@ class ToolServer(MCPServer):
         arguments: dict[str, Any] | None = None,
         context: Context[Any, Any] | None = None,
     ) -> GetPromptResult | InputRequiredResult:
-        """A prompt; clients give an optional argument that nobody filled in as an empty text.
+        """Return a prompt; clients give optional arguments that nobody filled in as empty texts.
 
         Raises:
             MCPError: There is no such prompt, or an argument is missing or invalid.

@@ -34,7 +34,7 @@ _GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to 
 
 
 def checked_period(period_ms: int) -> int:
-    """A period that can be kept to.
+    """Return a period that can be kept to.
 
     Raises:
         InvalidInputError: It cannot.
@@ -126,7 +126,7 @@ class ObserverBridge(MCPBridge):
         return self._session.simulation.mode_name
 
     def read_custom_data(self) -> CustomDataReader:
-        """What records the robots that have no bridge of their own."""
+        """Return what records the robots that have no bridge of their own."""
         own = self._session
         parts = (own.identity, own.simulation, own.clock, own.recorder, own.journal, own.errors)
         return CustomDataReader(ObserverParts(*parts))
@@ -327,7 +327,7 @@ def _standing(node: Any, robot: Any) -> dict[str, Any]:
 
 
 def _contact(contact: Any, robot: Any) -> list[Any]:
-    """Where it touches, and with which of its nodes."""
+    """Return where it touches, and with which of its nodes."""
     point = [round(float(value), DIGITS) for value in contact.getPoint()[:3]]
     node = robot.getFromId(contact.getNodeId())
     return [*point, None if node is None else node.getDef() or node.getTypeName()]

@@ -39,6 +39,9 @@ from webots_mcp.store.recording import RobotView
 from webots_mcp.store.robots import PRESS_PLAY, find_block, handler_at_work
 from webots_mcp.store.run_rows import state_at
 
+# The mode of the simulation after a command; a `run` sets what its `then` says.
+_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
+
 
 @dataclass(frozen=True)
 class RunAnswerSizes:
@@ -66,12 +69,10 @@ class RunAnswerSizes:
 
 
 _SIZES: Final = RunAnswerSizes()
-# The mode of the simulation after a command; a `run` sets what its `then` says.
-_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
 
 
 def command_answer(view: RobotView, command: QueuedCommand, waited_s: float) -> CommandAnswer:
-    """Return the answer about a command after so many wall seconds of waiting."""
+    """Return the answer about a command after that many wall seconds of waiting."""
     failed = command.status != "done" and command.error is not None
     facts: dict[str, Any] = {
         **view.header(),

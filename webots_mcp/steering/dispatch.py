@@ -29,7 +29,6 @@ from webots_mcp.store.robots import BlockedLoop, find_block, robot_name
 
 # Called with what is done, how much there is to do (None where unknown), and a text.
 ProgressReport = Callable[[float, float | None, str], Awaitable[None]]
-
 # A running loop claims a command at once. After this time the block that keeps it is searched for.
 BLOCK_NOTICED_S: Final = 2.0
 _WITHDRAWN: Final = "the command was withdrawn and will not run"
@@ -251,12 +250,12 @@ def withdraw_if_blocked(recording: RecordingAccess, command: QueuedCommand) -> b
 
 
 def is_withdrawn(answer: CommandAnswer) -> bool:
-    """Whether a command was withdrawn because its loop was known to be blocked."""
+    """Return whether a command was withdrawn because its loop was known to be blocked."""
     return (answer.error or "").endswith(_WITHDRAWN)
 
 
 def is_held_up(recording: RecordingAccess, command: QueuedCommand) -> bool:
-    """Whether a `step` or `run` that is under way cannot go on, since its loop is blocked."""
+    """Return whether a running `step` or `run` cannot continue, since its loop is blocked."""
     if command.status != "claimed" or command.action not in LOOPING:
         return False
     return _block_of(recording, command) is not None

@@ -94,15 +94,6 @@ class Breakpoint:
         self.evaluator.forget()
         self.hit_count, self.holding, self.asked_since_s = 0, False, None
 
-    def begins(self, state: Any, sim_time_s: float) -> bool:
-        """Evaluate the condition on a state; True if it begins to hold with it.
-
-        Raises:
-            ConditionFailedError: See `Evaluator.holds`.
-        """
-        held, self.holding = self.holding, self.evaluator.holds(state, sim_time_s)
-        return self.holding and not held
-
 
 class Breakpoints:
     """This robot's armed breakpoints: the stored ones, and those of the controller's code."""
@@ -274,11 +265,15 @@ class Breakpoints:
         clock, hit, self.reaches = self._clock, list[Breakpoint](), False
         if self.run is not clock.run:
             self.load()
+        now_s = clock.sim_time_s
         for each in tuple(self.armed):  # a copy: a failing one is removed meanwhile
+            held, evaluator = each.holding, each.evaluator
             try:
-                if each.begins(state, clock.sim_time_s):
+                each.holding = holds = evaluator.holds(state, now_s)
+                if holds and not held:
                     self._count(each, hit)
-                self.reaches |= each.evaluator.reaches
+                if evaluator.reaches:
+                    self.reaches = True
             except ConditionFailedError as error:
                 self._disarm(each, str(error))
             except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)

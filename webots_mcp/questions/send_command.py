@@ -24,7 +24,7 @@ from webots_mcp.answers.models import (
 )
 from webots_mcp.answers.shortening import cut_text, is_for_a_person, shorten, tokens_of
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
-from webots_mcp.database.queue import Command, list_commands
+from webots_mcp.database.queue import QueuedCommand, list_commands
 from webots_mcp.questions.arguments import Cursor, Id, RobotName, TimeoutS
 from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
 from webots_mcp.steering.command_answer import shown_result
@@ -127,7 +127,7 @@ def webots_list_commands(
         return _answer(view, commands, limit)
 
 
-def _command_row(command: Command, now_s: float) -> list[Any]:
+def _command_row(command: QueuedCommand, now_s: float) -> list[Any]:
     """A command as a row under `COMMAND_COLUMNS`."""
     took_s = None
     if command.finished_wall_time_s is not None:
@@ -144,7 +144,7 @@ def _command_row(command: Command, now_s: float) -> list[Any]:
     ]
 
 
-def _answer(view: RobotView, commands: list[Command], limit: int) -> CommandsAnswer:
+def _answer(view: RobotView, commands: list[QueuedCommand], limit: int) -> CommandsAnswer:
     rows = [_command_row(command, view.now_s) for command in commands]
     rows = fitting(rows, _SIZES.commands_tokens)
     more = len(rows) < len(commands) or len(commands) == limit

@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Generator
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
+from webots_mcp.bridge.scene_nodes import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.signals.naming import SEEN_SPEED, SOLIDS, WORLD
 
 DIGITS: Final = 6

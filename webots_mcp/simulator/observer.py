@@ -270,7 +270,7 @@ class Observer:
         if is_due and (seen := self.world.read_poses(sim_time_s)):
             self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
             self.bridge.publish(seen)
-        self.custom_data.look(
+        self.custom_data.read_all(
             [body for body in self.world.bodies.values() if body.is_robot], is_due=is_due
         )
 

@@ -17,7 +17,7 @@ from contextvars import copy_context
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.database.queue import Command, CommandQueue, fetch_command, find_command
+from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, withdraw_if_blocked
@@ -159,7 +159,7 @@ class TrialWorker(threading.Thread):
                 "check what it is waiting for, or restart its controller"
             )
 
-    def _sent(self, trial: TrialRecord) -> Command:
+    def _sent(self, trial: TrialRecord) -> QueuedCommand:
         """The command that runs a trial; one that was sent already is not sent again."""
         with self._job.writer() as connection:
             known = find_command(connection, _key(trial))
@@ -208,7 +208,7 @@ class TrialWorker(threading.Thread):
             borrow_parameters(connection, self.set_id, view.session.id, former)
         return view
 
-    def _watched(self, command: Command, timeout_s: float) -> Command:
+    def _watched(self, command: QueuedCommand, timeout_s: float) -> QueuedCommand:
         """Wait until the command is final; a run that takes longer is ended."""
         command = self._settled(command.id, timeout_s)
         if not command.is_final:
@@ -216,7 +216,9 @@ class TrialWorker(threading.Thread):
             command = self._settled(command.id, _TIMES.patience_s)
         return command
 
-    def _settled(self, command_id: int, timeout_s: float, *, hurried: bool = False) -> Command:
+    def _settled(
+        self, command_id: int, timeout_s: float, *, hurried: bool = False
+    ) -> QueuedCommand:
         """The command, once it is final or the time is over."""
         until_s, settle_s = time.monotonic() + timeout_s, time.monotonic() + _TIMES.settle_s
         search_s = time.monotonic() + BLOCK_NOTICED_S
@@ -240,7 +242,7 @@ class TrialWorker(threading.Thread):
                     raise _StopError
         return command
 
-    def _cancel(self, command: Command) -> None:
+    def _cancel(self, command: QueuedCommand) -> None:
         """Cancel a pending command, or end a running one."""
         with self._job.writer() as connection:
             queue = CommandQueue(connection)
@@ -250,7 +252,7 @@ class TrialWorker(threading.Thread):
 
     # -- results -------------------------------------------------------------------------------
 
-    def _result(self, trial: TrialRecord, command: Command) -> TrialResult:
+    def _result(self, trial: TrialRecord, command: QueuedCommand) -> TrialResult:
         """The result of a trial.
 
         Raises:
@@ -357,7 +359,9 @@ class TrialWorker(threading.Thread):
                 f"its parameters were not restored: {command.error or command.status}"
             )
 
-    def _ask_back(self, connection: sqlite3.Connection, noted: TrialSetRecord) -> Command | None:
+    def _ask_back(
+        self, connection: sqlite3.Connection, noted: TrialSetRecord
+    ) -> QueuedCommand | None:
         """The command that restores the parameters; None without any, or without its controller."""
         assert noted.robot_id is not None and noted.former_values is not None
         former = json.loads(noted.former_values)

@@ -18,7 +18,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.database.connection import FAILURES, LONGEST_WRITE_S, FrozenConnection, Step
+from webots_mcp.database.connection import (
+    FAILURES,
+    LONGEST_WRITE_S,
+    AtomicStatements,
+    FrozenConnection,
+)
 from webots_mcp.database.liveness import holder_of
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import DatabaseError, warn
@@ -108,7 +113,7 @@ _BEGIN_GROUP: Final = (
     "max_state_id, row_count, stored_row_count, lost_value_count, stored_row_bytes, chunk_bytes, "
     "is_complete) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 0)"
 )
-_STORE: Final = Step(  # unless another process has cleared the group up
+_STORE: Final = AtomicStatements(  # unless another process has cleared the group up
     "store_chunks",
     ("group_id", "first", "last"),
     f"INSERT INTO chunk (group_id, {_LIST}) SELECT NEW.group_id, {_LIST} FROM new_chunk "
@@ -120,7 +125,7 @@ _STORE: Final = Step(  # unless another process has cleared the group up
     "AND (signal.min IS NULL OR c.min < signal.min OR c.max > signal.max)",
     unless="NOT EXISTS (SELECT 1 FROM row_group WHERE id = NEW.group_id)",
 )
-_COMPLETE: Final = Step(  # unless another process has stored these rows meanwhile
+_COMPLETE: Final = AtomicStatements(  # unless another process has stored these rows meanwhile
     "complete_group",
     ("group_id", "run_id", "max_state_id", "chunks"),
     "UPDATE row_group SET is_complete = 1 WHERE id = NEW.group_id",
@@ -139,7 +144,8 @@ _ROWS_OF_GROUP: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id BETWEEN ? AND ? "
     "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s, id LIMIT ?"
 )
-_REPLACE: Final = Step(  # unless rows of the old group were deleted, or it was replaced meanwhile
+# Unless rows of the old group were deleted, or it was replaced meanwhile.
+_REPLACE: Final = AtomicStatements(
     "replace_group",
     ("old_id", "new_id", "chunks"),
     "UPDATE row_group SET is_complete = id = NEW.new_id WHERE id IN (NEW.old_id, NEW.new_id)",

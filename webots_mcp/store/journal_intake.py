@@ -44,7 +44,14 @@ from webots_mcp.contract import (
 )
 from webots_mcp.database import liveness, waiting_file
 from webots_mcp.database.connection import identify_files, in_transaction
-from webots_mcp.database.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, journal_parts
+from webots_mcp.database.waiting_file import (
+    FORMAT,
+    STATEMENTS,
+    Kind,
+    Taken,
+    WaitingEntry,
+    journal_parts,
+)
 from webots_mcp.errors import warn
 from webots_mcp.signals import register as signal_register
 from webots_mcp.signals.naming import flatten
@@ -159,7 +166,7 @@ class _Line(NamedTuple):
     """
 
     end: int
-    entry: Entry | None
+    entry: WaitingEntry | None
     state: dict[str, Any] | None = None
     fault: str = ""
     lost_run: dict[str, Any] | None = None
@@ -338,7 +345,7 @@ class _Reading:
         _places[self.path] = self._counted(session_id, place)
         return True
 
-    def _entries(self, lines: Sequence[_Line], session_id: int) -> list[Entry]:
+    def _entries(self, lines: Sequence[_Line], session_id: int) -> list[WaitingEntry]:
         """Their entries; the end of a session adds its count to what was dropped here."""
         entries = [each.entry for each in lines if each.entry]
         for entry in entries:
@@ -362,7 +369,9 @@ class _Reading:
             self._drop(session_id, place.faults)
             if run := self.connection.execute(_NEWEST_RUN, (session_id,)).fetchone():
                 uuid, *times = run
-                self._drop_event(Entry(place.number, "event", uuid, tuple(times)), place.faults)
+                self._drop_event(
+                    WaitingEntry(place.number, "event", uuid, tuple(times)), place.faults
+                )
 
         in_transaction(self.connection, act)
         warn(f"{lines} lines or values of {self.path} were dropped: {first}")
@@ -392,7 +401,7 @@ class _Reading:
         in_transaction(connection, act)
         return connection.execute(_KNOWN, (self.uuid,)).fetchone()
 
-    def _begin(self, looks: _Looks, entry: Entry) -> dict[str, Any] | None:
+    def _begin(self, looks: _Looks, entry: WaitingEntry) -> dict[str, Any] | None:
         """The values of the run of an entry that none has begun, if its line was lost."""
         lost = looks.lost_runs.get(entry.run or "", looks.lost_runs.get(""))
         if lost is None or isinstance(entry.values, dict) or not entry.run:
@@ -416,7 +425,7 @@ class _Reading:
         faults = list(taken.unfit)
         begun_here, self.begun = self.begun, ()
         runs, ends = dict[str, tuple[float, float, int]](), dict[Kind, dict[str, Any]]()
-        last: Entry | None = None
+        last: WaitingEntry | None = None
         for _, entry, state, fault, _ in _until(lines, taken.number):
             if entry is None or entry.number in written:
                 faults.append(fault)
@@ -465,7 +474,7 @@ class _Reading:
         values = {"count": dropped.lines, "why": why, "session": session_id}
         self.connection.execute(_DROP, values)
 
-    def _drop_event(self, entry: Entry, dropped: _Faults) -> None:
+    def _drop_event(self, entry: WaitingEntry, dropped: _Faults) -> None:
         data = {"row_count": dropped.lines, "why": f"{self.path.name}: {dropped.first}"}
         self._event(entry, "dropped", None, json.dumps(data))
 
@@ -474,7 +483,7 @@ class _Reading:
         signal_register.write_changes(self.connection, robot_id, changes)
         return True
 
-    def _event(self, entry: Entry, kind: str, name: str | None, data: str) -> None:
+    def _event(self, entry: WaitingEntry, kind: str, name: str | None, data: str) -> None:
         (run_id,) = self.connection.execute(_RUN_ID, (entry.run,)).fetchone()
         values = (run_id, *cast("tuple[Any, ...]", entry.values)[:2], kind, name, data)
         self.connection.execute(STATEMENTS["event"], values)
@@ -613,7 +622,7 @@ def _line(line: bytes, end: int) -> _Line:
         if kind == "run" and None in (given["uuid"], given["wall_time"], given["sim_time"]):
             raise ValueError(unfit)
         state = _state(given, text, line) if kind == "state" else None
-        entry = Entry(number, kind, run, _bound(kind, given))
+        entry = WaitingEntry(number, kind, run, _bound(kind, given))
     except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
         return _Line(end, None, fault=_fault(text, error), lost_run=_lost_run(text, given))
     return _Line(end, entry, state, _fault(text, unfit) if unfit else "")

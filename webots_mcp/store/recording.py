@@ -34,7 +34,7 @@ from webots_mcp.database.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.database.liveness import Lease, still_held
+from webots_mcp.database.liveness import JobLease, still_held
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.queue import any_unfinished
@@ -494,7 +494,7 @@ class Job:
     """
 
     recording: RecordingAccess
-    lease: Lease
+    lease: JobLease
 
     @contextmanager
     def writer(self) -> Generator[sqlite3.Connection]:

@@ -50,7 +50,7 @@ from webots_mcp.database.pauses import (
 )
 from webots_mcp.database.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
 from webots_mcp.database.waiting_file import (
-    Entry,
+    WaitingEntry,
     count_rows,
     next_entries,
     read_header,
@@ -917,7 +917,7 @@ def _path_of(
     return path if path and path.is_file() else None  # a FIFO would wait for a writer
 
 
-def _oldest_s(entries: list[tuple[int, Entry]]) -> float:
+def _oldest_s(entries: list[tuple[int, WaitingEntry]]) -> float:
     """When the first state, log line or event came; infinite where there is none."""
     stamped = ("state", "log", "event")
     times = (entry.values for _, entry in entries if entry.kind in stamped)

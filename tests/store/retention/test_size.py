@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 import sqlite3
 from contextlib import closing
@@ -13,7 +12,7 @@ import pytest
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.store import purge as upkeep_work
+from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.retention import Limit, Retention
@@ -70,7 +69,10 @@ def test_what_states_take_is_known_within_a_twentieth_of_what_sqlite_says(
 
 
 @pytest.mark.parametrize("length", [1300, 1500, 2500, 3000, 6000])
-def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int) -> None:
+def test_the_file_of_long_rows_shrinks_to_the_limit(
+    tmp_path: Path, length: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 16)
     file = tmp_path / "webots.db"
     with closing(connect(file, "writer", create=True)) as connection:
         create_schema(connection)
@@ -92,9 +94,8 @@ def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int)
 
 
 def test_the_file_of_a_recording_that_goes_on_stays_within_a_twentieth_of_its_limits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(upkeep_work, "PLANNING_SHARE", math.inf)  # on a slow machine too
     file, noise = tmp_path / "webots.db", random.Random(5)
     sizes_of = {"state": 2_000_000, "chunk": 1_200_000, "log": 600_000}
     of_states, of_chunks, of_logs = (Limit(size_bytes=each) for each in sizes_of.values())

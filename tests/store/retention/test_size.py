@@ -33,6 +33,10 @@ def mixed(low: int, high: int) -> list[int]:
     return [low + number * 7919 % (high - low) for number in range(97)]
 
 
+def shown(value: list[int] | int) -> str:
+    return f"{min(value)} to {max(value)} bytes" if isinstance(value, list) else f"{value} runs"
+
+
 @pytest.mark.parametrize(
     ("lengths", "runs"),
     [
@@ -42,7 +46,7 @@ def mixed(low: int, high: int) -> list[int]:
         (mixed(200, 3000), 6),
         (mixed(1300, 9000), 1),
     ],
-    ids=lambda each: f"{min(each)} to {max(each)} bytes" if isinstance(each, list) else f"{each}",
+    ids=shown,
 )
 def test_what_states_take_is_known_within_a_twentieth_of_what_sqlite_says(
     tmp_path: Path, lengths: list[int], runs: int

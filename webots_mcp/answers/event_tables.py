@@ -34,7 +34,7 @@ def fitting_events(
 ) -> tuple[Events, AnswerTable | None]:
     """At most `limit` of what was found, and as much of it as fits the budget."""
     while True:
-        told = found.told(view.connection, limit)
+        told = found.page(view.connection, limit)
         made = events_table(told.events, view, time_of_day=time_of_day)
         tokens = tokens_of([made.rows if made else [], not_shown_of(told), told.cursor])
         if tokens <= budget_tokens or limit <= 1:

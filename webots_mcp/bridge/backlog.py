@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
-from webots_mcp.bridge.simulation import Run
+from webots_mcp.bridge.simulation import CurrentRun
 from webots_mcp.database.waiting_file import (
     ENTRIES_AT_ONCE,
     Kind,
@@ -24,7 +24,7 @@ class Row:
 
     __slots__ = ("kind", "number", "run", "values")
 
-    def __init__(self, kind: Kind, run: Run | None, values: Values) -> None:
+    def __init__(self, kind: Kind, run: CurrentRun | None, values: Values) -> None:
         self.kind: Kind = kind
         self.run = run
         self.values = values
@@ -51,7 +51,7 @@ class Backlog:
     def __init__(
         self,
         file: WaitingFile | None,
-        describe_run: Callable[[Run], dict[str, Any]],
+        describe_run: Callable[[CurrentRun], dict[str, Any]],
         drop: Callable[[int, str], None],
     ) -> None:
         self._file = file

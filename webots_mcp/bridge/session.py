@@ -38,7 +38,7 @@ _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or w
 _UNMOVED_S: Final = 10.0  # of wall time
 
 
-class Session:
+class BridgeSession:
     """All parts of a bridge, from its construction to its end, and the runs in it.
 
     It is the one place that knows how the parts are connected: no part knows the session.

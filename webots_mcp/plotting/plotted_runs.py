@@ -318,7 +318,7 @@ def _found(
         if event.kind in options.kinds
         if event.kind not in of_numbers or event.name not in undrawn
     ]
-    return replace(before.only(drawn), context=()).told(connection, MOST_EVENTS)
+    return replace(before.only(drawn), context=()).page(connection, MOST_EVENTS)
 
 
 def stuck_mark(

@@ -271,7 +271,7 @@ def test_kills_lose_nothing_and_double_nothing(start: Start, tmp_path: Path) -> 
         for reader in readers:
             reader.communicate()
         while journal_parts(folder / "webots.db"):  # one answer has no time for thousands of rows
-            RecordingAccess(folder / "webots.db", folder).take_in()
+            RecordingAccess(folder / "webots.db", folder).ingest()
         found = [
             n for (n,) in read(folder, "SELECT json_extract(data, '$.i') FROM state ORDER BY id")
         ]

@@ -79,7 +79,7 @@ class Judged(NamedTuple):
     details: dict[str, Any]
 
 
-class Place(NamedTuple):
+class StandstillRows(NamedTuple):
     """Where it stood, and the rows of the frame in which it did: those with a position.
 
     Attributes:
@@ -118,7 +118,7 @@ class Standings:
         frame: Frame,
         motion: Motion,
         options: EventOptions,
-        places: Sequence[Place],
+        places: Sequence[StandstillRows],
         noise: RunNoise,
         uses: ModeUses,
     ) -> None:
@@ -238,7 +238,7 @@ class Standings:
         """The modes in some of the rows."""
         return np.flatnonzero(np.bincount(self.modes[rows])).tolist()
 
-    def facts(self, place: Place, rows: slice) -> dict[str, Any]:
+    def facts(self, place: StandstillRows, rows: slice) -> dict[str, Any]:
         """What is told of rows of a standstill, whether it was stuck or not."""
         facts: dict[str, Any] = {"x_m": place.x_m, "y_m": place.y_m}
         if self.motion.mode is not None:
@@ -481,7 +481,7 @@ def judge_standstills(
     return Findings(events, None, unseen, cut)
 
 
-def _batches(places: Sequence[Place]) -> Iterator[Sequence[Place]]:
+def _batches(places: Sequence[StandstillRows]) -> Iterator[Sequence[StandstillRows]]:
     """The standstills in order, each time so many that they have about `JUDGED_AT_ONCE` rows."""
     start, rows = 0, 0
     for at, place in enumerate(places):
@@ -491,7 +491,9 @@ def _batches(places: Sequence[Place]) -> Iterator[Sequence[Place]]:
             start, rows = at + 1, 0
 
 
-def _places(track: SmoothedTrack, rows: Indexes, frame: Frame, search: Search) -> Iterator[Place]:
+def _places(
+    track: SmoothedTrack, rows: Indexes, frame: Frame, search: Search
+) -> Iterator[StandstillRows]:
     """The standstills of a track, in parts where it climbs or sinks in between."""
     motion, options = search.motion, search.options
     limits = options.stuck_m, options.stuck_s
@@ -503,7 +505,7 @@ def _places(track: SmoothedTrack, rows: Indexes, frame: Frame, search: Search) -
         for start, stop in ends:
             part = slice(start, stop)
             course = track.times[part], track.x[part], track.y[part]
-            yield Place(rows[part], *course, each.x_m, each.y_m, track.left_m)
+            yield StandstillRows(rows[part], *course, each.x_m, each.y_m, track.left_m)
 
 
 def _at_one_height(

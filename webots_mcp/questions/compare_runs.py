@@ -372,9 +372,9 @@ def _measure_row(measure: Measure) -> list[Any]:
         short_name(measure.name),
         _medians(measure.spread),
         _ranges(measure.spread),
-        _as_dict(measure.different),
+        _verdicts_against_first(measure.different),
         _intervals(measure.interval),
-        _as_dict(measure.runs_wanted),
+        _verdicts_against_first(measure.runs_wanted),
     ]
 
 
@@ -424,7 +424,7 @@ def _difference_row(difference: Difference, *, with_extremes: bool) -> list[Any]
         _medians(difference.deviation),
         _against_first(figures(difference.effect)),
         _against_first(figures(difference.deviation_ratio)),
-        _as_dict(difference.different),
+        _verdicts_against_first(difference.different),
         _intervals(difference.interval),
         figures(difference.min) if with_extremes else None,
         figures(difference.max) if with_extremes else None,
@@ -437,13 +437,13 @@ def _against_first(figures: Sequence[Any]) -> Any:
     return others[0] if len(others) == 1 else others
 
 
-def _as_dict(verdicts: Sequence[Any]) -> Any:
+def _verdicts_against_first(verdicts: Sequence[Any]) -> Any:
     """Return what is said of each group but the first; None where nothing is said of any."""
     return _against_first(verdicts) if any(each is not None for each in verdicts[1:]) else None
 
 
 def _intervals(found: Sequence[tuple[float, float] | None]) -> Any:
-    return _as_dict([None if each is None else figures(each) for each in found])
+    return _verdicts_against_first([None if each is None else figures(each) for each in found])
 
 
 def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: int) -> str | None:

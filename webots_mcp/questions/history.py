@@ -346,7 +346,9 @@ def _page(
         view.connection, asked, names, limit=limit or DEFAULT_POINTS, after_id=after_id
     )
     budget_tokens = room_tokens(limit)
-    rows = _most(lambda rows: tokens_of(_as_dict(_row_columns(page, rows, view))), page, budget_tokens)
+    rows = _most(
+        lambda rows: tokens_of(_as_dict(_row_columns(page, rows, view))), page, budget_tokens
+    )
     cursor = page.ids[rows - 1] if 0 < rows < len(page.ids) else page.cursor
     shown = _row_columns(page, rows, view)
     left_out: list[str] = []

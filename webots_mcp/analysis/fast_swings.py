@@ -43,10 +43,10 @@ def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> I
 
 def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
     starts = np.arange(0, len(values) - _WINDOW + 1, _HOP)
-    windows = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
-    base = np.polynomial.legendre.legvander(np.linspace(-1, 1, _WINDOW), _DEGREE)
-    slow, _, _, _ = np.linalg.lstsq(base, windows.T, rcond=None)
-    rest = windows - (base @ slow).T
+    windows: Array = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
+    base = np.vander(np.linspace(-1, 1, _WINDOW), _DEGREE + 1)
+    orthogonal = np.linalg.qr(base)[0]
+    rest: Array = windows - (windows @ orthogonal) @ np.transpose(orthogonal)
     power = np.abs(np.fft.rfft(rest, axis=1)) ** 2
     power[:, -1] /= 2  # the last ordinate has one degree of freedom, the others two
     first = math.ceil(_WINDOW / LONGEST_FAST_ROWS)

@@ -21,7 +21,7 @@ class ShownPicture:
 
 
 def said(text: str) -> Any:
-    """A field that may be missing, with what it means."""
+    """Return a field that may be missing, with what it means."""
     return Field(default=None, description=text)
 
 

@@ -108,7 +108,7 @@ def _compile(recorded: Where) -> None:
 
 
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
-    """The answer with commands in the place of calls, and what passed in one line."""
+    """Return the answer with commands in the place of calls, and what passed in one line."""
     from webots_mcp.cli.asking import OPTIONS
     from webots_mcp.cli.wording import commands_by_tool
 
@@ -353,7 +353,7 @@ def profile(
 
 
 def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
-    """The stacks of the main thread, and how often each was met.
+    """Return the stacks of the main thread, and how often each was met.
 
     Raises:
         CommandRefusedError: py-spy is not installed, or not permitted; the text says what to do.
@@ -377,7 +377,7 @@ def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
 
 
 def _place_of(stack: str, own: str) -> tuple[str, str | None]:
-    """The innermost line of the controller's own files, and its function."""
+    """Return the innermost line of the controller's own files, and its function."""
     in_bridge = False
     for each in reversed(stack.split(";")):
         function, file, line = (

@@ -167,6 +167,7 @@ class Meaning:
         return self.role in ("commanded", "target")
 
 
+_OF_POSES: Final[dict[str, Quantity]] = {"x": "x", "y": "y", "z": "height", "yaw": "heading"}
 # A quantity that may be nothing at any time: an actuator is off, a foot is in the air, it is dark.
 CAN_BE_OFF: Final = frozenset[Quantity | None]((
     "speed", "turn rate", "wheel speed", "motor speed", "joint speed", "force", "torque", "current",
@@ -205,9 +206,10 @@ def meaning_by_name(
         return _named("text", _role_in(name), name, "it is a text")
     if kind == "null":
         return UNKNOWN
-    for role, quantity in (("x", "x"), ("y", "y"), ("z", "height"), ("yaw", "heading")):
-        if base == role:
-            return _named(quantity, _role_in(name) or "measured", name, "its name is one of a pose")
+    if base in _OF_POSES:
+        return _named(
+            _OF_POSES[base], _role_in(name) or "measured", name, "its name is one of a pose"
+        )
     quantity = _quantity_in(name, kind, base, frozenset(names))
     if quantity is None:
         return UNKNOWN
@@ -237,8 +239,10 @@ def targets_in(meanings: Mapping[str, Meaning]) -> list[tuple[str, str]]:
     and the same words but for those of a role and of the quantity itself: `elbow.pos` and
     `elbow.target`, `wheels.left.velocity` and `wheels.left.target`.
     """
-    found: dict[str, str] = {
-        each.target_of: name for name, each in meanings.items() if each.target_of in meanings
+    found = {
+        each.target_of: name
+        for name, each in meanings.items()
+        if each.target_of is not None and each.target_of in meanings
     }
     by_subject: dict[tuple[frozenset[str], tuple[str, ...]], list[str]] = {}
     for name, meaning in meanings.items():
@@ -306,8 +310,9 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
         return "pitch" if "pitch" in said else None
     if unit in ("m", "cm", "mm", "km") and not said & _JOINTS:
         return "distance"
-    if found := next((_WORD_QUANTITIES[each] for each in words if each in _WORD_QUANTITIES), None):
-        return found
+    for word in words:
+        if word in _WORD_QUANTITIES:
+            return _WORD_QUANTITIES[word]
     if said & _JOINTS and said & {"position", "angle", *_TARGET, *_COMMAND}:
         return "joint position"
     if unit in ("rad/s", "deg/s"):

@@ -87,14 +87,14 @@ def tilt_of(
     up = np.stack((-np.sin(along), np.sin(across) * np.cos(along), np.cos(across) * np.cos(along)))
     first = np.median(up[:, times <= times[0] + SETTLED_S], axis=1)
     first /= np.linalg.norm(first) or 1.0
-    return times, np.arccos(np.clip(first @ up, -1.0, 1.0))
+    return times, np.arccos(np.minimum(np.maximum(first @ up, -1.0), 1.0))
 
 
 def _signal(search: Search, quantity: Quantity) -> RegisteredSignal | None:
     """The first signal of that quantity that has values and is measured."""
     for name, meaning in search.meanings.items():
         is_one = meaning.quantity == quantity and meaning.is_sensed
-        if is_one and search.whole.zones(name).value_count.any():
+        if is_one and search.whole.zone_map(name).value_count.any():
             return search.known[name]
     return None
 

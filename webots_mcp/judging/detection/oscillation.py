@@ -25,7 +25,7 @@ from webots_mcp.judging.detection.kinds import (
 )
 from webots_mcp.judging.detection.search import MOST_NAMED, Search
 from webots_mcp.signals.naming import in_snake_case, listed
-from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.signals import RegisteredSignal
 
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
@@ -92,7 +92,7 @@ def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tupl
     asked = least, _longest_period_s(search)
     shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
     for signal in search.in_time("oscillation", signals):
-        for span in _changing(frame.zones(signal.name), least):
+        for span in _changing(frame.zone_map(signal.name), least):
             if span not in shared:
                 part = frame.rows(*span)
                 shared[span] = part, EvenRows.of(part.times)
@@ -126,7 +126,7 @@ def _overlap(one: Swing, other: Swing) -> bool:
     return one.start_s <= other.end_s and other.start_s <= one.end_s
 
 
-def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:
+def _changing(zones: ZoneMap, least: int) -> list[tuple[int, int]]:
     """Rows of the chunks in which the value changes, and of those next to them."""
     if int(zones.change_count.sum()) < least:
         return []

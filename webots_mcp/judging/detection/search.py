@@ -594,7 +594,7 @@ class Search:
             self.not_searched(kind, why)
 
     def _is_large(self, signal: RegisteredSignal) -> bool:
-        zones = self.frame.zones(signal.name)
+        zones = self.frame.zone_map(signal.name)
         spans = zones.spans(zones.value_count < zones.held_count)
         parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)
         return any((np.abs(part) > LARGEST).any() for part in parts)

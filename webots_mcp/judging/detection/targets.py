@@ -42,11 +42,11 @@ def pursuits_in(search: Search) -> list[Pursuit]:
     there = {
         name: meaning
         for name, meaning in search.meanings.items()
-        if known[name].kind in ("num", "angle") and frame.zones(name).value_count.any()
+        if known[name].kind in ("num", "angle") and frame.zone_map(name).value_count.any()
     }
     found: list[Pursuit] = []
     for measured, target in targets_in(there):
-        zones = frame.zones(target)
+        zones = frame.zone_map(target)
         is_set = (zones.min < 0).any() or (zones.max > 0).any()
         follows = there[measured].quantity not in _PLACES
         if is_set and follows and HOLDING.isdisjoint(words_in(measured)):
@@ -114,7 +114,7 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
 def _recent_range(times: Array, aims: Array) -> tuple[Array, Array]:
     """The minimum and maximum of a target in the last 3 s, in which a follower may lag."""
     first = np.searchsorted(times, times - OFF_S)
-    low, high = aims.copy(), aims.copy()
+    low, high = np.array(aims), np.array(aims)
     steps = np.flatnonzero(np.diff(aims)) + 1
     if not len(steps):
         return low, high

@@ -45,6 +45,7 @@ _ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
     "fail": ("failure", "failures"),
     "not looked at": ("error", "errors"),
     "not applicable": ("skipped", "skipped"),
+    "not judged": ("skipped", "skipped"),
 }
 _WAITING: Final = Waiting()
 _NOT_PERMITTED: Final = (

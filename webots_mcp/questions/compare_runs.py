@@ -488,7 +488,8 @@ def webots_check_run(
 ) -> CheckAnswer:
     """Is this run well? Motion against commands, sensors, estimates, pace, log, end, rows, goal.
 
-    Each check passes, warns, fails, is not applicable (what is missing) or was not looked at.
+    Each check passes, warns, fails, is not applicable (what is missing), is not judged (nothing
+    recorded decides it) or was not looked at.
     """
     expected = [read_expectation(each) for each in expect or ()]
     file = file_of(recording.data_dir)

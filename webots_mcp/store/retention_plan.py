@@ -45,7 +45,11 @@ _GROUPS: Final = (
     f"AND w.signal_id = {WALL_TIMES} WHERE g.is_complete = 1"
 )
 _ROW_COUNT: Final = "SELECT row_count FROM row_group WHERE id = ?"
-_SUMS: Final = "run_id, min(id), max(id), {payloads}, count(*), max(CAST(wall_time_s AS REAL))"
+# A damaged time (after the year 5000) must not keep the rows around it.
+_WALL_TIME: Final = (
+    "max(CASE WHEN CAST(wall_time_s AS REAL) < 1e11 THEN CAST(wall_time_s AS REAL) END)"
+)
+_SUMS: Final = f"run_id, min(id), max(id), {{payloads}}, count(*), {_WALL_TIME}"
 _IN_NO_GROUP: Final = (
     f"SELECT {_SUMS} FROM state WHERE run_id = :run AND sim_time_s >= coalesce((SELECT "
     "max(end_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1), -9e999) "

@@ -86,7 +86,7 @@ def _ends_of(values: Array, ordinate: int, first: int) -> tuple[int, int]:
     return first + int(loud[0]), first + int(loud[-1])
 
 
-class Course(NamedTuple):
+class SwingCourse(NamedTuple):
     """An oscillation with all periods that belong to it.
 
     Attributes:
@@ -98,7 +98,7 @@ class Course(NamedTuple):
     end_amplitude: float
 
 
-def course_of(swing: Swing, times: Array, values: Array) -> Course:
+def course_of(swing: Swing, times: Array, values: Array) -> SwingCourse:
     """Follow an oscillation to where its amplitude is lost in the noise, on both sides.
 
     A growing oscillation stands out late, though its first periods have the same period and phase.
@@ -135,7 +135,7 @@ def course_of(swing: Swing, times: Array, values: Array) -> Course:
             last_s = min(edge_s, float(times[-1]))
     half_swings = max(swing.half_swings, int(2 * (last_s - first_s) / period_s))
     longer = replace(swing, start_s=first_s, end_s=last_s, half_swings=half_swings)
-    return Course(longer, *amplitudes)
+    return SwingCourse(longer, *amplitudes)
 
 
 def _sine_at(

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, noise_of, np
-from webots_mcp.judging.detection.kinds import Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.kinds import Event, EventKind, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.search import Search, places_in
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.signals import RegisteredSignal
@@ -41,6 +41,8 @@ def degradation_events(search: Search) -> Iterator[Event]:
     wanted = {each.name for each in search.signals}
     signals = [each for each in signals if each.name in wanted and not each.is_index]
     if not signals:
+        if "degradation" not in search.options.kinds:
+            raise NotAskedError
         raise NotSearchableError("no sensor is known whose noise does not depend on motion")
     for signal in search.in_time("degradation", signals):
         found = _change_of(search, signal)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
-from webots_mcp.judging.detection.kinds import Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.kinds import Event, EventKind, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.reading.frame import Frame
@@ -28,6 +28,8 @@ def fall_events(search: Search) -> Iterator[Event]:
     """From where the tilt leaves the upright range to where the robot stands again, if ever."""
     signals = {quantity: _signal(search, quantity) for quantity in ("roll", "pitch")}
     if not any(signals.values()):
+        if "fall" not in search.options.kinds:
+            raise NotAskedError
         raise NotSearchableError(NO_ATTITUDE)
     times, tilt = tilt_of(search.frame, signals["roll"], signals["pitch"])
     if len(times) < 2:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, gap_borders, np, usual_interval_s
-from webots_mcp.analysis.fast_swings import Course, course_of, find_fast_swings
+from webots_mcp.analysis.fast_swings import SwingCourse, course_of, find_fast_swings
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.analysis.swings import (
     SLOW_HALF_SWINGS,
@@ -86,7 +86,7 @@ def _longest_period_s(search: Search) -> float:
     return max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
 
 
-def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tuple[str, Course]]:
+def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tuple[str, SwingCourse]]:
     """The swings of each signal, in the chunks in which it changes."""
     frame, least = search.frame, search.options.min_half_periods
     asked = least, _longest_period_s(search)
@@ -103,14 +103,14 @@ def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tupl
                 numbers = unwrap(numbers, signal.turn)
             found = [_course(swing, times, numbers) for swing in swings_in(rows, numbers, *asked)]
             fast = (
-                Course(swing, swing.amplitude, swing.amplitude)
+                SwingCourse(swing, swing.amplitude, swing.amplitude)
                 for swing in find_fast_swings(rows, numbers, least)
                 if not any(_overlap(swing, each.swing) for each in found)
             )
             yield from ((signal.name, each) for each in (*found, *fast))
 
 
-def _course(swing: Swing, times: Array, values: Array) -> Course:
+def _course(swing: Swing, times: Array, values: Array) -> SwingCourse:
     """The whole of an oscillation, in the rows around it without a gap."""
     gaps = gap_borders(times, usual_interval_s(times) or 0.0)
     edges = np.concatenate(([0], gaps, [len(times)]))
@@ -118,7 +118,7 @@ def _course(swing: Swing, times: Array, values: Array) -> Course:
     at = int(np.searchsorted(edges, row, "right")) - 1
     part = slice(int(edges[at]), int(edges[at + 1]))
     if swing.end_s > times[part][-1]:  # it goes on after a gap
-        return Course(swing, swing.amplitude, swing.amplitude)
+        return SwingCourse(swing, swing.amplitude, swing.amplitude)
     return course_of(swing, times[part], values[part])
 
 

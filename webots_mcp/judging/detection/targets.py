@@ -10,7 +10,13 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
-from webots_mcp.judging.detection.kinds import Alike, Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.kinds import (
+    Alike,
+    Event,
+    EventKind,
+    NotAskedError,
+    NotSearchableError,
+)
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.meaning import HOLDING, targets_in, words_in
 from webots_mcp.store.signals import RegisteredSignal
@@ -58,6 +64,8 @@ def off_target_events(search: Search) -> Iterator[Event]:
     """Where the median of each second is off the target, and not on its way to it, for 3 s."""
     pursuits = pursuits_in(search)
     if not pursuits:
+        if "off_target" not in search.options.kinds:
+            raise NotAskedError
         raise NotSearchableError(
             "no target, other than always 0, is published next to what it is the target of"
         )

@@ -16,6 +16,7 @@ from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.meanings import SignalMeanings
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.picture_actions import PictureActions
@@ -73,6 +74,7 @@ class Session:
         self.parameters = Parameters(
             clock, recorder, journal, self.handlers, errors, self.identity.robot_name
         )
+        self.meanings = SignalMeanings(recorder)
         self.breakpoints = Breakpoints(
             simulation, clock, recorder, journal, self.pause, self.keeper
         )

@@ -1,18 +1,125 @@
-"""What the signals of a robot mean: as declared, else as their names tell."""
+"""What the signals of a robot mean: as declared, else as their device says, else as names tell."""
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final, NamedTuple
 
-from webots_mcp.signals.meaning import Meaning, meanings_by_name
+from webots_mcp.signals.meaning import (
+    MEANING_FIELDS,
+    QUANTITIES,
+    ROLES,
+    DeclaredMeaning,
+    Meaning,
+    StatedMeaning,
+    fits_pattern,
+    meaning_stated,
+    meanings_by_name,
+)
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
+
+OF_TOOLS: Final = ("mcp", "cli")  # a person or an assistant has set it, the newest counts
+OF_PROJECT: Final = "project"
+OF_CODE: Final = "controller"
+OF_DEVICE: Final = "bridge"
+_STRENGTH: Final = {**dict.fromkeys(OF_TOOLS, 0), OF_PROJECT: 1, OF_CODE: 2, OF_DEVICE: 3}
+_BY_WHOM: Final = {
+    "mcp": "declared with webots_describe_signals",
+    "cli": "declared with webots-mcp signals --describe",
+    OF_PROJECT: "declared in webots-mcp.toml",
+    OF_CODE: "declared by the controller's code",
+}
+_STORED: Final = (
+    f"SELECT set_by, source, why, name, {', '.join(MEANING_FIELDS)} FROM meaning WHERE "
+    "robot_id = :robot OR (robot_id IS NULL AND robot_name IN ('*', (SELECT name FROM robot "
+    "WHERE id = :robot))) ORDER BY robot_name IS NULL DESC, robot_name = '*', "
+    "set_wall_time_s DESC, id DESC"
+)
+
+
+class StoredMeaning(NamedTuple):
+    """A row of the table `meaning`.
+
+    Attributes:
+        set_by: `mcp`, `cli`, `project`, `controller` or `bridge`.
+        stated: What it says; its name may be a pattern.
+    """
+
+    set_by: str
+    stated: StatedMeaning
 
 
 def meanings_of(known: Mapping[str, RegisteredSignal]) -> dict[str, Meaning]:
-    """Return the meaning of each signal of a robot.
+    """Return the meaning of each signal of a robot, by the strongest source that there is.
 
     Args:
-        known: All its signals, or those of a run.
+        known: All its signals, or those of a run, with what was stated of them.
     """
     kinds = {name: signal.kind for name, signal in known.items()}
-    return meanings_by_name(kinds, stored_roles(dict(known)))
+    found = meanings_by_name(kinds, stored_roles(dict(known)))
+    for name, signal in known.items():
+        if signal.stated:
+            found[name] = meaning_stated(name, signal.stated, found[name])
+    return found
+
+
+def with_stated(
+    connection: sqlite3.Connection, robot_id: int, known: dict[str, RegisteredSignal]
+) -> dict[str, RegisteredSignal]:
+    """Return the signals with what was declared of them, or is known from their devices."""
+    stored = stored_meanings(connection, robot_id)
+    if not stored:
+        return known
+    plain: dict[str, list[StatedMeaning]] = {}
+    for each in stored:
+        if "*" not in each.stated.said.name:
+            plain.setdefault(each.stated.said.name, []).append(each.stated)
+    patterns = [each for each in stored if "*" in each.stated.said.name]
+    if not patterns:
+        return known | {
+            name: replace(known[name], stated=tuple(stated))
+            for name, stated in plain.items()
+            if name in known
+        }
+    return {name: replace(signal, stated=_of(name, stored)) for name, signal in known.items()}
+
+
+def _of(name: str, stored: list[StoredMeaning]) -> tuple[StatedMeaning, ...]:
+    return tuple(each.stated for each in stored if fits_pattern(each.stated.said.name, name))
+
+
+def stored_meanings(connection: sqlite3.Connection, robot_id: int) -> list[StoredMeaning]:
+    """Return all that is stored of a robot's signals, the strongest first.
+
+    Of equally strong ones, a name comes before patterns, and of those the longer one first. What no
+    version of webots-mcp writes is left out.
+    """
+    rows = connection.execute(_STORED, {"robot": robot_id}).fetchall()
+    found = [
+        StoredMeaning(set_by, StatedMeaning(said, source, why or _BY_WHOM.get(set_by, source)))
+        for set_by, source, why, *values in rows
+        if (said := _said(values)) is not None
+        if set_by in _STRENGTH and source in ("declared", "device")
+    ]
+    found.sort(key=_place)  # stable: the newest of equal ones comes first
+    return found
+
+
+def _place(stored: StoredMeaning) -> tuple[int, bool, int]:
+    name = stored.stated.said.name
+    return _STRENGTH[stored.set_by], "*" in name, -len(name)
+
+
+def _said(values: list[object]) -> DeclaredMeaning | None:
+    said = DeclaredMeaning(*values)  # type: ignore[arg-type]
+    texts = (said.name, said.unit, said.target_of, said.same_as, said.side)
+    is_ours = (
+        isinstance(said.name, str)
+        and said.quantity in (None, *QUANTITIES)
+        and said.role in (None, *ROLES)
+        and all(each is None or isinstance(each, str) for each in texts)
+        and all(each is None or isinstance(each, (int, float)) for each in (said.low, said.high))
+    )
+    return said if is_ours else None

@@ -14,6 +14,7 @@ from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.signals.naming import REDUCTIONS, Value, nearest_first
 from webots_mcp.signals.register import MAX_SIGNALS, Kind
 from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
+from webots_mcp.store.meanings import with_stated
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.observed_pose import with_observed_pose
 from webots_mcp.store.reading.ranges import TimeRange, find_subject
@@ -99,6 +100,7 @@ def _signals_in(
     for columns in samples.values():
         known = seen_with(known, robot_id, columns)
     known = _without_placeholders(known)
+    known = with_stated(connection, robot_id, known)
     return with_observed_pose(connection, robot_id, known, samples.items())
 
 
@@ -122,7 +124,8 @@ def signals_of_frame(
 ) -> dict[str, RegisteredSignal]:
     """Every signal of the subject's robot: the registered, and those in all rows of a frame."""
     known = registered(connection, subject.robot_id)
-    return _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
+    known = _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
+    return with_stated(connection, subject.robot_id, known)
 
 
 def held_by(

@@ -52,7 +52,7 @@ def test_a_wrong_declaration_is_refused_with_what_is_allowed(
     given: dict[str, Any], allowed: str
 ) -> None:
     with pytest.raises(ValueError, match=r"signal|name") as raised:
-        declare_meaning(**{"name": "s", **given})
+        declare_meaning(given.pop("name", "s"), **given)
     assert allowed in str(raised.value)
 
 

@@ -97,14 +97,14 @@ def check(
 
 def _compile(recorded: Where) -> None:
     """Let controllers that start without a server read what their project expects now."""
-    from webots_mcp.store.project_file import compile_project, file_of, read_project
+    from webots_mcp.store.project_file import NO_PROJECT, compile_project, file_of, read_project
 
     recording = recorded.recording(read_only=False)
     file = file_of(recording.data_dir)
-    expected = read_project(file) if file else []
+    project = read_project(file) if file else NO_PROJECT
     # Where nothing can be written it is asked all the same, of what is recorded.
     with contextlib.suppress(WebotsMCPError, sqlite3.Error), recording.writer() as connection:
-        compile_project(connection, expected)
+        compile_project(connection, project)
 
 
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:

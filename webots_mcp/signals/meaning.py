@@ -270,7 +270,7 @@ class StatedMeaning(NamedTuple):
     why: str
 
 
-def declare_meaning(name: object, **said: object) -> DeclaredMeaning:
+def declare_meaning(name: object, /, **said: object) -> DeclaredMeaning:
     """Return a declaration that is checked as a whole.
 
     Args:

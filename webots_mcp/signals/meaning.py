@@ -126,6 +126,39 @@ def side_in(name: str) -> str | None:
     return f"{end} {side}"
 
 
+def understood_words() -> dict[str, list[str]]:
+    """Return the words and units of names that are understood, by what they say.
+
+    They are given in the long, singular form. The documentation shows this list.
+    """
+    said: dict[str, set[str]] = {}
+    for word, quantity in (*_WORD_QUANTITIES.items(), *_MORE_UNITS.items()):
+        said.setdefault(quantity, set()).add(word)
+    for unit, quantity in _UNIT_QUANTITIES.items():
+        said.setdefault(quantity, set()).add(unit)
+    groups = {
+        "role commanded": _COMMAND,
+        "role target": _TARGET,
+        "role limit": _LIMIT,
+        "role measured": _MEASURED,
+        "side": frozenset((*_SIDES, *_ENDS)),
+        **said,
+        "speed, with unit or alone": frozenset(("speed", "velocity")),
+        "wheel speed": frozenset(("wheel",)),
+        "turn rate": _TURNING | {"yaw", "heading"},
+        "joint position or joint speed": _JOINTS,
+        "motor speed, not of a wheel": _FREE_MOTORS,
+        "angular velocity": said.get("angular velocity", set()) | _GYROS,
+        "count": _COUNTS,
+    }
+    return {meaning: sorted(words) for meaning, words in groups.items()}
+
+
+def short_forms() -> dict[str, str]:
+    """Return the short forms that are understood, with the long form of each."""
+    return dict(sorted(_SHORT_FORMS.items()))
+
+
 # -- meanings ----------------------------------------------------------------------------------
 
 
@@ -165,6 +198,14 @@ class Meaning:
     def is_sensed(self) -> bool:
         """Whether it is the reading of a sensor: a known quantity that nobody set or counted."""
         return self.quantity not in _NO_SENSOR and self.role in (None, "measured")
+
+    @property
+    def words(self) -> str | None:
+        """What it is in words, such as `commanded wheel speed, left`; None where it is unknown."""
+        if self.quantity is None:
+            return None
+        said = " ".join(filter(None, (self.role, self.quantity)))
+        return f"{said}, {self.side}" if self.side else said
 
     @property
     def sets(self) -> bool:

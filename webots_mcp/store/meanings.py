@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from webots_mcp.database.connection import transaction
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.meaning import (
     MEANING_FIELDS,
     QUANTITIES,
@@ -18,10 +21,12 @@ from webots_mcp.signals.meaning import (
     meaning_stated,
     meanings_by_name,
 )
+from webots_mcp.signals.naming import nearest_first
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 OF_TOOLS: Final = ("mcp", "cli")  # a person or an assistant has set it, the newest counts
 OF_PROJECT: Final = "project"
+_MOST_NEAR: Final = 5  # names in an error
 OF_CODE: Final = "controller"
 OF_DEVICE: Final = "bridge"
 _STRENGTH: Final = {**dict.fromkeys(OF_TOOLS, 0), OF_PROJECT: 1, OF_CODE: 2, OF_DEVICE: 3}
@@ -31,6 +36,20 @@ _BY_WHOM: Final = {
     OF_PROJECT: "declared in webots-mcp.toml",
     OF_CODE: "declared by the controller's code",
 }
+_SET: Final = (
+    f"INSERT INTO meaning (robot_id, name, {', '.join(MEANING_FIELDS)}, source, set_wall_time_s, "
+    f"set_by) VALUES (?, ?, {', '.join('?' * len(MEANING_FIELDS))}, 'declared', ?, ?)"
+)
+_FORGET: Final = (
+    "DELETE FROM meaning WHERE robot_id = ? AND name = ? AND source = 'declared' AND {}"
+)
+_BY_TOOL: Final = "set_by IN ('mcp', 'cli')"
+_BY_CODE: Final = f"set_by = '{OF_CODE}'"
+_DECLARED: Final = (
+    "SELECT DISTINCT name FROM meaning WHERE (robot_id = :robot OR (robot_id IS NULL AND "
+    "robot_name IN ('*', (SELECT name FROM robot WHERE id = :robot)))) AND source = 'declared' "
+    "ORDER BY name"
+)
 _STORED: Final = (
     f"SELECT set_by, source, why, name, {', '.join(MEANING_FIELDS)} FROM meaning WHERE "
     "robot_id = :robot OR (robot_id IS NULL AND robot_name IN ('*', (SELECT name FROM robot "
@@ -105,6 +124,67 @@ def stored_meanings(connection: sqlite3.Connection, robot_id: int) -> list[Store
     ]
     found.sort(key=_place)  # stable: the newest of equal ones comes first
     return found
+
+
+def set_meanings(
+    connection: sqlite3.Connection, robot_id: int, declared: Iterable[DeclaredMeaning], set_by: str
+) -> None:
+    """Store what a person or an assistant says of signals, in place of what they said before.
+
+    Args:
+        connection: In the role "writer".
+        robot_id: The robot whose signals they are.
+        declared: What is said of each.
+        set_by: `mcp` or `cli`.
+    """
+    now_s = time.time()
+    with transaction(connection):
+        for each in declared:
+            connection.execute(_FORGET.format(_BY_TOOL), (robot_id, each.name))
+            connection.execute(_SET, (robot_id, *each, now_s, set_by))
+
+
+def undo_meanings(connection: sqlite3.Connection, robot_id: int, names: Iterable[str]) -> list[str]:
+    """Forget what was declared of signals; of each what counts most, so that the next one counts.
+
+    First goes what a person or an assistant has set, then what the controller's code says, which
+    counts again from its next start on.
+
+    Args:
+        connection: In the role "writer".
+        robot_id: The robot whose signals they are.
+        names: As they were declared, or patterns of such names.
+
+    Returns:
+        The names of which something was forgotten.
+
+    Raises:
+        InvalidInputError: A name has no declaration, or only one in the project's file. Then
+            nothing is forgotten.
+    """
+    with transaction(connection):
+        known = [name for (name,) in connection.execute(_DECLARED, {"robot": robot_id}).fetchall()]
+        wanted: dict[str, None] = {}
+        for asked in names:
+            found = [name for name in known if name == asked or fits_pattern(asked, name)]
+            if not found:
+                near = ", ".join(nearest_first(asked, known)[:_MOST_NEAR]) or "none"
+                raise InvalidInputError(
+                    f"nothing is declared of signal {asked!r:.80}. Declared signals: {near}"
+                )
+            wanted |= dict.fromkeys(found)
+        for name in wanted:
+            _forget(connection, robot_id, name)
+    return list(wanted)
+
+
+def _forget(connection: sqlite3.Connection, robot_id: int, name: str) -> None:
+    for whose in (_BY_TOOL, _BY_CODE):
+        if connection.execute(_FORGET.format(whose), (robot_id, name)).rowcount:
+            return
+    raise InvalidInputError(
+        f"signal {name!r:.80} is declared in webots-mcp.toml: change its table [signals]"
+    )
 
 
 def _place(stored: StoredMeaning) -> tuple[int, bool, int]:

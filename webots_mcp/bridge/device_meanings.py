@@ -71,8 +71,9 @@ def _ask(device: Any, method: str, *arguments: Any) -> Any:
 
 
 def _number(value: object) -> float | None:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if is_number and math.isfinite(value) else None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    return float(value) if math.isfinite(value) else None
 
 
 def _why(device: Any, turned: _Turned | None) -> str:

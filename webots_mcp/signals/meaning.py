@@ -86,6 +86,7 @@ _WORD_QUANTITIES: Final[dict[str, Quantity]] = {
     "temperature": "temperature", "pressure": "pressure", "suction": "pressure", "light": "light",
     "lux": "light", "acceleration": "acceleration", "gyro": "angular velocity",
     "compass": "magnetic field", "percent": "percentage", "roll": "roll", "pitch": "pitch",
+    "time": "time", "timestamp": "time",
 }  # fmt: skip
 _UNIT_QUANTITIES: Final[dict[str, Quantity]] = {
     "N": "force", "N·m": "torque", "A": "current", "V": "voltage", "%": "percentage",
@@ -443,10 +444,12 @@ def targets_in(meanings: Mapping[str, Meaning]) -> list[tuple[str, str]]:
     `wheels.left.target`.
     """
     found: dict[str, str] = {
-        each.target_of: name for name, each in meanings.items() if each.target_of in meanings
+        each.target_of: name
+        for name, each in meanings.items()
+        if each.target_of is not None and each.target_of in meanings
     }
     for name, each in meanings.items():
-        if each.same_as in meanings and not each.sets:
+        if each.same_as is not None and each.same_as in meanings and not each.sets:
             for one, other in ((name, each.same_as), (each.same_as, name)):
                 if other in found:
                     found.setdefault(one, found[other])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.database.connection import transaction
 from webots_mcp.errors import InvalidInputError
@@ -192,14 +192,15 @@ def _place(stored: StoredMeaning) -> tuple[int, bool, int]:
     return _STRENGTH[stored.set_by], "*" in name, -len(name)
 
 
-def _said(values: list[object]) -> DeclaredMeaning | None:
-    said = DeclaredMeaning(*values)  # type: ignore[arg-type]
-    texts = (said.name, said.unit, said.target_of, said.same_as, said.side)
+def _said(values: Sequence[Any]) -> DeclaredMeaning | None:
+    """What a row says; None where it holds values that no version writes: SQLite takes any."""
+    name, quantity, role, unit, target_of, same_as, side, low, high = values
+    texts, numbers = (unit, target_of, same_as, side), (low, high)
     is_ours = (
-        isinstance(said.name, str)
-        and said.quantity in (None, *QUANTITIES)
-        and said.role in (None, *ROLES)
+        isinstance(name, str)
+        and quantity in (None, *QUANTITIES)
+        and role in (None, *ROLES)
         and all(each is None or isinstance(each, str) for each in texts)
-        and all(each is None or isinstance(each, (int, float)) for each in (said.low, said.high))
+        and all(each is None or isinstance(each, (int, float)) for each in numbers)
     )
-    return said if is_ours else None
+    return DeclaredMeaning(*values) if is_ours else None

@@ -16,6 +16,7 @@ from webots_mcp.cli import described
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.server.mcp_server import create_server
+from webots_mcp.signals.meaning import QUANTITIES, ROLES, SIDES, short_forms, understood_words
 from webots_mcp.testing import pytest_plugin
 
 _COMMENT: Final = re.compile(r"/\*(.*?)\*/", re.DOTALL)
@@ -77,6 +78,25 @@ def checks(_page: str = "") -> str:
     """Each check with what it needs."""
     rows = [[each.name, each.means, each.needs or "nothing"] for each in CHECKS]
     return "## The checks\n\n" + _table(["check", "when it warns and fails", "needs"], rows)
+
+
+def meanings(_page: str = "") -> str:
+    """What may be declared of a signal, and the words of names that need no declaration."""
+    fields = [
+        ["`quantity`", ", ".join(f"`{each}`" for each in QUANTITIES)],
+        ["`role`", ", ".join(f"`{each}`" for each in ROLES)],
+        ["`side`", ", ".join(f"`{each}`" for each in SIDES)],
+        ["`unit`", "a text of up to 20 characters"],
+        ["`target_of`, `same_as`", "the name of one other signal"],
+        ["`low`, `high`", "finite numbers"],
+    ]
+    words = [[said, ", ".join(f"`{w}`" for w in ws)] for said, ws in understood_words().items()]
+    forms = [[f"`{short}`", f"`{long}`"] for short, long in short_forms().items()]
+    return "\n".join((
+        "## What may be declared\n", _table(["field", "values"], fields),
+        "## Words that are understood\n", _table(["meaning", "words and units"], words),
+        "## Short forms\n", _table(["short form", "stands for"], forms),
+    ))  # fmt: skip
 
 
 def commands(_page: str = "") -> str:
@@ -181,6 +201,7 @@ def _table(columns: list[str], rows: list[list[str]]) -> str:
 ADDED: Final[dict[str, Callable[[str], str]]] = {
     "docs/index": navigation,
     "docs/check": checks,
+    "docs/meanings": meanings,
     "docs/tools": tools,
     "docs/command-line": commands,
     "docs/database": tables,

@@ -137,7 +137,7 @@ def test_a_publisher_records_what_its_throttle_admits(base: Base) -> None:
         base.breakpoints(pause, keeper),
         Watch(base.clock, 0.0),
         keeper,
-        DeviceReader(base.simulation, base.journal, base.errors),
+        DeviceReader(base.simulation, base.journal, base.errors, lambda: None),
         Reloads(base.errors.failed),
         begin_run=lambda: None,
     )

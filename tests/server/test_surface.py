@@ -39,6 +39,7 @@ READING = {
 }
 ACTING = {
     "webots_annotate_run",
+    "webots_describe_signals",
     "webots_report",
     "webots_set_parameters",
     "webots_take_screenshot",
@@ -75,7 +76,7 @@ async def test_exactly_the_named_tools_are_there(
 
 
 @pytest.mark.parametrize(
-    ("core", "tools", "size", "tokens"), [(False, 33, 31_000, 7_150), (True, 18, 18_200, 4_150)]
+    ("core", "tools", "size", "tokens"), [(False, 34, 33_000, 7_600), (True, 18, 18_400, 4_200)]
 )
 async def test_the_list_is_short(
     connect: Connect, core: bool, tools: int, size: int, tokens: int
@@ -209,6 +210,7 @@ async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
     assert {name for name, note in told.items() if not note.destructive_hint} == {
         "webots_annotate_run",
         "webots_breakpoint",
+        "webots_describe_signals",
         "webots_set_parameters",
         "webots_take_screenshot",
     }

@@ -205,6 +205,15 @@ class SignalsAnswer(NotedAnswer):
     cursor: int | None = said("Ask again with this cursor for more.")
 
 
+class SignalMeaningsAnswer(NotedAnswer):
+    """What signals mean."""
+
+    signals: AnswerTable | None = said("source: declared, device, named or unknown.")
+    total: int | None = said("How many signals match.")
+    unknown: list[str] | None = said("Numeric signals of unknown meaning, which are not judged.")
+    changed: list[str] | None = said("The signals that were described, or the undone names.")
+
+
 class NumberSeries(AnswerPart):
     """A numeric signal: one item per bucket in each list, null where it has no value."""
 

@@ -294,16 +294,26 @@ _MOST_CLASSES: Final = 1000  # a program may make classes without end
 class DeviceReader:
     """Reads a robot's devices, and measures how long that takes.
 
+    Args:
+        describe: Called once, after the first reading: records what the devices are.
+
     Attributes:
         ring_interval: One call of `auto_publish` in this many reads the devices for the ring
             buffer alone, which limits the mean time of all calls to 100 us.
         why: The reason for an interval above 1; empty while the interval is 1.
     """
 
-    def __init__(self, simulation: Simulation, journal: Journal, errors: ErrorReport) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        journal: Journal,
+        errors: ErrorReport,
+        describe: Callable[[], object],
+    ) -> None:
         self._simulation = simulation
         self._journal = journal
         self._errors = errors
+        self._describe: Callable[[], object] | None = describe
         self._durations_us: deque[float] = deque(maxlen=_READINGS)
         self._reported_interval = 1
         self.ring_interval = 1
@@ -315,12 +325,22 @@ class DeviceReader:
             return {}
         started_s = time.perf_counter()
         try:
-            return read_devices(self._simulation.robot, self._failed)
+            values = read_devices(self._simulation.robot, self._failed)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
             return {}
         finally:
             self._count(1e6 * (time.perf_counter() - started_s))
+        if self._describe is not None:
+            self._describe_devices(self._describe)
+        return values
+
+    def _describe_devices(self, describe: Callable[[], object]) -> None:
+        self._describe = None
+        try:
+            describe()
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("describing the devices", error)
 
     def _failed(self, name: str, error: Exception) -> None:
         self._errors.failed(f"auto_publish of the device {name!r}", error)

@@ -32,6 +32,7 @@ from webots_mcp.contract import (
 )
 from webots_mcp.database.location import Database, MemoryDatabase, resolve_database
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.signals.meaning import declare_meaning
 from webots_mcp.signals.parameter import declare
 
 if TYPE_CHECKING:
@@ -420,6 +421,50 @@ class MCPBridge:
             name, default, low=low, high=high, choices=choices, doc=doc, unit=unit
         )
         return self._session.parameters.declare(declaration)
+
+    def describe(
+        self,
+        name: str,
+        *,
+        quantity: str | None = None,
+        role: str | None = None,
+        unit: str | None = None,
+        target_of: str | None = None,
+        same_as: str | None = None,
+        side: str | None = None,
+        low: float | None = None,
+        high: float | None = None,
+    ) -> None:
+        """Say what a published signal means, where its name does not.
+
+            bridge.describe("u", quantity="speed", role="commanded", unit="m/s")
+            bridge.describe("q.*", quantity="joint position", unit="rad", low=-1.5, high=1.5)
+
+        Events, checks and comparisons then use it, also for runs that were recorded before. A
+        signal whose meaning is unknown is not judged. The declaration is stored with the robot; a
+        later one replaces it. docs/meanings.md lists the quantities and the names that need no
+        description.
+
+        Args:
+            name: The dotted name of the signal, such as `motors.left`. A `*` stands for any text.
+            quantity: What it measures or sets, such as `speed`, `wheel speed` or `distance`.
+            role: `measured`, `commanded`, `target` or `limit`.
+            unit: Its unit, such as `m/s`.
+            target_of: The measured signal whose target it is.
+            same_as: Another signal that measures the same.
+            side: The part of the robot, such as `left` or `front right`.
+            low: The lowest value that it can have.
+            high: The highest value that it can have.
+
+        Raises:
+            ValueError: A value is not allowed (the text lists those that are), nothing is said, or
+                there are 2,000 declarations already.
+        """
+        said = {
+            "quantity": quantity, "role": role, "unit": unit, "target_of": target_of,
+            "same_as": same_as, "side": side, "low": low, "high": high,
+        }  # fmt: skip
+        self._session.meanings.declare(declare_meaning(name, **said))
 
     def breakpoint(
         self, condition: str, action: BreakpointAction = "pause", after_hits: int = 1

@@ -12,10 +12,12 @@ from webots_mcp.bridge.breakpoints import Breakpoints, Watch
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.controller_actions import ControllerActions
+from webots_mcp.bridge.device_meanings import describe_devices
 from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.meanings import SignalMeanings
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.picture_actions import PictureActions
@@ -74,6 +76,7 @@ class BridgeSession:
         self.parameters = Parameters(
             clock, recorder, journal, self.handlers, errors, self.identity.robot_name
         )
+        self.meanings = SignalMeanings(recorder)
         self.breakpoints = Breakpoints(
             simulation, clock, recorder, journal, self.pause, self.keeper
         )
@@ -87,7 +90,7 @@ class BridgeSession:
             self.breakpoints,
             self.watch,
             self.keeper,
-            DeviceReader(simulation, journal, errors),
+            DeviceReader(simulation, journal, errors, self._describe_devices),
             self.reloads,
             self.begin_run,
         )
@@ -126,6 +129,12 @@ class BridgeSession:
         by_name = {name: action for part in actions for name, action in part.by_name().items()}
         parts = (simulation, clock, self.journal, self.heartbeat, queue, pause)
         return Control(*parts, self.reloads, self.handlers, by_name)
+
+    def _describe_devices(self) -> None:
+        """Record what the devices say of the signals that are made of them."""
+        simulation = self.simulation
+        known = describe_devices(simulation.robot, is_supervisor=simulation.supervisor)
+        self.meanings.record_devices(known)
 
     def attach(self, serve: Callable[[], ClaimedCommand | None]) -> Attachment:
         """Listen to each step of the robot from now on.

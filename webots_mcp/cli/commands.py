@@ -39,7 +39,7 @@ _OF_THE_CORE: Final = {
     "history": CommandEntry(PAST, f"{_Q}.history", "webots_query_history"),
     "label": CommandEntry(DATA, f"{_Q}.compare_runs", "webots_annotate_run"),
     "runs": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
-    "signals": CommandEntry(PAST, f"{_Q}.history", "webots_list_signals"),
+    "signals": CommandEntry(PAST, _STEERING, "signals"),
     "sql": CommandEntry(PAST, f"{_Q}.query_sql", "webots_query_sql"),
     "status": CommandEntry(NOW, f"{_Q}.list_robots", "webots_list_robots"),
     "trends": CommandEntry(PAST, f"{_Q}.history", "webots_get_trends"),

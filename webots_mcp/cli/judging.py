@@ -98,14 +98,14 @@ def check(
 
 def _compile(recorded: Where) -> None:
     """Let controllers that start without a server read what their project expects now."""
-    from webots_mcp.store.project_file import compile_project, file_of, read_project
+    from webots_mcp.store.project_file import NO_PROJECT, compile_project, file_of, read_project
 
     recording = recorded.recording(read_only=False)
     file = file_of(recording.data_dir)
-    expected = read_project(file) if file else []
+    project = read_project(file) if file else NO_PROJECT
     # Where nothing can be written it is asked all the same, of what is recorded.
     with contextlib.suppress(WebotsMCPError, sqlite3.Error), recording.writer() as connection:
-        compile_project(connection, expected)
+        compile_project(connection, project)
 
 
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
@@ -116,7 +116,9 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     def typed(cell: Any) -> Any:
         called = re.fullmatch(r"webots_(\w+)\(.*\)", str(cell))
         if called is None:
-            return cell
+            return cell.replace(_DESCRIBE, _DESCRIBE_TYPED) if isinstance(cell, str) else cell
+        if called[1] == "describe_signals":
+            return _description_as_typed(cell)
         words = ["webots-mcp", commands_by_tool().get(called[1], called[1])]
         call: Any = ast.parse(cell, mode="eval").body
         for keyword in call.keywords:
@@ -131,6 +133,18 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     if table:
         changed["checks"] = table | {"rows": [[*map(typed, row)] for row in table["rows"]]}
     return answer | changed
+
+
+_DESCRIBE: Final = "webots_describe_signals(...)"
+_DESCRIBE_TYPED: Final = "webots-mcp signals --describe"
+
+
+def _description_as_typed(call: str) -> str:
+    """The command that describes a signal, for the call of the tool."""
+    keywords: Any = cast("Any", ast.parse(call, mode="eval").body).keywords
+    said = {each.arg: ast.literal_eval(each.value) for each in keywords}
+    (name,) = said.pop("signals")
+    return f"{_DESCRIBE_TYPED} {shlex.join([name, *(f'{k}={v}' for k, v in said.items())])}"
 
 
 def _write(file: Path, answer: dict[str, Any]) -> None:

@@ -360,16 +360,19 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
 
     if (file := file_of(data_dir)) is None:
         return None
-    expected = read_project(file)
-    if not expected and not (data_dir / DATABASE_NAME).exists():
+    project = read_project(file)
+    if not any(project) and not (data_dir / DATABASE_NAME).exists():
         return None
     if not writing.dry_run:
         make_folder(data_dir)
         with closing(connect(data_dir / DATABASE_NAME, "writer", create=True)) as connection:
             if schema_version(connection) == 0:
                 create_schema(connection)
-            compile_project(connection, expected)
-    counted = f"{len(expected)} expectation{'s' * (len(expected) != 1)}"
+            compile_project(connection, project)
+    expected, signals = map(len, project)
+    counted = f"{expected} expectation{'s' * (expected != 1)}"
+    if signals:
+        counted += f" and the meaning of {signals} signal{'s' * (signals != 1)}"
     return f"{file}: {counted}; webots-mcp check judges runs by what is there"
 
 

@@ -122,6 +122,82 @@ def parameters(
     _show(webots_set_parameters, asked, as_json=json, values=settings, when=when)
 
 
+def signals(
+    *words: Annotated[
+        str,
+        Parameter(
+            "PATTERN",
+            help=r"Of signals; '\*' is any text. (\*) With --describe: FIELD=VALUE, such as "
+            "quantity=speed.",
+        ),
+    ],
+    describe: Annotated[
+        str | None,
+        Parameter("--describe", metavar="NAME", help="Say what the signals of this name mean."),
+    ] = None,
+    undo: Annotated[
+        str | None,
+        Parameter("--undo", metavar="NAME", help="Remove what was declared of these signals."),
+    ] = None,
+    meanings: Annotated[
+        bool, Parameter("--meanings", negative=(), help="List what they mean, and why.")
+    ] = False,
+    limit: Annotated[Count, Parameter("-n", metavar="N", help="Most shown (100).")] = 100,
+    cursor: Annotated[
+        int | None, Parameter("--after", converter=whole_number, help="From the last answer.")
+    ] = None,
+    run_id: RunId = None,
+    asked: ToRobot = _ROBOT,
+    json: Json = False,
+) -> None:
+    """List the signals of a run: kind, last value, range, missing values, meaning and its source.
+
+        webots-mcp signals 'front*'
+
+    Describe those whose meaning is unknown or wrong. The fields are quantity, role, unit,
+    target_of, same_as, side, low and high; docs/meanings.md lists their values. A description
+    applies to past runs too.
+
+        webots-mcp signals --describe motors.left quantity='wheel speed' role=commanded
+    """
+    from webots_mcp.questions.describe_signals import webots_describe_signals, webots_list_meanings
+    from webots_mcp.questions.history import webots_list_signals
+
+    if describe is not None and undo is not None:
+        raise InvalidInputError("give --describe NAME or --undo NAME, not both")
+    if describe is not None:
+        said = _fields_of(words)
+        return _show(webots_describe_signals, asked, as_json=json, signals=[describe], **said)
+    if undo is not None and words:
+        raise InvalidInputError(f"--undo takes one name: leave out {words[0]!r}")
+    if undo is not None:
+        return _show(webots_describe_signals, asked, as_json=json, signals=[undo], undo=True)
+    if meanings:
+        names = [*words] or None
+        return _show(webots_list_meanings, asked, as_json=json, signals=names)
+    if len(words) > 1:
+        raise InvalidInputError(f"give one pattern, in quotes: {words[1]!r} is too much")
+    given = {"pattern": words[0]} if words else {}
+    given |= {"limit": limit, "cursor": cursor, "run_id": run_id}
+    _show(webots_list_signals, asked, as_json=json, **given)
+
+
+def _fields_of(words: tuple[str, ...]) -> dict[str, Any]:
+    """What is said of a signal, of texts FIELD=VALUE; only limits are numbers."""
+    from webots_mcp.cli.options import settings_of
+    from webots_mcp.signals.meaning import MEANING_FIELDS
+
+    limits = ("low", "high")
+    kinds = dict.fromkeys((each for each in MEANING_FIELDS if each not in limits), "str")
+    said = settings_of(words, kinds)
+    if not said:
+        raise InvalidInputError("--describe NAME needs FIELD=VALUE, such as quantity=speed")
+    if unknown := [name for name in said if name not in MEANING_FIELDS]:
+        fields = ", ".join(MEANING_FIELDS)
+        raise InvalidInputError(f"unknown field {unknown[0]!r:.80}. Fields: {fields}")
+    return said
+
+
 def breakpoint_(
     condition: Annotated[
         str | None, Parameter("CONDITION", help="Such as 'front_m < 0.1 for 0.5'.")

@@ -18,6 +18,9 @@ _OTHERS: Final = {  # by tool: those that are answered by a command of another n
     "breakpoint": "breakpoint", "list_commands breakpoints": "breakpoint",
     "list_commands parameters": "parameters", "set_parameters": "parameters",
     "list_commands outcome": "wait", "list_runs trials": "trials", "run_trials": "trials",
+    "list_signals": "signals", "get_trends signals": "signals",
+    "describe_signals": "signals --describe", "get_trends meanings": "signals --meanings",
+    "list_meanings": "signals --meanings",
     "plot": "plot", "report": "report",
     "simulation_control": "send", "world_reset": "send reset",
 }  # fmt: skip

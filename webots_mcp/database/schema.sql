@@ -112,6 +112,26 @@ CREATE TABLE signal (
 	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_signal_robot_id_role ON signal (robot_id, role) WHERE role IS NOT NULL;
+CREATE TABLE meaning (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER /* null: of robot_name */, 
+	name TEXT NOT NULL /* signal.name, or a pattern in which * is any text */, 
+	source TEXT NOT NULL /* declared or device */, 
+	quantity TEXT /* speed, wheel speed, distance, ... */, 
+	role TEXT /* measured, commanded, target or limit */, 
+	unit TEXT, 
+	target_of TEXT /* the signal whose target it is */, 
+	same_as TEXT /* the signal that measures the same */, 
+	side TEXT /* left, right, front left, ... */, 
+	low FLOAT /* the lowest value it can have */, 
+	high FLOAT /* the highest value it can have */, 
+	set_wall_time_s FLOAT NOT NULL, 
+	set_by TEXT NOT NULL /* mcp, cli, project (its file), controller (its code), bridge (the device) */, 
+	why TEXT /* of a device: its type, model and sampling period */, 
+	robot_name TEXT /* of the project's file: a robot's, or * for all */, 
+	CONSTRAINT uq_meaning_robot_id UNIQUE (robot_id, name, source, set_by), 
+	CONSTRAINT fk_meaning_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
+);
 CREATE TABLE row_group (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	run_id INTEGER NOT NULL, 

@@ -53,6 +53,8 @@ Kind = Literal[
     "parameter",
     "parameter values",
     "parameter next",
+    "meaning",
+    "device meanings",
     "command issued",
     "command finished",
     "reload confirmed",
@@ -63,6 +65,17 @@ Kind = Literal[
     "kept state",
 ]
 Values = tuple[Any, ...] | dict[str, Any]
+
+_OF_MEANING: Final = (
+    "name, quantity, role, unit, target_of, same_as, side, low, high"  # in this order
+)
+_OF_ITEMS: Final = ", ".join(f"json_extract(r.value, '$[{item}]')" for item in range(10))
+_SAME_MEANING: Final = (
+    "ON CONFLICT (robot_id, name, source, set_by) DO UPDATE SET quantity = excluded.quantity, "
+    "role = excluded.role, unit = excluded.unit, target_of = excluded.target_of, "
+    "same_as = excluded.same_as, side = excluded.side, low = excluded.low, high = excluded.high, "
+    "why = excluded.why, set_wall_time_s = excluded.set_wall_time_s"
+)
 
 # Values in order follow on the run's id, where there is a run; named ones may use the ids of
 # `run` and `session` too. Ids are those of the database at hand, so they never wait in a file.
@@ -143,6 +156,17 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "json_extract(value, '$[0]') AS name, json_extract(value, '$[1]') AS next_value "
         "FROM json_each(:rows)) AS r WHERE parameter.name = r.name AND session_id = :session "
         "AND robot_id = (SELECT robot_id FROM session WHERE id = :session)"
+    ),
+    "meaning": (
+        f"INSERT INTO meaning (robot_id, {_OF_MEANING}, source, set_wall_time_s, set_by) "
+        "SELECT robot_id, :name, :quantity, :role, :unit, :target_of, :same_as, :side, :low, "
+        f":high, 'declared', :now, 'controller' FROM session WHERE id = :session {_SAME_MEANING}"
+    ),
+    # Many at once: each of `rows` is an array of name, what the device says, and why.
+    "device meanings": (
+        f"INSERT INTO meaning (robot_id, {_OF_MEANING}, why, source, set_wall_time_s, set_by) "
+        f"SELECT s.robot_id, {_OF_ITEMS}, 'device', :now, 'bridge' "
+        f"FROM session s, json_each(:rows) r WHERE s.id = :session {_SAME_MEANING}"
     ),
     "command issued": queue.ISSUE,
     "command finished": queue.FINISH,

@@ -15,8 +15,8 @@ from webots_mcp.questions.declaring import Question
 # In the order in which clients list them; those of plugins follow.
 MODULES: Final = (
     "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor", "history",
-    "events", "compare_runs", "query_sql", "control_simulation", "run_trials", "breakpoints",
-    "send_command", "parameters", "edit_scene",
+    "describe_signals", "events", "compare_runs", "query_sql", "control_simulation", "run_trials",
+    "breakpoints", "send_command", "parameters", "edit_scene",
 )  # fmt: skip
 
 

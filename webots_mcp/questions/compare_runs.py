@@ -493,7 +493,7 @@ def webots_check_run(
     """
     expected = [read_expectation(each) for each in expect or ()]
     file = file_of(recording.data_dir)
-    project = None if file is None else read_project(file)
+    project = None if file is None else read_project(file).expected
     with recording.view(robot, run_id) as view:
         return answer_about(view, CheckAnswer, lambda: _checked(view, expected, project))
 

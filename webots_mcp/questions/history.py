@@ -49,6 +49,7 @@ from webots_mcp.questions.arguments import (
     ShownLimit,
 )
 from webots_mcp.questions.declaring import READS, merged, question
+from webots_mcp.questions.describe_signals import webots_list_meanings
 from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
@@ -62,7 +63,9 @@ from webots_mcp.store.series import (
     query_rows,
 )
 
-SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
+SIGNAL_COLUMNS: Final = (
+    "signal", "kind", "unit", "last", "min", "max", "missing", "meaning", "source",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,9 +91,6 @@ _SIZES: Final = HistorySizes()
 @question(
     "List the signals",
     READS,
-    command="signals",
-    positional=("pattern",),
-    example="'front*'",
     quotes=True,
 )
 def webots_list_signals(
@@ -105,7 +105,8 @@ def webots_list_signals(
 ) -> SignalsAnswer:
     """The dotted names of all that was published in a run: kind, last value, range, missing values.
 
-    Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
+    `meaning` is what each signal is taken for, `source` how that is known; webots_describe_signals
+    corrects it. Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
     """
     with recording.view(robot, run_id) as view:
         return answer_about(view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0))
@@ -116,9 +117,11 @@ def _signal_row(info: SignalInfo, rows: int) -> list[Any]:
     return [
         short_name(info.name),
         info.kind,
-        info.unit,
+        info.meaning.unit or info.unit,
         *(_value(info, each) for each in (shown(info.last), figure(info.min), figure(info.max))),
         _missing(info, rows),
+        info.meaning.words,
+        info.meaning.source,
     ]
 
 
@@ -457,8 +460,12 @@ def _hint_of_trends(runs: Sequence[RunTrendTables]) -> str | None:
 TRENDS: Final = merged(
     webots_get_trends,
     choice="what",
-    meaning="signals: names, kinds, last values, ranges.",
-    parts={"trends": webots_get_trends, "signals": webots_list_signals},
+    meaning="signals: names, last values, ranges, meanings; meanings: what each is taken for, why.",
+    parts={
+        "trends": webots_get_trends,
+        "signals": webots_list_signals,
+        "meanings": webots_list_meanings,
+    },
     text="""\
 What each signal did, in words: shape, slope, when its least and greatest; what matters first.
 

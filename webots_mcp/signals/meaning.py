@@ -9,10 +9,11 @@ Standard library only, because the bridge imports it inside a robot's controller
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 from webots_mcp.signals.naming import SOLIDS, WORLD, angle_unit, unit_in, words_of
 
@@ -30,6 +31,11 @@ ROLES: Final[tuple[Role, ...]] = get_args(Role)
 SOURCES: Final[tuple[Source, ...]] = get_args(Source)  # the strongest first
 FIRM: Final = frozenset[Source](("declared", "device", "named"))  # a failure may rest on these
 _OF_OTHERS: Final = (f"{WORLD}.", f"{SOLIDS}.")
+SIDES: Final = (
+    "left", "right", "front", "rear", "front left", "front right", "rear left", "rear right",
+)  # fmt: skip
+LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is declared for
+_LONGEST_UNIT: Final = 20  # characters
 _REMEMBERED: Final = 4096  # names whose words are kept
 
 # -- the words of names ------------------------------------------------------------------------
@@ -81,6 +87,7 @@ _WORD_QUANTITIES: Final[dict[str, Quantity]] = {
     "temperature": "temperature", "pressure": "pressure", "suction": "pressure", "light": "light",
     "lux": "light", "acceleration": "acceleration", "gyro": "angular velocity",
     "compass": "magnetic field", "percent": "percentage", "roll": "roll", "pitch": "pitch",
+    "time": "time", "timestamp": "time",
 }  # fmt: skip
 _UNIT_QUANTITIES: Final[dict[str, Quantity]] = {
     "N": "force", "N·m": "torque", "A": "current", "V": "voltage", "%": "percentage",
@@ -119,6 +126,39 @@ def side_in(name: str) -> str | None:
     if side is None or " " in side or end is None:
         return side
     return f"{end} {side}"
+
+
+def understood_words() -> dict[str, list[str]]:
+    """Return the words and units of names that are understood, by what they say.
+
+    They are given in the long, singular form. The documentation shows this list.
+    """
+    said: dict[str, set[str]] = {}
+    for word, quantity in (*_WORD_QUANTITIES.items(), *_MORE_UNITS.items()):
+        said.setdefault(quantity, set()).add(word)
+    for unit, quantity in _UNIT_QUANTITIES.items():
+        said.setdefault(quantity, set()).add(unit)
+    groups = {
+        "role commanded": _COMMAND,
+        "role target": _TARGET,
+        "role limit": _LIMIT,
+        "role measured": _MEASURED,
+        "side": frozenset((*_SIDES, *_ENDS)),
+        **said,
+        "speed, with unit or alone": frozenset(("speed", "velocity")),
+        "wheel speed": frozenset(("wheel",)),
+        "turn rate": _TURNING | {"yaw", "heading"},
+        "joint position or joint speed": _JOINTS,
+        "motor speed, not of a wheel": _FREE_MOTORS,
+        "angular velocity": said.get("angular velocity", set()) | _GYROS,
+        "count": _COUNTS,
+    }
+    return {meaning: sorted(words) for meaning, words in groups.items()}
+
+
+def short_forms() -> dict[str, str]:
+    """Return the short forms that are understood, with the long form of each."""
+    return dict(sorted(_SHORT_FORMS.items()))
 
 
 # -- meanings ----------------------------------------------------------------------------------
@@ -160,6 +200,14 @@ class Meaning:
     def is_sensed(self) -> bool:
         """Whether it is the reading of a sensor: a known quantity that nobody set or counted."""
         return self.quantity not in _NO_SENSOR and self.role in (None, "measured")
+
+    @property
+    def words(self) -> str | None:
+        """What it is in words, such as `commanded wheel speed, left`; None where it is unknown."""
+        if self.quantity is None:
+            return None
+        said = " ".join(filter(None, (self.role, self.quantity)))
+        return f"{said}, {self.side}" if self.side else said
 
     @property
     def sets(self) -> bool:
@@ -232,18 +280,184 @@ def meanings_by_name(
     }
 
 
+# -- meanings that are declared, or known from a device ------------------------------------------
+
+
+class DeclaredMeaning(NamedTuple):
+    """What is said of a signal; None where nothing is said. The fields are those of `Meaning`."""
+
+    name: str
+    quantity: Quantity | None = None
+    role: Role | None = None
+    unit: str | None = None
+    target_of: str | None = None
+    same_as: str | None = None
+    side: str | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+MEANING_FIELDS: Final = DeclaredMeaning._fields[1:]
+_CHOICES: Final[dict[str, tuple[str, ...]]] = {
+    "quantity": QUANTITIES, "role": ROLES, "side": SIDES,
+}  # fmt: skip
+
+
+class StatedMeaning(NamedTuple):
+    """What a source says of a signal.
+
+    Attributes:
+        said: What it says.
+        source: `declared` or `device`.
+        why: The reason, for a person.
+    """
+
+    said: DeclaredMeaning
+    source: Source
+    why: str
+
+
+def declare_meaning(name: object, /, **said: object) -> DeclaredMeaning:
+    """Return a declaration that is checked as a whole.
+
+    Args:
+        name: The signal, or a pattern in which `*` stands for any text.
+        said: Values by the names in `MEANING_FIELDS`. None is the same as leaving one out.
+
+    Raises:
+        ValueError: A value is not allowed, or nothing is said. The text names what is allowed.
+    """
+    name = _signal_name("name", name)
+    given = {field: value for field, value in said.items() if value is not None}
+    if unknown := sorted(given.keys() - set(MEANING_FIELDS)):
+        fields = ", ".join(MEANING_FIELDS)
+        raise ValueError(f"unknown field {unknown[0]!r} of signal {name!r}. Fields: {fields}")
+    if not given:
+        fields = ", ".join(MEANING_FIELDS)
+        raise ValueError(f"nothing is said of signal {name!r}. Give one or more of {fields}")
+    checked = {field: _checked(name, field, value) for field, value in given.items()}
+    low, high = checked.get("low"), checked.get("high")
+    if low is not None and high is not None and low > high:
+        raise ValueError(f"signal {name!r}: low={low:g} is greater than high={high:g}")
+    return DeclaredMeaning(name, **checked)
+
+
+def _checked(name: str, field: str, value: object) -> Any:
+    if field in _CHOICES:
+        if value not in _CHOICES[field]:
+            allowed = ", ".join(_CHOICES[field])
+            raise ValueError(
+                f"signal {name!r}: {field} cannot be {value!r:.80}. Use one of {allowed}"
+            )
+        return value
+    if field in ("target_of", "same_as"):
+        other = _signal_name(field, value)
+        if other == name or "*" in other:
+            raise ValueError(f"signal {name!r}: {field} must be the name of one other signal")
+        return other
+    if field == "unit":
+        fits = isinstance(value, str) and value.isprintable() and len(value) <= _LONGEST_UNIT
+        if not fits or not value:
+            raise ValueError(
+                f"signal {name!r}: unit must be a text of up to {_LONGEST_UNIT} characters, such "
+                f"as 'm/s', not {value!r:.80}"
+            )
+        return value
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
+        raise ValueError(f"signal {name!r}: {field} must be a finite number, not {value!r:.80}")
+    return float(value)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
+
+
+def _signal_name(field: str, value: object) -> str:
+    if isinstance(value, str) and value.isprintable() and 0 < len(value) <= LONGEST_NAME:
+        return value
+    raise ValueError(
+        f"{field} must be the name of a signal, such as 'motors.left', not {value!r:.80}"
+    )
+
+
+def fits_pattern(pattern: str, name: str) -> bool:
+    """Return whether a pattern fits a name: `*` stands for any text, and nothing else is special.
+
+    In one pass: a regular expression tries all ways, which a long name makes many.
+    """
+    first, *parts = pattern.split("*")
+    if not parts:
+        return name == first
+    at = len(first) if name.startswith(first) else -1
+    for part in parts[:-1]:
+        found = name.find(part, at) if at >= 0 else -1
+        at = found + len(part) if found >= 0 else -1
+    return at >= 0 and name.endswith(parts[-1], at)
+
+
+def meaning_stated(name: str, stated: Sequence[StatedMeaning], named: Meaning) -> Meaning:
+    """Return what a signal means by all that is said of it and by its name.
+
+    Each field is that of the strongest source that says it. Unit, limits and role of a weaker
+    source count only where the stronger one does not say another quantity.
+
+    Args:
+        name: The signal.
+        stated: What is said of it, the strongest first.
+        named: What its name tells.
+    """
+    meaning = named
+    for each in reversed(stated):
+        meaning = _stated_over(name, each, meaning)
+    return meaning
+
+
+def _stated_over(name: str, stated: StatedMeaning, weaker: Meaning) -> Meaning:
+    said = stated.said
+    quantity = said.quantity or weaker.quantity
+    agrees = weaker.quantity in (None, quantity)
+    role = said.role or (weaker.role if agrees else None)
+    if role is None and quantity is not None:
+        role = _role_of(name, quantity, "")
+    decides = said.quantity is not None or weaker.quantity is None
+    low, high = said.low, said.high
+    if low is None and high is None and agrees:
+        low, high = weaker.low, weaker.high
+    return Meaning(
+        quantity,
+        role,
+        said.unit or (weaker.unit if agrees else None) or unit_in(name),
+        said.target_of or weaker.target_of,
+        said.same_as or weaker.same_as,
+        said.side or weaker.side or side_in(name),
+        low,
+        high,
+        stated.source if decides else weaker.source,
+        stated.why if decides else f"{weaker.why}; {stated.why}",
+    )
+
+
 def targets_in(meanings: Mapping[str, Meaning]) -> list[tuple[str, str]]:
     """Return the pairs of a measured signal and its target.
 
-    Declared ones count first. Else both have the same quantity, or one of them none that is known,
-    and the same words but for those of a role and of the quantity itself: `elbow.pos` and
-    `elbow.target`, `wheels.left.velocity` and `wheels.left.target`.
+    Declared ones count first; a signal that is the same as another one has its target too. Else
+    both have the same quantity, or one of them none that is known, and the same words but for those
+    of a role and of the quantity itself: `elbow.pos` and `elbow.target`, `wheels.left.velocity` and
+    `wheels.left.target`.
     """
-    found = {
+    found: dict[str, str] = {
         each.target_of: name
         for name, each in meanings.items()
         if each.target_of is not None and each.target_of in meanings
     }
+    for name, each in meanings.items():
+        if each.same_as is not None and each.same_as in meanings and not each.sets:
+            for one, other in ((name, each.same_as), (each.same_as, name)):
+                if other in found:
+                    found.setdefault(one, found[other])
     by_subject: dict[tuple[frozenset[str], tuple[str, ...]], list[str]] = {}
     for name, meaning in meanings.items():
         if meaning.sets or (meaning.quantity is None and _role_in(name) in ("commanded", "target")):

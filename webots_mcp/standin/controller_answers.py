@@ -137,6 +137,11 @@ class SupervisorRequests:
         """Return a node by its number."""
         return self.shown(self._world.node(node_id))
 
+    def on_node_get_from_device(self, tag: int) -> Any:
+        """Return the node of one of the robot's devices."""
+        device = self._robot.devices.get(tag)
+        return self.shown(device.node if device else None)
+
     def on_node_get_parent_node(self, node_id: int) -> Any:
         """Return the parent of a node."""
         return self.shown(self._world.parent_of(self._node(node_id)))

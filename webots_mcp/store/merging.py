@@ -31,6 +31,7 @@ from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
 from webots_mcp.database.liveness import end_session, reap
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.signals.meaning import MEANING_FIELDS
 from webots_mcp.signals.register import Kind, Seen
 from webots_mcp.store.chunks import (
     SIM_TIMES,
@@ -110,6 +111,15 @@ _RUN_OF_REQUESTS: Final = (
     "UPDATE main.request SET run_id = (SELECT n.id FROM source.request s JOIN source.run r "
     "ON r.id = s.run_id JOIN main.run n ON n.uuid = r.uuid WHERE s.uuid = request.uuid) "
     "WHERE run_id IS NULL AND uuid IN (SELECT uuid FROM source.request)"
+)
+_OF_MEANING: Final = ", ".join(
+    ("name", "source", *MEANING_FIELDS, "set_wall_time_s", "set_by", "why")
+)
+_COPY_MEANINGS: Final = (
+    f"INSERT OR IGNORE INTO main.meaning (robot_id, {_OF_MEANING}) SELECT :here, {_OF_MEANING} "
+    "FROM source.meaning WHERE robot_id = :there OR (robot_id IS NULL AND robot_name IN ('*', "
+    "(SELECT name FROM source.robot WHERE id = :there))) "
+    "ORDER BY robot_name IS NULL DESC, robot_name = '*', id"  # of two, the robot's own is taken
 )
 _TRIAL_SETS: Final = (
     "SELECT id, uuid FROM source.trial_set s WHERE :run IS NULL "
@@ -316,8 +326,17 @@ def _ingest_run_rows(
         set_by = connection.execute(_SET_BY, (run,)).fetchall()
         renamed = [(commands.get(command_id), value_id) for value_id, command_id in set_by]
         connection.executemany("UPDATE parameter_value SET command_id = ? WHERE id = ?", renamed)
+    _copy_meanings(connection, robot_id, owner["robot_id"])
     if is_new:
         _insert(connection, "parameter", "session_id = ?", session_id, owner | {"session_id": here})
+
+
+def _copy_meanings(connection: sqlite3.Connection, there: int, here: int) -> None:
+    """Copy what is said of a robot's signals, unless the same one has said something of it here.
+
+    What the file of its project says is from now on said of this robot alone: here is another file.
+    """
+    connection.execute(_COPY_MEANINGS, {"there": there, "here": here})
 
 
 def _ingest_trials(connection: sqlite3.Connection, run_id: int | None) -> None:

@@ -210,6 +210,38 @@ class Signal(SQLModel, table=True):
     max: float | None = _number()
 
 
+class SignalMeaning(SQLModel, table=True):
+    """What is said of a signal's meaning: declared by somebody, or known from its device.
+
+    Of what several say, the newest of `mcp` and `cli` counts, then `project`, `controller` and
+    `bridge`.
+    """
+
+    __tablename__: ClassVar[Any] = "meaning"
+    __table_args__ = (
+        UniqueConstraint("robot_id", "name", "source", "set_by"),
+        _KEEP_IDS,
+    )
+    id: int | None = _id()
+    robot_id: int | None = _to("robot", "null: of robot_name", nullable=True, on_delete="CASCADE")
+    name: str = _text("signal.name, or a pattern in which * is any text", nullable=False)
+    source: str = _text("declared or device", nullable=False)
+    quantity: str | None = _text("speed, wheel speed, distance, ...")
+    role: str | None = _text("measured, commanded, target or limit")
+    unit: str | None = _text()
+    target_of: str | None = _text("the signal whose target it is")
+    same_as: str | None = _text("the signal that measures the same")
+    side: str | None = _text("left, right, front left, ...")
+    low: float | None = _number("the lowest value it can have")
+    high: float | None = _number("the highest value it can have")
+    set_wall_time_s: float = _number(nullable=False)
+    set_by: str = _text(
+        "mcp, cli, project (its file), controller (its code), bridge (the device)", nullable=False
+    )
+    why: str | None = _text("of a device: its type, model and sampling period")
+    robot_name: str | None = _text("of the project's file: a robot's, or * for all")
+
+
 class RowGroup(SQLModel, table=True):
     """About 1,024 state rows of a run that follow each other, whose values stand in chunks.
 

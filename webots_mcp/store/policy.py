@@ -32,6 +32,7 @@ from webots_mcp.contract import PROJECT_FILE
 from webots_mcp.database.files import full_path
 from webots_mcp.database.location import Database, find_project
 from webots_mcp.errors import InvalidInputError, NotAllowedError
+from webots_mcp.signals.meaning import fits_pattern
 from webots_mcp.store.project_file import load_toml
 
 ALLOW: Final = "allow"
@@ -145,7 +146,7 @@ class Policy:
     def _require_not_forbidden(self, brought_about: str, action: str) -> None:
         """Refuse what another action brings about, where a pattern forbids it."""
         patterns = cast("list[str]", self.allow.get("actions", []))
-        if any(_fits(each.removeprefix("!"), brought_about) for each in patterns):
+        if any(fits_pattern(each.removeprefix("!"), brought_about) for each in patterns):
             said = f"{brought_about!r}, which this {action!r:.100} does as well, is not allowed"
             self._require("actions", [brought_about], said)
 
@@ -153,7 +154,7 @@ class Policy:
         """Refuse what the tools of an action may not do, also if another one is asked for it."""
         tools = TOOLS_OF_ACTIONS.get(action, ())
         patterns = cast("list[str]", self.allow.get("tools", []))
-        is_named = any(_fits(p.removeprefix("!"), tool) for p in patterns for tool in tools)
+        is_named = any(fits_pattern(p.removeprefix("!"), tool) for p in patterns for tool in tools)
         if tools and (is_named or ANY_ACTION in asked):
             by = f"{action!r:.100}, which {tools[-1]} does, is not allowed"
             self._require("tools", tools, by)
@@ -182,7 +183,7 @@ class Policy:
         if not isinstance(values, Mapping):
             raise self._refusal("parameters", "parameters without names are not allowed")
         for name, value in cast("Mapping[str, object]", values).items():
-            key = name if name in rules else next((k for k in rules if _fits(k, name)), None)
+            key = name if name in rules else next((k for k in rules if fits_pattern(k, name)), None)
             if key is None:
                 raise self._refusal("parameters", f"the parameter {name!r:.100} is not allowed")
             if not _is_within(value, rules[key]):
@@ -194,7 +195,9 @@ class Policy:
         patterns = cast("list[str] | None", self.allow.get(key))
         if patterns is None:
             return
-        fitting = [p for p in patterns if any(_fits(p.removeprefix("!"), name) for name in names)]
+        fitting = [
+            p for p in patterns if any(fits_pattern(p.removeprefix("!"), name) for name in names)
+        ]
         if not fitting or fitting[-1].startswith("!"):
             raise self._refusal(key, said, fitting[-1] if fitting else None)
 
@@ -219,21 +222,6 @@ def _brought_about(action: str, params: Mapping[str, Any]) -> Iterator[str]:
         yield "fast"
     if is_run and params.get("then") == "go_on":
         yield "resume"
-
-
-def _fits(pattern: str, name: str) -> bool:
-    """Whether a pattern is of a name: `*` is any text, and nothing else is special.
-
-    In one pass: a regular expression tries all ways, which a long name makes many.
-    """
-    first, *parts = pattern.split("*")
-    if not parts:
-        return name == first
-    at = len(first) if name.startswith(first) else -1
-    for part in parts[:-1]:
-        found = name.find(part, at) if at >= 0 else -1
-        at = found + len(part) if found >= 0 else -1
-    return at >= 0 and name.endswith(parts[-1], at)
 
 
 def _is_within(value: object, rule: Any) -> bool:
@@ -293,8 +281,10 @@ def read_policy(file: Path) -> Policy | None:
     """
     try:
         text, content = load_toml(file)
-        if unknown := sorted(set(content) - {ALLOW, "expect"}):
-            raise InvalidInputError(f"{file}: {unknown[0]!r} is unknown; there is allow and expect")
+        if unknown := sorted(set(content) - {ALLOW, "expect", "signals"}):
+            raise InvalidInputError(
+                f"{file}: {unknown[0]!r} is unknown; there is allow, expect and signals"
+            )
         if ALLOW not in content:
             return None
         if (wrong := next(_faults(content[ALLOW]), None)) is not None:

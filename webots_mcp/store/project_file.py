@@ -1,4 +1,6 @@
-"""`webots-mcp.toml` of a project: what is expected of its robots, compiled into the database.
+"""`webots-mcp.toml` of a project: what is expected of its robots and what their signals mean.
+
+Both are compiled into the database.
 
     [[expect]]
     name = "keeps its distance"
@@ -6,8 +8,14 @@
     during = "mode == 'drive'"  # may be left out, as may the name
     robot = "rover"             # else all robots
 
-Bridges read it from there, with each run. A file that is invalid changes nothing. `policy` reads
-its table `[allow]`.
+    [signals]                      # what signals mean, of every robot
+    "motors.left" = {quantity = "wheel speed", role = "commanded", side = "left"}
+
+    [signals.rover]                # of this robot alone
+    u = {quantity = "speed", role = "commanded", unit = "m/s"}
+
+Bridges read expectations from there, with each run. A file that is invalid changes nothing.
+`policy` reads its table `[allow]`.
 """
 
 from __future__ import annotations
@@ -16,7 +24,6 @@ import re
 import sqlite3
 import sys
 import time
-from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
@@ -27,6 +34,7 @@ from webots_mcp.database.location import find_project
 from webots_mcp.database.pauses import OF_PROJECT
 from webots_mcp.errors import InvalidInputError, warn
 from webots_mcp.signals.conditions.compiler import Expectation, parse_expectation
+from webots_mcp.signals.meaning import MEANING_FIELDS, DeclaredMeaning, declare_meaning
 
 ALL: Final = "*"
 _KEYS: Final = ("name", "condition", "during", "robot")
@@ -41,11 +49,39 @@ _ADD: Final = (
 )
 
 
+_OF_MEANING: Final = ("robot_name", "name", *MEANING_FIELDS)
+_STORED_MEANINGS: Final = (
+    f"SELECT {', '.join(_OF_MEANING)}, id FROM meaning WHERE robot_id IS NULL "
+    f"AND set_by = '{OF_PROJECT}'"
+)
+_ADD_MEANING: Final = (
+    f"INSERT INTO meaning ({', '.join(_OF_MEANING)}, source, set_wall_time_s, set_by) "
+    f"VALUES ({', '.join('?' * len(_OF_MEANING))}, 'declared', ?, '{OF_PROJECT}')"
+)
+
+
 class Expected(NamedTuple):
     """An entry of the file; `robot` is a name, or `ALL`."""
 
     expectation: Expectation
     robot: str
+
+
+class DescribedSignal(NamedTuple):
+    """An entry of the table `[signals]`; `robot` is a name, or `ALL`."""
+
+    meaning: DeclaredMeaning
+    robot: str
+
+
+class ProjectFile(NamedTuple):
+    """What the file of a project says of its robots."""
+
+    expected: list[Expected]
+    signals: list[DescribedSignal]
+
+
+NO_PROJECT: Final = ProjectFile([], [])  # of where there is no file
 
 
 def file_of(data_dir: Path) -> Path | None:
@@ -54,25 +90,70 @@ def file_of(data_dir: Path) -> Path | None:
     return next((file for file in found if file and file.is_file()), None)
 
 
-def read_project(file: Path) -> list[Expected]:
-    """What the file says.
+def read_project(file: Path) -> ProjectFile:
+    """Read what the file says of expectations and signals.
 
     Raises:
         InvalidInputError: It cannot be read, or something in it is invalid: which line, and why.
     """
     text, content = load_toml(file)
     content.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
+    signals = content.pop("signals", {})
     entries: list[Any] = content.pop("expect", [])
     is_list = type(entries) is list and all(type(each) is dict for each in entries)
     if content or not is_list:
         found = (
             f"{next(iter(content))!r} is unknown" if content else "'expect' is no list of tables"
         )
-        raise InvalidInputError(f"{file}: {found}; it holds tables [[expect]], and [allow]")
+        raise InvalidInputError(
+            f"{file}: {found}; it holds tables [[expect]], [signals] and [allow]"
+        )
     tables = cast("list[dict[str, Any]]", entries)
     if len(tables) > MAX_BREAKPOINTS:
         raise InvalidInputError(f"{file}: {len(tables)} expectations; at most {MAX_BREAKPOINTS}")
-    return [_entry(file, text, number, table) for number, table in enumerate(tables)]
+    expected = [_entry(file, text, number, table) for number, table in enumerate(tables)]
+    return ProjectFile(expected, _signals_in(file, text, signals))
+
+
+def _signals_in(file: Path, text: str, table: Any) -> list[DescribedSignal]:
+    """The entries of the table [signals]; a table of tables is of the robot of that name."""
+    if not isinstance(table, dict):
+        raise InvalidInputError(
+            f"{file}, line {_signal_line(text)}: signals must be a table: [signals]"
+        )
+    found: list[DescribedSignal] = []
+    for name, entry in cast("dict[str, Any]", table).items():
+        of_robot = _is_table(entry) and entry and all(map(_is_table, entry.values()))
+        own: dict[str, Any] = entry if of_robot else {name: entry}
+        robot = recorded_name(name) if of_robot else ALL
+        for signal, said in own.items():
+            found.append(DescribedSignal(_signal(file, text, signal, said), robot))
+    return found
+
+
+def _signal(file: Path, text: str, name: str, said: Any) -> DeclaredMeaning:
+    try:
+        if not _is_table(said):
+            example = '{quantity = "speed", role = "commanded"}'
+            raise ValueError(f"signal {name!r} must be a table such as {example}, not {said!r:.80}")
+        return declare_meaning(name, **said)
+    except ValueError as error:
+        line = _signal_line(text, name)
+        raise InvalidInputError(f"{file}, line {line}: {error}") from error
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+def _signal_line(text: str, signal: str = "") -> int:
+    """The first line of the table, or behind it the first one that has the signal's name."""
+    lines = text.splitlines()
+    starts = (at for at, line in enumerate(lines) if re.match(r"\s*\[?\s*signals\b", line))
+    start = next(starts, 0)
+    key = re.compile(rf"(^|[\s\"'{{,.]){re.escape(signal)}[\"']?\s*[=\]]")
+    named = (at for at in range(start, len(lines)) if signal and key.search(lines[at]))
+    return next(named, start) + 1
 
 
 def load_toml(file: Path) -> tuple[str, dict[str, Any]]:
@@ -122,18 +203,25 @@ def _line_of(text: str, number: int, why: str, table: dict[str, Any]) -> int:
     return starts[number] + 1
 
 
-def compile_project(connection: sqlite3.Connection, expected: Sequence[Expected]) -> None:
-    """Let the database expect what the file says, and nothing that it does not say any more."""
-    wanted = {(*each.expectation.asks, each.robot): each.expectation for each in expected}
+def compile_project(connection: sqlite3.Connection, project: ProjectFile) -> None:
+    """Let the database say what the file says, and nothing that it does not say any more."""
+    wanted = {(*each.expectation.asks, each.robot): each.expectation for each in project.expected}
     there = {tuple(row[:4]): row[4] for row in connection.execute(_STORED).fetchall()}
     gone = [(number,) for asks, number in there.items() if asks not in wanted]
     new = [asks for asks in wanted if asks not in there]
-    if not (gone or new):
+    meanings = {(each.robot, *each.meaning) for each in project.signals}
+    stored = {tuple(row[:-1]): row[-1] for row in connection.execute(_STORED_MEANINGS).fetchall()}
+    old_meanings = [(stored[each],) for each in stored if each not in meanings]
+    new_meanings = sorted(meanings - stored.keys(), key=repr)
+    if not (gone or new or old_meanings or new_meanings):
         return
+    now_s = time.time()
     with transaction(connection):
         connection.executemany("DELETE FROM breakpoint WHERE id = ?", gone)
-        rows = [(*asks, wanted[asks].violation.text, time.time()) for asks in new]
+        rows = [(*asks, wanted[asks].violation.text, now_s) for asks in new]
         connection.executemany(_ADD, rows)
+        connection.executemany("DELETE FROM meaning WHERE id = ?", old_meanings)
+        connection.executemany(_ADD_MEANING, [(*each, now_s) for each in new_meanings])
 
 
 class ProjectWatch:
@@ -151,6 +239,6 @@ class ProjectWatch:
             return
         self._seen = seen
         try:
-            compile_project(connection, read_project(file) if file else [])
+            compile_project(connection, read_project(file) if file else NO_PROJECT)
         except InvalidInputError as error:
             warn(f"{error}. What was expected before stays")

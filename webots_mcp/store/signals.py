@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
+from webots_mcp.signals.meaning import StatedMeaning
 from webots_mcp.signals.naming import Value, find_mode
 from webots_mcp.signals.register import (
     MOST_CHOICES,
@@ -52,6 +53,8 @@ class RegisteredSignal:
         reduction: None, or how the long array at `path` becomes one number.
         role: What it tells of the robot's motion, as `signal_register` decides; None of most.
         is_choice: Its whole numbers, of which there are few, name what a robot does.
+        stated: What was declared of its meaning, or is known from its device, the strongest first;
+            filled in by `meanings.with_stated`.
     """
 
     id: int | None
@@ -63,6 +66,7 @@ class RegisteredSignal:
     reduction: str | None
     role: str | None = None
     is_choice: bool = False
+    stated: tuple[StatedMeaning, ...] = ()
 
     @property
     def turn(self) -> float | None:

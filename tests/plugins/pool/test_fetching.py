@@ -420,3 +420,19 @@ def test_what_a_killed_fetch_left_is_removed_by_the_next(lab: Lab, runs: Recorde
     (lab.here / ".fetch-999999999-x").mkdir()
     lab.fetch(robot="rover")
     assert not list(lab.here.glob(".fetch-*"))
+
+
+@IN_EACH_POOL
+def test_what_was_declared_of_signals_comes_with_the_runs_of_their_robot(
+    lab: Lab, rounds: Path
+) -> None:
+    with closing(connect(rounds, "writer")) as connection:
+        connection.execute(
+            "INSERT INTO meaning (robot_id, name, source, quantity, low, set_wall_time_s, set_by) "
+            "SELECT robot_id, 'u', 'declared', 'speed', -1.5, 1, 'mcp' FROM run WHERE id = 1"
+        )
+    lab.ship(rounds)
+    lab.fetch(run_uuid=uuid_of(rounds, 1))
+    with lab.opened() as here:
+        rows = here.execute("SELECT name, quantity, low, set_by FROM meaning").fetchall()
+    assert rows == [("u", "speed", -1.5, "mcp")]

@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("robot")]
 # by the actions that it brings about.
 WITHOUT_ACTION = {
     "webots_annotate_run", "webots_breakpoint", "webots_remove_breakpoint", "webots_report",
-    "webots_run_trials", "webots_send_command",
+    "webots_run_trials", "webots_send_command", "webots_describe_signals",
 }  # fmt: skip
 HARMLESS = {"cancel_run", "arm_breakpoints"}
 PARAMS: dict[str, dict[str, Any]] = {

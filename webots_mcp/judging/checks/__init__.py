@@ -35,7 +35,7 @@ from webots_mcp.judging.detection.events import Found, asked_kinds, search_event
 from webots_mcp.judging.detection.kinds import EventOptions, NotSearchableError
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.conditions.compiler import Expectation
-from webots_mcp.signals.naming import counted
+from webots_mcp.signals.naming import counted, listed
 from webots_mcp.store.project_file import ALL, Expected
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
@@ -257,6 +257,41 @@ def reaches_goal(run: RunUnderCheck) -> Finding:
     return Finding("fail", f"{goal}: not reached ({ended})", at_s, 1, run.more("command"))
 
 
+UNDERSTOOD: Final = "signals understood"  # never changes what the run comes to
+_MOST_UNKNOWN: Final = 5  # names in the evidence
+
+
+def understands_signals(run: RunUnderCheck) -> Finding:
+    """Not judged where numeric signals have an unknown meaning: no other check is about them."""
+    changes: Counter[str] = Counter()
+    understood = 0
+    for name, signal in run.search.known.items():
+        zones = run.frame.zone_map(name)
+        if not signal.is_number or not zones.value_count.any():
+            continue
+        if run.meanings[name].quantity is not None:
+            understood += 1
+        elif signal.reduction is None:
+            changes[name] += int(zones.change_count.sum())
+    if not changes and not understood:
+        raise NotSearchableError("no number was published: call bridge.publish")
+    if not changes:
+        said = "the meaning of its number is" if understood == 1 else "the meanings of all are"
+        return Finding("pass", f"{counted(understood, 'numeric signal')}, {said} known")
+    branches = list(dict.fromkeys(_whole_array(name) for name, _ in changes.most_common()))
+    named = listed(branches, _MOST_UNKNOWN)
+    evidence = f"{counted(len(changes), 'signal')} of unknown meaning: {named}"
+    evidence += "; declare them with webots_describe_signals(...)"
+    more = f"webots_describe_signals(signals={branches[:1]}, quantity='speed', role='measured')"
+    return Finding("not judged", evidence, None, len(changes), more)
+
+
+def _whole_array(name: str) -> str:
+    """The pattern of an array for one of its items, so that an array is named once."""
+    branch, _, item = name.rpartition(".")
+    return f"{branch}.*" if branch and item.isdigit() else name
+
+
 # -- all of them -----------------------------------------------------------------------------------
 
 _JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
@@ -282,6 +317,7 @@ CHECKS: Final[list[Check]] = [
     Check("loses no rows", loses_no_rows, "", ("bridge_event",)),
     Check("reaches its goal", reaches_goal, "a run command with a condition in `until`"),
     Check("keeps expectations", keeps_expectations, "expectations", of_values=True),
+    Check(UNDERSTOOD, understands_signals, "numbers"),
 ]
 
 
@@ -299,8 +335,11 @@ class CheckedRun:
 
     @property
     def outcome(self) -> Outcome:
-        """The worst of all; a check that could not be made shows nothing."""
-        there = {each.outcome for each in self.findings}
+        """The worst of all; a check that could not be made shows nothing.
+
+        Whether signals are understood says what could be judged, not how the run went.
+        """
+        there = {each.outcome for each in self.findings if each.name != UNDERSTOOD}
         return next(each for each in WORST_FIRST if each in there)
 
     @property

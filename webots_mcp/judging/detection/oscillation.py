@@ -86,7 +86,9 @@ def _longest_period_s(search: Search) -> float:
     return max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
 
 
-def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tuple[str, SwingCourse]]:
+def _found(
+    search: Search, signals: Sequence[RegisteredSignal]
+) -> Iterator[tuple[str, SwingCourse]]:
     """The swings of each signal, in the chunks in which it changes."""
     frame, least = search.frame, search.options.min_half_periods
     asked = least, _longest_period_s(search)

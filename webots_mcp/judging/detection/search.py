@@ -131,17 +131,27 @@ def find_motion(
     if options.position is not None:
         x, y = (one_signal(known, each) for each in options.position)
         position = x, y
+    meanings = meanings_of(own)
+    declared = {
+        meaning.quantity: own[name]
+        for name, meaning in reversed(meanings.items())
+        if meaning.source == "declared" and not meaning.sets and meaning.role != "limit"
+    }
+    if position is None and "x" in declared and "y" in declared:
+        position = declared["x"], declared["y"]
     names = (position[0].name, position[1].name) if position else None
     roles = roles_of(own, names) if names else stored_roles(own)
-    signals = {role: own[name] for name, role in roles.items() if name in own}
+    signals = {
+        role: own[name]
+        for name, role in roles.items()
+        if name in own and _may_have(role, meanings[name])
+    }
 
     def first(role: str, name: str | None = None) -> RegisteredSignal | None:
         if name is not None:
             return one_signal(known, name)
         found = first_in(role, signals)
         return signals[found] if found else None
-
-    meanings = meanings_of(own)
 
     def meant(quantity: Quantity, *, sets: bool) -> list[RegisteredSignal]:
         return [
@@ -152,7 +162,12 @@ def find_motion(
 
     place = "" if position else pair_in(signals)
     if position is None:  # it may be missing in the rows that were seen
-        ever = {role: known[name] for name, role in stored_roles(known).items()}
+        all_meanings = meanings_of(known)
+        ever = {
+            role: known[name]
+            for name, role in stored_roles(known).items()
+            if _may_have(role, all_meanings[name])
+        }
         position = _pair(signals, place) or _pair(ever, pair_in(ever))
     commanded = first("commanded_speed", options.commanded)
     if options.commanded is None and (
@@ -167,13 +182,23 @@ def find_motion(
         position,
         commanded,
         None if commanded else speed,
-        first("mode", options.mode),
-        heading=first("yaw"),
+        (declared.get("mode") if options.mode is None else None) or first("mode", options.mode),
+        heading=declared.get("heading") or first("yaw"),
         wheels=tuple(each for each in wheels if each != commanded),
-        height=signals.get(f"z{place}"),
+        height=declared.get("height") or signals.get(f"z{place}"),
         wheel_commands=tuple(each for each in wheel_commands if each != commanded),
         turn_command=next(iter(meant("turn rate", sets=True)), None),
     )
+
+
+_OF_ROLES: Final = {"x": "x", "y": "y", "z": "height", "yaw": "heading", "mode": "mode"}
+
+
+def _may_have(role: str, meaning: Meaning) -> bool:
+    """Whether a signal may have a role by its name: nothing stronger says something else."""
+    quantity = _OF_ROLES.get(role.rstrip("0123456789"))
+    is_said = meaning.source in ("declared", "device") and meaning.quantity is not None
+    return quantity is None or not is_said or meaning.quantity == quantity
 
 
 def _pair(
@@ -201,7 +226,7 @@ def motion_in(frame: Frame, known: dict[str, RegisteredSignal], options: EventOp
     telling = [
         name
         for name, each in known.items()
-        if options.position or each.role or meanings[name].quantity in _OF_MOTION
+        if options.position or each.role or each.stated or meanings[name].quantity in _OF_MOTION
     ]
     here = {name for name in telling if any(row.held(name).any() for row in rows)}
     return find_motion(known, options, here)

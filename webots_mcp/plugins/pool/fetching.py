@@ -253,6 +253,7 @@ class _Copy:
         self.rows("session", "id", sessions)
         self.rows("robot", "id", robots)
         self.rows("signal", "robot_id", robots)
+        self.rows("meaning", "robot_id", robots)
         self.rows("command", "session_id", sessions)
         self.rows("parameter", "session_id", sessions)
 

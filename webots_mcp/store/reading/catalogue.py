@@ -11,9 +11,11 @@ from typing import Final
 
 from webots_mcp.analysis.arrays import Indexes, np
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.signals.meaning import Meaning
 from webots_mcp.signals.naming import REDUCTIONS, Value, nearest_first
 from webots_mcp.signals.register import MAX_SIGNALS, Kind
 from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
+from webots_mcp.store.meanings import meanings_of, with_stated
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.observed_pose import with_observed_pose
 from webots_mcp.store.reading.ranges import TimeRange, find_subject
@@ -46,6 +48,7 @@ class SignalInfo:
         missing: Of the run's rows, those without a value.
         first_s: Simulation time of the first value; `last_s` of the last one.
         last: The value in the run's newest row; None where that has none.
+        meaning: What it means, and where that is known from.
     """
 
     name: str
@@ -58,6 +61,7 @@ class SignalInfo:
     last: Value
     min: float | None
     max: float | None
+    meaning: Meaning
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,7 @@ def _signals_in(
     for columns in samples.values():
         known = seen_with(known, robot_id, columns)
     known = _without_placeholders(known)
+    known = with_stated(connection, robot_id, known)
     return with_observed_pose(connection, robot_id, known, samples.items())
 
 
@@ -122,7 +127,8 @@ def signals_of_frame(
 ) -> dict[str, RegisteredSignal]:
     """Every signal of the subject's robot: the registered, and those in all rows of a frame."""
     known = registered(connection, subject.robot_id)
-    return _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
+    known = _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
+    return with_stated(connection, subject.robot_id, known)
 
 
 def held_by(
@@ -257,14 +263,15 @@ def list_signals(
     there = with_observed_pose(connection, subject.robot_id, there, own)
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)
-    infos = tuple(_info(frame, signal) for signal in matching[:limit])
+    meanings = meanings_of(there)
+    infos = tuple(_info(frame, signal, meanings[signal.name]) for signal in matching[:limit])
     notes = [str(each) for each in frame.unread]
     if len(known) >= MAX_SIGNALS:
         notes.append(_ONLY_FIRST)
     return SignalList(subject.robot, subject.run_id, len(frame), infos, len(matching), tuple(notes))
 
 
-def _info(frame: Frame, signal: RegisteredSignal) -> SignalInfo:
+def _info(frame: Frame, signal: RegisteredSignal, meaning: Meaning) -> SignalInfo:
     zones = frame.zone_map(signal.name)
     counts, is_usable = zones.value_count, bool(zones.value_count.any())
     if not is_usable and signal.is_number:  # all beyond 1e100, or null
@@ -284,6 +291,7 @@ def _info(frame: Frame, signal: RegisteredSignal) -> SignalInfo:
         last=cleaned(signal, [newest])[0],
         min=float(np.nanmin(zones.min)) if has_numbers else None,
         max=float(np.nanmax(zones.max)) if has_numbers else None,
+        meaning=meaning,
     )
 
 

@@ -262,6 +262,10 @@ class Supervisor(Robot):
         """Return the node with this number; None if there is none."""
         return self._node("node_get_from_id", integer(id), lambda node: node[0] == id)
 
+    def getFromDevice(self, tag: int) -> Node | None:
+        """Return the node of a device, by the device's tag; None if there is none."""
+        return self._node("node_get_from_device", integer(tag), lambda _: False)
+
     def _node(
         self, operation: str, argument: Any, matches: Callable[[NodeFacts], bool]
     ) -> Node | None:

@@ -1,0 +1,169 @@
+"""What signals mean: listed with the source of each meaning, declared, and undone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Final
+
+from pydantic import Field
+
+from webots_mcp.answers.budget import fitting, short_name, some, without_empty
+from webots_mcp.answers.models import SignalMeaningsAnswer
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.questions.arguments import LONGEST_NAME, AnyNames, RobotName
+from webots_mcp.questions.declaring import CHANGES, READS, question
+from webots_mcp.signals.meaning import Meaning, Quantity, Role, declare_meaning
+from webots_mcp.store.meanings import meanings_of, set_meanings, undo_meanings
+from webots_mcp.store.reading.catalogue import catalogue, resolve_signals
+from webots_mcp.store.recording import RecordingAccess, RobotView
+from webots_mcp.store.signals import RegisteredSignal
+
+MEANING_COLUMNS: Final = (
+    "signal", "quantity", "role", "unit", "side", "target_of", "same_as", "low", "high", "source",
+    "why",
+)  # fmt: skip
+_NOT_YET: Final = "no signal has been recorded yet: run the simulation first, then describe them"
+_DECLARE: Final = (
+    "signals of unknown meaning are not judged: declare them, such as "
+    "webots_describe_signals(signals=[{!r}], quantity='speed', role='commanded')"
+)
+
+_Name = Annotated[str, Field(max_length=LONGEST_NAME)]
+
+
+@question("List meanings", READS, quotes=True)
+def webots_list_meanings(
+    recording: RecordingAccess, signals: AnyNames = None, robot: RobotName = None
+) -> SignalMeaningsAnswer:
+    """Show what each signal is taken for, how that is known, and which signals are unknown."""
+    with recording.view(robot) as view:
+        return SignalMeaningsAnswer(
+            **view.header(), **_listed(view, signals, None, is_undone=False)
+        )
+
+
+@question("Describe signals", CHANGES, quotes=True)
+def webots_describe_signals(
+    recording: RecordingAccess,
+    signals: Annotated[
+        list[_Name] | None,
+        Field(
+            max_length=50, description="Names of signals; '*' stands for any text. Default: all."
+        ),
+    ] = None,
+    quantity: Annotated[
+        Quantity | None, Field(description="What the signal measures or sets.")
+    ] = None,
+    role: Annotated[
+        Role | None,
+        Field(description="Whether it is a measurement, a command, a target or a limit."),
+    ] = None,
+    unit: Annotated[str | None, Field(max_length=20, description="Unit, such as 'm/s'.")] = None,
+    target_of: Annotated[
+        _Name | None, Field(description="Name of the measured signal whose target it is.")
+    ] = None,
+    same_as: Annotated[
+        _Name | None, Field(description="Name of another signal that measures the same.")
+    ] = None,
+    side: Annotated[
+        str | None, Field(max_length=20, description="Part of the robot, such as 'front left'.")
+    ] = None,
+    low: Annotated[float | None, Field(description="Lowest value the signal can have.")] = None,
+    high: Annotated[float | None, Field(description="Highest value the signal can have.")] = None,
+    undo: Annotated[
+        bool, Field(description="Remove the declarations of these signals instead.")
+    ] = False,
+    robot: RobotName = None,
+) -> SignalMeaningsAnswer:
+    """Show what each signal is taken for and why, or declare it so that events and checks use it.
+
+    Without a quantity, role or other field it lists the meanings. Signals of unknown meaning are
+    not judged, so declare them before you ask for checks. A declaration also applies to runs
+    recorded before, and replaces the previous one.
+    """
+    said: dict[str, Any] = {
+        "quantity": quantity, "role": role, "unit": unit, "target_of": target_of,
+        "same_as": same_as, "side": side, "low": low, "high": high,
+    }  # fmt: skip
+    declares = any(value is not None for value in said.values())
+    if (declares or undo) and not signals:
+        raise InvalidInputError(
+            "signals is missing: name the signals to describe, for example signals=['motors.left']"
+        )
+    if declares and undo:
+        raise InvalidInputError("give undo=true or a description, not both")
+    changed: list[str] | None = None
+    if declares:
+        changed = _declare(recording, robot, signals or [], said)
+    elif undo:
+        changed = _undo(recording, robot, signals or [])
+    with recording.view(robot) as view:
+        return SignalMeaningsAnswer(
+            **view.header(), **_listed(view, signals, changed, is_undone=undo)
+        )
+
+
+def _declare(
+    recording: RecordingAccess, robot: str | None, names: Sequence[str], said: Mapping[str, Any]
+) -> list[str]:
+    """Store the declaration for each signal that the names mean; return those signals."""
+    with recording.view(robot) as view:
+        robot_id, known = view.robot.id, _known(view)
+        if not known:
+            raise InvalidInputError(_NOT_YET)
+        meant = [each.name for each in resolve_signals(known, names)]
+        partners = [said[field] for field in ("target_of", "same_as") if said[field] is not None]
+        if partners:
+            resolve_signals(known, partners)
+    try:
+        declared = [declare_meaning(name, **said) for name in meant]
+    except ValueError as error:
+        raise InvalidInputError(str(error)) from error
+    with recording.writer() as connection:
+        set_meanings(connection, robot_id, declared, recording.asker)
+    return meant
+
+
+def _undo(recording: RecordingAccess, robot: str | None, names: Sequence[str]) -> list[str]:
+    with recording.view(robot) as view:
+        robot_id = view.robot.id
+    with recording.writer() as connection:
+        return undo_meanings(connection, robot_id, names)
+
+
+def _known(view: RobotView) -> dict[str, RegisteredSignal]:
+    """All signals of the robot, also those of earlier runs; none before anything was recorded."""
+    return catalogue(view.connection, view.subject) if view.run is not None else {}
+
+
+def _listed(
+    view: RobotView, names: Sequence[str] | None, changed: Sequence[str] | None, *, is_undone: bool
+) -> dict[str, Any]:
+    known = _known(view)
+    meanings = meanings_of(known)
+    if is_undone:  # what was undone may have been declared of names that were never recorded
+        shown = [name for name in changed or () if name in known]
+    elif names is None:
+        shown = sorted(known)
+    else:
+        shown = sorted(each.name for each in resolve_signals(known, names)) if known else []
+    rows = fitting([_meaning_row(name, meanings[name]) for name in shown]) if shown else []
+    unknown = [n for n in shown if known[n].is_number and meanings[n].quantity is None]
+    hints = [_DECLARE.format(name) for name in unknown[:1]]
+    if len(rows) < len(shown):
+        hints.append(f"{len(rows)} of {len(shown)} are shown: narrow signals, such as ['motors.*']")
+    return {
+        "signals": without_empty(MEANING_COLUMNS, rows),
+        "total": len(shown),
+        "unknown": [some(unknown)] if unknown else None,
+        "changed": [some(changed)] if changed else None,
+        "hint": "; ".join(hints) or (None if known else _NOT_YET),
+    }
+
+
+def _meaning_row(name: str, meaning: Meaning) -> list[Any]:
+    return [
+        short_name(name),
+        *(getattr(meaning, column) for column in MEANING_COLUMNS[1:-1]),
+        meaning.why,
+    ]

@@ -23,6 +23,7 @@ from webots_mcp.store.chunks import (
     Statistics,
     decoded_of,
     groups_with_steps,
+    statistics_by_signal,
     statistics_in,
     statistics_of,
     values_in,
@@ -213,6 +214,13 @@ class FrameSource:
             part = decoded_of(values[first : first + chunk_making.GROUP_ROWS])
             table[len(self._group_ids) + at] = statistics_of(part)
         return table
+
+    def whole_statistics(self) -> dict[str, Statistics] | None:
+        """Return the statistics of all signals where one group has all rows; None elsewhere."""
+        if len(self._group_ids) != 1 or len(self.columns) or self.unread or self.derived:
+            return None
+        found = statistics_by_signal(self.connection, self.run_id, int(self._group_ids[0]))
+        return {name: found[each] for name, each in self.ids.items() if each in found}
 
     def with_long_steps(self, longer_s: float) -> Flags:
         """Return in which parts two successive rows are further apart in simulation time."""

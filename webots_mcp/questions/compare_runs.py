@@ -175,7 +175,7 @@ def webots_compare_runs(
     position: Position = None,
     mode: Mode = None,
     min_effect_sd: Annotated[
-        float, Field(gt=0, le=100, description="What matters, in deviations of repeated runs.")
+        float, Field(gt=0, le=100, description="What matters, in deviations of like runs.")
     ] = MIN_EFFECT_SD,
     first_difference: Annotated[bool, Field(description="Where two part, row by row.")] = False,
     robot: RobotName = None,
@@ -183,10 +183,10 @@ def webots_compare_runs(
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
     Without run_ids: the runs before and after the last edit of the controller's file. Runs of one
-    code and parameters are one group. Distance, mean speed, time per mode, events per minute, the
-    loop's own ms per step, and the signals that differ most; whether runs reached their goal comes
-    first. `different`: true beyond the spread of repeated runs (4 of each or more), false where a
-    difference that matters is excluded, null: not decided yet, and `undecided` says why.
+    code and parameters are one group. Goal, distance, mean speed, time per mode, events per minute,
+    the loop's own ms per step, and the signals that differ most. `different`: true beyond the
+    spread of repeated runs (4 of each or more), false where a difference that matters is excluded,
+    null where `undecided` says why.
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")

@@ -505,6 +505,8 @@ def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:
     """Rows [start, stop) between edges where it is wanted; those side by side are one span."""
     if not wanted.any():
         return []
+    if wanted.all():
+        return [(int(edges[0]), int(edges[-1]))]
     ends = edges[np.flatnonzero(np.diff(wanted, prepend=False, append=False))].tolist()
     return list(zip(ends[::2], ends[1::2], strict=True))
 

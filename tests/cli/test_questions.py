@@ -59,7 +59,7 @@ REFUSED = [
     ("trends lost_s", "'lost_s'"),
     ("events --kind explosion", "--kind must be one of"),
     ("events --after x", "--after 'x' is not a cursor"),
-    ("compare 1 1", "1 to 10"),
+    ("compare 1 1", "1 to 300"),
     ("compare 77 78", "no run 77: the newest runs are ["),
     ("diff 1", "RUN"),
     ("diff 1 1", "two different runs"),

@@ -24,7 +24,9 @@ MOST_CHANCE: Final = 0.002  # of reporting any difference between repeated runs,
 MIN_EFFECT_SD: Final = 1.0  # smallest relevant difference, in deviations of repeated runs
 MOST_REPEATED: Final = 10  # runs of each group: who asks for more of them has no answer
 _OUTSIDE: Final = 0.1  # how often an interval does not hold the difference
-_LEAST_RUNS: Final = 4  # of each group, that tell how much they differ, and no two clusters
+MIN_REPEATED: Final = (
+    4  # runs of each group, to tell how much they differ and that no two clusters do
+)
 _DUST: Final = 1e-9  # of the largest figure: what differs by less differs by rounding
 MOST_CHANCE_OF_BEST: Final = 0.01  # that a set is called better than the next one, and is not
 
@@ -358,7 +360,7 @@ class Verdict(NamedTuple):
         runs_wanted: So many runs of each would tell, if they went on like these; None where they
             need not, or where even 10 would not.
         interval: The difference from the mean of the first group lies in it nine times of ten;
-            None where like runs were not seen to differ.
+            None where runs agree to the last digit and are too few to tell.
     """
 
     different: bool | None
@@ -527,8 +529,8 @@ def _verdict(
     within = apart.error * _student_quantile(apart.freedom)
     interval = (apart.by - within, apart.by + within) if apart.deviation else None
     different = _differs(first, other, limits[0], chance, min_effect_sd)
-    if different is not None:
-        return Verdict(different, None, interval)
+    if different is not None:  # runs that agree to the last digit know the difference exactly
+        return Verdict(different, None, interval or (apart.by, apart.by))
     fewest = min(len(first), len(other)) + 1
     for runs in range(fewest, MOST_REPEATED + 1):
         more = _so_many(first, runs), _so_many(other, runs)
@@ -547,7 +549,7 @@ def _differs(
     apart, found = _apart(first, other), chance(first, other)
     if apart is None or found is None:
         return None
-    is_repeated = min(len(first), len(other)) >= _LEAST_RUNS
+    is_repeated = min(len(first), len(other)) >= MIN_REPEATED
     is_repeated &= bool(apart.deviation) or apart.split < MOST_CHANCE
     if found < limit and is_repeated:
         return True

@@ -435,16 +435,19 @@ class ComparisonAnswer(NotedAnswer):
         "Each run as a whole: median over the runs of each group, and their range. "
         "Of each group but the first: different; null where it cannot be told, then runs_wanted: "
         "this many runs of each would tell, if they went on like these. interval: of the "
-        "difference of the means, 90 %."
+        "difference of the means, 90 %. compared: share of runs, where rare events are counted by "
+        "run; runs: those that have any. holds_for: null is compared_s."
     )
     unknown: dict[str, str] | None = said(
         "Figures that are null, or not of everything: why; what to do."
     )
+    undecided: dict[str, str] | None = said("Why different is null.")
     differences: AnswerTable | None = said(
         "Signals, most different first; lists are in the order of the groups. Of each "
         "group but the first (a list where there are several): effect, how far the mean is from "
         "the first group's, in standard deviations (0.8 is large, null: unequal constants), "
-        "deviation_ratio, different, interval of the mean. min and max where signals were named."
+        "deviation_ratio, different and interval of the mean, deviation_different and "
+        "deviation_interval of the deviation. min and max where signals were named."
     )
     total: int | None = said("Numeric signals that all groups have.")
     only_in: dict[str, list[str]] | None = said("Signals that not every group has.")

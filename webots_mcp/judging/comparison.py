@@ -1,28 +1,52 @@
-"""`compare_runs`: what a run came to, and whether it is better than the last one, and in what."""
+"""`compare_runs`: what runs achieved, whether one group is better than another, and in what.
+
+Figures are compared over the time that all runs have, at even moments of simulation time.
+"""
 
 from __future__ import annotations
 
 import math
 import sqlite3
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Final
 
-from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread, Summary, spread_of, verdicts_on
+from webots_mcp.analysis.summary import (
+    MIN_EFFECT_SD,
+    Spread,
+    Summary,
+    Verdict,
+    spread_of,
+    verdicts_on,
+    with_extremes,
+)
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
-from webots_mcp.judging.run_measures import OUT_OF_TIME, Measure, RunPart, outcomes_of
+from webots_mcp.judging.even_rows import EvenRows, shared_interval_s
+from webots_mcp.judging.run_measures import (
+    MOST_SEARCHED,
+    OUT_OF_TIME,
+    Measure,
+    RunGoal,
+    RunOutcome,
+    RunPart,
+    goals_of,
+    outcome_of,
+    outcomes_of,
+    reasons_of,
+)
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.naming import listed
 from webots_mcp.signals.parameter import Value
 from webots_mcp.store.parameters import differing, parameters_of, scored_runs
-from webots_mcp.store.reading.catalogue import catalogue, resolve_signals
-from webots_mcp.store.reading.frame import read_frame
-from webots_mcp.store.reading.frame_summary import summary_of
-from webots_mcp.store.reading.ranges import whole_run
-from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
+from webots_mcp.store.reading import frame_summary
+from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
+from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
+from webots_mcp.store.reading.ranges import TimeRange, whole_run
+from webots_mcp.store.reading.segment import Deadline, Segment, in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_infos
@@ -31,11 +55,14 @@ from webots_mcp.store.signals import RegisteredSignal
 # -- how a signal differs between groups of runs ---------------------------------------------------
 
 
+_NONE: Final = Summary()
 _DUST: Final = 1e-9  # of a signal's largest value: what varies by less does not vary
 COMPARE_DEADLINE_S: Final = 5.0
-MOST_COMPARED: Final = 10
+MOST_COMPARED: Final = 300  # runs that are given
+MOST_OF_EDIT: Final = 10  # newest runs before and after an edit, and of each set of parameters
 MOST_SETS: Final = 5  # of a trial set
-_AS_LONG: Final = 1.01  # times the compared stretch: the ends of like runs differ by a few rows
+_MOST_NAMED: Final = 10  # runs in the name of a group
+_AS_LONG: Final = 1.01  # times the compared time: the ends of identical runs differ by a few rows
 _CODE_OF_RUNS: Final = (
     "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
     "WHERE r.robot_id = ? "
@@ -46,10 +73,10 @@ _CODE_OF_RUNS: Final = (
 
 @dataclass(frozen=True)
 class Difference:
-    """A signal in each group, over the compared stretch; lists are in the order of the groups.
+    """A signal in each group, over the compared time; lists are in the order of the groups.
 
     Attributes:
-        mean: Over the runs of the group; of an angle the circular mean.
+        mean: Over the runs of the group, of values at even moments; of an angle the circular mean.
         deviation: The standard deviation within a run, over the runs of the group.
         deviation_ratio: Of its median to that of the first group; None where that is 0.
         effect: How far each mean is from that of the first group, in pooled standard deviations:
@@ -58,9 +85,14 @@ class Difference:
             deviations); 0.2 is called small, 0.5 medium, 0.8 large. None where it is not defined:
             without values, or both constant and not equal. Rows follow each other too closely to
             be independent, so it describes, and proves nothing.
-        different: Whether the means or the deviations differ by more than those of like runs do;
-            None where that cannot be decided (`analysis.summary`).
+        different: Whether the means differ by more than those of repeated runs do; None where that
+            cannot be decided (`analysis.summary`).
         interval: The difference of the means of the groups lies in it nine times of ten.
+        deviation_different: Whether the deviations within runs differ by more than those of
+            repeated runs do; None where that cannot be decided.
+        deviation_interval: The difference of the deviations lies in it nine times of ten.
+        reasons: Why `different` or `deviation_different` is None.
+        asked: It was asked for by its name.
     """
 
     name: str
@@ -75,11 +107,21 @@ class Difference:
     effect: list[float | None]
     different: list[bool | None]
     interval: list[tuple[float, float] | None]
+    deviation_different: list[bool | None]
+    deviation_interval: list[tuple[float, float] | None]
+    reasons: list[str | None]
+    asked: bool = False
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether its level or its spread differs for certain in any group."""
+        return any(self.different) or any(self.deviation_different)
 
 
 def difference_of(
     signal: RegisteredSignal,
     groups: Sequence[Sequence[dict[str, Summary] | None]],
+    run_ids: Sequence[Sequence[int]],
     tests: int,
     min_effect_sd: float,
 ) -> Difference:
@@ -88,7 +130,8 @@ def difference_of(
     Args:
         signal: Which.
         groups: Of each run its summaries; None of one of which not all was read.
-        tests: So many are made at once.
+        run_ids: Of the runs.
+        tests: How many are made at once.
         min_effect_sd: See `analysis.summary`.
     """
     runs: list[list[Summary] | None] = []  # that have a value; None of a group that is not known
@@ -105,7 +148,17 @@ def difference_of(
     mean, deviation = [spread_of(each) for each in means], [spread_of(each) for each in deviations]
     of_means = verdicts_on(means, tests, min_effect_sd=min_effect_sd)
     of_deviations = verdicts_on(deviations, tests, min_effect_sd=min_effect_sd)
-    verdicts = zip(of_means, of_deviations, strict=True)
+    missing = _without_value(signal, groups, run_ids)
+    reasons = [
+        missing or _reason(level, spread)
+        for level, spread in zip(
+            reasons_of(of_means, means, _runs_of(means, run_ids)),
+            reasons_of(of_deviations, deviations, _runs_of(deviations, run_ids)),
+            strict=True,
+        )
+    ]
+    if missing:
+        of_means = of_deviations = [Verdict(None)] * len(groups)
     lows = ([each.min for each in group or () if each.min is not None] for group in runs)
     highs = ([each.max for each in group or () if each.max is not None] for group in runs)
     return Difference(
@@ -119,9 +172,48 @@ def difference_of(
         count=[None if group is None else sum(each.present for each in group) for group in runs],
         deviation_ratio=[_ratio(each, deviation[0]) for each in deviation],
         effect=[_effect(turn, mean, deviation, index) for index in range(len(groups))],
-        different=[_either(a.different, b.different) for a, b in verdicts],
+        different=[each.different for each in of_means],
         interval=[each.interval for each in of_means],
+        deviation_different=[each.different for each in of_deviations],
+        deviation_interval=[each.interval for each in of_deviations],
+        reasons=reasons,
     )
+
+
+def _reason(level: str | None, spread: str | None) -> str | None:
+    return level or (spread and f"deviation: {spread}")
+
+
+def _runs_of(
+    figures: Sequence[Sequence[float | None]], run_ids: Sequence[Sequence[int]]
+) -> list[Sequence[int]]:
+    """The ids of the runs of these figures; of a group that is not known that of its first run."""
+    return [ids[: len(of)] for ids, of in zip(run_ids, figures, strict=True)]
+
+
+def _without_value(
+    signal: RegisteredSignal,
+    groups: Sequence[Sequence[dict[str, Summary] | None]],
+    run_ids: Sequence[Sequence[int]],
+) -> str:
+    """Why a signal cannot be compared: runs that hold no value of it, or that were not read."""
+    named = [
+        (run_id, run)
+        for ids, group in zip(run_ids, groups, strict=True)
+        for run_id, run in zip(ids, group, strict=True)
+    ]
+    unread = [str(run_id) for run_id, run in named if run is None]
+    if unread:
+        return f"not all rows of run {listed(unread)} were read"
+    groups_without = [
+        group
+        for group in groups
+        if all(run and run.get(signal.name, _NONE).sum is None for run in group)
+    ]
+    if not groups_without:
+        return ""
+    without = [str(i) for i, run in named if run and run.get(signal.name, _NONE).sum is None]
+    return f"run {listed(without)} has no number of it"
 
 
 def _means(
@@ -146,10 +238,6 @@ def _deviation(turn: float | None, summary: Summary) -> float | None:
     if deviation is None or summary.min is None or summary.max is None:
         return deviation
     return deviation if deviation > _DUST * max(abs(summary.min), abs(summary.max)) else 0.0
-
-
-def _either(one: bool | None, other: bool | None) -> bool | None:
-    return True if one or other else None if None in (one, other) else False
 
 
 def _ratio(deviation: Spread | None, first: Spread | None) -> float | None:
@@ -185,7 +273,7 @@ def size_of(difference: Difference) -> tuple[bool, float]:
     effects = (math.inf if each is None else abs(each) for each in difference.effect[1:])
     ratios = (each for each in difference.deviation_ratio[1:] if each is not None)
     doublings = (math.inf if each == 0 else abs(math.log2(each)) for each in ratios)
-    return any(difference.different), max((0.0, *effects, *doublings))
+    return difference.is_certain, max((0.0, *effects, *doublings))
 
 
 def only_in(differences: Sequence[Difference], groups: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -283,44 +371,188 @@ def compare_runs(
         groups = _repeats(connection, run_ids)
     elif set_id is not None:
         found = scored_runs(connection, set_id)
-        groups = {name: found[name][:MOST_COMPARED] for name in list(found)[:MOST_SETS]}
+        groups = {name: found[name][:MOST_OF_EDIT] for name in list(found)[:MOST_SETS]}
         if len(found) > len(groups):
             notes += [f"the best {len(groups)} of {len(found)} sets of parameters"]
     else:
         groups = _around_last_edit(connection, robot)
     options = options or EventOptions()
     deadline = Deadline(deadline_s)
-    parts = [
-        [_part(connection, run_id, options, deadline) for run_id in found]
-        for found in groups.values()
-    ]
-    segments = [part.segment for found in parts for part in found]
-    durations_s = {segment.run_id: segment.end_s - segment.start_s for segment in segments}
-    compared_s = min(durations_s.values())
-    cut = [[each.cut(compared_s) for each in found] for found in parts]
-    unread: dict[str, None] = {}
-    differences = _differences(connection, cut, names, min_effect_sd, deadline, unread)
-    shared = [each for each in differences if 0 not in each.count]
-    shared.sort(key=size_of, reverse=True)
     compared = _groups(connection, groups)
-    outcomes = outcomes_of(connection, cut, options, deadline, min_effect_sd)
+    runs = _Runs(connection, compared, options, deadline)
+    compared_s = min(runs.durations_s.values())
+    known = runs.known
+    asked = resolve_signals(known, names)
+    is_named = tuple(names) != ("*",)
+    signals = [each for each in asked if each.is_number or (is_named and each.kind == "bool")]
+    unread: dict[str, None] = {}
+    summaries: list[list[dict[str, Summary] | None]] = []
+    outcomes: list[list[RunOutcome]] = []
+    for group in runs.parts(compared_s):
+        summaries.append([])
+        outcomes.append([])
+        for part in group:
+            if len(runs.durations_s) > 1:
+                summaries[-1].append(_summarise(connection, part, signals, deadline, unread))
+            outcomes[-1].append(outcome_of(connection, part, options, deadline))
+            part.rows.frame.forget()
+    of_groups = [[run.run_id for run in group.runs] for group in compared]
+    tests = 2 * len(signals)
+    differences = [
+        replace(difference_of(each, summaries, of_groups, tests, min_effect_sd), asked=is_named)
+        for each in signals
+        if len(runs.durations_s) > 1
+    ]
+    shared = [each for each in differences if each.asked or 0 not in each.count]
+    if is_named and len(runs.durations_s) > 1:
+        shared += [_of_text(each, len(groups)) for each in asked if each not in signals]
+    shared.sort(key=size_of, reverse=True)
+    found_outcomes = outcomes_of(outcomes, compared_s, min_effect_sd)
     return Comparison(
         groups=compared,
         compared_s=compared_s,
-        measures=outcomes.measures,
-        unknown=outcomes.unknown
+        measures=found_outcomes.measures,
+        unknown=found_outcomes.unknown
         | ({"means of signals": "; ".join(unread)} if unread and differences else {}),
         differences=tuple(shared[:limit]),
         total=len(shared),
         only_in=only_in(differences, list(groups)),
-        notes=(*notes, *_notes(compared), *_cut_notes(durations_s, compared_s)),
+        notes=(
+            *notes,
+            *_notes(compared),
+            *_goal_notes(runs.goals, runs.durations_s),
+            *_cut_notes(runs.durations_s, compared_s),
+        ),
     )
+
+
+def _of_text(signal: RegisteredSignal, groups: int) -> Difference:
+    """A text that was asked for: it has no mean, and the answer says what compares it."""
+    return Difference(
+        name=signal.name,
+        kind=signal.kind,
+        unit=None,
+        mean=[None] * groups,
+        deviation=[None] * groups,
+        min=[None] * groups,
+        max=[None] * groups,
+        count=[None] * groups,
+        deviation_ratio=[None] * groups,
+        effect=[None] * groups,
+        different=[None] * groups,
+        interval=[None] * groups,
+        deviation_different=[None] * groups,
+        deviation_interval=[None] * groups,
+        reasons=[f"its values are texts: mode='{signal.name}' compares the time in each"] * groups,
+        asked=True,
+    )
+
+
+class _Runs:
+    """The runs of a comparison, read one after the other.
+
+    Attributes:
+        durations_s: Of each run, from its first row to its last.
+        goals: Of the runs that had one.
+        known: All signals of the robots.
+
+    Raises:
+        NothingRecordedError: A run has no state row.
+    """
+
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        groups: Sequence[Group],
+        options: EventOptions,
+        deadline: Deadline,
+    ) -> None:
+        self._connection = connection
+        self._groups = groups
+        self._options = options
+        self._deadline = deadline
+        run_ids = [run.run_id for group in groups for run in group.runs]
+        self._segments = {run_id: _whole_run(connection, run_id) for run_id in run_ids}
+        self._robots = {run_id: fetch_run(connection, run_id).robot_id for run_id in run_ids}
+        self.durations_s = {
+            run_id: segment.end_s - segment.start_s for run_id, segment in self._segments.items()
+        }
+        self.goals: dict[int, RunGoal] = {}
+        self._known: dict[int, dict[str, RegisteredSignal]] = {}
+        for robot_id in dict.fromkeys(self._robots.values()):
+            own = [run_id for run_id in run_ids if self._robots[run_id] == robot_id]
+            self.goals |= goals_of(connection, robot_id, own)
+            segments = tuple(self._segments[run_id] for run_id in own)
+            time_range = TimeRange(robot_id, "", segments, "simulation")
+            self._known[robot_id] = known_signals(connection, time_range)
+        self._frames = [[self._frame(run.run_id) for run in group.runs] for group in groups]
+        self._interval_s = shared_interval_s(self._frames)
+
+    @property
+    def known(self) -> dict[str, RegisteredSignal]:
+        robots = reversed(list(self._known.values()))
+        return {name: signal for known in robots for name, signal in known.items()}
+
+    def _frame(self, run_id: int) -> Frame:
+        """All rows of a run, without those that only a full-rate segment has if it has others."""
+        segment, deadline = self._segments[run_id], self._deadline
+        frame = read_frame(self._connection, segment, deadline, full_rate=False)
+        if segment.full_rate and len(frame) < 2:
+            return read_frame(self._connection, segment, deadline)
+        return frame
+
+    def parts(self, compared_s: float) -> Iterator[Iterator[RunPart]]:
+        """The compared part of each run of each group."""
+        for group, frames in zip(self._groups, self._frames, strict=True):
+            newest = sorted((run.run_id for run in group.runs), reverse=True)[:MOST_SEARCHED]
+            yield (
+                self._part(run, frame, compared_s, searched=run.run_id in newest)
+                for run, frame in zip(group.runs, frames, strict=True)
+            )
+
+    def _part(self, run: RunInfo, frame: Frame, compared_s: float, *, searched: bool) -> RunPart:
+        whole = self._segments[run.run_id]
+        end_s = whole.start_s + compared_s
+        segment = whole if end_s >= whole.end_s else whole.until(end_s)
+        robot_id = self._robots[run.run_id]
+        known = self._known[robot_id]
+        return RunPart(
+            robot_id,
+            run,
+            whole,
+            segment,
+            known,
+            motion_in(frame, known, self._options),
+            EvenRows(frame, self._interval_s, segment.end_s),
+            self.goals.get(run.run_id),
+            searched,
+        )
+
+
+def _whole_run(connection: sqlite3.Connection, run_id: int) -> Segment:
+    segment = whole_run(connection, run_id)
+    if segment is None:
+        raise NothingRecordedError(f"run {run_id} has no state row: there is nothing to compare")
+    return segment
+
+
+def _goal_notes(goals: dict[int, RunGoal], durations_s: dict[int, float]) -> list[str]:
+    """That a run which never reached its goal is not better for having been shorter."""
+    missed = [run_id for run_id in durations_s if run_id in goals and goals[run_id].took_s is None]
+    if not missed:
+        return []
+    named = listed([f"{run_id} (after {durations_s[run_id]:.4g} s)" for run_id in missed])
+    return [
+        f"goal not reached by run {named}: {goals[missed[0]].condition}. Its other figures hold "
+        "for the time it ran; less time or distance is no advantage"
+    ]
 
 
 def _repeats(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str, list[int]]:
     """Runs by robot, code and parameters, if that makes groups; by themselves where it does not."""
     if not 1 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
-        raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {list(run_ids)}")
+        found = len(run_ids) if len(run_ids) > MOST_COMPARED else list(run_ids)
+        raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {found}")
     had = parameters_of(connection, run_ids)
     groups: dict[object, list[int]] = {}
     for run_id, run in zip(run_ids, run_infos(connection, run_ids), strict=True):
@@ -328,7 +560,13 @@ def _repeats(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str
         code = run.controller_sha256 or run_id  # of unknown code nothing is a repeat
         groups.setdefault((run.robot, code, *values), []).append(run_id)
     alike = groups.values() if len(groups) > 1 else [[run_id] for run_id in run_ids]
-    return {f"run{'s' * (len(each) > 1)} {', '.join(map(str, each))}": each for each in alike}
+    return {_name_of(each): each for each in alike}
+
+
+def _name_of(run_ids: Sequence[int]) -> str:
+    if len(run_ids) > _MOST_NAMED:
+        return f"{len(run_ids)} runs from {run_ids[0]} to {run_ids[-1]}"
+    return f"run{'s' * (len(run_ids) > 1)} {', '.join(map(str, run_ids))}"
 
 
 def _around_last_edit(connection: sqlite3.Connection, robot: str | None) -> dict[str, list[int]]:
@@ -340,29 +578,8 @@ def _around_last_edit(connection: sqlite3.Connection, robot: str | None) -> dict
             "every recorded run had the same controller file: there is no edit to compare across; "
             "give two or more run_ids (webots_list_runs has them)"
         )
-    after, before = (each[:MOST_COMPARED][::-1] for each in blocks)
+    after, before = (each[:MOST_OF_EDIT][::-1] for each in blocks)
     return {"before": before, "after": after}
-
-
-def _differences(
-    connection: sqlite3.Connection,
-    groups: Sequence[Sequence[RunPart]],
-    names: Sequence[str],
-    min_effect_sd: float,
-    deadline: Deadline,
-    unread: dict[str, None],
-) -> list[Difference]:
-    """The numbers of those names, group by group; none for a single run; into `unread` why."""
-    parts = [part for group in groups for part in group]
-    known = {name: signal for part in reversed(parts) for name, signal in part.known.items()}
-    found = resolve_signals(known, names)
-    numbers = [each for each in found if each.is_number and len(parts) > 1]
-    summaries = [
-        [_summarise(connection, part, numbers, deadline, unread) for part in group]
-        for group in groups
-    ]
-    tests = 2 * len(numbers)
-    return [difference_of(signal, summaries, tests, min_effect_sd) for signal in numbers]
 
 
 def _notes(groups: Sequence[Group]) -> list[str]:
@@ -394,18 +611,6 @@ def _cut_notes(durations_s: dict[int, float], compared_s: float) -> list[str]:
     ]
 
 
-def _part(
-    connection: sqlite3.Connection, run_id: int, options: EventOptions, deadline: Deadline
-) -> RunPart:
-    robot_id = fetch_run(connection, run_id).robot_id
-    segment = whole_run(connection, run_id)
-    if segment is None:
-        raise NothingRecordedError(f"run {run_id} has no state row: there is nothing to compare")
-    known = catalogue(connection, Subject(robot_id, "", run_id))
-    frame = read_frame(connection, segment, deadline)
-    return RunPart(robot_id, segment, known, motion_in(frame, known, options))
-
-
 def _summarise(
     connection: sqlite3.Connection,
     part: RunPart,
@@ -414,12 +619,19 @@ def _summarise(
     unread: dict[str, None],
 ) -> dict[str, Summary] | None:
     """Each signal that the run has over its compared stretch; None where not all was read."""
-    frame = read_frame(connection, part.segment, deadline)
-    found: dict[str, Summary] = {}
+    rows, found = part.rows, dict[str, Summary]()
+    frame, kept = (
+        rows.frame,
+        read_kept(connection, replace(part.segment, full_rate=False), deadline),
+    )
     for signal in (part.known[each.name] for each in signals if each.name in part.known):
         if deadline.passed:
             break
-        found[signal.name] = summary_of(frame, signal)
+        found[signal.name] = rows.summary_of(signal)
+        if kept is not None and signal.name in kept:
+            found[signal.name] = with_extremes(
+                found[signal.name], frame_summary.summary_of(kept, signal)
+            )
     if deadline.passed or frame.cut_at_s is not None:
         unread[OUT_OF_TIME] = None
         return None

@@ -1,4 +1,4 @@
-"""What a run came to: its path, speed, modes and events, compared over groups of runs."""
+"""What a run achieved: goal, path, speed, modes and events, compared over groups of runs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import re
 import sqlite3
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np
+from webots_mcp.analysis.rare import is_rare, may_shares_differ, verdicts_on_shares
 from webots_mcp.analysis.summary import (
+    MIN_REPEATED,
     Spread,
     Verdict,
     chance_of,
@@ -20,20 +22,28 @@ from webots_mcp.analysis.summary import (
     verdicts_on,
 )
 from webots_mcp.analysis.track import PathLength, tracks_of, travelled
+from webots_mcp.judging.detection.condition import VIOLATION, expectations_of
 from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
-from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION
-from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.frame_summary import change_points
+from webots_mcp.judging.even_rows import EvenRows
+from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed
+from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.reading.frame_summary import MOST_VALUES, change_points, spelled
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.reading.unread import Unread
-from webots_mcp.store.runs import run_info
+from webots_mcp.store.runs import RunInfo
 from webots_mcp.store.signals import RegisteredSignal
 
+MOST_SEARCHED: Final = 10  # newest runs of each group in which events are searched
 _SHARE: Final = "share of "
 _DUST: Final = 1e-9  # of a figure
+_AS_LONG: Final = 1.01  # times another duration: the ends of identical runs differ by a few rows
+_CLOCK_MARGIN: Final = (
+    0.25  # wall times of two sessions differ by less on a machine with other load
+)
 _OF_THIS_RUN: Final = re.compile(r"^run \d+ lasted only [^;,]*|(?<=a period is over )\S+")
 _RATE: Final = " per min"
 NO_MODE: Final = (
@@ -41,12 +51,26 @@ NO_MODE: Final = (
 )
 NO_WAY: Final = "fewer than two rows have a position"
 OUT_OF_TIME: Final = "time limit reached before all rows were read: compare fewer runs at once"
+_NOT_EXPECTED: Final = "nothing was expected of it when it ran"
 _SPEED: Final = "mean_speed_m_s"
+_GOAL_REACHED: Final = "goal reached"
+_GOAL_TIME: Final = "time_to_goal_s"
+_DURATION: Final = "duration_s"
+_OWN_MS: Final = "own_ms_per_step"
+WHOLE_RUNS: Final = "whole runs"
+_OF_WHOLE_RUNS: Final = (_GOAL_REACHED, _GOAL_TIME, _DURATION, _OWN_MS)
+_GOALS: Final = (  # the last run command with a goal that finished in each run
+    "SELECT json_extract(result, '$.run_id'), json_extract(params, '$.until'), "
+    "json_extract(result, '$.ended'), json_extract(result, '$.advanced_s') FROM command "
+    "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
+    "AND json_extract(params, '$.until') IS NOT NULL ORDER BY id"
+)
+_REACHED: Final = "condition held"
 
 
 @dataclass(frozen=True)
 class Way:
-    """Where a robot was in a stretch of one run.
+    """Where a robot was in a segment of one run.
 
     Attributes:
         times: Of the rows that have a position, in s.
@@ -68,42 +92,84 @@ class Way:
 
 
 def way_in(frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal]) -> Way:
-    """The way of a robot in a frame, as far as it is read before the deadline."""
+    """The path of a robot in a frame, as far as it is read before the deadline."""
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
     return Way(frame.times[there], x[there], y[there], frame.cut_at_s, frame.unread)
 
 
+def _way_in_even_rows(rows: EvenRows, position: tuple[RegisteredSignal, RegisteredSignal]) -> Way:
+    x, y = (in_metres(each, rows.numbers(each.name)) for each in position)
+    there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
+    frame = rows.frame
+    return Way(rows.moments[there], x[there], y[there], frame.cut_at_s, frame.unread)
+
+
+class RunGoal(NamedTuple):
+    """The goal of a run: the condition in `until` of its last run command.
+
+    Attributes:
+        took_s: Simulated seconds until it was reached; None where it was not.
+    """
+
+    condition: str
+    took_s: float | None
+
+
+def goals_of(
+    connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int]
+) -> dict[int, RunGoal]:
+    """Return the goals of those runs of a robot that had one."""
+    wanted = set(run_ids)
+    return {
+        run_id: RunGoal(str(condition), took_s if ended == _REACHED else None)
+        for run_id, condition, ended, took_s in connection.execute(_GOALS, (robot_id,))
+        if run_id in wanted
+    }
+
+
 @dataclass(frozen=True)
 class RunPart:
-    """A run, and what its own robot's signals are."""
+    """A run, its own robot's signals, and the part of it that is compared.
+
+    Attributes:
+        segment: The compared part.
+        rows: Its rows at even moments.
+        goal: None of a run without one.
+        searched: Whether events are searched in it.
+    """
 
     robot_id: int
+    run: RunInfo
+    whole: Segment
     segment: Segment
     known: dict[str, RegisteredSignal]
     motion: Motion
-
-    def cut(self, compared_s: float) -> RunPart:
-        """The first so many seconds of it."""
-        end_s = self.segment.start_s + compared_s
-        whole = end_s >= self.segment.end_s
-        return self if whole else replace(self, segment=self.segment.until(end_s))
+    rows: EvenRows
+    goal: RunGoal | None
+    searched: bool = True
 
 
 @dataclass(frozen=True)
 class Measure:
-    """What each run came to as a whole, over the compared stretch, by group.
+    """What each run achieved as a whole, by group.
 
     Attributes:
-        name: distance_m, mean_speed_m_s, `share of MODE` (of the time), `KIND per min` (events),
-            own_ms_per_step (wall time in the controller's own code, of the whole run).
+        name: `goal reached` (1 or 0), time_to_goal_s, distance_m, mean_speed_m_s, `share of MODE`
+            (of the time), `KIND per min` (events), duration_s, own_ms_per_step (wall time in the
+            controller's own code).
         spread: Over the runs of the group; None where it is not known of all of them.
-        different: Whether the group differs from the first by more than like runs do; None where
-            that cannot be decided, because both groups are one run each, a figure is missing, or
-            more runs are wanted; False where a difference that matters is excluded.
-        runs_wanted: So many runs of each group would tell, if they went on like these; None where
+        different: Whether the group differs from the first by more than repeated runs do; None
+            where that cannot be decided; False where a difference that matters is excluded.
+        runs_wanted: This many runs of each group would tell, if they went on like these; None where
             nothing shows that they would.
-        interval: The difference of the means lies in it nine times of ten (`analysis.summary`).
+        interval: The difference lies in it nine times of ten: of the means, or of what `compared`
+            says.
+        holds_for: Over which time the figures hold.
+        compared: What the verdict is about: "means", or "share of runs" for rare events, which are
+            counted by run (Fisher's exact test).
+        runs: Of a figure that is counted by run, the runs that have it, by group.
+        reasons: Why `different` is None, by group.
     """
 
     name: str
@@ -111,11 +177,15 @@ class Measure:
     different: list[bool | None]
     runs_wanted: list[int | None]
     interval: list[tuple[float, float] | None]
+    holds_for: str = ""
+    compared: str = "means"
+    runs: list[list[int]] | None = None
+    reasons: list[str | None] = field(default_factory=list[str | None])
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What the runs came to.
+    """What the runs achieved.
 
     Attributes:
         unknown: Figures that are not known, or not wholly: of which runs, why, and what would
@@ -126,30 +196,78 @@ class Outcomes:
     unknown: dict[str, str]
 
 
+class RunOutcome(NamedTuple):
+    """What one run achieved in the compared part.
+
+    Attributes:
+        has_mode: Its mode is known: one in which it never was took no time.
+        events: How many of each kind.
+        unknown: What is not known of it, or not wholly, with why.
+        unlooked: Kinds that were not searched at all, or not in rows that could not be read.
+        complete: All rows were searched.
+        searched: Whether events were searched in it.
+    """
+
+    run_id: int
+    duration_s: float
+    figures: dict[str, float | None]
+    has_mode: bool
+    events: Counter[str]
+    unknown: dict[str, tuple[str, ...]]
+    unlooked: frozenset[str]
+    complete: bool
+    searched: bool
+
+    def figure(self, name: str) -> float | None:
+        """The path, or the share of the time that a mode took."""
+        none = 0.0 if name.startswith(_SHARE) and self.has_mode else None
+        return self.figures.get(name, none)
+
+    def events_of(self, kind: str) -> int | None:
+        """How many events of a kind, where that is known."""
+        return self.events[kind] if self.complete and kind not in self.unlooked else None
+
+
 def outcomes_of(
-    connection: sqlite3.Connection,
-    groups: Sequence[Sequence[RunPart]],
-    options: EventOptions,
-    deadline: Deadline,
-    min_effect_sd: float,
+    groups: Sequence[Sequence[RunOutcome]], compared_s: float, min_effect_sd: float
 ) -> Outcomes:
-    """What the runs came to: the way, the modes and the events of the compared stretch."""
-    found = [[_outcome(connection, part, options, deadline) for part in group] for group in groups]
-    runs = [run for group in found for run in group]
-    names = dict.fromkeys(name for run in runs for name in run.figures)
-    kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
-    tests, of_more = _facts(found, list(names), kinds)
+    """Compare what the runs of each group achieved; the goal comes first."""
+    runs = [run for group in groups for run in group]
+    named = dict.fromkeys(name for run in runs for name in run.figures)
+    first = [name for name in (_GOAL_REACHED, _GOAL_TIME) if name in named]
+    names = [*first, *(name for name in named if name not in first)]
+    if _DURATION in names and not _varies_in_length([run.figures[_DURATION] for run in runs]):
+        names.remove(_DURATION)
+    searched = [[run for run in group if run.searched] for group in groups]
+    kinds = list(dict.fromkeys(kind for run in runs for kind in run.events))
+    tests, of_more = _facts(groups, searched, names, kinds)
+    holds_for = f"first {compared_s:.4g} s of each run"
     measures = [
-        _measure(name, figures, verdicts_on(figures, tests, chance_of, of_more, min_effect_sd))
-        for name in names
-        for figures in [[[run.figure(name) for run in group] for group in found]]
+        _measure(name, groups, (tests, of_more), min_effect_sd, holds_for) for name in names
     ]
-    measures += [_counted(kind, found, tests, of_more, min_effect_sd) for kind in kinds]
-    return Outcomes(tuple(measures), _not_known(runs))
+    measures += [
+        _counted(kind, searched, (tests, of_more), min_effect_sd, holds_for) for kind in kinds
+    ]
+    unknown = _not_known(runs)
+    left_out = [run.run_id for run in runs if not run.searched]
+    if left_out:
+        unknown[f"events{_RATE}"] = (
+            f"searched in the newest {MOST_SEARCHED} runs of each group, not in the other "
+            f"{len(left_out)}: compare fewer runs"
+        )
+    return Outcomes(tuple(measures), unknown)
+
+
+def _varies_in_length(durations_s: Sequence[float | None]) -> bool:
+    known = [each for each in durations_s if each is not None]
+    return bool(known) and max(known) > _AS_LONG * min(known)
 
 
 def _facts(
-    groups: Sequence[Sequence[_Outcome]], names: Sequence[str], kinds: Sequence[str]
+    groups: Sequence[Sequence[RunOutcome]],
+    searched: Sequence[Sequence[RunOutcome]],
+    names: Sequence[str],
+    kinds: Sequence[str],
 ) -> tuple[int, int]:
     """How many figures can differ by chance, each on its own, and how many if runs are repeated.
 
@@ -160,11 +278,13 @@ def _facts(
     runs = [run for group in groups for run in group]
     vary = [name for name in names if _varies([run.figure(name) for run in runs])]
     shares = sum(name.startswith(_SHARE) for name in vary)
-    alike = (_SPEED in vary) + (shares > 0)
-    kinds = [kind for kind in kinds if len({run.events_of(kind) for run in runs}) > 1]
-    counts = [[[run.events_of(kind) or 0 for run in group] for group in groups] for kind in kinds]
-    figures, counted = len(vary) - alike, sum(map(may_differ, counts))
-    return max(1, figures + counted), max(1, figures + len(kinds))
+    one_fact = (_SPEED in vary) + (shares > 0)
+    of_events = [run for group in searched for run in group]
+    kinds = [kind for kind in kinds if len({run.events_of(kind) for run in of_events}) > 1]
+    counts = [[[run.events_of(kind) or 0 for run in group] for group in searched] for kind in kinds]
+    may = (may_shares_differ(each) if is_rare(each) else may_differ(each) for each in counts)
+    figures = len(vary) - one_fact
+    return max(1, figures + sum(may)), max(1, figures + len(kinds))
 
 
 def _varies(figures: Sequence[float | None]) -> bool:
@@ -175,32 +295,150 @@ def _varies(figures: Sequence[float | None]) -> bool:
 
 
 def _measure(
-    name: str, groups: Sequence[Sequence[float | None]], verdicts: Sequence[Verdict]
+    name: str,
+    groups: Sequence[Sequence[RunOutcome]],
+    tests: tuple[int, int],
+    min_effect_sd: float,
+    holds_for: str,
+) -> Measure:
+    figures = [[run.figure(name) for run in group] for group in groups]
+    by_run = name == _GOAL_REACHED
+    if by_run:
+        verdicts = verdicts_on_shares(figures, *tests, min_effect_sd)
+    else:
+        verdicts = verdicts_on(figures, tests[0], chance_of, tests[1], min_effect_sd)
+    run_ids = [[run.run_id for run in group] for group in groups]
+    reasons = reasons_of(verdicts, figures, run_ids)
+    if name == _OWN_MS:
+        verdicts, reasons = _beyond_load(verdicts, reasons, figures)
+    if name == _GOAL_TIME:
+        missing = [run.run_id for group in groups for run in group if run.figure(name) is None]
+        why = f"run {listed(list(map(str, missing)))} did not reach a goal, so it has no such time"
+        reasons = [each and why if missing else each for each in reasons]
+    return _made(
+        name,
+        figures,
+        verdicts,
+        holds_for=WHOLE_RUNS if name in _OF_WHOLE_RUNS else holds_for,
+        compared="share of runs" if by_run else "means",
+        runs=_having(run_ids, figures) if by_run else None,
+        reasons=reasons,
+    )
+
+
+def _beyond_load(
+    verdicts: list[Verdict], reasons: list[str | None], figures: Sequence[Sequence[float | None]]
+) -> tuple[list[Verdict], list[str | None]]:
+    """Without differences in wall time that another load of the machine can make.
+
+    Repeated runs of one session share the load of their hour: how much they differ does not tell
+    how much two sessions do.
+    """
+    spreads = [spread_of(each) for each in figures]
+    verdicts, reasons = list(verdicts), list(reasons)
+    for at, (verdict, spread) in enumerate(zip(verdicts, spreads, strict=True)):
+        first = spreads[0]
+        if verdict.different and first is not None and spread is not None:
+            apart = abs(spread.median - first.median)
+            if apart <= _CLOCK_MARGIN * max(spread.median, first.median):
+                verdicts[at] = verdict._replace(different=None)
+                reasons[at] = (
+                    f"less than {_CLOCK_MARGIN:.0%} of wall time, which another load of the "
+                    "machine makes too"
+                )
+    return verdicts, reasons
+
+
+def _having(
+    run_ids: Sequence[Sequence[int]], figures: Sequence[Sequence[float | None]]
+) -> list[list[int]]:
+    groups = zip(run_ids, figures, strict=True)
+    return [[run_id for run_id, each in zip(ids, of, strict=True) if each] for ids, of in groups]
+
+
+def _made(
+    name: str,
+    figures: Sequence[Sequence[float | None]],
+    verdicts: Sequence[Verdict],
+    **others: Any,
 ) -> Measure:
     different, wanted, interval = map(list, zip(*verdicts, strict=True))
-    return Measure(name, [spread_of(each) for each in groups], different, wanted, interval)
+    return Measure(
+        name, [spread_of(each) for each in figures], different, wanted, interval, **others
+    )
 
 
 def _counted(
     kind: str,
-    groups: Sequence[Sequence[_Outcome]],
-    tests: int,
-    of_more: int,
+    groups: Sequence[Sequence[RunOutcome]],
+    tests: tuple[int, int],
     min_effect_sd: float,
+    holds_for: str,
 ) -> Measure:
-    """Events per minute; whether they differ is asked of their counts, in stretches of a length."""
+    """Events per minute; their counts are compared, of rare ones the runs that have any."""
     counts = [[run.events_of(kind) for run in group] for group in groups]
+    run_ids = [[run.run_id for run in group] for group in groups]
     rate = 60 / groups[0][0].duration_s
     per_min = [[None if each is None else each * rate for each in group] for group in counts]
-    verdicts = verdicts_on(counts, tests, chance_of_counts, of_more, min_effect_sd)
-    scaled = [
-        each._replace(interval=each.interval and (each.interval[0] * rate, each.interval[1] * rate))
-        for each in verdicts
+    if by_run := is_rare(counts) and any(len(group) > 1 for group in groups):
+        verdicts = verdicts_on_shares(counts, *tests, min_effect_sd)
+    else:
+        found = verdicts_on(counts, tests[0], chance_of_counts, tests[1], min_effect_sd)
+        verdicts = [_per_min(each, rate) for each in found]
+    return _made(
+        f"{kind}{_RATE}",
+        per_min,
+        verdicts,
+        holds_for=holds_for,
+        compared="share of runs" if by_run else "means",
+        runs=_having(run_ids, counts) if by_run else None,
+        reasons=reasons_of(verdicts, counts, run_ids),
+    )
+
+
+def _per_min(verdict: Verdict, rate: float) -> Verdict:
+    if verdict.interval is None:
+        return verdict
+    return verdict._replace(interval=(verdict.interval[0] * rate, verdict.interval[1] * rate))
+
+
+def reasons_of(
+    verdicts: Sequence[Verdict],
+    figures: Sequence[Sequence[float | None]],
+    run_ids: Sequence[Sequence[int]],
+) -> list[str | None]:
+    """Return why a verdict is None, by group; None where there is one."""
+    unknown = [
+        str(run_id)
+        for ids, of in zip(run_ids, figures, strict=True)
+        for run_id, figure in zip(ids, of, strict=True)
+        if figure is None
     ]
-    return _measure(f"{kind}{_RATE}", per_min, scaled)
+    return [
+        None if verdict.different is not None else _reason(verdict, figures[0], group, unknown)
+        for verdict, group in zip(verdicts, figures, strict=True)
+    ]
 
 
-def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
+def _reason(
+    verdict: Verdict,
+    first: Sequence[float | None],
+    other: Sequence[float | None],
+    unknown: Sequence[str],
+) -> str:
+    if unknown:
+        return f"not known of run {listed(unknown)}"
+    counts = (len(first), len(other))
+    if verdict.runs_wanted is not None:
+        return f"{counts[0]} and {counts[1]} runs: {verdict.runs_wanted} of each would tell"
+    if max(counts) == 1:
+        return "one run each: how much repeated runs differ is not known"
+    if min(counts) < MIN_REPEATED:
+        return f"{counts[0]} and {counts[1]} runs: it takes {MIN_REPEATED} of each or more"
+    return "the runs of each group scatter too much to show a difference, or that there is none"
+
+
+def _not_known(runs: Sequence[RunOutcome]) -> dict[str, str]:
     """Why figures are not known: those that share a reason under one key, reasons in one text."""
     alike: dict[tuple[str, str], dict[int, str]] = {}
     for run in runs:
@@ -227,50 +465,24 @@ def _reason_of_runs(reasons: dict[int, str], of: int) -> str:
     return f"run {', '.join(map(str, reasons))}: {first[1]}"
 
 
-class _Outcome(NamedTuple):
-    """What one run came to in the compared stretch.
-
-    Attributes:
-        has_mode: Its mode is known: one in which it never was took no time.
-        events: How many of each kind.
-        unknown: What is not known of it, or not wholly, with why.
-        unlooked: Kinds that were not looked for at all, or not in rows that could not be read.
-        complete: All rows were looked at.
-    """
-
-    run_id: int
-    duration_s: float
-    figures: dict[str, float | None]
-    has_mode: bool
-    events: Counter[str]
-    unknown: dict[str, tuple[str, ...]]
-    unlooked: frozenset[str]
-    complete: bool
-
-    def figure(self, name: str) -> float | None:
-        """The way, or the share of the time that a mode took."""
-        none = 0.0 if name.startswith(_SHARE) and self.has_mode else None
-        return self.figures.get(name, none)
-
-    def events_of(self, kind: str) -> int | None:
-        """How many events of a kind, where that is known."""
-        return self.events[kind] if self.complete and kind not in self.unlooked else None
-
-
-def _outcome(
+def outcome_of(
     connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
-) -> _Outcome:
+) -> RunOutcome:
+    """Return what a run achieved in the compared part: path, modes and events."""
     run_id, duration_s = part.segment.run_id, part.segment.end_s - part.segment.start_s
     figures: dict[str, float | None] = {}
-    own_ms = run_info(connection, run_id).own_ms
-    if own_ms is not None:
-        figures["own_ms_per_step"] = own_ms
+    if part.goal is not None:
+        figures[_GOAL_REACHED] = float(part.goal.took_s is not None)
+        figures[_GOAL_TIME] = part.goal.took_s
+    figures[_DURATION] = part.whole.end_s - part.whole.start_s
+    if part.run.own_ms is not None:
+        figures[_OWN_MS] = part.run.own_ms
     unknown: dict[str, tuple[str, ...]] = {}
     position = part.motion.position
     if position is None:
         unknown["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
     else:
-        read = way_in(read_frame(connection, part.segment, deadline), position)
+        read = _way_in_even_rows(part.rows, position)
         is_known = len(read.times) > 1 and not (deadline.passed or read.unread)
         way = read.length if is_known else None
         speed = None if way is None else way.length_m / duration_s
@@ -279,41 +491,67 @@ def _outcome(
         doubt = doubt or (NO_WAY if way is None else doubt_of_unit(position, speed or 0.0))
         if doubt := doubt or (way and doubt_of_length(way)):
             unknown["distance_m, mean_speed_m_s"] = (doubt,)
-    modes, unread = _mode_times(connection, part, deadline)
+    shares, unread = _mode_shares(connection, part, deadline)
     if deadline.passed or unread:
-        modes = {}
-    figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
-    if not modes:
+        shares = {}
+    figures |= {f"{_SHARE}{mode}": share for mode, share in shares.items()}
+    if not shares:
         unknown["share of each mode"] = (OUT_OF_TIME if deadline.passed else unread or NO_MODE,)
+    counts, unlooked = Counter[str](), frozenset[str]()
+    if part.searched:
+        counts, unlooked, of_events = _event_counts(connection, part, options, deadline)
+        unknown |= of_events
+    return RunOutcome(
+        run_id,
+        duration_s,
+        figures,
+        bool(shares),
+        counts,
+        unknown,
+        unlooked,
+        not deadline.passed,
+        part.searched,
+    )
+
+
+def _event_counts(
+    connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
+) -> tuple[Counter[str], frozenset[str], dict[str, tuple[str, ...]]]:
+    """How many events of each kind, the kinds that were not searched, and why."""
     found = _events(connection, part, options, deadline)
     verdicts, counts = found.verdicts, Counter(event.kind for event in found.events)
     kinds = sorted(asked_kinds(options), key=lambda kind: not kind.stored)
-    counts = {kind.name: counts[kind.name] for kind in kinds}
+    in_order = {kind.name: counts[kind.name] for kind in kinds if counts[kind.name]}
+    unlooked = {e for e in verdicts.reasons if verdicts.unlooked(e) or verdicts.unread(e)}
+    unknown: dict[str, tuple[str, ...]] = {}
     if deadline.passed:
         unknown[f"events{_RATE}"] = (OUT_OF_TIME,)
     else:
         unknown |= {f"{kind}{_RATE}": reasons for kind, reasons in verdicts.reasons.items()}
-    return _Outcome(
-        run_id,
-        duration_s,
-        figures,
-        bool(modes),
-        Counter({kind: count for kind, count in counts.items() if count}),
-        unknown,
-        frozenset(e for e in verdicts.reasons if verdicts.unlooked(e) or verdicts.unread(e)),
-        not deadline.passed,
-    )
+    if not expectations_of(connection, part.segment.run_id):
+        unlooked.add(VIOLATION)  # a run of which nothing was expected has not met it
+    return Counter(in_order), frozenset(unlooked), unknown
 
 
-def _mode_times(
+def _mode_shares(
     connection: sqlite3.Connection, part: RunPart, deadline: Deadline
 ) -> tuple[dict[str, float], str]:
-    """Seconds in each mode, and what was not read."""
+    """The share of the even moments in each mode, and what was not read."""
     if part.motion.mode is None:
         return {}, ""
-    changes = change_points(connection, part.segment, [part.motion.mode], deadline)
-    times = changes.longest_values(part.motion.mode.name, part.segment.end_s)
-    return times, "; ".join(map(str, changes.unread))
+    frame = part.rows.frame
+    changes = change_points(
+        connection, part.segment, [part.motion.mode], deadline, frame=frame, since=False
+    )
+    points = changes.points[part.motion.mode.name]
+    starts_s: Array = np.array([point.sim_time_s for point in points], np.float64)
+    moments = part.rows.moments
+    at = np.searchsorted(starts_s, moments + SAME_TIME_S, "right") - 1
+    found = Counter[str]()
+    for place, count in zip(*np.unique(at[at >= 0], return_counts=True), strict=True):
+        found[spelled(points[int(place)].value)] += int(count)
+    shares = {mode: count / len(moments) for mode, count in found.most_common(MOST_VALUES)}
+    return shares, "; ".join(map(str, changes.unread))
 
 
 def _events(

@@ -42,7 +42,7 @@ from webots_mcp.judging.comparison import (
 )
 from webots_mcp.judging.detection.kinds import EventOptions, both_of
 from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
-from webots_mcp.judging.run_measures import Measure
+from webots_mcp.judging.run_measures import WHOLE_RUNS, Measure
 from webots_mcp.questions.arguments import (
     AnyNames,
     Cursor,
@@ -58,6 +58,7 @@ from webots_mcp.questions.arguments import (
 )
 from webots_mcp.questions.declaring import READS, SETS, question
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
+from webots_mcp.signals.naming import listed
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
@@ -72,10 +73,13 @@ GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
     "total_duration_s", "real_time_factor",
 )  # fmt: skip
-MEASURE_COLUMNS: Final = ("name", "median", "range", "different", "interval", "runs_wanted")
+MEASURE_COLUMNS: Final = (
+    "name", "median", "range", "different", "interval", "runs_wanted", "compared", "runs",
+    "holds_for",
+)  # fmt: skip
 DIFFERENCE_COLUMNS: Final = (
     "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
-    "interval", "min", "max",
+    "interval", "deviation_different", "deviation_interval", "min", "max",
 )  # fmt: skip
 CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
 _GOING_ON: Final = "going on"
@@ -179,10 +183,10 @@ def webots_compare_runs(
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
     Without run_ids: the runs before and after the last edit of the controller's file. Runs of one
-    code and parameters are one group. Distance, mean speed, time per mode, events per minute, the
-    loop's own ms per step, and the signals that differ most. `different`: true beyond the spread
-    of like runs (4 of each or more), false where a difference that matters is excluded, null: it
-    cannot be told yet.
+    code and parameters are one group. Goal, distance, mean speed, time per mode, events per minute,
+    the loop's own ms per step, and the signals that differ most. `different`: true beyond the
+    spread of repeated runs (4 of each or more), false where a difference that matters is excluded,
+    null where `undecided` says why.
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
@@ -340,9 +344,10 @@ def _compared(
     asked |= {"set_id": set_id or None, "robot": view.robot.name}
     found = compare_runs(view.connection, run_ids or None, **asked)
     differing = [each for each in found.differences if _differs(each)]
+    undecided = _undecided(found.measures, differing)
     groups, notes, only_in = _groups(found), notes_of(found.notes), list(found.only_in.items())
     most = len(only_in) if is_for_a_person() else _SIZES.only_in
-    beside: list[Any] = [groups and groups.rows, found.unknown, notes]
+    beside: list[Any] = [groups and groups.rows, found.unknown, undecided, notes]
     of_measures = int(_SIZES.measures_share * room_tokens(limit, beside))
     measures = fitting(list(map(_measure_row, found.measures)), of_measures)
     beside.append(measures)
@@ -353,6 +358,7 @@ def _compared(
         "compared_s": seconds(found.compared_s),
         "measures": without_empty(MEASURE_COLUMNS, measures),
         "unknown": found.unknown or None,
+        "undecided": undecided,
         "differences": without_empty(DIFFERENCE_COLUMNS, rows),
         "total": found.total,
         "only_in": {name: list(groups) for name, groups in only_in[:most]} or None,
@@ -361,8 +367,24 @@ def _compared(
     }
 
 
+def _undecided(
+    measures: Sequence[Measure], differences: Sequence[Difference]
+) -> dict[str, str] | None:
+    """Why `different` is null, by the names of the figures that share a reason."""
+    names: dict[str, list[str]] = {}
+    figures: list[Measure | Difference] = [*measures, *differences]
+    for each in figures:
+        if reasons := dict.fromkeys(reason for reason in each.reasons[1:] if reason):
+            names.setdefault("; ".join(reasons), []).append(short_name(each.name) or "")
+    if len(names) == 1 and len(figures) > 1 and len(next(iter(names.values()))) == len(figures):
+        return {"all figures": next(iter(names))}
+    return {listed(each): why for why, each in names.items()} or None
+
+
 def _differs(difference: Difference) -> bool:
-    """Return whether mean or deviation of any group is another one than in the first."""
+    """Whether mean or deviation of any group differs from the first, or it was asked for."""
+    if difference.asked:
+        return True
     first, *others = difference.deviation
     return any(each != 0 for each in difference.effect[1:]) or any(each != first for each in others)
 
@@ -375,6 +397,9 @@ def _measure_row(measure: Measure) -> list[Any]:
         _verdicts_against_first(measure.different),
         _intervals(measure.interval),
         _verdicts_against_first(measure.runs_wanted),
+        None if measure.compared == "means" else measure.compared,
+        measure.runs,
+        measure.holds_for if measure.holds_for == WHOLE_RUNS else None,
     ]
 
 
@@ -405,7 +430,7 @@ def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
         group.name,
         short_name(group.runs[0].robot) if told_robot else None,
         [run.run_id for run in group.runs],
-        labels or None,
+        labels[: _SIZES.only_in] or None,
         _values_of({n: v[0] if len(v) == 1 else v for n, v in group.parameters.items()}),
         ", ".join(hashes) or None,
         ", ".join(dict.fromkeys(run.end_reason or _GOING_ON for run in group.runs)),
@@ -426,6 +451,8 @@ def _difference_row(difference: Difference, *, with_extremes: bool) -> list[Any]
         _against_first(figures(difference.deviation_ratio)),
         _verdicts_against_first(difference.different),
         _intervals(difference.interval),
+        _verdicts_against_first(difference.deviation_different),
+        _intervals(difference.deviation_interval),
         figures(difference.min) if with_extremes else None,
         figures(difference.max) if with_extremes else None,
     ]

@@ -1,10 +1,11 @@
 """Making chunks: the maintainer's work, never the control loop's.
 
 1,024 rows of a run become a group with a chunk of each signal when there are as many, what is left
-of a run when it has ended, and all of it before retention deletes its rows. A group is prepared
-outside the write lock, stored in pieces of about half a millisecond, and counts once its last piece
-is in. Ids of state rows are given under the write lock, so that a watermark tells which rows were
-looked at. Rows that come late, into a time that is in chunks, become a group of their own.
+of a run when it has ended (from 32 rows on), and all of it before retention deletes its rows. A
+group is prepared outside the write lock, stored in pieces of about half a millisecond, and counts
+once its last piece is in. Ids of state rows are given under the write lock, so that a watermark
+tells which rows were looked at. Rows that come late, into a time that is in chunks, become a group
+of their own.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from webots_mcp.store.run_rows import reading_texts
 from webots_mcp.store.signals import RegisteredSignal, enter_signals, may_widen, registered, seen_in
 
 GROUP_ROWS: Final = 1024
-MIN_ROWS_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
+MIN_ROWS_AT_END: Final = 32  # fewer rows at the end of a run are not put into chunks
 _IDS_AT_ONCE: Final = 20_000
 _FIRST_AT_ONCE: Final = 100_000  # bytes
 _STEP_BYTES: Final = 5_000  # a chunk takes as long as so many bytes, and its own besides

@@ -474,6 +474,10 @@ def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]
 
 
 _STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
+_STATISTICS_OF_GROUP: Final = (
+    f"SELECT signal_id, {', '.join(Statistics._fields)} FROM chunk WHERE run_id = ? "
+    "AND signal_id > 0 AND group_id = ?"
+)
 
 
 class ChunkGroup(NamedTuple):
@@ -549,6 +553,14 @@ def statistics_in(
     """
     rows = connection.execute(_STATISTICS, (run_id, signal_id, *between)).fetchall()
     return np.reshape(np.array(rows, np.float64), (-1, 1 + len(Statistics._fields)))
+
+
+def statistics_by_signal(
+    connection: sqlite3.Connection, run_id: int, group_id: int
+) -> dict[int, Statistics]:
+    """Return the statistics of each signal in one group of a run, by the signal's id."""
+    rows = connection.execute(_STATISTICS_OF_GROUP, (run_id, group_id)).fetchall()
+    return {signal_id: Statistics(*figures) for signal_id, *figures in rows}
 
 
 def groups_with_steps(

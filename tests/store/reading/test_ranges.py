@@ -21,6 +21,7 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
+from webots_mcp.store.reading import ranges
 from webots_mcp.store.reading.ranges import Scope, find_range, parse_wall_time
 from webots_mcp.store.reading.segment import Segment
 
@@ -170,7 +171,22 @@ def test_what_was_never_recorded_is_named_as_such(
         find_range(empty, Scope(robot="a"))
 
 
-def test_a_wall_range_over_very_many_runs_takes_the_newest(empty: sqlite3.Connection) -> None:
+def test_a_wall_range_over_hundreds_of_runs_holds_all_of_them(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    session_id = recorder.session(robot_id, "x")
+    for _ in range(300):
+        recorder.run(session_id, robot_id)
+        recorder.publish(1.0, {"x": 1})
+    found = find_range(empty, Scope(since_wall_time=0.0))
+    assert [segment.run_id for segment in found.segments] == list(range(1, 301))
+    assert found.notes == ()
+
+
+def test_a_wall_range_over_very_many_runs_takes_the_newest(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ranges, "MOST_RUNS", 50)
     recorder = Recorder(empty)
     robot_id = recorder.robot("r")
     session_id = recorder.session(robot_id, "x")

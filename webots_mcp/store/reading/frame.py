@@ -266,6 +266,13 @@ class Frame:
         key = ("zones", name, self._start, self._stop)
         return self._source.cached(key, lambda: self._make_zone_map(name))
 
+    def whole_statistics(self) -> dict[str, Statistics] | None:
+        """Return the statistics of all signals of a short run, which one group of chunks holds.
+
+        None of other frames, and of those that do not hold the whole group.
+        """
+        return None if self.cuts_chunks else self._source.whole_statistics()
+
     def opened(self, name: str, wanted: Flags) -> Iterator[tuple[int, Array]]:
         """The numbers of some of its chunks, each with its first row; of those that have any."""
         if self._source.order is None and np.count_nonzero(wanted) * _FEW < len(wanted):
@@ -502,6 +509,10 @@ def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Fr
 
 def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:
     """Rows [start, stop) between edges where it is wanted; those side by side are one span."""
+    if not wanted.any():
+        return []
+    if wanted.all():
+        return [(int(edges[0]), int(edges[-1]))]
     ends = edges[np.flatnonzero(np.diff(wanted, prepend=False, append=False))].tolist()
     return list(zip(ends[::2], ends[1::2], strict=True))
 

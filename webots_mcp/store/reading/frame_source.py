@@ -9,6 +9,7 @@ from __future__ import annotations
 import sqlite3
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any, Final, TypeVar, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
@@ -23,6 +24,7 @@ from webots_mcp.store.chunks import (
     Statistics,
     decoded_of,
     groups_with_steps,
+    statistics_by_signal,
     statistics_in,
     statistics_of,
     values_in,
@@ -204,7 +206,10 @@ class FrameSource:
                 table[place] = statistics_of(part)
             return table
         signal_id = self._signal_id(column)
-        if signal_id is not None and len(self._group_ids):
+        if signal_id is not None and signal_id > SIM_TIMES and len(self._group_ids) == 1:
+            if signal_id in self._of_one_group:
+                table[0] = np.array(self._of_one_group[signal_id], np.float64)
+        elif signal_id is not None and len(self._group_ids):
             stored = statistics_in(self.connection, self.run_id, signal_id, self._between)
             at, known = self._places_of(stored[:, 0])
             table[at] = stored[known, 1:]
@@ -213,6 +218,18 @@ class FrameSource:
             part = decoded_of(values[first : first + chunk_making.GROUP_ROWS])
             table[len(self._group_ids) + at] = statistics_of(part)
         return table
+
+    def whole_statistics(self) -> dict[str, Statistics] | None:
+        """Return the statistics of all signals where one group has all rows; None elsewhere."""
+        if len(self._group_ids) != 1 or len(self.columns) or self.unread or self.derived:
+            return None
+        found = self._of_one_group
+        return {name: found[each] for name, each in self.ids.items() if each in found}
+
+    @cached_property
+    def _of_one_group(self) -> dict[int, Statistics]:
+        """The statistics of all signals of a short run, read at once."""
+        return statistics_by_signal(self.connection, self.run_id, int(self._group_ids[0]))
 
     def with_long_steps(self, longer_s: float) -> Flags:
         """Return in which parts two successive rows are further apart in simulation time."""

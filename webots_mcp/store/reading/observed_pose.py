@@ -40,6 +40,7 @@ _BESIDE: Final = (
     "ORDER BY min(o.last_wall_time_s, r.last_wall_time_s) "
     "- max(o.started_wall_time_s, r.started_wall_time_s) DESC, o.id DESC LIMIT 1"
 )
+_HAS_OBSERVER: Final = f"SELECT 1 FROM robot WHERE kind = '{OBSERVER}' LIMIT 1"
 # The newest description of the world that has the robot; a name is left out where it is the key.
 _KEY: Final = (
     "SELECT min(r.value ->> '$.key'), count(*) FROM event e, "
@@ -80,6 +81,8 @@ def find_observed(
     Returns:
         None where the run has a position, or no observer saw the robot meanwhile.
     """
+    if connection.execute(_HAS_OBSERVER).fetchone() is None:
+        return None
     row = connection.execute(_BESIDE, (run_id,)).fetchone()
     if row is None or _has_position(connection, run_id, columns):
         return None

@@ -81,6 +81,11 @@ _RUNS_IN: Final = (
     "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
     "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?"
 )
+# Whether all rows of a run that has ended were recorded within these wall times.
+_LIES_IN: Final = (
+    "SELECT coalesce(started_wall_time_s >= ? AND ended_wall_time_s < ? "
+    "AND last_wall_time_s <= ended_wall_time_s, 0) FROM run WHERE id = ?"
+)
 # What was stored just before a bound and is shown as of it; commands know no run but their robot's.
 _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
     " UNION ALL ".join(
@@ -95,7 +100,7 @@ _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
     )
 )
 USE_EVERY_ROW: Final = "; ask for such a stretch alone to use every row"
-MOST_RUNS: Final = 50  # that one range in wall time may hold
+MOST_RUNS: Final = 1000  # that one range in wall time may hold
 _IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
 _LONGEST_SHOWN: Final = 80
 
@@ -442,6 +447,8 @@ def _cut(
         run_id, recorded[0], just_after(recorded[1]), wall_start_s, wall_end_s,
         open_start=True, open_end=True,
     )  # fmt: skip
+    if connection.execute(_LIES_IN, (wall_start_s, wall_end_s, run_id)).fetchone()[0]:
+        return _rated(connection, whole)
     frame = read_frame(connection, whole, Deadline())
     if frame.cut_at_s is not None:  # who reads the rows says what there is no time for
         return _rated(connection, whole)

@@ -24,6 +24,11 @@ _LATE: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
     "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
 )
+_LATE_BY_TIME: Final = _LATE.replace("+run_id", "run_id")
+_IDS_AND_ROWS: Final = (  # how many ids each of the two ways to find late rows goes through
+    "SELECT coalesce((SELECT max(id) FROM state), 0) - ?, (SELECT coalesce(sum(row_count), 0) "
+    "FROM row_group WHERE run_id = ? AND is_complete = 1)"
+)
 _FEWER_THAN: Final = (
     "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
     "LIMIT ?)"
@@ -53,7 +58,9 @@ def rows_in_no_chunk(
     columns, cut_s = StateColumns(), None
     if at.end_s != float("-inf"):  # without a chunk no row is late, and this would read the file
         late = (run_id, at.max_state_id, *span, *place)
-        cut_s = read_rows(connection, _LATE, late, columns, deadline)
+        ids, rows = connection.execute(_IDS_AND_ROWS, (at.max_state_id, run_id)).fetchone()
+        query = _LATE if ids <= rows else _LATE_BY_TIME
+        cut_s = read_rows(connection, query, late, columns, deadline)
     if cut_s is None and span[1] >= at.end_s:
         # SQLite would go through all rows from the start of the range rather than from the place.
         after = (max(span[0], at.end_s), span[1])

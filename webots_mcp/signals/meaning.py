@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, get_args
 
@@ -163,8 +162,7 @@ def short_forms() -> dict[str, str]:
 # -- meanings ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Meaning:
+class Meaning(NamedTuple):
     """What a signal means.
 
     Attributes:
@@ -250,7 +248,10 @@ def meaning_by_name(
         return _named("text", _role_in(name), name, "it is a text")
     if kind == "null":
         return UNKNOWN
-    for role, quantity in (("x", "x"), ("y", "y"), ("z", "height"), ("yaw", "heading")):
+    of_pose: tuple[tuple[str, Quantity], ...] = (
+        ("x", "x"), ("y", "y"), ("z", "height"), ("yaw", "heading"),
+    )  # fmt: skip
+    for role, quantity in of_pose:
         if base == role:
             return _named(quantity, _role_in(name) or "measured", name, "its name is one of a pose")
     quantity = _quantity_in(name, kind, base, frozenset(names))

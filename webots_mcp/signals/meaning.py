@@ -520,8 +520,9 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
         return "pitch" if "pitch" in said else None
     if unit in ("m", "cm", "mm", "km") and not said & _JOINTS:
         return "distance"
-    if found := next((_WORD_QUANTITIES[each] for each in words if each in _WORD_QUANTITIES), None):
-        return found
+    for word in words:
+        if word in _WORD_QUANTITIES:
+            return _WORD_QUANTITIES[word]
     if said & _JOINTS and said & {"position", "angle", *_TARGET, *_COMMAND}:
         return "joint position"
     return None

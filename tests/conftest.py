@@ -42,6 +42,16 @@ _MEMORY_BYTES = 4_000_000_000  # all tests at once take a tenth of it
 if _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free > _MEMORY_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
 
+# The longest of the slow files begin first, so that no process is left with one at the end.
+_LONGEST = (
+    "tests/judging/detection/test_detected.py",
+    "tests/benchmarks/test_benchmarks.py",
+    "tests/plugins/pool/parquet/test_reading.py",
+    "tests/plugins/cluster/test_cluster.py",
+    "tests/steering/trials/test_killed.py",
+    "tests/bridge/test_interrupts.py",
+)
+
 # The same examples each time, so that a red run was made red by the change that it tests;
 # `pytest --hypothesis-profile=explore` looks for new ones. No machine is too slow for them.
 settings.register_profile(
@@ -67,11 +77,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Slow tests run last, or not at all: what fails quickly is seen quickly."""
     slow = [item for item in items if item.get_closest_marker("slow")]
+    slow.sort(key=_begins)
     fast = [item for item in items if not item.get_closest_marker("slow")]
     if config.getoption("--fast"):
         config.hook.pytest_deselected(items=slow)
         slow = []
     items[:] = [*fast, *slow]
+
+
+def _begins(item: pytest.Item) -> int:
+    file = item.nodeid.partition("::")[0]
+    return _LONGEST.index(file) if file in _LONGEST else len(_LONGEST)
 
 
 def pytest_collection_finish() -> None:

@@ -25,7 +25,7 @@ class Progress:
         self._expected: Counter[str] = Counter()
         self._done: Counter[str] = Counter()
         self._outcomes: defaultdict[str, Counter[str]] = defaultdict(Counter)
-        self._lasted_s: Counter[str] = Counter()
+        self._lasted_s: defaultdict[str, float] = defaultdict(float)
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
         """Know what will run in this process."""

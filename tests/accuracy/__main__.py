@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from tests.accuracy import comparing, costs, events, recorders
+from tests.accuracy import comparing, costs, events
 from tests.accuracy.page import FIGURES, PAGE, README, Part, headline, sections
+from tests.benchmarks import recorders
 from tests.benchmarks.core import Bench
 
 PARTS: Final = (

@@ -23,7 +23,8 @@ from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import identify
 from webots_mcp.bridge.running_actions import RunningActions
-from webots_mcp.bridge.scene_changes import SceneActions, SceneEdits
+from webots_mcp.bridge.scene_changes import SceneActions
+from webots_mcp.bridge.scene_edits import SceneEdits
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp.bridge.scene import SceneNode, find_field, find_inner_field, read_value, walk
+from webots_mcp.bridge.scene_nodes import SceneNode, find_field, find_inner_field, read_value, walk
 from webots_mcp.standin import InProcessSupervisor
 
 CROWD = Path(__file__).parent / "worlds" / "crowd.wbt"

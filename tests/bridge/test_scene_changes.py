@@ -278,7 +278,7 @@ def test_a_node_without_its_parent_is_said_not_to_be_put_back(scene: Scene) -> N
 def test_a_node_that_is_too_long_to_be_remembered_is_said_to_stay_away(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.bridge.scene_changes._LONGEST_REMOVED", 20)
+    monkeypatch.setattr("webots_mcp.bridge.scene_edits._LONGEST_REMOVED", 20)
     removed = scene.ask("remove_node", path="CRATE")
     assert removed["a_reset"] == "does not bring it back; a reload does"
     scene.reset()

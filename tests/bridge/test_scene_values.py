@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.bridge.scene import is_nearer, is_same
+from webots_mcp.bridge.field_values import is_nearer, is_same
 
 
 @pytest.mark.parametrize(

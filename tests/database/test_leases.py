@@ -14,7 +14,7 @@ from tests.recordings.rows import Recorded
 from webots_mcp.database.connection import connect
 from webots_mcp.database.liveness import (
     LEASE_S,
-    Lease,
+    JobLease,
     give_back,
     holder_of,
     lease_of,
@@ -33,7 +33,7 @@ def file(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.fixture
-def lease(file: Path) -> Lease:
+def lease(file: Path) -> JobLease:
     taken = lease_of(JOB)
     with closing(connect(file, "writer")) as connection:
         assert take(connection, taken)
@@ -41,7 +41,7 @@ def lease(file: Path) -> Lease:
 
 
 @contextmanager
-def renewed_before_each_statement(file: Path, lease: Lease) -> Generator[sqlite3.Connection]:
+def renewed_before_each_statement(file: Path, lease: JobLease) -> Generator[sqlite3.Connection]:
     """A connection whose every statement begins just after the holder renewed its lease."""
     with (
         closing(connect(file, "writer")) as holder,
@@ -57,13 +57,13 @@ def renewed_before_each_statement(file: Path, lease: Lease) -> Generator[sqlite3
         connection.set_trace_callback(None)
 
 
-def test_a_lease_that_is_renewed_just_as_one_asks_is_held(file: Path, lease: Lease) -> None:
+def test_a_lease_that_is_renewed_just_as_one_asks_is_held(file: Path, lease: JobLease) -> None:
     with renewed_before_each_statement(file, lease) as connection:
         assert holder_of(connection, JOB) == lease.holder
 
 
 def test_a_lease_that_is_renewed_just_as_another_takes_it_stays_with_its_holder(
-    file: Path, lease: Lease
+    file: Path, lease: JobLease
 ) -> None:
     with renewed_before_each_statement(file, lease) as connection:
         assert not take(connection, lease_of(JOB))
@@ -72,7 +72,7 @@ def test_a_lease_that_is_renewed_just_as_another_takes_it_stays_with_its_holder(
 
 @pytest.mark.parametrize("left_s", [-1.0, 10 * LEASE_S])
 def test_a_lease_that_ran_out_or_is_of_a_clock_that_was_set_back_is_nobodys(
-    file: Path, lease: Lease, left_s: float
+    file: Path, lease: JobLease, left_s: float
 ) -> None:
     with closing(connect(file, "writer")) as connection:
         connection.execute("UPDATE lease SET until_wall_time_s = ?", (time.time() + left_s,))

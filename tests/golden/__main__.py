@@ -32,11 +32,12 @@ def main() -> int:
     for name in arguments.names or RECORDINGS:
         answers = answers_of(name)
         if patterns := arguments.question:
-            answers = {
-                asked: text if any(fnmatchcase(asked, each) for each in patterns) else before
-                for asked, text in answers.items()
-                if (before := stored(name).get(asked, text)) is not None
+            accepted = {
+                asked: text
+                for asked, text in stored(name).items()
+                if not any(fnmatchcase(asked, each) for each in patterns)
             }
+            answers |= accepted
         found = difference(name, answers)
         differing += bool(found)
         print(found or f"{name}: {len(answers)} answers as stored")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import pytest
 
@@ -37,8 +37,12 @@ def answers_to(question: str) -> list[Any]:
 
 def is_answered(answer: Any) -> bool:
     """Whether it says more than of which robot and run it is, or why there is nothing to say."""
-    answers = answer if isinstance(answer, list) else [answer]
-    return any(isinstance(each, dict) and set(each) - HEADER for each in answers)
+    answers = cast("list[Any]", answer) if isinstance(answer, list) else [answer]
+    return any(
+        bool(cast("dict[str, Any]", each).keys() - HEADER)
+        for each in answers
+        if isinstance(each, dict)
+    )
 
 
 @pytest.mark.parametrize("name", RECORDINGS)

@@ -29,7 +29,7 @@ MODULES: Final = Path(__file__).with_name("modules.toml")
 SEED: Final = 36  # the same sample for everyone, as long as the module is the same
 NOTICED: Final = ("noticed", "timeout", "crashed")
 # The exit codes of mutmut's runs of pytest; None where the mutant was not run.
-OUTCOMES: Final = {
+OUTCOMES: Final[dict[int | None, str]] = {
     0: "survived", 1: "noticed", 3: "noticed", 33: "no test", 34: "skipped",
     24: "timeout", -24: "timeout", 36: "timeout", 152: "timeout", 255: "timeout",
     -9: "timeout", -11: "crashed",

@@ -143,7 +143,7 @@ def draw_long(folder: Path) -> None:
 
 
 def draw_purged(folder: Path) -> None:
-    """Rounds of 17 minutes, of which only the newest 500 rows are kept."""
+    """Rounds of 17 minutes, of which retention leaves at most 500 rows: the newest row group."""
     record_rounds(folder / "webots.db")
     rows = Limit(rows=500, spared_rows=0)
     others = (Limit(), Limit(), Limit(), Limit())

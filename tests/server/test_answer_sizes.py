@@ -133,6 +133,7 @@ def _add_runs(connection: Any) -> None:
         )
 
 
+@pytest.mark.slow
 async def test_every_default_answer_is_under_2000_tokens(big: Path) -> None:
     async with client_on(big) as client:
         table: list[str] = []

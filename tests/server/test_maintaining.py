@@ -32,13 +32,13 @@ async def test_a_server_that_may_write_maintains_the_database(
 
 async def test_the_server_keeps_as_much_as_it_was_told(file: Path, recorded: Recorded) -> None:
     robot = recorded.robot()
-    for i in range(1024):
+    for i in range(1028):
         robot.state(i * 1.0, {"x": float(i)})
     limits = {"state": Limit(rows=4)}
     async with Client(create_server(file, file.parent, limits=limits)):
         counted = "SELECT count(*) FROM state"
         await until(lambda: recorded.connection.execute(counted).fetchone()[0] <= 4)
-    assert recorded.connection.execute("SELECT min(sim_time_s) FROM state").fetchone() == (1020.0,)
+    assert recorded.connection.execute("SELECT min(sim_time_s) FROM state").fetchone() == (1024.0,)
 
 
 async def test_a_run_whose_states_are_all_gone_is_not_said_to_have_had_none(

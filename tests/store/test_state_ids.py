@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -121,6 +122,7 @@ def older(tmp_path: Path) -> Path:
     recording(tmp_path / "current").close()
     folder = tmp_path / "older"
     folder.mkdir()
+    shutil.copytree(tmp_path / "current" / "camera", folder / "camera")
     make_older(folder / "webots.db")
     with closing(connect(folder / "webots.db", "writer")) as connection:
         connection.execute("PRAGMA foreign_keys=OFF")

@@ -131,7 +131,7 @@ def _runs(starts: Indexes, stops: Indexes, times: Array) -> Runs:
     return Runs(starts, stops, times[starts], times[stops - 1])
 
 
-def runs_alike(numbers: Array, times: Array) -> Runs:
+def constant_runs(numbers: Array, times: Array) -> Runs:
     """Where a number stays exactly the same in two rows at least; NaN is never the same."""
     edges = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))
     stops = np.append(edges[1:], len(numbers))

@@ -14,13 +14,16 @@ from typing import Final, NamedTuple
 from webots_mcp.analysis.arrays import Array, noise_of, np, runs_of
 from webots_mcp.analysis.swings import EvenRows, Swing
 
-LONGEST_FAST_ROWS: Final = 8.0  # of a period; longer ones are found by their bends
+LONGEST_FAST_ROWS: Final = 7.0  # of a period; longer ones are found by their bends
 FALSE_ALARMS: Final = 1e-6  # of a window without an oscillation
 _WINDOW: Final = 64  # rows
 _HOP: Final = 32
+_LOCAL: Final = 14  # rows over which an amplitude is local
+_LEAST_WINDOWS: Final = 3  # that follow each other: filtered noise seldom makes two
 _DEGREE: Final = 3  # of the polynomial that takes slow motion out of a window
 _CERTAIN: Final = 4.0  # standard errors: an amplitude beyond is none of noise
 _SAME_PHASE_RAD: Final = 1.0  # from one period to the next
+_GOES_ON: Final = 0.6  # of the amplitude of the next period: else it only reaches into this one
 _MOST_PERIODS: Final = 10_000
 
 
@@ -40,10 +43,10 @@ def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> I
 
 def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
     starts = np.arange(0, len(values) - _WINDOW + 1, _HOP)
-    windows = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
-    base = np.polynomial.legendre.legvander(np.linspace(-1, 1, _WINDOW), _DEGREE)
-    slow, _, _, _ = np.linalg.lstsq(base, windows.T, rcond=None)
-    rest = windows - (base @ slow).T
+    windows: Array = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
+    base = np.vander(np.linspace(-1, 1, _WINDOW), _DEGREE + 1)
+    orthogonal = np.linalg.qr(base)[0]
+    rest: Array = windows - (windows @ orthogonal) @ np.transpose(orthogonal)
     power = np.abs(np.fft.rfft(rest, axis=1)) ** 2
     power[:, -1] /= 2  # the last ordinate has one degree of freedom, the others two
     first = math.ceil(_WINDOW / LONGEST_FAST_ROWS)
@@ -58,8 +61,11 @@ def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
     swings = (chance < FALSE_ALARMS) & (total > 1e-12 * np.maximum(power.sum(axis=1), 1e-300))
     amplitude = np.sqrt(2 * total * share) / (_WINDOW / math.sqrt(2))
     for run in runs_of(swings, times[starts]).spans():
+        if run.stop - run.start < _LEAST_WINDOWS or np.ptp(peak[run.start : run.stop]) > 2:
+            continue
         ordinate = first + int(np.bincount(peak[run.start : run.stop]).argmax())
         begin, end = int(starts[run.start]), int(starts[run.stop - 1]) + _WINDOW - 1
+        begin, end = _ends_of(values[begin : end + 1], ordinate, begin)
         interval_s = float(times[end] - times[begin]) / (end - begin)
         period_s = _WINDOW / ordinate * interval_s
         half_swings = int(2 * float(times[end] - times[begin]) / period_s)
@@ -71,7 +77,16 @@ def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
             )
 
 
-class Course(NamedTuple):
+def _ends_of(values: Array, ordinate: int, first: int) -> tuple[int, int]:
+    """The first and last row where the oscillation has half of its usual amplitude."""
+    wave = np.exp(-2j * math.pi * ordinate / _WINDOW * np.arange(len(values)))
+    steps = values - np.convolve(values, np.ones(_LOCAL) / _LOCAL, "same")
+    local = np.abs(np.convolve(steps * wave, np.ones(_LOCAL) / _LOCAL, "same"))
+    loud = np.flatnonzero(local >= np.median(local) / 2)
+    return first + int(loud[0]), first + int(loud[-1])
+
+
+class SwingCourse(NamedTuple):
     """An oscillation with all periods that belong to it.
 
     Attributes:
@@ -83,7 +98,7 @@ class Course(NamedTuple):
     end_amplitude: float
 
 
-def course_of(swing: Swing, times: Array, values: Array) -> Course:
+def course_of(swing: Swing, times: Array, values: Array) -> SwingCourse:
     """Follow an oscillation to where its amplitude is lost in the noise, on both sides.
 
     A growing oscillation stands out late, though its first periods have the same period and phase.
@@ -109,7 +124,8 @@ def course_of(swing: Swing, times: Array, values: Array) -> Course:
             amplitude, here, rows = found
             error = noise * math.sqrt(2 / rows)
             drift = abs(math.remainder(here - phase, 2 * math.pi))
-            if amplitude < _CERTAIN * error or amplitude <= 0 or drift > _SAME_PHASE_RAD:
+            is_lost = amplitude < max(_CERTAIN * error, _GOES_ON * size) or amplitude <= 0
+            if is_lost or drift > _SAME_PHASE_RAD:
                 break
             edge_s, phase, size = edge_s + step_s, here, amplitude
         amplitudes.append(size)
@@ -119,7 +135,7 @@ def course_of(swing: Swing, times: Array, values: Array) -> Course:
             last_s = min(edge_s, float(times[-1]))
     half_swings = max(swing.half_swings, int(2 * (last_s - first_s) / period_s))
     longer = replace(swing, start_s=first_s, end_s=last_s, half_swings=half_swings)
-    return Course(longer, *amplitudes)
+    return SwingCourse(longer, *amplitudes)
 
 
 def _sine_at(

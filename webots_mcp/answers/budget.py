@@ -42,7 +42,7 @@ MOST_RUNS: Final = 5  # of which one answer tells
 
 
 def wall_clock(wall_time_s: float) -> str:
-    """A moment of wall time in this machine's zone, as ISO 8601 with that zone."""
+    """Return a moment of wall time in this machine's zone, as ISO 8601 with that zone."""
     try:
         return datetime.fromtimestamp(wall_time_s).astimezone().isoformat("T", "milliseconds")
     except (OverflowError, OSError, ValueError):  # no bridge has written this
@@ -55,7 +55,7 @@ _T = TypeVar("_T")
 
 
 def answer_about(view: RobotView, model: type[_A], find: Callable[[], dict[str, Any]]) -> _A:
-    """The header with what was found; where nothing was recorded, with the reason as the hint."""
+    """Return the header with what was found, or with the reason why nothing was recorded."""
     answer: dict[str, Any] = view.header() | view.position_by()
     try:
         answer |= find()
@@ -65,13 +65,13 @@ def answer_about(view: RobotView, model: type[_A], find: Callable[[], dict[str, 
 
 
 def header_of(recording: RecordingAccess, robot: str | None) -> dict[str, Any]:
-    """The header of a robot, now."""
+    """Return the header of a robot, now."""
     with recording.view(robot) as view:
         return view.header()
 
 
 def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
-    """The header of the only robot that can be meant; empty where several can, or none."""
+    """Return the header of the only robot that can be meant; empty where several can, or none."""
     try:
         return view_robot(connection, None).header()
     except (AmbiguousRobotError, NothingRecordedError):
@@ -81,7 +81,7 @@ def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
 def room_tokens(
     asked: int | None = None, beside: Any = None, usual_tokens: int = BUDGET_TOKENS
 ) -> int:
-    """The tokens for rows: more where it was said how many rows, in a terminal as many as come.
+    """Return the token budget for rows; it is larger if a limit was given, or for a person.
 
     Args:
         asked: The most rows or points that were asked for.
@@ -97,14 +97,14 @@ def room_tokens(
 
 
 def detailed(value: Any, budget_tokens: int = DETAIL_BUDGET_TOKENS) -> Any:
-    """A value of any kind, rounded, and for a model cut where it is long."""
+    """Return a value of any kind, rounded, and for a model cut where it is long."""
     if is_for_a_person():
         return shorten(value, _FOR_A_PERSON_TOKENS, _AT_LENGTH).value
     return shorten(value, budget_tokens).value
 
 
 def figure(value: float | None) -> float | None:
-    """A number as it is shown; None where there is none, or none that JSON could hold.
+    """Return a number as it is shown; None where there is none, or none that JSON could hold.
 
     Adding zero makes -0.0 the 0.0 that it means.
     """
@@ -112,27 +112,27 @@ def figure(value: float | None) -> float | None:
 
 
 def seconds(time_s: float | None) -> float | None:
-    """A simulation time as it is shown: to the millisecond."""
+    """Return a simulation time as it is shown: to the millisecond."""
     return None if time_s is None or not math.isfinite(time_s) else shown_time(time_s)
 
 
 def figures(values: Sequence[float | None]) -> list[float | None]:
-    """A column of numbers as they are shown."""
+    """Return a column of numbers as they are shown."""
     return [figure(value) for value in values]
 
 
 def shown(value: Any) -> Any:
-    """A value of any kind, rounded, and for a model cut where it is long."""
+    """Return a value of any kind, rounded, and for a model cut where it is long."""
     return detailed(value)
 
 
 def short_name(name: str | None) -> str | None:
-    """A name; an absurdly long one is cut."""
+    """Return a name; an absurdly long one is cut."""
     return name and cut_for_a_model(name, LONGEST_NAME)
 
 
 def fitting(items: Sequence[_T], budget_tokens: int | None = None) -> list[_T]:
-    """The first items whose JSON fits the budget, at least one."""
+    """Return the first items whose JSON fits the budget, at least one."""
     left = room_tokens() if budget_tokens is None else budget_tokens
     kept: list[_T] = []
     for item in items:
@@ -144,18 +144,18 @@ def fitting(items: Sequence[_T], budget_tokens: int | None = None) -> list[_T]:
 
 
 def table(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable | None:
-    """A table, or None without rows."""
+    """Return a table, or None without rows."""
     return AnswerTable(columns=list(columns), rows=list(rows)) if rows else None
 
 
 def without_empty(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable | None:
-    """A table without the columns that have no value in any row."""
+    """Return a table without the columns that have no value in any row."""
     kept = [index for index in range(len(columns)) if any(row[index] is not None for row in rows)]
     return table([columns[index] for index in kept], [[row[i] for i in kept] for row in rows])
 
 
 def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable | None:
-    """A table that says once what all its rows share; the first column names the row."""
+    """Return a table that says once what all its rows share; the first column names the row."""
     full = without_empty(columns, rows)
     if full is None or len(rows) < 2:
         return full
@@ -170,7 +170,7 @@ def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable 
 
 
 def notes_of(notes: Sequence[str]) -> list[str] | None:
-    """The notes of an answer, for a model of many the first and how many more; None without any."""
+    """Return the notes of an answer, shortened for a model; None without any."""
     if is_for_a_person():
         return [*notes] or None
     left_out = len(notes) - _MOST_NOTES
@@ -179,7 +179,7 @@ def notes_of(notes: Sequence[str]) -> list[str] | None:
 
 
 def some(names: Sequence[str], most: int = 10) -> str:
-    """The first names, and how many more there are; for a person all."""
+    """Return the first names, and how many more there are; for a person all."""
     most = len(names) if is_for_a_person() else most
     return listed([cut_for_a_model(name, LONGEST_NAME) for name in names], most)
 
@@ -188,7 +188,7 @@ def some(names: Sequence[str], most: int = 10) -> str:
 
 
 def range_in(view: RobotView, scope: Scope) -> TimeRange:
-    """What a scope means for the robot of a view, in its newest few runs.
+    """Return what a scope means for the robot of a view, in its newest few runs.
 
     Raises:
         InvalidRangeError: See `find_range`.
@@ -203,7 +203,7 @@ def range_in(view: RobotView, scope: Scope) -> TimeRange:
 
 
 def newest_runs(found: TimeRange) -> TimeRange:
-    """The range within its newest few runs; a note names earlier ones."""
+    """Return the range within its newest few runs; a note names earlier ones."""
     earlier = len(found.segments) - MOST_RUNS
     if earlier <= 0:
         return found

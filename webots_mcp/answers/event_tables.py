@@ -34,7 +34,7 @@ def fitting_events(
 ) -> tuple[Events, AnswerTable | None]:
     """At most `limit` of what was found, and as much of it as fits the budget."""
     while True:
-        told = found.told(view.connection, limit)
+        told = found.page(view.connection, limit)
         made = events_table(told.events, view, time_of_day=time_of_day)
         tokens = tokens_of([made.rows if made else [], not_shown_of(told), told.cursor])
         if tokens <= budget_tokens or limit <= 1:
@@ -44,7 +44,7 @@ def fitting_events(
 
 
 def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
-    """What became of each kind, as it is shown."""
+    """Return what became of each kind, as it is shown."""
     return KindVerdicts(
         found=verdicts.found or None,
         not_found=", ".join(verdicts.far) or None,
@@ -54,7 +54,7 @@ def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
 
 
 def not_shown_of(told: Events) -> dict[str, str] | None:
-    """How many of each kind are not shown, and from when to when they are.
+    """Return how many of each kind are not shown, and from when to when they are.
 
     Of log lines the newest are shown, so an error that many warnings follow is named here.
     """
@@ -95,6 +95,6 @@ def events_table(
 
 
 def _details_of(event: Event) -> Any:
-    """What stands for many events may be longer: it stands once."""
+    """Return what stands for many events may be longer: it stands once."""
     budget_tokens = DETAIL_BUDGET_TOKENS if event.count == 1 else _GROUP_BUDGET_TOKENS
     return detailed(event.details, budget_tokens)

@@ -21,7 +21,7 @@ class ShownPicture:
 
 
 def said(text: str) -> Any:
-    """A field that may be missing, with what it means."""
+    """Return a field that may be missing, with what it means."""
     return Field(default=None, description=text)
 
 
@@ -332,7 +332,7 @@ class EventsAnswer(NotedAnswer):
 class CheckAnswer(NotedAnswer):
     """Whether a run is well."""
 
-    outcome: str | None = said("The worst: fail, not looked at, warn or pass.")
+    outcome: str | None = said("The worst: fail, not looked at, warn, pass, or not judged.")
     checks: AnswerTable | None = said(
         "Those that did not pass; more: the call that shows it in full."
     )

@@ -32,7 +32,7 @@ class ShorteningLimits:
     exact: bool = False
 
     def rule(self) -> str:
-        """The rule in words."""
+        """Return the rule in words."""
         return (
             f"arrays over {self.items} items are summarised; texts over {self.text} characters, "
             f"objects over {self.keys} keys and what is nested over {self.depth} deep are cut"
@@ -65,7 +65,7 @@ class Shortened(NamedTuple):
 
 
 def is_for_a_person() -> bool:
-    """Whether the answer is read in a terminal, where nothing is cut to save a model's context."""
+    """Return whether a person reads the answer in a terminal, where nothing is cut."""
     return reader.get() == "cli"
 
 
@@ -105,20 +105,20 @@ def tokens_in(text: str) -> int:
 
 
 def tokens_of(value: Any) -> int:
-    """How many tokens of compact JSON an answer has, or a part of it."""
+    """Return how many tokens of compact JSON an answer has, or a part of it."""
     return tokens_in(compact_json(value))
 
 
 def _fits(value: Any, budget_tokens: int) -> bool:
-    """Whether it has no more tokens; of most values their length tells it, without a count."""
+    """Return whether a value fits; its length usually decides it without a count."""
     text = compact_json(value)
-    if len(text) <= budget_tokens or len(text) > budget_tokens * 16:
+    if len(text) <= budget_tokens or len(text) > budget_tokens * 16:  # of a token at most
         return len(text) <= budget_tokens
     return tokens_in(text) <= budget_tokens
 
 
 def round_number(value: float) -> float:
-    """A number with 4 significant digits, but never coarser than a thousandth.
+    """Return a number with 4 significant digits, but never coarser than a thousandth.
 
     So a time of 1234.567 s and a position far from the origin keep what moves. What adding leaves
     of a sum, as 2.25e-16, is the 0 that it means.
@@ -129,7 +129,7 @@ def round_number(value: float) -> float:
 
 
 def cut_text(text: str, longest: int) -> str:
-    """A text with its true length at the end where something was left out."""
+    """Return a text with its true length at the end where something was left out."""
     return text if len(text) <= longest else _cut(text, longest)
 
 
@@ -205,16 +205,16 @@ class _Shortener:
 
 
 def _is_figure(item: Any) -> bool:
-    """Whether it is a number that a float can hold, unlike an integer of 400 digits."""
+    """Return whether it is a number that a float can hold, unlike an integer of 400 digits."""
     return type(item) in (int, float) and abs(item) <= sys.float_info.max
 
 
 def _counts(others: list[Any]) -> dict[str, int]:
-    """How many items are no numbers, by what they are."""
+    """Return how many items are no numbers, by what they are."""
     names = ["null" if item is None else str(item) for item in others]
     return {name: names.count(name) for name in dict.fromkeys(names)}
 
 
 def cut_for_a_model(text: str, longest: int) -> str:
-    """A text that is cut where it would fill a model's context."""
+    """Return a text that is cut where it would fill a model's context."""
     return text if is_for_a_person() else cut_text(text, longest)

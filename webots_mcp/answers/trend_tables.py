@@ -15,6 +15,7 @@ from webots_mcp.judging.trends import RunTrends, StateTrend, Trend
 TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
 STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")
 MOST_SIGNALS: Final = 500
+EMPTY: Final = '""'  # a name without a character
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,10 @@ class TrendSizes:
 
 
 _SIZES: Final = TrendSizes()
-EMPTY: Final = '""'  # a name without a character
 
 
 def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTables:
-    """The trends of a run as tables that fit the budget."""
+    """Return the trends of a run as tables that fit the budget."""
     changed = [state for state in run.states if state.changes]
     states = fitting(
         [_state_row(state) for state in changed], int(budget_tokens * _SIZES.states_share)
@@ -64,12 +64,12 @@ def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTabl
 
 
 def _moving(run: RunTrends) -> list[Trend]:
-    """Those that changed, or lost their value: no constant is dead."""
+    """Return those that changed, or lost their value: no constant is dead."""
     return [trend for trend in run.numbers if trend.shape != "constant" or trend.is_lacking]
 
 
 def _constants(run: RunTrends) -> list[str]:
-    """What never changed, each with its value."""
+    """Return what never changed, each with its value."""
     numbers = [
         f"{trend.name or EMPTY} {figure(trend.summary.last):g} {trend.unit or ''}".rstrip()
         for trend in run.numbers
@@ -82,7 +82,7 @@ def _constants(run: RunTrends) -> list[str]:
 
 
 def _trend_row(trend: Trend) -> list[Any]:
-    """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
+    """Return a number as a row under `TREND_COLUMNS`; its text names extremes with times."""
     return [
         short_name(trend.name),
         cut_for_a_model(trend.says, _SIZES.text_characters),
@@ -93,7 +93,7 @@ def _trend_row(trend: Trend) -> list[Any]:
 
 
 def _state_row(state: StateTrend) -> list[Any]:
-    """A text or a flag as a row under `STATE_COLUMNS`."""
+    """Return a text or a flag as a row under `STATE_COLUMNS`."""
     longest_first = [*state.time_by_value_s.items()]
     most = len(longest_first) if is_for_a_person() else _SIZES.values
     times = {shown(value): round(duration_s, 3) for value, duration_s in longest_first[:most]}
@@ -109,7 +109,7 @@ def _state_row(state: StateTrend) -> list[Any]:
 
 
 def _not_shown(run: RunTrends, numbers: int, states: int) -> str | None:
-    """How many of the signals that changed are not shown."""
+    """Return how many of the signals that changed are not shown."""
     all_states = sum(bool(state.changes) for state in run.states)
     counts = (("numbers", numbers, _changed(run)), ("texts and flags", states, all_states))
     others = [
@@ -119,5 +119,5 @@ def _not_shown(run: RunTrends, numbers: int, states: int) -> str | None:
 
 
 def _changed(run: RunTrends) -> int:
-    """How many numbers changed, also beyond those that were read."""
+    """Return how many numbers changed, also beyond those that were read."""
     return run.total - (len(run.numbers) - len(_moving(run)))

@@ -6,8 +6,14 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
-from webots_mcp.bridge.simulation import Run
-from webots_mcp.database.waiting_file import ENTRIES_AT_ONCE, Entry, Kind, Values, WaitingFile
+from webots_mcp.bridge.simulation import CurrentRun
+from webots_mcp.database.waiting_file import (
+    ENTRIES_AT_ONCE,
+    Kind,
+    Values,
+    WaitingEntry,
+    WaitingFile,
+)
 
 MAX_WAITING_ROWS: Final = 10_000
 MAX_WAITING_BYTES: Final = 16_000_000
@@ -18,7 +24,7 @@ class Row:
 
     __slots__ = ("kind", "number", "run", "values")
 
-    def __init__(self, kind: Kind, run: Run | None, values: Values) -> None:
+    def __init__(self, kind: Kind, run: CurrentRun | None, values: Values) -> None:
         self.kind: Kind = kind
         self.run = run
         self.values = values
@@ -45,7 +51,7 @@ class Backlog:
     def __init__(
         self,
         file: WaitingFile | None,
-        describe_run: Callable[[Run], dict[str, Any]],
+        describe_run: Callable[[CurrentRun], dict[str, Any]],
         drop: Callable[[int, str], None],
     ) -> None:
         self._file = file
@@ -56,7 +62,7 @@ class Backlog:
         self._last_number = 0
         self._in_file = 0
         self._offset = 0
-        self._read: list[tuple[int, Entry]] = []
+        self._read: list[tuple[int, WaitingEntry]] = []
         self._described: set[str] = set()
         self._names: dict[str, str] = {}
         self.why = "too many wait"
@@ -103,14 +109,14 @@ class Backlog:
                 self._described.add(row.run.uuid)
             self._remove_oldest()
 
-    def next_entries(self) -> list[Entry]:
+    def next_entries(self) -> list[WaitingEntry]:
         """The oldest entries, which stay until `forget`; an empty list where nothing waits."""
         if self._in_file and self._file is not None:
             self._read = self._read or self._file.read(self._offset)
             if self._read:
                 return [self._renamed(entry) for _, entry in self._read]
             self._empty_file()
-        entries: list[Entry] = []
+        entries: list[WaitingEntry] = []
         described: set[str] = set()
         for index in range(min(len(self._rows), ENTRIES_AT_ONCE)):
             row = self._rows[index]
@@ -164,7 +170,7 @@ class Backlog:
     def _remove_oldest(self) -> None:
         self._bytes -= _weight(self._rows.popleft())
 
-    def _renamed(self, entry: Entry) -> Entry:
+    def _renamed(self, entry: WaitingEntry) -> WaitingEntry:
         if isinstance(entry.values, dict) and (
             name := self._names.get(entry.values.get("uuid", ""))
         ):
@@ -178,15 +184,15 @@ class Backlog:
         self._file.empty()
         self._in_file = 0
 
-    def _entries(self, row: Row, described: set[str]) -> list[Entry]:
+    def _entries(self, row: Row, described: set[str]) -> list[WaitingEntry]:
         """The row's entry, after that of its run if it is not among those described."""
         if row.number is None:
             self._last_number += 2  # two numbers: the run's own entry precedes that of the row
             row.number = self._last_number
-        entry = Entry(row.number, row.kind, row.run.uuid if row.run else None, row.values)
+        entry = WaitingEntry(row.number, row.kind, row.run.uuid if row.run else None, row.values)
         if row.run is None or row.run.uuid in described:
             return [entry]
-        run = Entry(row.number - 1, "run", None, self._describe_run(row.run))
+        run = WaitingEntry(row.number - 1, "run", None, self._describe_run(row.run))
         return [run, entry]
 
 

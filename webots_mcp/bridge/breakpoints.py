@@ -14,7 +14,7 @@ from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
-from webots_mcp.bridge.simulation import Clock, Run, Simulation
+from webots_mcp.bridge.simulation import Clock, CurrentRun, Simulation
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS, MAX_RUN_S, Pace, RunEnd, Then
 from webots_mcp.database.pauses import ARMED, OF_CONTROLLER, SET, VIOLATION, Cause
 from webots_mcp.errors import (
@@ -42,7 +42,7 @@ _CANNOT_PAUSE: Final = (
 )
 
 
-class Breakpoint:
+class ArmedBreakpoint:
     """An armed breakpoint.
 
     Attributes:
@@ -94,15 +94,6 @@ class Breakpoint:
         self.evaluator.forget()
         self.hit_count, self.holding, self.asked_since_s = 0, False, None
 
-    def begins(self, state: Any, sim_time_s: float) -> bool:
-        """Evaluate the condition on a state; True if it begins to hold with it.
-
-        Raises:
-            ConditionFailedError: See `Evaluator.holds`.
-        """
-        held, self.holding = self.holding, self.evaluator.holds(state, sim_time_s)
-        return self.holding and not held
-
 
 class Breakpoints:
     """This robot's armed breakpoints: the stored ones, and those of the controller's code."""
@@ -122,12 +113,14 @@ class Breakpoints:
         self._journal = journal
         self._pause = pause
         self._keeper = keeper
-        self.run: Run | None = None  # in which the stored ones were read; None: to be read again
-        self.reaches = False  # the state that was looked at meets what is expected within a time
+        self.run: CurrentRun | None = (
+            None  # in which the stored ones were read; None: to be read again
+        )
+        self.reaches = False  # the newest state meets what is expected within a time
         self._begun = clock.run
         self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
-        self.armed: list[Breakpoint] = []
+        self.armed: list[ArmedBreakpoint] = []
         recorder.new_database_entries.append(self._read_later)
 
     # -- setting -------------------------------------------------------------------------------
@@ -173,7 +166,7 @@ class Breakpoints:
         self.run = None
         return ()
 
-    def _move(self, stored: list[Breakpoint]) -> None:
+    def _move(self, stored: list[ArmedBreakpoint]) -> None:
         """Move to another database: what is armed and not there is stored in it."""
         there = {each.asks: each for each in stored}
         for each in self.armed:
@@ -183,7 +176,7 @@ class Breakpoints:
 
     def _read(
         self, number: int, text: bytes, action: bytes, after_hits: int, *expected: bytes | None
-    ) -> Breakpoint | None:
+    ) -> ArmedBreakpoint | None:
         from webots_mcp.signals.conditions import parse_condition
         from webots_mcp.signals.conditions.compiler import parse_expectation
 
@@ -229,7 +222,7 @@ class Breakpoints:
 
         return self._arm(_expected(None, parse_expectation(text, during, name)))
 
-    def _arm(self, new: Breakpoint) -> int | None:
+    def _arm(self, new: ArmedBreakpoint) -> int | None:
         for each in self.armed:
             if each.asks == new.asks:
                 if each.id is None:
@@ -269,16 +262,20 @@ class Breakpoints:
             self.load()
         return bool(self.armed)
 
-    def evaluate(self, state: Any) -> list[Breakpoint]:
+    def evaluate(self, state: Any) -> list[ArmedBreakpoint]:
         """The breakpoints whose condition begins to hold and whose action is due; usually none."""
-        clock, hit, self.reaches = self._clock, list[Breakpoint](), False
+        clock, hit, self.reaches = self._clock, list[ArmedBreakpoint](), False
         if self.run is not clock.run:
             self.load()
+        now_s = clock.sim_time_s
         for each in tuple(self.armed):  # a copy: a failing one is removed meanwhile
+            held, evaluator = each.holding, each.evaluator
             try:
-                if each.begins(state, clock.sim_time_s):
+                each.holding = holds = evaluator.holds(state, now_s)
+                if holds and not held:
                     self._count(each, hit)
-                self.reaches |= each.evaluator.reaches
+                if evaluator.reaches:
+                    self.reaches = True
             except ConditionFailedError as error:
                 self._disarm(each, str(error))
             except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)
@@ -287,14 +284,14 @@ class Breakpoints:
                 self._report_unpublished(each, state)
         return hit
 
-    def _count(self, each: Breakpoint, hit: list[Breakpoint]) -> None:
+    def _count(self, each: ArmedBreakpoint, hit: list[ArmedBreakpoint]) -> None:
         each.hit_count += 1
         if each.id is not None:
             self._recorder.record("breakpoint hit", None, (each.id,))
         if each.hit_count >= each.after_hits:
             hit.append(each)
 
-    def act(self, hit: list[Breakpoint], state: Any) -> None:
+    def act(self, hit: list[ArmedBreakpoint], state: Any) -> None:
         """Record the hits, keep the seconds around them, and pause where one demands it."""
         for each in hit:
             if each.action in _KEEPING:
@@ -306,7 +303,7 @@ class Breakpoints:
             first = pausing[0]
             self._pause.begin(Cause(breakpoint_id=first.id, condition=first.condition.text))
 
-    def _record_hit(self, each: Breakpoint, state: Any) -> None:
+    def _record_hit(self, each: ArmedBreakpoint, state: Any) -> None:
         data: dict[str, object] = {
             "breakpoint_id": each.id,
             "action": each.action,
@@ -325,7 +322,7 @@ class Breakpoints:
 
     # -- failures ------------------------------------------------------------------------------
 
-    def _disarm(self, each: Breakpoint, why: str) -> None:
+    def _disarm(self, each: ArmedBreakpoint, why: str) -> None:
         """Report a condition that fails and turn it off: it would fail on every state."""
         self.armed.remove(each)
         if each.id is not None:
@@ -337,7 +334,7 @@ class Breakpoints:
         self._off[number] = text
         self._recorder.record("breakpoint failed", None, (text, number))
 
-    def _report_unpublished(self, each: Breakpoint, state: Any) -> None:
+    def _report_unpublished(self, each: ArmedBreakpoint, state: Any) -> None:
         """Warn once of signals that are never published: a name may be misspelt."""
         now_s = self._clock.sim_time_s
         if each.asked_since_s is None:
@@ -351,13 +348,15 @@ class Breakpoints:
                 self._journal.log("warning", "bridge", f"{each.called}: {text}")
 
 
-def _armed(number: int | None, condition: Condition, action: str, after_hits: int) -> Breakpoint:
-    return Breakpoint(number, condition, condition.evaluator(plain), action, after_hits)
+def _armed(
+    number: int | None, condition: Condition, action: str, after_hits: int
+) -> ArmedBreakpoint:
+    return ArmedBreakpoint(number, condition, condition.evaluator(plain), action, after_hits)
 
 
-def _expected(number: int | None, expectation: Expectation) -> Breakpoint:
+def _expected(number: int | None, expectation: Expectation) -> ArmedBreakpoint:
     condition, evaluator = expectation.violation, expectation.evaluator(plain)
-    return Breakpoint(number, condition, evaluator, "keep", 1, expectation)
+    return ArmedBreakpoint(number, condition, evaluator, "keep", 1, expectation)
 
 
 def _require_action(action: str, after_hits: object) -> None:
@@ -459,7 +458,7 @@ class Reached(NamedTuple):
     """
 
     end: RunEnd
-    run: Run
+    run: CurrentRun
     sim_time_s: float
     monotonic_s: float
     why: str | None = None

@@ -175,7 +175,7 @@ class Cleaner:
 
     # -- dicts ---------------------------------------------------------------------------------
 
-    def _copy_mapping(self, value: Mapping[object, object], path: _Path, depth: int) -> object:
+    def _copy_mapping(self, value: Mapping[Any, Any], path: _Path, depth: int) -> object:
         pairs: Iterable[Any]
         count = len(value)
         if not depth and count > self._items_left - CONTAINER_ITEMS:
@@ -183,14 +183,16 @@ class Cleaner:
             self._name(path, TOO_LARGE)
             pairs = islice(value.items(), count)
         elif type(value) is dict:
-            pairs = value.items()
+            pairs = cast("Iterable[Any]", value.items())
         else:
             self._require_items(count)
             pairs = self._pairs_of(value, path)
             count = len(pairs)
         self._take_items(count)
         copy: dict[str, object] = {}
-        self._unfilled.append(_Unfilled(copy, type_name(value), pairs, path, depth + 1))
+        self._unfilled.append(
+            _Unfilled(copy, type_name(cast("object", value)), pairs, path, depth + 1)
+        )
         return copy
 
     def _pairs_of(self, value: Mapping[object, object], path: _Path) -> list[tuple[Any, Any]]:

@@ -56,7 +56,7 @@ def convert(value: Any) -> object:
     if isinstance(value, _Pointer):
         raise UnsupportedError(value.type_name)
     if isinstance(value, (type, memoryview)):
-        raise UnsupportedError(type_name(value))
+        raise UnsupportedError(type_name(cast("object", value)))
     if (ctypes := _ctypes_of(value)) is not None:
         return _convert_c_data(ctypes, value)
     if type(value).__name__ in _WEBOTS_RECORDS:
@@ -169,7 +169,7 @@ def _is_followed_when_read(kind: Any) -> bool:
     return isinstance(code, str) and code in _C_ADDRESSES
 
 
-# -- all other types, by the attribute that tells them apart -----------------------------------
+# -- all other types, by the attribute that identifies them -----------------------------------
 
 _CONVERSIONS: Final[tuple[tuple[str, Callable[[Any], object]], ...]] = (
     ("tolist", lambda array: _convert_array(array)),  # numpy scalars and arrays, array.array

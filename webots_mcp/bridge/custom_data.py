@@ -1,14 +1,13 @@
-"""Robots without a bridge, as an observer records them from what they write into `customData`.
+"""Recordings of robots without a bridge, made by an observer from their field `customData`.
 
-A controller in any language says what it knows in one call (`wb_robot_set_custom_data` in C). The
-field holds one text, which supervisors see a step later. A JSON object gives the signals of a
-state, anything else the one signal `custom_data`. A robot has a session of its own once it has
-written something, and as long as no other process records it: a bridge that comes later takes its
-place.
+A controller in any language publishes with one call (`wb_robot_set_custom_data` in C). The field
+holds one text, which supervisors see a step later. A JSON object gives the signals of a state, any
+other text the one signal `custom_data`. A robot has a session of its own from its first text on, as
+long as no other process records it. A bridge that starts later takes over.
 
-The field comes with the steps (`enableSFTracking`), so that reading it is no request; a long text
-is read once a second instead. Whatever a robot writes, a round of the observer goes on: long texts
-and what is no JSON are cut, and what fails for one robot is reported and stops no other.
+Webots sends the field with each step (`enableSFTracking`), so that reading it is no request. A long
+text is read once a second instead. No text stops the observer: long texts and texts that are not
+JSON are cut, and a failure with one robot is reported and affects no other.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ from webots_mcp.bridge.error_report import ErrorReport, cut
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Identity, same_simulation
-from webots_mcp.bridge.scene import SceneNode, find_field
+from webots_mcp.bridge.scene_nodes import SceneNode, find_field
 from webots_mcp.bridge.simulation import Clock, LoopMeter, Simulation
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
 from webots_mcp.database.liveness import is_living
 from webots_mcp.signals.register import SignalNames, StateChanges
 
-TEXT: Final = "custom_data"  # the signal of what is no JSON object
+TEXT: Final = "custom_data"  # the signal of a text that is no JSON object
 MISSED: Final = "seq_missed"  # how many messages of this run were overwritten before a reading
 SEEN: Final = "seen"  # the branch of the pose where a robot publishes one of its keys itself
 LONGEST_TEXT: Final = 65_536  # characters that are taken for JSON, and sent with each step
-_LONGEST_SIGNAL: Final = 1_000  # characters of what is no JSON
+_LONGEST_SIGNAL: Final = 1_000  # characters of a text that is not JSON
 _READ_LONG_AGAIN_S: Final = 1.0  # of wall time
-_MOST_FOUND: Final = 10  # robots whose fields are looked for in one round
+_MOST_FOUND: Final = 10  # new robots whose fields are searched in one round
 _STALE_S: Final = 1.0  # of simulation time in which a text from before a reset is not believed
 _EPSILON_S: Final = 1e-9
 _DELAY_STEPS: Final = 2  # after a reset in which a text that is new may be from before it
@@ -64,16 +63,16 @@ class SeenRobot(Protocol):
 
     @property
     def is_there(self) -> bool:
-        """Whether its node is still in the world."""
+        """Return whether its node is still in the world."""
         ...
 
     def pose_now(self) -> dict[str, float] | None:
-        """Its pose as signals; None where it has none."""
+        """Return its pose as signals; None without a pose."""
         ...
 
 
 def signals_of(text: str) -> dict[str, Any]:
-    """The members of a JSON object; of any other text the signal `custom_data`.
+    """Return the members of a JSON object; of any other text the signal `custom_data`.
 
     `nan` and `inf`, as C prints them, are read like JSON's NaN and Infinity.
     """
@@ -107,7 +106,7 @@ class ObserverParts(NamedTuple):
 
 
 class CustomDataReader:
-    """Reads what the robots of a world write, and records it for those that no other records.
+    """Reads `customData` of the robots of a world, and records robots that nothing else records.
 
     Args:
         observer: What is known of the observer itself, and its recorder.
@@ -117,35 +116,35 @@ class CustomDataReader:
         self._observer = observer
         self._robots: dict[int, _Robot] = {}  # by the id of the body
         self._taken: set[str] = set()  # names of robots that other processes record
-        self._look_again_s = 0.0
+        self._check_sessions_s = 0.0
 
-    def look(self, bodies: Iterable[SeenRobot], *, is_due: bool) -> None:
-        """Read all fields; record what is new, and where it is due what is as before.
+    def read_all(self, bodies: Iterable[SeenRobot], *, is_due: bool) -> None:
+        """Read all fields and record the texts that are new.
 
         Args:
             bodies: The robots that are followed now.
-            is_due: Whether it is time for a row of each robot, also of one that wrote nothing.
+            is_due: Also record a row of each robot that has written nothing new.
         """
         now_s = time.monotonic()
-        if now_s >= self._look_again_s:
-            self._look_again_s = now_s + HEARTBEAT_INTERVAL_S
+        if now_s >= self._check_sessions_s:
+            self._check_sessions_s = now_s + HEARTBEAT_INTERVAL_S
             self._taken = self._names_taken()
         robots = {id(body): body for body in bodies}
         for key in self._robots.keys() - robots.keys():
             self._robots.pop(key).end("finished")
         for key in list(robots.keys() - self._robots.keys())[:_MOST_FOUND]:
             self._robots[key] = _Robot(robots[key], self._observer)
-        waiting = [robot for robot in self._robots.values() if self._look_at(robot, now_s, is_due)]
+        waiting = [robot for robot in self._robots.values() if self._read(robot, now_s, is_due)]
         if waiting:  # one in a round, since it takes milliseconds
             self._taken = self._names_taken()
             free = (robot for robot in waiting if recorded_name(robot.body.name) not in self._taken)
             for robot in islice(free, 1):
                 robot.begin()
 
-    def _look_at(self, robot: _Robot, now_s: float, is_due: bool) -> bool:
-        """Read one robot; True where it has written something and has no session yet."""
+    def _read(self, robot: _Robot, now_s: float, is_due: bool) -> bool:
+        """Read one robot; return whether it has written something and has no session yet."""
         try:
-            return robot.look(
+            return robot.read(
                 now_s, is_due=is_due, is_taken=recorded_name(robot.body.name) in self._taken
             )
         except Exception as error:  # noqa: BLE001  (the other robots are read nevertheless)
@@ -153,21 +152,22 @@ class CustomDataReader:
             return False
 
     def close(self) -> None:
-        """The observer ends, or the world."""
+        """End all recordings, because the observer or the world ends."""
         for robot in self._robots.values():
             robot.end("finished")
         self._robots.clear()
 
     def _names_taken(self) -> set[str]:
+        """Return the names of the robots of this simulation that other processes record."""
         own = {robot.session_id for robot in self._robots.values()}
-        here, now_s = self._observer.identity.instance, time.time()
+        instance, now_s = self._observer.identity.instance, time.time()
         rows = self._observer.recorder.fetch(_OPEN_SESSIONS, ())
         if rows is None:
             return self._taken
         return {
             name
-            for name, session_id, instance, host, pid, process, seen_s in rows
-            if session_id not in own and same_simulation(instance, here)
+            for name, session_id, recorded_in, host, pid, process, seen_s in rows
+            if session_id not in own and same_simulation(recorded_in, instance)
             and is_living(host, pid, process, seen_s, now_s)
         }  # fmt: skip
 
@@ -182,21 +182,30 @@ class _Robot:
     def __init__(self, body: SeenRobot, observer: ObserverParts) -> None:
         self.body = body
         self._observer = observer
-        self._field: Any = None  # where it has none, or is gone
-        self._is_asked_for = False
+        self._field: Any = None  # None without such a field, or once the node was removed
+        self._is_searched = False
         self._recording: _Recording | None = None
-        self._text = self._text_left = ""  # the newest, and what is there of another's time
-        self._read_again_s: float | None = None  # None where the field comes with the steps
+        self._text = self._text_left = ""  # newest; written while another recorded
+        self._read_again_s: float | None = None  # None while Webots sends the field with each step
 
     @property
     def session_id(self) -> int | None:
-        """Of its recording."""
+        """The session of its recording; None without one."""
         registration = self._recording and self._recording.recorder.registration
         return registration.session_id if registration else None
 
-    def look(self, now_s: float, *, is_due: bool, is_taken: bool) -> bool:
-        """Record what is new; True where there is something and no session yet."""
-        if not self._is_asked_for:  # what is asked for at once is newer than the last step
+    def read(self, now_s: float, *, is_due: bool, is_taken: bool) -> bool:
+        """Read the field and record its text, if there is a recording.
+
+        Args:
+            now_s: The time of the monotonic clock.
+            is_due: Also record a text that is not new.
+            is_taken: Another process records this robot.
+
+        Returns:
+            Whether there is a text to record and no session yet.
+        """
+        if not self._is_searched:  # a value read in this round would be newer than the last step
             self._find_field()
             return False
         if self._field is None:
@@ -205,24 +214,26 @@ class _Robot:
             self._field = None
             self.end("finished")
             return False
-        before, self._text = self._text, self._read(now_s)
+        before, self._text = self._text, self._read_text(now_s)
         if is_taken:
             self.end("superseded")
             self._text_left = self._text
             return False
         if self._recording is None:
             return self._text not in ("", self._text_left)
-        self._recording.look(self._text, is_new=self._text != before, is_due=is_due)
+        self._recording.record(self._text, is_new=self._text != before, is_due=is_due)
         return False
 
     def begin(self) -> None:
-        """Begin its session, with what it has written."""
-        self.body.scene.node.enablePoseTracking(self._step_ms)  # of the moment of each text
+        """Begin its session with the text that it has written."""
+        self.body.scene.node.enablePoseTracking(
+            self._step_ms
+        )  # so that each text gets the pose of its step
         self._recording = _Recording(self.body, self._observer)
-        self._recording.look(self._text, is_new=True, is_due=True)
+        self._recording.record(self._text, is_new=True, is_due=True)
 
     def end(self, reason: str) -> None:
-        """Nothing more comes of it, or another process records it from now on."""
+        """End its session, because the robot ends or another process records it now."""
         if self._recording is not None:
             self._recording.end(reason)
             self._recording = None
@@ -232,7 +243,7 @@ class _Robot:
         return max(int(1000 * self._observer.simulation.basic_time_step_s), 1)
 
     def _find_field(self) -> None:
-        self._is_asked_for = True
+        self._is_searched = True
         self._field = find_field(self.body.scene.node, CUSTOM_DATA)
         if self._field is None:
             why = f"the PROTO of robot {self.body.name!r} hides its customData: it cannot be read"
@@ -240,8 +251,8 @@ class _Robot:
         else:
             self._field.enableSFTracking(self._step_ms)
 
-    def _read(self, now_s: float) -> str:
-        """What the field holds; a long text is not sent with each step but read once a second."""
+    def _read_text(self, now_s: float) -> str:
+        """Return the text of the field; a long one is read once a second, not sent with steps."""
         if self._read_again_s is not None and now_s < self._read_again_s:
             return self._text
         try:
@@ -258,7 +269,7 @@ class _Robot:
 
 
 class _Recording:
-    """The session of a robot, written by its observer."""
+    """Writes the session of one robot."""
 
     def __init__(self, body: SeenRobot, observer: ObserverParts) -> None:
         identity = observer.identity._replace(
@@ -274,7 +285,7 @@ class _Recording:
         self._body = body
         self._followed, self._observed_run = observer.clock, observer.clock.run
         self._clock = Clock(observer.simulation)
-        self._clock.meter = LoopMeter()  # of its own loop, which is not seen
+        self._clock.meter = LoopMeter()  # the robot's own loop cannot be seen
         self._errors = ErrorReport(strict=False)
         self.recorder = Recorder(observer.recorder.database, identity, self._clock, self._errors)
         self._journal = Journal(self.recorder, self._clock)
@@ -289,8 +300,8 @@ class _Recording:
             self._clock.run.start_reason = "reload"
         self._journal.event(self._clock.run.start_reason)
 
-    def look(self, text: str, *, is_new: bool, is_due: bool) -> None:
-        """Record a text that is new, or, where a row is due, the one that still stands there."""
+    def record(self, text: str, *, is_new: bool, is_due: bool) -> None:
+        """Record a text that is new, or, if a row is due, one that was recorded before."""
         if self._clock.follow(self._followed, self._observed_run):
             self._begin_run()
         if is_new:
@@ -304,7 +315,7 @@ class _Recording:
         self._heartbeat.beat_if_due()
 
     def end(self, reason: str) -> None:
-        """End run and session; one that a bridge has ended already stays ended so."""
+        """End run and session; a session that a bridge has ended keeps its reason."""
         ids = self.recorder.registration
         for (ended,) in (ids and self.recorder.fetch(_END_REASON, (ids.session_id,))) or ():
             reason = ended or reason
@@ -312,12 +323,12 @@ class _Recording:
 
     @property
     def _may_be_of_former_run(self) -> bool:
-        """Whether a text that is new may have been on its way when the world was reset."""
+        """Whether a new text may have been sent before the world was reset."""
         was_reset = self._stale_until_s >= 0.0
         return was_reset and self._clock.sim_time_s < self._delay_s + _EPSILON_S
 
     def _begin_run(self) -> None:
-        """The world was reset: what the field holds is of the time before it."""
+        """Begin a run after a reset; the field still holds the text from before it."""
         self._observed_run = self._followed.run
         self.recorder.end_run("reset", self._clock.ended_sim_time_s)
         self.recorder.run = self._clock.run
@@ -327,6 +338,7 @@ class _Recording:
         self._journal.event("reset")
 
     def _record(self) -> None:
+        """Record the newest values with the pose of the robot."""
         is_stale = self._clock.sim_time_s < self._stale_until_s
         state = dict({} if is_stale else self._values)
         pose = self._body.pose_now() or {}
@@ -340,6 +352,7 @@ class _Recording:
         self._names.register(state, encoded.text, self.recorder.enter_signals)
 
     def _report_missed(self) -> None:
+        """Report that the robot overwrites messages before they are read."""
         counted = self._sequence
         self._journal.event("missed", {"messages": counted.missed, "of": counted.total})
         self._errors.warn(  # also shown by status, as its newest error
@@ -351,12 +364,12 @@ class _Recording:
 
 
 class _Sequence:
-    """Counts what was missed, by the key `seq` that a robot raises by 1 with each message.
+    """Counts missed messages by the key `seq`, which a robot raises by 1 with each message.
 
     Attributes:
-        last: The newest; None before the first.
-        missed: How many were overwritten before they were read.
-        total: How many there were, as far as it is known.
+        last: The newest number; None before the first.
+        missed: Number of messages that were overwritten before they were read.
+        total: Number of messages, read or missed.
     """
 
     def __init__(self) -> None:
@@ -365,10 +378,10 @@ class _Sequence:
         self._report_from = 1
 
     def count(self, given: object) -> bool:
-        """Count a message; one whose number is not above the last begins anew.
+        """Count a message; a number that is not above the last one begins a new count.
 
         Returns:
-            Whether the number of those missed has doubled since this was last said.
+            Whether the number of missed messages has doubled since it was last reported.
         """
         if isinstance(given, float) and given.is_integer():  # 12.0, as some languages write it
             given = int(given)

@@ -34,12 +34,13 @@ class Rule(NamedTuple):
 
     Attributes:
         group: The key of the state under which they are published.
-        period_ms: The sampling period in milliseconds; 0 while the device is disabled.
+        period_ms: The sampling period in milliseconds, 0 while the device is disabled; None of
+            devices that need not be enabled.
         read: Reads the value.
     """
 
     group: str
-    period_ms: Callable[[Any], int]
+    period_ms: Callable[[Any], int] | None
     read: Callable[[Any], object]
 
 
@@ -49,11 +50,7 @@ def _sensor(read: Callable[[Any], object]) -> Rule:
 
 def _actuator(group: str, read: Callable[[Any], object]) -> Rule:
     """The rule of an actuator: its command can be read without enabling anything."""
-    return Rule(group, _always, read)
-
-
-def _always(_: Any) -> int:
-    return 1
+    return Rule(group, None, read)
 
 
 def read_devices(robot: Any, failed: Failed) -> dict[str, object]:
@@ -72,23 +69,47 @@ def read_devices(robot: Any, failed: Failed) -> dict[str, object]:
         `pose`: [x_m, y_m, yaw_rad] from the first GPS and inertial unit, where both are enabled.
     """
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
-    groups: dict[str, dict[str, object]] = {"sensors": {}}
+    sensors: dict[str, object] = {}
+    groups: dict[str, dict[str, object]] = {"sensors": sensors}
+    gps = unit = None  # the first enabled ones
     for name, device in devices.items():
-        rule = RULES.get(type(device).__name__)
+        cls: type[Any] = device.__class__
+        rule = _RULES_OF_CLASSES.get(cls, ...)
+        if rule is ...:
+            rule = _remember_rule(cls)
+        if rule is None:
+            continue
         try:
-            if rule is not None and rule.period_ms(device) > 0:
-                groups.setdefault(rule.group, {})[name] = rule.read(device)
+            if rule.period_ms is not None and rule.period_ms(device) <= 0:
+                continue
+            value = rule.read(device)
         except Exception as error:  # noqa: BLE001  (the other devices are still read)
             failed(name, error)
-    return {**_pose(devices, groups["sensors"]), **groups, **_battery(robot)}
+            continue
+        if rule.group == "sensors":
+            sensors[name] = value
+            if gps is None and cls.__name__ == "GPS":
+                gps = device, value
+            elif unit is None and cls.__name__ == "InertialUnit":
+                unit = device, value
+        else:
+            groups.setdefault(rule.group, {})[name] = value
+    pose = {} if gps is None or unit is None else _pose(*gps, unit[1])
+    return {**pose, **groups, **_battery(robot)}
 
 
-def _pose(devices: dict[str, Any], sensors: dict[str, object]) -> dict[str, object]:
-    kinds = {type(devices[name]).__name__: name for name in reversed(sensors)}
-    gps, unit = kinds.get("GPS"), kinds.get("InertialUnit")
-    if gps is None or unit is None or devices[gps].getCoordinateSystem() == _WGS84:
+def _remember_rule(cls: type[Any]) -> Rule | None:
+    """Return the rule of a class of devices, and look its name up only once."""
+    rule = RULES.get(cls.__name__)
+    if len(_RULES_OF_CLASSES) < _MOST_CLASSES:
+        _RULES_OF_CLASSES[cls] = rule
+    return rule
+
+
+def _pose(gps: Any, position: object, angles: object) -> dict[str, object]:
+    if gps.getCoordinateSystem() == _WGS84:
         return {}
-    (x_m, y_m, _), (*_, yaw) = cast("list[float]", sensors[gps]), cast("list[float]", sensors[unit])
+    (x_m, y_m, _), (*_, yaw) = cast("list[float]", position), cast("list[float]", angles)
     return {"pose": [x_m, y_m, yaw]}
 
 
@@ -100,17 +121,19 @@ def _battery(robot: Any) -> dict[str, object]:
 def _read_motor(motor: Any) -> dict[str, float]:
     """The commands of a motor in its unit; Webots has one class for rotational and linear ones."""
     if motor.getType() == motor.LINEAR:
-        unit, feedback, period_ms = "m", "force_feedback_n", motor.getForceFeedbackSamplingPeriod()
+        values = {
+            "target_position_m": motor.getTargetPosition(),
+            "target_velocity_m_s": motor.getVelocity(),
+        }
+        if motor.getForceFeedbackSamplingPeriod() > 0:
+            values["force_feedback_n"] = motor.getForceFeedback()
     else:
-        unit, feedback = "rad", "torque_feedback_nm"
-        period_ms = motor.getTorqueFeedbackSamplingPeriod()
-    values = {
-        f"target_position_{unit}": motor.getTargetPosition(),
-        f"target_velocity_{unit}_s": motor.getVelocity(),
-    }
-    if period_ms > 0:
-        measured = motor.getForceFeedback() if unit == "m" else motor.getTorqueFeedback()
-        values[feedback] = measured
+        values = {
+            "target_position_rad": motor.getTargetPosition(),
+            "target_velocity_rad_s": motor.getVelocity(),
+        }
+        if motor.getTorqueFeedbackSamplingPeriod() > 0:
+            values["torque_feedback_nm"] = motor.getTorqueFeedback()
     return values
 
 
@@ -261,6 +284,8 @@ RULES: Final[dict[str, Rule]] = {
     "TouchSensor": _sensor(_read_touch),
     "VacuumGripper": _actuator("actuators", _read_vacuum_gripper),
 }
+_RULES_OF_CLASSES: Final[dict[type[Any], Rule | None]] = {}  # of those that were seen
+_MOST_CLASSES: Final = 1000  # a program may make classes without end
 
 
 # -- how often devices are read --------------------------------------------------------------------
@@ -323,6 +348,8 @@ class DeviceReader:
     def _count(self, duration_us: float) -> None:
         """Set the interval by the median of the last durations; log it when it has doubled."""
         self._durations_us.append(duration_us)
+        if duration_us <= MOST_READING_US and self.ring_interval == 1:
+            return  # the median has not grown
         usual_us = sorted(self._durations_us)[len(self._durations_us) // 2]
         interval = max(1, math.ceil(usual_us / MOST_READING_US))
         if interval != self.ring_interval:

@@ -23,7 +23,7 @@ from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album, HeldFrame, image_of
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.bridge.simulation import Clock, CurrentRun
 from webots_mcp.bridge.state_copies import StateCopier, StateCopy
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import KEEP_AFTER_S, new_uuid
@@ -53,7 +53,7 @@ class Stretch:
         gaps: Why calls are missing in it; None where none is.
     """
 
-    def __init__(self, run: Run, start_s: float) -> None:
+    def __init__(self, run: CurrentRun, start_s: float) -> None:
         self.uuid = new_uuid()
         self.run = run
         self.start_s = self.end_s = start_s
@@ -111,8 +111,8 @@ class Keeper:
         self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
         self._stretch: Stretch | None = None
         self._going_on = False
-        self._asked: deque[tuple[Run, str]] = deque(maxlen=_MOST_REASONS)
-        self._unwritten: deque[tuple[Run, RingRow]] = deque()
+        self._asked: deque[tuple[CurrentRun, str]] = deque(maxlen=_MOST_REASONS)
+        self._unwritten: deque[tuple[CurrentRun, RingRow]] = deque()
         self._unwritten_frames: deque[tuple[Stretch, HeldFrame]] = deque()
         self._lock = threading.RLock()  # of all that is held: any thread may publish
         self.frames = CameraFrames(journal, last_s)

@@ -15,7 +15,7 @@ from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport, describe
 from webots_mcp.bridge.parameters import Parameter, V
 from webots_mcp.bridge.pictures import MOST_FRAMES
-from webots_mcp.bridge.session import Session
+from webots_mcp.bridge.session import BridgeSession
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
@@ -123,7 +123,7 @@ class MCPBridge:
             former.close("superseded")
         where = (self.database, self.data_dir)
         limits = (throttle, keep_last_s, self._errors, self._kind, hang_after_s)
-        self._session = Session(simulation, *where, *limits)
+        self._session = BridgeSession(simulation, *where, *limits)
         self._meter = simulation.meter
         self._publisher = self._session.publisher
         self._session.begin()

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.bridge.simulation import Clock, CurrentRun
 from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
@@ -87,7 +87,7 @@ class Album:
             self._forget(kept.popleft())
         return {"path": path, "width": width, "height": height, "size_bytes": size}
 
-    def add_kept(self, run: Run, stretch_uuid: str, frame: HeldFrame) -> None:
+    def add_kept(self, run: CurrentRun, stretch_uuid: str, frame: HeldFrame) -> None:
         """Write a small frame of a kept stretch, which exists as long as the stretch.
 
         Raises:
@@ -228,7 +228,7 @@ class Picture(NamedTuple):
     scale: str | None = None
 
 
-def _drawn(drawn: tuple[Canvas, str]) -> Picture:
+def _drawn(drawn: tuple[PixelCanvas, str]) -> Picture:
     canvas, scale = drawn
     return Picture(canvas.bgra, canvas.width, canvas.height, scale)
 
@@ -290,7 +290,7 @@ def _kind(device: Any) -> str:
 # from above, since its own image is often a single row.
 
 
-def draw_depths(device: Any) -> tuple[Canvas, str]:
+def draw_depths(device: Any) -> tuple[PixelCanvas, str]:
     """A range finder's image in colours, and the scale in words.
 
     Raises:
@@ -302,7 +302,7 @@ def draw_depths(device: Any) -> tuple[Canvas, str]:
     grown = max(1, _SHORTEST_WIDTH_PX // width) if step == 1 else 1
     rows = [ranges[i : i + width : step] for i in range(0, len(ranges), width * step)]
     shown = max(_SHORTEST_WIDTH_PX, grown * len(rows[0]))
-    canvas = Canvas(shown, grown * len(rows))
+    canvas = PixelCanvas(shown, grown * len(rows))
     shades, per_m = _shades(), (_SHADES - 1) / max(far_m - near_m, 1e-9)
     for number, row in enumerate(rows):
         pixels = [_shade_of(shades, (each - near_m) * per_m) for each in row]
@@ -313,7 +313,7 @@ def draw_depths(device: Any) -> tuple[Canvas, str]:
     return canvas, scale
 
 
-def draw_from_above(device: Any) -> tuple[Canvas, str]:
+def draw_from_above(device: Any) -> tuple[PixelCanvas, str]:
     """A lidar's points as seen from above with distance rings, and the scale in words.
 
     Raises:
@@ -324,7 +324,7 @@ def draw_from_above(device: Any) -> tuple[Canvas, str]:
     farthest_m = max((math.hypot(*point) for point in points), default=device.getMaxRange())
     spacing_m = _round_number(farthest_m / 4)
     rings = max(1, math.ceil(farthest_m / spacing_m - 1e-6))
-    canvas, middle = Canvas(_TOP_VIEW_PX, _TOP_VIEW_PX), _TOP_VIEW_PX / 2
+    canvas, middle = PixelCanvas(_TOP_VIEW_PX, _TOP_VIEW_PX), _TOP_VIEW_PX / 2
     per_m = (middle - 8) / (rings * spacing_m)
     for number in range(1, rings + 1):
         radius = number * spacing_m * per_m
@@ -402,7 +402,7 @@ GREY: Final = colour(110, 110, 110)
 WHITE: Final = colour(255, 255, 255)
 
 
-class Canvas:
+class PixelCanvas:
     """An image to draw into; drawing outside of it has no effect."""
 
     def __init__(self, width: int, height: int, background: int = BLACK) -> None:

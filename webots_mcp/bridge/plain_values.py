@@ -126,7 +126,7 @@ def _check_unusual(value: Any, left: int) -> int:
 def _has_short_keys(value: dict[Any, Any]) -> bool:
     """Check the keys of a dict and remember them."""
     for key in value:
-        kind = type(key)
+        kind = type(key)  # pyright: ignore[reportUnknownVariableType]
         if kind is str:
             is_short = len(key) <= _SHORT_KEY_CHARACTERS
         elif kind is int:

@@ -37,7 +37,7 @@ from webots_mcp.bridge.registration import (
     describe_session,
     register,
 )
-from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.bridge.simulation import Clock, CurrentRun
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import (
     FAILURES,
@@ -164,7 +164,7 @@ class Recorder:
 
     # -- rows ----------------------------------------------------------------------------------
 
-    def record(self, kind: Kind, run: Run | None, values: Values) -> int | None:
+    def record(self, kind: Kind, run: CurrentRun | None, values: Values) -> int | None:
         """Write a row now, or keep it until it can be written.
 
         Args:
@@ -209,7 +209,7 @@ class Recorder:
         finally:
             self._lock.release()
 
-    def record_together(self, kind: Kind, run: Run, rows: Sequence[tuple[Any, ...]]) -> None:
+    def record_together(self, kind: Kind, run: CurrentRun, rows: Sequence[tuple[Any, ...]]) -> None:
         """Write rows of one kind in one transaction, or keep them until they can be written."""
         self.last_use_s = time.monotonic()
         if not self._lock.acquire(this_call(), _LOCK_PATIENCE_S):
@@ -314,7 +314,7 @@ class Recorder:
         self._backlog.abandon()
         self.off = "a forked process does not record for its parent"
 
-    def describe_run(self, run: Run) -> dict[str, Any]:
+    def describe_run(self, run: CurrentRun) -> dict[str, Any]:
         """The values of a run's own row."""
         return {
             "uuid": run.uuid,
@@ -327,7 +327,7 @@ class Recorder:
 
     # -- writing: the caller has the connection lock -------------------------------------------
 
-    def _write(self, kind: Kind, run: Run | None, values: Values) -> int | None:
+    def _write(self, kind: Kind, run: CurrentRun | None, values: Values) -> int | None:
         """Write a row; returns how many rows the statement changed, or None if it was deferred."""
         if not self._is_ready(run):
             self._keep(Row(kind, run, values))
@@ -347,7 +347,7 @@ class Recorder:
             run.rows += 1
         return changed
 
-    def _write_together(self, kind: Kind, run: Run, rows: Sequence[tuple[Any, ...]]) -> bool:
+    def _write_together(self, kind: Kind, run: CurrentRun, rows: Sequence[tuple[Any, ...]]) -> bool:
         """Write rows in one transaction; False where it fails: one by one, each fails by itself."""
         if not self._is_ready(run):
             return False
@@ -386,7 +386,7 @@ class Recorder:
             ids = (self._ids.session_id, run.id, run.rows)
             self._transact(partial(write_heartbeat, self._opened, loop, status, *ids))
 
-    def _is_ready(self, run: Run | None) -> bool:
+    def _is_ready(self, run: CurrentRun | None) -> bool:
         """Whether all rows that precede a new row of that run are written; tries to write them."""
         connection = self.connection
         if (
@@ -399,7 +399,7 @@ class Recorder:
             return self._catch_up(run)
         return True
 
-    def _catch_up(self, run: Run | None) -> bool:
+    def _catch_up(self, run: CurrentRun | None) -> bool:
         """Write the waiting rows and the run's own row; False where some are still waiting."""
         if not self._is_connected():
             return False
@@ -428,7 +428,7 @@ class Recorder:
             if time.monotonic() > until_s:
                 break
 
-    def _enter_run(self, run: Run) -> None:
+    def _enter_run(self, run: CurrentRun) -> None:
         """Write the run's row, or continue the existing one."""
         values = bind(None, self._ids.session_id, self.describe_run(run))
         entered = self._execute(STATEMENTS["run"], values)

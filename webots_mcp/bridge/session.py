@@ -26,7 +26,8 @@ from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.running_actions import RunningActions
-from webots_mcp.bridge.scene_changes import SceneActions, SceneEdits
+from webots_mcp.bridge.scene_changes import SceneActions
+from webots_mcp.bridge.scene_edits import SceneEdits
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog
@@ -39,7 +40,7 @@ _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or w
 _UNMOVED_S: Final = 10.0  # of wall time
 
 
-class Session:
+class BridgeSession:
     """All parts of a bridge, from its construction to its end, and the runs in it.
 
     It is the one place that knows how the parts are connected: no part knows the session.

@@ -449,7 +449,7 @@ class Clock:
             0  # calls of `update` at which time had advanced, or the steps between them
         )
         self.step_s: float | None = None  # of a loop that only watches the steps of others
-        self.run = Run("start", self.sim_time_s)
+        self.run = CurrentRun("start", self.sim_time_s)
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
         self._reset_from_s: float | None = None
 
@@ -471,16 +471,16 @@ class Clock:
             return False
         self._reset_from_s = None
         self.ended_sim_time_s = before
-        self.run = Run("reset", now)
+        self.run = CurrentRun("reset", now)
         self.start_moving()
         return True
 
-    def follow(self, other: Clock, run: Run) -> bool:
+    def follow(self, other: Clock, run: CurrentRun) -> bool:
         """Take the time of another clock; True if a run has begun there since `run`."""
         is_new = other.run is not run
         if is_new:
             self.ended_sim_time_s = self.sim_time_s
-            self.run = Run("reset", other.sim_time_s)
+            self.run = CurrentRun("reset", other.sim_time_s)
         self.sim_time_s, self.moved_s = other.sim_time_s, other.moved_s
         return is_new
 
@@ -488,7 +488,7 @@ class Clock:
         """Count time as moving from now on; it counts as standing still only after a while."""
         self.moved_s = time.monotonic()
 
-    def newest_s(self, run: Run) -> float:
+    def newest_s(self, run: CurrentRun) -> float:
         """The newest simulation time of the current run, or of the one before it."""
         return self.sim_time_s if run is self.run else self.ended_sim_time_s
 
@@ -516,7 +516,7 @@ class Clock:
 # -- runs and simulation time ----------------------------------------------------------------------
 
 
-class Run:
+class CurrentRun:
     """A stretch of rising simulation time; its id is None until its row is written.
 
     Attributes:

@@ -107,7 +107,7 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
 
 
 def _named(error: CycloptsError) -> str:
-    """What is wrong, and of what; of a value without an option cyclopts leaves its name out."""
+    """Say what is wrong, and with which argument: cyclopts omits some names."""
     text, argument = _OFFER.sub(_harmless_offer, str(error)), error.argument
     if argument is None or any(name in text for name in argument.names):
         return text
@@ -115,7 +115,7 @@ def _named(error: CycloptsError) -> str:
 
 
 def _harmless_offer(offer: re.Match[str]) -> str:
-    """What cyclopts offers for a name that it does not know; nothing where that loses something."""
+    """Return what cyclopts offers for an unknown name, unless that would destroy something."""
     return "" if is_destructive(offer[1]) else offer[0]
 
 
@@ -139,7 +139,7 @@ def _end(code: int, text: str) -> int:
 
 
 def _explain_missing(error: ModuleNotFoundError) -> str:
-    """Which packages are missing, and the line that installs them: a bridge does without any.
+    """Name the missing packages, and the line that installs them.
 
     Raises:
         ModuleNotFoundError: Again, where it is a defect of ours.
@@ -167,7 +167,7 @@ def _explain_missing(error: ModuleNotFoundError) -> str:
 
 
 def _explain_value(error: Exception) -> str:
-    """What is most likely wrong with the recording, and where it shows.
+    """Return what is most likely wrong with the recording, and where it shows.
 
     Raises:
         Exception: Again, where it is not about a value of a row.
@@ -191,7 +191,7 @@ def _discard_output() -> None:
 
 
 def app_for(argv: Sequence[str]) -> App:
-    """The application with the command that is called; with all of them for help and completion."""
+    """Return the application with the called command, or with all for help and completion."""
     from cyclopts import App, Group, Parameter
 
     from webots_mcp.cli.commands import COMMANDS, GROUPS
@@ -250,13 +250,13 @@ def described() -> dict[str, CommandHelp]:
 
 
 def called_value(argument: Argument) -> str:
-    """The word for its value."""
+    """Return the word for its value."""
     metavar = getattr(argument.parameter, "metavar", None)  # cyclopts 4 has none
     return metavar if isinstance(metavar, str) else value_name(argument.names[-1])
 
 
 def _typed(argument: Argument) -> str:
-    """All names of an option, with a word for its value."""
+    """Return all names of an option, with a word for its value."""
     names = argument.names
     if argument.hint is bool or not names[0].startswith("-"):
         return ", ".join(names)

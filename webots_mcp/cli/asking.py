@@ -78,7 +78,7 @@ _END_IT: Final = "\nor end it with\n\n    {}\n"
 
 
 def command_of(question: Question) -> Callable[..., None]:
-    """The function that the command line calls for a question."""
+    """Return the function that the command line calls for a question."""
 
     def run(
         *positional: Any,
@@ -124,7 +124,7 @@ def command_of(question: Question) -> Callable[..., None]:
 
 
 def _named(question: Question, positional: Sequence[Any]) -> dict[str, Any]:
-    """What was typed without options, by the names of the arguments; the last takes the rest."""
+    """Return positional arguments by name; the last one takes the rest."""
     *single, last = question.positional or ("",)
     named = dict(zip(single, positional, strict=False))
     rest = positional[len(single) :]
@@ -168,9 +168,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
     asks_controllers = question.has_caller  # which takes a row in the queue, also to read
     recording = where.recording(read_only=question.effect.reads and not asks_controllers)
     valid = _valid(question, given, recording)
-    if not (frozenset({"signals", "pattern"})).isdisjoint(
-        each.name for each in question.parameters
-    ):
+    if {"signals", "pattern"} & {each.name for each in question.parameters}:
         make_chunks_first(recording)
     with line_of_progress(), _caller(question, recording) as caller:
         return anyio.run(question.ask, recording, valid, caller)
@@ -195,7 +193,7 @@ def _caller(question: Question, recording: RecordingAccess) -> Generator[Caller 
 def _valid(
     question: Question, given: Mapping[str, Any], recording: RecordingAccess
 ) -> dict[str, Any]:
-    """The arguments as the question takes them; what was not given is left to their defaults."""
+    """Return the arguments as the question takes them; others keep their defaults."""
     meant: dict[str, Any] = {}
     for parameter in question.parameters:
         value, kind = given.get(parameter.name), _plain(parameter.annotation)
@@ -251,7 +249,7 @@ def show(question: Question, reply: Reply, where: Where, *, as_json: bool) -> No
 
 
 def _not_done(question: Question, answer: Mapping[str, Any], where: Where) -> str:
-    """What became of a command, and what to do next."""
+    """Return what became of a command, and what to do next."""
     is_under_way = answer["outcome"] == "claimed" and "command_id" in answer
     hint = _under_way(answer, where) if is_under_way else answer.get("hint")
     failed = (f"{route}: {reason}" for route, reason in answer.get("failed_routes", {}).items())
@@ -260,7 +258,7 @@ def _not_done(question: Question, answer: Mapping[str, Any], where: Where) -> st
 
 
 def _under_way(answer: Mapping[str, Any], where: Where) -> str:
-    """The command lines that go on waiting, and that end what lets the loop come round."""
+    """Return the command lines that go on waiting, and that end what lets the loop come round."""
     wait = shlex.join(["webots-mcp", "wait", str(answer["command_id"]), *where.typed()])
     robot = ["--robot", answer["robot"]] if "robot" in answer else []
     end = shlex.join(["webots-mcp", "pause", *robot, *where.typed()])
@@ -315,7 +313,7 @@ class _NewRows:
         self._newest: dict[bool, int] = {}
 
     def of(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Those that are new; rows that wait for a run have numbers of their own."""
+        """Return those that are new; rows that wait for a run have numbers of their own."""
         new = [row for row in rows if row["id"] > self._newest.get(row["run_id"] is None, 0)]
         for row in new:
             self._newest[row["run_id"] is None] = row["id"]
@@ -337,7 +335,7 @@ def _print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def option_of(question: Question, argument: str) -> str:
-    """The option of an argument, as it is typed; of one without an option how the help calls it."""
+    """Return the option of an argument as it is typed, or its name in the help."""
     own = question.options or {}
     if argument in own:
         return own[argument]
@@ -392,17 +390,17 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
 
 
 def _value_name(argument: str) -> str | None:
-    """How the help calls its value; None for the name of its type."""
+    """Return how the help calls its value; None for the name of its type."""
     return next((name for end, name in _VALUE_NAMES.items() if argument.endswith(end)), None)
 
 
 def _place(question: Question, argument: str) -> list[int]:
-    """Where it stands among those without an option's name."""
+    """Return where it stands among those without an option's name."""
     return [place for place, name in enumerate(question.positional) if name == argument]
 
 
 def _plain(annotation: Any) -> Any:
-    """The type without what pydantic is told beside it."""
+    """Return the type without what pydantic is reported beside it."""
     if get_origin(annotation) is Annotated:
         return _plain(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
@@ -429,12 +427,12 @@ def _is_mapping(kind: Any) -> bool:
 
 
 def _is_of_parameters(kind: Any) -> bool:
-    """Whether the values of a mapping are those of parameters, which have declared kinds."""
+    """Return whether the values of a mapping are those of parameters, which have declared kinds."""
     return get_args(_without_none(kind))[1] is not Any
 
 
 def _is_json(kind: Any) -> bool:
-    """Whether several kinds of values are possible, of which the one typed is found by JSON."""
+    """Return whether several types are possible; JSON decides which one was typed."""
     each = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
     kinds = [one for one in each if one is not type(None)]
     return kinds == [Any] or (len(kinds) > 1 and all(get_origin(k) is not Literal for k in kinds))

@@ -21,7 +21,7 @@ class CommandEntry(NamedTuple):
     name: str
 
     def declared(self) -> Any:
-        """What the module has under its name: a `Question`, or a function."""
+        """Return what the module has under its name: a `Question`, or a function."""
         return getattr(importlib.import_module(self.module), self.name)
 
 

@@ -194,7 +194,7 @@ def _export_for_viewers(recorded: Where, part: TimeRangeOptions, file: Path, for
 
 
 def _notes_of(wanted: TimeRange) -> list[str]:
-    """Each call in a kept stretch is a row of an export, whatever else was asked for."""
+    """Each call in a full-rate segment is a row of an export, whatever else was asked for."""
     from webots_mcp.store.reading.ranges import USE_EVERY_ROW
 
     return [note.removesuffix(USE_EVERY_ROW) for note in wanted.notes]
@@ -259,7 +259,7 @@ def import_(
 
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
-    """What the import has brought, of the runs that are in both recordings now."""
+    """Return what the import has brought, of the runs that are in both recordings now."""
     from webots_mcp.database.upgrade import in_current_schema
     from webots_mcp.store.merging import settled
 
@@ -392,7 +392,7 @@ def _prune(
 
 
 def _as_data(wanted: Plan) -> dict[str, Any]:
-    """What goes and what does not, for programs."""
+    """Return what goes and what does not, for programs."""
     return {
         "goes": [
             {
@@ -432,7 +432,7 @@ def _print_plan(wanted: Plan, going: str) -> None:
 
 
 def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
-    """What lies on the disk, bytes: limits are about rows, not about signals and free room."""
+    """Return what takes space on the disk, in bytes; limits count rows only."""
     held = dict(wanted.held_bytes)
     beside = {"pictures": held.pop("image"), "log": sizes["log_beside_bytes"]}
     free = sizes["free_in_file_bytes"]
@@ -502,7 +502,7 @@ def tail(
         following = not no_follow and recorded.may_change()
         while following:
             wait(interval_s)
-            recorded.recording().take_in()
+            recorded.recording().ingest()
             _print_lines(_newest_states_only(follower.read_new()), as_json=json)
 
 
@@ -517,7 +517,7 @@ def _print_lines(lines: Sequence[FollowedLine], *, as_json: bool) -> None:
 
 
 def _newest_states_only(lines: Sequence[FollowedLine]) -> list[FollowedLine]:
-    """A robot that publishes a hundred times a second would scroll all else away."""
+    """Return a robot that publishes a hundred times a second would scroll all else away."""
     newest = {line.robot: line for line in lines if line.kind == "state"}
     return [line for line in lines if line.kind != "state" or newest[line.robot] is line]
 
@@ -575,7 +575,7 @@ def plot(
 
 
 def _is_id(text: str) -> bool:
-    """Whether it is the id of a run; what is none is a signal that was typed behind the runs."""
+    """Return whether a text is the id of a run; otherwise it is a signal."""
     return text.isascii() and text.isdecimal()
 
 

@@ -110,7 +110,7 @@ def _handling(handler: Handler, *numbers: int) -> Generator[None]:
 
 
 def ended_by(interrupt: KeyboardInterrupt) -> tuple[int, str]:
-    """The exit code of a process that a signal has ended, and a word about it."""
+    """Return the exit code of a process that a signal has ended, and a word about it."""
     number = signal.Signals(interrupt.args[0] if interrupt.args else signal.SIGINT)
     return 128 + number, _WORDS[number]
 

@@ -45,6 +45,7 @@ _ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
     "fail": ("failure", "failures"),
     "not looked at": ("error", "errors"),
     "not applicable": ("skipped", "skipped"),
+    "not judged": ("skipped", "skipped"),
 }
 _WAITING: Final = Waiting()
 _NOT_PERMITTED: Final = (
@@ -108,7 +109,7 @@ def _compile(recorded: Where) -> None:
 
 
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
-    """The answer with commands in the place of calls, and what passed in one line."""
+    """Return the answer with commands in the place of calls, and what passed in one line."""
     from webots_mcp.cli.asking import OPTIONS
     from webots_mcp.cli.wording import commands_by_tool
 
@@ -367,7 +368,7 @@ def profile(
 
 
 def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
-    """The stacks of the main thread, and how often each was met.
+    """Return the stacks of the main thread, and how often each was met.
 
     Raises:
         CommandRefusedError: py-spy is not installed, or not permitted; the text says what to do.
@@ -391,7 +392,7 @@ def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
 
 
 def _place_of(stack: str, own: str) -> tuple[str, str | None]:
-    """The innermost line of the controller's own files, and its function."""
+    """Return the innermost line of the controller's own files, and its function."""
     in_bridge = False
     for each in reversed(stack.split(";")):
         function, file, line = (

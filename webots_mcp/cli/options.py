@@ -40,7 +40,7 @@ if TYPE_CHECKING or hasattr(cyclopts.Parameter(), "metavar"):
 else:  # cyclopts 4, the last for Python 3.10: options have no words for their values
 
     def Parameter(*names: str, metavar: str | None = None, **given: Any) -> cyclopts.Parameter:  # noqa: N802
-        """How an argument is typed, without the word for its value."""
+        """Return how an argument is typed, without the word for its value."""
         return cyclopts.Parameter(*names, **given)
 
 
@@ -50,7 +50,7 @@ _RUNS: Final = "outlive"
 
 
 def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
-    """What was typed; cyclopts by itself would round 1.5.
+    """Return what was typed; cyclopts by itself would round 1.5.
 
     Raises:
         ValueError: It is no whole number, or one that SQLite cannot hold.
@@ -107,7 +107,7 @@ def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> d
 
 
 def value_of(text: str) -> Any:
-    """What was typed, as JSON; what is none is a text."""
+    """Return what was typed, as JSON; what is none is a text."""
     try:
         return json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError):
@@ -152,7 +152,7 @@ class Where:
     ] = None
 
     def recording(self, *, read_only: bool = True) -> RecordingAccess:
-        """The recording."""
+        """Return the recording."""
         from webots_mcp.database.location import resolve_database
         from webots_mcp.store.recording import RecordingAccess
 
@@ -160,7 +160,7 @@ class Where:
         return RecordingAccess(*where, read_only=read_only, asker="cli")
 
     def typed(self) -> list[str]:
-        """The options that name it in another command line."""
+        """Return the options that name it in another command line."""
         given = (("--data-dir", self.data_dir), ("--database", self.database))
         return [text for option, value in given if value for text in (option, str(value))]
 
@@ -175,7 +175,7 @@ class Where:
             yield connection
 
     def may_change(self) -> bool:
-        """Whether rows may still come: none do where the file cannot be written."""
+        """Return whether rows may still come: none do where the file cannot be written."""
         from webots_mcp.database.connection import FrozenConnection
 
         with self.recording().reader() as connection:
@@ -268,20 +268,20 @@ class TimeRangeOptions:
     ] = None
 
     def scope(self) -> Scope:
-        """What is asked for."""
+        """Return what is asked for."""
         from webots_mcp.store.reading.ranges import Scope
 
         return Scope(**vars(self))
 
     def in_recording(self, connection: sqlite3.Connection) -> TimeRange:
-        """What the options mean in a recording."""
+        """Return what the options mean in a recording."""
         from webots_mcp.store.reading.ranges import find_range
 
         return find_range(connection, self.scope())
 
 
 def only_reading(command: Callable[_Given, None]) -> Callable[_Given, None]:
-    """A command that fails over a value that no bridge has written reads again past such rows."""
+    """Return a command that reads again past invalid rows if a value makes it fail."""
 
     @functools.wraps(command)
     def read(*arguments: _Given.args, **options: _Given.kwargs) -> None:
@@ -295,9 +295,9 @@ def past_wrong_values(run: Callable[[], None]) -> None:
     try:
         return run()
     except Exception as error:
-        if isinstance(error, (WebotsMCPError, OSError, ImportError)) and not isinstance(
-            error, MalformedRowError
-        ):
+        # Other errors are due to a value in a row: reading past invalid rows helps only there.
+        is_other = isinstance(error, (WebotsMCPError, OSError, ImportError))
+        if is_other and not isinstance(error, MalformedRowError):
             raise
     past_invalid_rows(run)
 
@@ -328,7 +328,7 @@ def make_chunks_first(recording: RecordingAccess) -> None:
 
 
 def _option(name: str, text: str) -> Parameter:
-    """The option of a limit, with what holds where nobody has set one."""
+    """Return the option of a limit, with what holds where nobody has set one."""
     value = getattr(DEFAULT, name)
     default = f"{value:g}" if name == _RUNS else limit_text(value)
     if isinstance(value, Limit) and value.limits:
@@ -375,7 +375,7 @@ class RetentionOptions:
     ] = None
 
     def asked(self) -> Asked:
-        """The limits that were given; None goes back to the default.
+        """Return the limits that were given; None goes back to the default.
 
         Raises:
             InvalidInputError: A text is not a limit, or a number is below 1.
@@ -396,7 +396,7 @@ def _value(name: str, text: str) -> Limit | float | None:
 
 
 def _times_of(text: str) -> float:
-    """How many times; 0 for ever, which a person might take for the opposite, and writes as all."""
+    """Return how many times; 0 means for ever, which a person writes as all."""
     if text == NO_LIMIT:
         return 0.0
     try:

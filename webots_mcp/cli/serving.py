@@ -192,7 +192,7 @@ def _ending_with_the_client() -> Generator[None]:
 
 
 def _is_broken_pipe(error: object) -> bool:
-    """Whether it is nothing else, also where the server's tasks have grouped it."""
+    """Return whether it is nothing else, also where the server's tasks have grouped it."""
     parts: tuple[object, ...] = getattr(error, "exceptions", ())
     return all(map(_is_broken_pipe, parts)) if parts else isinstance(error, BrokenPipeError)
 
@@ -412,7 +412,7 @@ def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
 
 
 def _has_recorded(recording: RecordingAccess, before: int) -> bool:
-    """Whether a session after `before` has a run."""
+    """Return whether a session after `before` has a run."""
     from webots_mcp.simulator.launch import starts_since
 
     try:
@@ -443,7 +443,7 @@ def _watch(recording: RecordingAccess, before: int, world: Path, patience_s: flo
 
 
 def _recording(data_dir: Path | None, project: Path) -> RecordingAccess:
-    """Where the controllers of the project record, whatever folder this one is started in."""
+    """Return where the controllers of the project record, whatever the current folder is."""
     from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER
     from webots_mcp.database.location import resolve_database
     from webots_mcp.store.recording import RecordingAccess

@@ -242,7 +242,7 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
 
 
 def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
-    """The Python that can run the observer, where the one that Webots takes cannot."""
+    """Return the Python that can run the observer, where the one that Webots takes cannot."""
     from webots_mcp.setup.interpreter import probe_interpreter
     from webots_mcp.setup.observer_edits import python_change
 
@@ -379,7 +379,7 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
 def _written(
     file: Path, writing: Writing, planned: Callable[[], tuple[FileChange, str | None]]
 ) -> dict[str, str]:
-    """What became of a file, with what there is to know about it; or why it was left as it is."""
+    """Return what was done with a file, with notes, or why it was left as it is."""
     try:
         change, note = planned()
         return writing.apply(change) | ({"note": note} if note else {})
@@ -388,7 +388,7 @@ def _written(
 
 
 def _allowed(project: Path) -> tuple[FileChange, str | None]:
-    """What may be asked for in the project, unless that is written already."""
+    """Return what may be asked for in the project, unless that is written already."""
     from webots_mcp.setup.client_entries import policy_file
     from webots_mcp.store.policy import read_policy
 
@@ -398,7 +398,7 @@ def _allowed(project: Path) -> tuple[FileChange, str | None]:
 
 
 def _ignored(data_dir: Path, writing: Writing) -> tuple[FileChange, str | None]:
-    """What keeps the recording out of the project's repository."""
+    """Return what keeps the recording out of the project's repository."""
     from webots_mcp.database.files import make_folder
     from webots_mcp.setup.client_entries import ignore_file
 
@@ -409,7 +409,7 @@ def _ignored(data_dir: Path, writing: Writing) -> tuple[FileChange, str | None]:
 
 
 def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
-    """A controller, the lines that it needs, and the Python that it is started with."""
+    """Return a controller, the lines that it needs, and the Python that it is started with."""
     from dataclasses import asdict
 
     from webots_mcp.setup.interpreter import probe_interpreter

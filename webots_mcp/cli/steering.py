@@ -449,7 +449,7 @@ def run_plan(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions)
 
 
 def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManager[Simulators]:
-    """Where the trials run; that there is such a program is seen before anything is written."""
+    """Return where the trials run; that the program exists is checked first."""
     from webots_mcp.steering.trial_run import LocalSimulators, stand_in, webots
 
     if options.scheduler is not None:
@@ -478,7 +478,7 @@ def _cluster(options: TrialOptions, plan: WorldPlan) -> Generator[Simulators]:
 
 
 def _picture_of(file: Path | None) -> Callable[[RecordingAccess, int], None] | None:
-    """What draws the picture that is asked for; None where none is."""
+    """Return what draws the picture that is asked for; None where none is."""
     if file is None:
         return None
     from webots_mcp.plotting.canvas import Sheet, image_format_of
@@ -496,7 +496,7 @@ def _picture_of(file: Path | None) -> Callable[[RecordingAccess, int], None] | N
 
 
 def _set_of(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) -> int:
-    """The set that was begun with this plan, or a new one."""
+    """Return the set that was begun with this plan, or a new one."""
     from webots_mcp.store.parameters import create_trial_set, find_trial_set
 
     text = _text_of(plan, options)
@@ -508,7 +508,7 @@ def _set_of(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) 
 def _begun_set(
     recording: RecordingAccess, file: Path, plan: WorldPlan, options: TrialOptions
 ) -> int:
-    """The set that was begun with this plan.
+    """Return the set that was begun with this plan.
 
     Raises:
         NothingRecordedError: There is none.

@@ -63,7 +63,7 @@ def spelling_out() -> Generator[None]:
 
 
 def binary_stdout() -> Any:
-    """Where data is written as it is; on a terminal it is spelled out as all else."""
+    """Return where data is written as it is; on a terminal it is spelled out as all else."""
     return _Bytes(sys.stdout) if sys.stdout.isatty() else sys.stdout.buffer
 
 

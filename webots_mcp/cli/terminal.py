@@ -19,6 +19,17 @@ from typing import Any, Final, TextIO, cast
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.signals.naming import spelled_out
 
+_HEAD: Final = {
+    "robot": "{}",
+    "run_id": "run {}",
+    "sim_time_s": "at {} s",
+    "status": "{}",
+    "age_s": "{} s old",
+}
+_TIMES: Final = ("sim_time_s", "since_s")  # lists of them
+_AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
+_NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
+
 
 @dataclass(frozen=True)
 class TextLayout:
@@ -42,16 +53,6 @@ class TextLayout:
 
 
 _LAYOUT: Final = TextLayout()
-_HEAD: Final = {
-    "robot": "{}",
-    "run_id": "run {}",
-    "sim_time_s": "at {} s",
-    "status": "{}",
-    "age_s": "{} s old",
-}
-_TIMES: Final = ("sim_time_s", "since_s")  # lists of them
-_AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
-_NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
 
 
 def print_answer(answer: Mapping[str, Any]) -> None:
@@ -84,7 +85,7 @@ def answer_lines(
 
 
 def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:
-    """What there is to know about an answer, whole."""
+    """Return what there is to know about an answer, whole."""
     lines = textwrap.wrap(
         f"note: {printable(as_typed(text))}",
         min(width, _LAYOUT.paragraph),
@@ -109,7 +110,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 def table_lines(
     columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int = _LAYOUT.endless
 ) -> Iterator[str]:
-    """The lines of a table that is no wider than so many characters; what is longer is folded.
+    """The lines of a table that is no wider than that many characters; what is longer is folded.
 
     Where not even the longest words of its columns fit beside each other, each row is a paragraph.
     """
@@ -146,7 +147,7 @@ def table_lines(
 
 
 def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> list[str]:
-    """A row as a paragraph that names its columns."""
+    """Return a row as a paragraph that names its columns."""
     named = (
         f"{printable(column)} {text_of(value)}"
         for column, value in zip(columns, row, strict=True)
@@ -162,7 +163,7 @@ def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> lis
 
 
 def _shared_out(room: int, least: Mapping[int, int], full: Mapping[int, int]) -> dict[int, int]:
-    """The width of each column: what its words need, and what is left for those that want more.
+    """Return the width of each column: what its words need, and a share of what is left.
 
     Those that want little more come first.
     """
@@ -181,7 +182,7 @@ def _longest(words: Iterable[str]) -> int:
 
 
 def text_of(value: Any) -> str:
-    """A value in one line; what a terminal would obey is spelled out instead."""
+    """Return a value in one line; what a terminal would obey is spelled out instead."""
     if value is None:
         return ""
     if isinstance(value, float):
@@ -193,7 +194,7 @@ def text_of(value: Any) -> str:
 
 
 def printable(text: str) -> str:
-    """A text in one line, with what a terminal would obey spelled out."""
+    """Return a text in one line, with what a terminal would obey spelled out."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return spelled_out(line)
 
@@ -210,7 +211,7 @@ def id_ranges(numbers: Sequence[int]) -> str | None:
 
 
 def clock_text(wall_time_s: float) -> str:
-    """A wall time in local time."""
+    """Return a wall time in local time."""
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(wall_time_s))
 
 
@@ -220,7 +221,7 @@ def print_json(found: Any) -> None:
 
 
 def terminal_width(stream: TextIO) -> int:
-    """The characters of a line; no limit where nobody looks at it."""
+    """Return the characters of a line; no limit where nobody looks at it."""
     return shutil.get_terminal_size().columns if stream.isatty() else _LAYOUT.endless
 
 
@@ -307,7 +308,7 @@ class _Layout:
 def _without_lists(
     part: Mapping[str, Any], length: int, path: tuple[str, ...], columns: dict[str, list[Any]]
 ) -> dict[str, Any]:
-    """The part without lists of that length, which become columns; without what is empty then."""
+    """Return the part without lists of that length, which become columns."""
     rest: dict[str, Any] = {}
     for name, value in part.items():
         if isinstance(value, dict):
@@ -330,6 +331,6 @@ def _without_lists(
 
 
 def _has_members(value: Any) -> bool:
-    """Whether it is an object, or a list of such."""
+    """Return whether it is an object, or a list of such."""
     each = cast("list[Any]", value)[:1] if isinstance(value, list) else [value]
     return any(isinstance(one, dict) for one in each)

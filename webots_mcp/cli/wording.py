@@ -41,7 +41,7 @@ def speak_of(arguments: Iterable[Typed]) -> None:
 
 
 def running() -> tuple[Typed, ...]:
-    """The arguments of the command that runs."""
+    """Return the arguments of the command that runs."""
     return _running.get()
 
 
@@ -59,12 +59,12 @@ class Typed(NamedTuple):
 
 
 def value_name(option: str) -> str:
-    """The word for an option's value, as help shows it."""
+    """Return the word for an option's value, as help shows it."""
     return option.lstrip("-").replace("-", "_").upper()
 
 
 def as_typed(text: str) -> str:
-    """The text with a person's options instead of the names of arguments.
+    """Return the text with a person's options instead of the names of arguments.
 
     A name that is a common word (`since`) is meant only where a value follows it, or where it is
     joined to another one ("since and until").
@@ -101,14 +101,14 @@ def _text_as_typed(text: str) -> str:
 
 
 def commands_by_tool() -> dict[str, str]:
-    """The command that answers what a tool does, by the tool's name without `webots_`."""
+    """Return the command that answers what a tool does, by the tool's name without `webots_`."""
     from webots_mcp.cli.commands import COMMANDS
 
     return {each.name.removeprefix("webots_"): name for name, each in COMMANDS.items()} | _OTHERS
 
 
 def _command_for(found: re.Match[str]) -> str:
-    """The command that answers what a tool does; the tool itself where there is none."""
+    """Return the command that answers what a tool does; the tool itself where there is none."""
     tool, what, number = found["tool"], found["what"], found["id"]
     command = commands_by_tool().get(f"{tool} {what}" if what else tool)
     whole = f"{command} {number}" if number else command

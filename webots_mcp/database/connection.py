@@ -155,7 +155,7 @@ def roll_back(connection: sqlite3.Connection) -> None:
         connection.execute("ROLLBACK")
 
 
-class Step:
+class AtomicStatements:
     """Statements that SQLite runs as one: one short transaction in one call.
 
     Work done while control loops run holds the write lock for a millisecond at most. In a

@@ -453,7 +453,7 @@ def end_runs(
 # what it writes for the job, it writes with the lease in the same transaction (`still_held`).
 
 
-class Lease(NamedTuple):
+class JobLease(NamedTuple):
     """The right to do a job.
 
     Attributes:
@@ -471,9 +471,9 @@ class Lease(NamedTuple):
         return now_s + _TIMES * self.lasts_s
 
 
-def lease_of(name: str) -> Lease:
+def lease_of(name: str) -> JobLease:
     """A lease that this process may take, by the name of the job."""
-    return Lease(name, f"{host_name()} {os.getpid()} {os.urandom(4).hex()}")
+    return JobLease(name, f"{host_name()} {os.getpid()} {os.urandom(4).hex()}")
 
 
 def holder_of(connection: sqlite3.Connection, name: str) -> str | None:
@@ -492,7 +492,7 @@ def held_jobs(connection: sqlite3.Connection, prefix: str) -> list[str]:
 
 def take(
     connection: sqlite3.Connection,
-    lease: Lease,
+    lease: JobLease,
     *,
     forced: bool = False,
     outranked: str | None = None,
@@ -511,13 +511,13 @@ def take(
     return connection.execute(_TAKE, {**names, **times, "forced": forced}).rowcount > 0
 
 
-def give_back(connection: sqlite3.Connection, lease: Lease) -> None:
+def give_back(connection: sqlite3.Connection, lease: JobLease) -> None:
     """Let others take it at once."""
     connection.execute(_GIVE_BACK, (lease.name, lease.holder))
 
 
 @contextmanager
-def still_held(connection: sqlite3.Connection, lease: Lease) -> Generator[None]:
+def still_held(connection: sqlite3.Connection, lease: JobLease) -> Generator[None]:
     """A transaction for what only the holder may write; it renews the lease.
 
     Raises:

@@ -33,7 +33,7 @@ from webots_mcp.database.connection import (
     require_current,
     text_of,
 )
-from webots_mcp.database.liveness import Lease, give_back, take
+from webots_mcp.database.liveness import JobLease, give_back, take
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn
@@ -89,7 +89,7 @@ class Maintainer(threading.Thread):
     ) -> None:
         super().__init__(name="webots-mcp maintainer", daemon=True)
         self._database = database
-        self._lease = Lease(_JOB, f"{kind} {os.getpid()} {os.urandom(3).hex()}", LEASE_S)
+        self._lease = JobLease(_JOB, f"{kind} {os.getpid()} {os.urandom(3).hex()}", LEASE_S)
         self._outranked = _BRIDGES if kind == "server" else None
         self._on_tick = on_tick
         self._work = work

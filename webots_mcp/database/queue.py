@@ -93,7 +93,7 @@ LOSE: Final = (
 )
 
 
-class Command(NamedTuple):
+class QueuedCommand(NamedTuple):
     """A command and its outcome; `params` and `result` are JSON. Columns as in `store.models`."""
 
     id: int
@@ -126,7 +126,7 @@ class Command(NamedTuple):
             return None
 
 
-_COLUMNS: Final = ", ".join(Command._fields)
+_COLUMNS: Final = ", ".join(QueuedCommand._fields)
 _BY_KEY: Final = f"SELECT {_COLUMNS} FROM command WHERE idempotency_key = ?"
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM command WHERE id = ?"
 _NEWEST: Final = (
@@ -168,7 +168,7 @@ class CommandQueue:
         requested_by: str | None = None,
         idempotency_key: str | None = None,
         request_id: int | None = None,
-    ) -> Command:
+    ) -> QueuedCommand:
         """Ask for an action; sending it again with the same key makes no second command.
 
         The insert is repeated while the database is busy. That is safe: every repetition carries
@@ -201,7 +201,7 @@ class CommandQueue:
             "request": request_id,
         }
         _while_busy(lambda: self._connection.execute(_ENQUEUE, values))
-        command = Command(*self._connection.execute(_BY_KEY, (key,)).fetchone())
+        command = QueuedCommand(*self._connection.execute(_BY_KEY, (key,)).fetchone())
         if any(getattr(command, name) != values[name] for name in ("robot_id", "action", "params")):
             raise InvalidInputError(
                 f"idempotency key {key!r} already belongs to command {command.id} "
@@ -226,13 +226,13 @@ class CommandQueue:
         return _while_busy(lambda: self._connection.execute(_CANCEL, values)).rowcount == 1
 
 
-def find_command(connection: sqlite3.Connection, idempotency_key: str) -> Command | None:
+def find_command(connection: sqlite3.Connection, idempotency_key: str) -> QueuedCommand | None:
     """The command that was sent with that key; None where none was."""
     row = connection.execute(_BY_KEY, (idempotency_key,)).fetchone()
-    return Command(*row) if row else None
+    return QueuedCommand(*row) if row else None
 
 
-def fetch_command(connection: sqlite3.Connection, command_id: int) -> Command:
+def fetch_command(connection: sqlite3.Connection, command_id: int) -> QueuedCommand:
     """The command of that id.
 
     Raises:
@@ -241,7 +241,7 @@ def fetch_command(connection: sqlite3.Connection, command_id: int) -> Command:
     row = connection.execute(_BY_ID, (command_id,)).fetchone()
     if row is None:
         raise InvalidInputError(f"no command {command_id}; webots_list_commands lists them")
-    return Command(*row)
+    return QueuedCommand(*row)
 
 
 def list_commands(
@@ -251,13 +251,13 @@ def list_commands(
     limit: int,
     status: str | None = None,
     before_id: int | None = None,
-) -> list[Command]:
+) -> list[QueuedCommand]:
     """The robot's newest commands, newest first; with a limit of -1 all of them.
 
     `before_id` pages towards older ones.
     """
     values = {"robot_id": robot_id, "status": status, "limit": limit, "before_id": before_id}
-    return [Command(*row) for row in connection.execute(_NEWEST, values).fetchall()]
+    return [QueuedCommand(*row) for row in connection.execute(_NEWEST, values).fetchall()]
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:

@@ -8,8 +8,8 @@ the same transaction as the rows. So it does not matter what happens to the file
 process that finds it again, after a kill or an interrupt at any place, skips the entries that are
 already in the database.
 
-The first line says who records. Each further one is an `Entry` as a JSON array: its number, its
-kind, the UUID of its run and its values. A line that was cut off by a kill in the middle of its
+The first line says who records. Each further one is a `WaitingEntry` as a JSON array: its number,
+its kind, the UUID of its run and its values. A line that was cut off by a kill in the middle of its
 `write()` is no JSON array, and its caller never had an answer.
 
 Standard library only, because the bridge imports it inside a robot's controller.
@@ -250,7 +250,7 @@ _PART: Final = re.compile(
 )
 
 
-class Entry(NamedTuple):
+class WaitingEntry(NamedTuple):
     """One write of a session.
 
     Attributes:
@@ -347,7 +347,7 @@ class WaitingFile:
         self._file: FileIO | None = None
         self._is_whole = True  # it ends with a whole line
 
-    def append(self, entries: list[Entry]) -> None:
+    def append(self, entries: list[WaitingEntry]) -> None:
         """Add entries with one `write()`, all or none of them.
 
         Raises:
@@ -360,7 +360,7 @@ class WaitingFile:
                 former.close()
         self._write(file, b"".join(encoded(entry) for entry in entries))
 
-    def read(self, offset: int) -> list[tuple[int, Entry]]:
+    def read(self, offset: int) -> list[tuple[int, WaitingEntry]]:
         """The next entries from that byte on; see `next_entries`."""
         if self._file is None:
             return []
@@ -424,12 +424,12 @@ class WaitingFile:
 _open_privately: Final = partial(os.open, mode=0o600)
 
 
-def next_entries(file: BinaryIO, offset: int) -> list[tuple[int, Entry]]:
+def next_entries(file: BinaryIO, offset: int) -> list[tuple[int, WaitingEntry]]:
     """Some entries from that byte on, each with the byte that follows; none at the end.
 
     Lines that were cut off are passed over.
     """
-    entries: list[tuple[int, Entry]] = []
+    entries: list[tuple[int, WaitingEntry]] = []
     file.seek(offset)
     for line in file:
         offset += len(line)
@@ -474,11 +474,13 @@ def encoded(value: object) -> bytes:
     return json.dumps(value).encode() + b"\n"
 
 
-def _decoded(line: bytes) -> Entry | None:
+def _decoded(line: bytes) -> WaitingEntry | None:
     """None for what is no entry: cut off by a kill, or damaged since."""
     try:
         number, kind, run, values = json.loads(line)
-        entry = Entry(number, kind, run, values if isinstance(values, dict) else tuple(values))
+        entry = WaitingEntry(
+            number, kind, run, values if isinstance(values, dict) else tuple(values)
+        )
         known = kind in STATEMENTS
     except (ValueError, TypeError, RecursionError):
         return None
@@ -523,16 +525,16 @@ class Taken(NamedTuple):
 
     since: int
     number: int
-    written: list[Entry]
+    written: list[WaitingEntry]
     unfit: list[str]
 
 
 def take_in(
     connection: sqlite3.Connection,
     session_id: int,
-    piece: Sequence[Entry],
+    piece: Sequence[WaitingEntry],
     finish: Callable[[Taken], object] | None = None,
-    begin: Callable[[Entry], dict[str, Any] | None] | None = None,
+    begin: Callable[[WaitingEntry], dict[str, Any] | None] | None = None,
 ) -> Taken:
     """Write the entries of a session in one transaction, as many as there is time for.
 
@@ -573,8 +575,8 @@ def take_in(
 def _write(
     connection: sqlite3.Connection,
     session_id: int,
-    entry: Entry,
-    begin: Callable[[Entry], dict[str, Any] | None] | None,
+    entry: WaitingEntry,
+    begin: Callable[[WaitingEntry], dict[str, Any] | None] | None,
 ) -> str | None:
     """Write an entry; or why the database will never take it, which stops no other."""
     run_id = None

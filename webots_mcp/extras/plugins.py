@@ -77,19 +77,19 @@ class Plugin(NamedTuple):
 
 @cache
 def plugins() -> tuple[Plugin, ...]:
-    """What each plugin offers, in the order of their names."""
+    """Return what each plugin offers, in the order of their names."""
     packages = pkgutil.iter_modules(import_module(_FOLDER).__path__)
     names = sorted(each.name for each in packages if each.ispkg)
     return tuple(import_module(f"{_FOLDER}.{name}").PLUGIN for name in names)
 
 
 def load(name: str) -> Any:
-    """What a plugin named as `module:function`."""
+    """Return what a plugin named as `module:function`."""
     return pkgutil.resolve_name(name)
 
 
 def plugin_commands() -> tuple[PluginCommand, ...]:
-    """The commands of all plugins."""
+    """Return the commands of all plugins."""
     return tuple(each for plugin in plugins() for each in plugin.commands)
 
 
@@ -99,15 +99,15 @@ def question_modules() -> Iterator[ModuleType]:
 
 
 def export_formats() -> tuple[ExportFormat, ...]:
-    """The formats that plugins write."""
+    """Return the formats that plugins write."""
     return tuple(each for plugin in plugins() for each in plugin.formats)
 
 
 def cluster_offered() -> str:
-    """Where trials run on other machines."""
+    """Return where trials run on other machines."""
     return next(plugin.cluster for plugin in plugins() if plugin.cluster is not None)
 
 
 def stand_in_simulator() -> Callable[[Path, str, float | None, dict[str, str], object], int]:
-    """What runs a world where no Webots is."""
+    """Return what runs a world where no Webots is."""
     return load(next(each.stand_in for each in plugins() if each.stand_in))

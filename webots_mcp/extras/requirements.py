@@ -26,7 +26,7 @@ _PYTHON: Final = re.compile(r"""python_version (<|>=) ['"]3\.(\d+)['"]""")
 
 
 def missing_requirements(extra: str | None = None) -> list[str]:
-    """What is not installed of the packages that the server needs, or of those of an extra."""
+    """Return what is not installed of the packages of the server, or of an extra."""
     return [each for each in _requirements(extra) if not _is_installed(package_of(each))]
 
 
@@ -45,7 +45,7 @@ def explain_extra(what: str, extra: str) -> str:
 
 
 def install_line(requirements: Iterable[str]) -> str:
-    """The line that installs packages for this Python; uv's environments have no pip."""
+    """Return the line that installs packages for this Python; uv's environments have no pip."""
     quote = '"' if sys.platform == "win32" else "'"  # each: > would write to a file
     wanted = " ".join(f"{quote}{each}{quote}" for each in requirements)
     if find_spec("pip") is None:
@@ -54,13 +54,13 @@ def install_line(requirements: Iterable[str]) -> str:
 
 
 def package_of(requirement: str) -> str:
-    """The package that a requirement names."""
+    """Return the package that a requirement names."""
     found = _NAME.match(requirement)
     return found.group() if found else requirement
 
 
 def checkout() -> str:
-    """Where this package was installed from, as pip takes it: a folder, an archive or a repository.
+    """Return where this package was installed from, as pip takes it.
 
     The word CHECKOUT, for a person to replace, where that is not known or not there any more.
     """
@@ -80,7 +80,7 @@ def checkout() -> str:
 
 
 def quoted(command: list[str], platform: str = sys.platform) -> str:
-    """The command as it is typed into the system's shell; on Windows cmd or PowerShell."""
+    """Return the command as it is typed into the system's shell; on Windows cmd or PowerShell."""
     if platform != "win32":
         return shlex.join(command)
     line = subprocess.list2cmdline(command)
@@ -102,7 +102,7 @@ def _extra_of(requirement: str) -> str | None:
 
 
 def _is_for_us(requirement: str) -> bool:
-    """Whether this Python is as old, or as new, as those that need it."""
+    """Return whether this Python is as old, or as new, as those that need it."""
     found = _PYTHON.search(requirement)
     is_older = found is not None and sys.version_info < (3, int(found[2]))
     return found is None or is_older == (found[1] == "<")

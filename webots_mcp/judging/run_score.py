@@ -17,7 +17,7 @@ from webots_mcp.signals.naming import listed, nearest_first
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import TimeRange, unrecorded, whole_run
-from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot, kept_parts
+from webots_mcp.store.reading.segment import Deadline, Subject, full_rate_parts, in_one_snapshot
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import run_info
 from webots_mcp.store.signals import RegisteredSignal
@@ -105,7 +105,7 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
     alike: dict[str, list[str]] = {}
     scored = list(filter(None, run_ids))
     for run_id in scored:
-        kept = len(kept_parts(connection, run_id, -math.inf, math.inf))
+        kept = len(full_rate_parts(connection, run_id, -math.inf, math.inf))
         notes = [unrecorded(connection, run_id)]
         notes += ["rows that only kept stretches have do not count"] if kept else []
         if said := "; ".join(filter(None, notes)):

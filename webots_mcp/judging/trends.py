@@ -38,7 +38,7 @@ from webots_mcp.signals.naming import words_of
 from webots_mcp.store import chunk_making
 from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.catalogue import signals_of
-from webots_mcp.store.reading.frame import Frame, Zones, read_frame, read_kept
+from webots_mcp.store.reading.frame import Frame, ZoneMap, read_frame, read_kept
 from webots_mcp.store.reading.frame_summary import (
     ChangePoints,
     change_points,
@@ -206,7 +206,7 @@ def in_means(course: Course, rows: int) -> Course:
     )
 
 
-def course_of_means(frame: Frame, name: str, zones: Zones) -> Course:
+def course_of_means(frame: Frame, name: str, zones: ZoneMap) -> Course:
     """The course of a signal with numbers, of many rows, from what its chunks come to."""
     held = np.flatnonzero(~np.isnan(zones.sum))
     counts, means = zones.value_count[held], zones.sum[held] / zones.value_count[held]
@@ -233,7 +233,7 @@ def _digits(length_s: Any) -> float:
     return float(f"{float(length_s):.3g}")
 
 
-def _rest_of_chunks(frame: Frame, name: str, zones: Zones, held: Indexes) -> float | None:
+def _rest_of_chunks(frame: Frame, name: str, zones: ZoneMap, held: Indexes) -> float | None:
     """Since when all values stay within 0.5 % of their range, as `flat_since` says it."""
     low, high = float(zones.min[held].min()), float(zones.max[held].max())
     if low == high:
@@ -246,7 +246,7 @@ def _rest_of_chunks(frame: Frame, name: str, zones: Zones, held: Indexes) -> flo
     return flat_since(times, values, span=high - low, start_s=float(zones.start_s[held[0]]))
 
 
-def _monotonic_chunks(zones: Zones, held: Indexes) -> Monotonic | None:
+def _monotonic_chunks(zones: ZoneMap, held: Indexes) -> Monotonic | None:
     """As far as the ends and extremes of the chunks tell, taken in the one order or the other."""
     low, high = zones.min[held], zones.max[held]
     orders = ((low, high), (high, low))
@@ -664,7 +664,7 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
             spikes = find_spikes(times, numbers, signal.turn)
         too_large = int(np.count_nonzero(np.abs(frame.numbers(name)) > LARGEST))
     else:
-        course = course_of_means(frame, name, frame.zones(name))
+        course = course_of_means(frame, name, frame.zone_map(name))
         course = replace(course, counted=None if signal.turn is None else summary)
     if kept is not None and name in kept:
         summary = with_extremes(summary, summary_of(kept, signal))

@@ -35,7 +35,7 @@ def plot(
     height_px: int = HEIGHT_PX,
     image_format: ImageFormat = "png",
 ) -> PlotImage:
-    """A picture of signals over a range of time, of the robot's way, or of trials.
+    """Return a picture of signals over a range of time, of the robot's way, or of trials.
 
     Args:
         connection: Any.
@@ -74,7 +74,7 @@ def plot(
 
 
 def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:
-    """The three numbers that changed most, which are drawn where none is named."""
+    """Return the three numbers that changed most, which are drawn where none is named."""
     found = trends(connection, time_range, limit=3).runs
     return [trend.name for run in found for trend in run.numbers] or ["*"]
 

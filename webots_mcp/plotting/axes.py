@@ -49,18 +49,18 @@ class AxesBox:
         return self.top + self.height
 
     def px(self, x: Any) -> Any:
-        """A value, or an array of values, of the horizontal axis in pixels."""
+        """Return a value, or an array of values, of the horizontal axis in pixels."""
         low, high = self.x
         return self.left + self.width * ((x - low) / (high - low))
 
     def py(self, y: Any) -> Any:
-        """The same of the vertical axis."""
+        """Return the same of the vertical axis."""
         low, high = self.y
         return self.bottom - self.height * ((y - low) / (high - low))
 
 
 def axis_range(low: float, high: float, margin: float = 0.08) -> tuple[float, float]:
-    """The range of an axis for such values: what is constant but for rounding is a flat line."""
+    """Return the range of an axis; values that are constant but for rounding are a flat line."""
     largest = max(abs(low), abs(high))
     middle = low / 2 + high / 2
     if high - low <= _LIMITS.rounding_span * largest:
@@ -71,7 +71,7 @@ def axis_range(low: float, high: float, margin: float = 0.08) -> tuple[float, fl
 
 
 def ticks(low: float, high: float, most: float) -> list[tuple[float, str]]:
-    """Round values between two others, at most so many, with their labels."""
+    """Round values between two others, at most that many, with their labels."""
     least = (high - low) / max(most, 1.0)
     unit = 10.0 ** math.floor(math.log10(least))
     step = next(unit * factor for factor in (1, 2, 5, 10) if unit * factor >= least * (1 - 1e-9))

@@ -19,6 +19,27 @@ from webots_mcp.plotting.colours import LINES, ON_PAPER, Theme
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.series import MOST_POINTS
 
+MOST_PANELS: Final = 3
+WIDTH_PX: Final = 900
+HEIGHT_PX: Final = 500
+LEAST_WIDTH_PX: Final = 400
+LEAST_HEIGHT_PX: Final = 300
+MOST_PX: Final = 2000
+ROW_PX: Final = 17
+TEXT_PX: Final = 11.0  # the size of usual letters
+_LONGEST_NAME: Final = 24
+_CELL_PX: Final = 24
+_SHOWN_TEXTS: Final = 3
+_HATCHES: Final = (
+    '<defs><pattern id="hatch-gap" width="6" height="6" patternUnits="userSpaceOnUse">'
+    '<path d="M-1 7L7-1M-1 1L1-1M5 7L7 5" stroke="#A0A0A0" stroke-width=".8"/></pattern>'
+    '<pattern id="hatch-unread" width="7" height="7" patternUnits="userSpaceOnUse">'
+    f'<path d="M0 0L7 7M0 7L7 0" stroke="{LINES[1]}" stroke-opacity=".6" stroke-width=".8"/>'
+    '</pattern><pattern id="hatch-dots" width="6" height="6" patternUnits="userSpaceOnUse">'
+    '<circle cx="3" cy="3" r="1" fill="#333333"/></pattern></defs>'
+)
+ImageFormat = Literal["png", "svg"]
+
 
 @dataclass(frozen=True)
 class SheetLayout:
@@ -40,26 +61,6 @@ class SheetLayout:
 
 
 _LAYOUT: Final = SheetLayout()
-MOST_PANELS: Final = 3
-WIDTH_PX: Final = 900
-HEIGHT_PX: Final = 500
-LEAST_WIDTH_PX: Final = 400
-LEAST_HEIGHT_PX: Final = 300
-MOST_PX: Final = 2000
-ROW_PX: Final = 17
-TEXT_PX: Final = 11.0  # the size of usual letters
-_LONGEST_NAME: Final = 24
-_CELL_PX: Final = 24
-_SHOWN_TEXTS: Final = 3
-_HATCHES: Final = (
-    '<defs><pattern id="hatch-gap" width="6" height="6" patternUnits="userSpaceOnUse">'
-    '<path d="M-1 7L7-1M-1 1L1-1M5 7L7 5" stroke="#A0A0A0" stroke-width=".8"/></pattern>'
-    '<pattern id="hatch-unread" width="7" height="7" patternUnits="userSpaceOnUse">'
-    f'<path d="M0 0L7 7M0 7L7 0" stroke="{LINES[1]}" stroke-opacity=".6" stroke-width=".8"/>'
-    '</pattern><pattern id="hatch-dots" width="6" height="6" patternUnits="userSpaceOnUse">'
-    '<circle cx="3" cy="3" r="1" fill="#333333"/></pattern></defs>'
-)
-ImageFormat = Literal["png", "svg"]
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def _require_size(name: str, value: int, least: int) -> None:
 
 
 def image_format_of(file: Path) -> ImageFormat:
-    """The format that a file's name asks for.
+    """Return the format that a file's name asks for.
 
     Raises:
         InvalidInputError: Its suffix is neither .png nor .svg.
@@ -178,7 +179,7 @@ class Canvas:
         self._parts.append(f"<text{written}>{escape(text, quote=False)}</text>")
 
     def svg(self) -> str:
-        """The whole SVG."""
+        """Return the whole SVG."""
         width, height = f"{self.width_px:g}", f"{self.height_px:g}"
         # Aileron comes with Pillow, for a computer without any font.
         families = "DejaVu Sans, Segoe UI, Helvetica Neue, Arial, Liberation Sans, Aileron"
@@ -191,7 +192,7 @@ class Canvas:
         )
 
     def picture(self, image_format: ImageFormat, caption: str, notes: Sequence[str]) -> PlotImage:
-        """The picture as a file; of a PNG a note says which texts no font here can show."""
+        """Return the picture as a file; of a PNG a note says which texts no font here can show."""
         svg = self.svg()
         if image_format == "svg":
             return PlotImage(svg.encode(), "image/svg+xml", caption, tuple(notes))
@@ -222,7 +223,7 @@ def _png(svg: str) -> bytes:
 
 
 def _missing_fonts(texts: Iterable[str]) -> tuple[str, ...]:
-    """A note with the first of the texts that have characters which no font here has."""
+    """Return a note with the first of the texts that have characters which no font here has."""
     foreign = {character for text in texts for character in text if _is_foreign(character)}
     boxed = _boxed(sorted(foreign)) if foreign else set[str]()
     named = [repr(text) for text in dict.fromkeys(texts) if boxed & set(text)]
@@ -242,7 +243,7 @@ def _is_foreign(character: str) -> bool:
 
 
 def _boxed(characters: Sequence[str]) -> set[str]:
-    """Those that are drawn like a character that no font has."""
+    """Return those that are drawn like a character that no font has."""
     from PIL import Image
 
     cells = Canvas(_CELL_PX, _CELL_PX * (len(characters) + 1))
@@ -274,13 +275,13 @@ def _em(character: str) -> float:
 
 
 def short(name: str) -> str:
-    """A name that fits a legend, in one line: of a long one the end, which tells more."""
+    """Return a name that fits a legend, in one line: of a long one the end, which tells more."""
     line = " ".join(spelled_out(name).split())
     return line if len(line) <= _LONGEST_NAME else f"…{line[1 - _LONGEST_NAME :]}"
 
 
 def fitted(text: str, width_px: float, size: float = TEXT_PX) -> str:
-    """A text in one line that is no wider: of a longer one the end."""
+    """Return a text in one line that is no wider: of a longer one the end."""
     line = " ".join(spelled_out(text).split())
     if width_of(line, size) <= width_px:
         return line
@@ -290,7 +291,7 @@ def fitted(text: str, width_px: float, size: float = TEXT_PX) -> str:
 
 
 def wrapped(text: str, width_px: float, size: float = TEXT_PX, most: int = 4) -> list[str]:
-    """A text in as many lines as it needs, at most so many; the last one keeps its end."""
+    """Return a text in as many lines as it needs, at most that many; the last one keeps its end."""
     lines: list[str] = []
     words = spelled_out(text).split()
     while words and len(lines) < most - 1:

@@ -47,7 +47,7 @@ MERGED: Final = Area("#DDDDDD", dotted=False)
 
 
 def area_styles(values: Iterable[str]) -> dict[str, Area]:
-    """A style for each value: eight colours, the same with dots, and grey from the 17th value on.
+    """Return a style for each value: eight colours, the same with dots, then grey.
 
     The colour hangs on the value's own text, so that "cruise" looks alike in every picture, unless
     another value in the same one has taken it.
@@ -63,7 +63,7 @@ def area_styles(values: Iterable[str]) -> dict[str, Area]:
 
 
 def scaled(share: float, scale: str) -> str:
-    """The colour at a share, from 0 to 1, of a scale."""
+    """Return the colour at a share, from 0 to 1, of a scale."""
     stops = SCALES[scale]
     place = min(max(share, 0.0), 1.0) * (len(stops) - 1)
     index = min(int(place), len(stops) - 2)

@@ -36,7 +36,7 @@ class Curve:
 
 
 def curve_of(columns: NumberColumns, run: RunHistory, origin_s: float = 0.0) -> Curve | None:
-    """The curve of a signal; None where it has no value.
+    """Return the curve of a signal; None where it has no value.
 
     Args:
         columns: The signal, in buckets.
@@ -53,7 +53,7 @@ def curve_of(columns: NumberColumns, run: RunHistory, origin_s: float = 0.0) -> 
 
 
 def _present(columns: NumberColumns, run: RunHistory) -> list[Point]:
-    """The buckets that hold a value, each at its middle."""
+    """Return the buckets that hold a value, each at its middle."""
     half_s = (run.step_s or 0.0) / 2
     cells = zip(run.sim_time_s, columns.mean, columns.min, columns.max, strict=True)
     return [
@@ -101,7 +101,7 @@ class Panel:
         return len(self.curves) == MOST_CURVES
 
     def suits(self, curve: Curve) -> bool:
-        """Whether it has the unit and the scale of the others."""
+        """Return whether it has the unit and the scale of the others."""
         if curve.unit != self.curves[0].unit:
             return False
         together = [*self.curves, curve]
@@ -116,7 +116,7 @@ def _is_visible(curve: Curve, height: float) -> bool:
 
 
 def by_scale(curves: Iterable[Curve], most_panels: int) -> tuple[list[Panel], list[str]]:
-    """The curves of one run in at most so many panels, and the names of those left out.
+    """Return the curves of one run in at most that many panels, and the names of those left out.
 
     A unit or a scale that has no panel yet comes before a second panel for one that has.
     """
@@ -148,7 +148,7 @@ def _fill(panel: Panel, waiting: list[Curve]) -> None:
 
 
 def by_signal(curves: Sequence[Curve], most_panels: int) -> tuple[list[Panel], list[str]]:
-    """The curves of several runs, one panel per signal, and the names of those left out."""
+    """Return the curves of several runs, one panel per signal, and the names of those left out."""
     names = list(dict.fromkeys(curve.name for curve in curves))
     panels = [
         Panel([curve for curve in curves if curve.name == name]) for name in names[:most_panels]
@@ -159,7 +159,7 @@ def by_signal(curves: Sequence[Curve], most_panels: int) -> tuple[list[Panel], l
 def by_choice(
     curves: Sequence[Curve], grouped: Sequence[Sequence[str]], most_panels: int
 ) -> tuple[list[Panel], list[str]]:
-    """The curves of one run in the panels that are named; others by scale in what room is left."""
+    """Return the curves of one run in the given panels; others share the panels left."""
     panels = [Panel([curve for curve in curves if curve.name in names]) for names in grouped]
     panels = [panel for panel in panels if panel.curves][:most_panels]
     drawn = {name for panel in panels for name in panel.names}

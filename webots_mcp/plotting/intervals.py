@@ -23,7 +23,7 @@ class Interval:
     end_s: float
 
     def moved(self, origin_s: float) -> Interval:
-        """The same on a clock that begins at `origin_s`."""
+        """Return the same on a clock that begins at `origin_s`."""
         return Interval(self.value, self.start_s - origin_s, self.end_s - origin_s)
 
 
@@ -42,12 +42,12 @@ class Lane:
     merged: Sequence[str] = ()
 
     def moved(self, origin_s: float, name: str) -> Lane:
-        """The same under that name, on a clock that begins at `origin_s`."""
+        """Return the same under that name, on a clock that begins at `origin_s`."""
         return replace(self, name=name, intervals=[i.moved(origin_s) for i in self.intervals])
 
 
 def lane_of(columns: ChangeColumns, run: RunHistory, end_s: float) -> Lane:
-    """A text or boolean signal as intervals; values beyond the sixteenth share a name.
+    """Return a text or boolean signal as intervals; values beyond the sixteenth share a name.
 
     Where nothing was recorded or read there is no interval: nobody knows the value.
     """
@@ -66,7 +66,7 @@ def lane_of(columns: ChangeColumns, run: RunHistory, end_s: float) -> Lane:
 
 
 def at_resolution(intervals: Sequence[Interval], step_s: float) -> Sequence[Interval]:
-    """The intervals as a picture with one pixel per `step_s` can show them.
+    """Return the intervals as a picture with one pixel per `step_s` can show them.
 
     Of those that are shorter than a step and begin in the same one, the value that lasts longest
     there stands for the whole step.
@@ -89,7 +89,7 @@ def at_resolution(intervals: Sequence[Interval], step_s: float) -> Sequence[Inte
 
 
 def merged_notes(lanes: Sequence[Lane]) -> list[str]:
-    """Which values of which signal cannot be told apart in the picture."""
+    """Return which values of which signal cannot be told apart in the picture."""
     return [
         f"{lane.name} has {len(lane.merged)} more values than colours, drawn as {OTHER_VALUES}: "
         f"{listed(dict.fromkeys(lane.merged))}"
@@ -104,7 +104,7 @@ def _stretches(points: Sequence[Point], end_s: float) -> list[tuple[Point, float
 
 
 def _recorded(start_s: float, end_s: float, gaps: Sequence[Gap]) -> list[tuple[float, float]]:
-    """The parts of a stretch outside the gaps."""
+    """Return the parts of a stretch outside the gaps."""
     inside = [gap for gap in gaps if start_s <= gap.start_s and gap.end_s <= end_s]
     starts = [start_s, *(gap.end_s for gap in inside)]
     ends = [*(gap.start_s for gap in inside), end_s]

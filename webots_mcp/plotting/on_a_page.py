@@ -69,7 +69,7 @@ class Figure:
 
 
 def figure_part(name: str) -> str:
-    """What a page with figures has in it: `figure.js`, `figure.css`."""
+    """Return what a page with figures has in it: `figure.js`, `figure.css`."""
     return (File(__file__).parent / name).read_text("utf-8")
 
 

@@ -14,6 +14,9 @@ from webots_mcp.plotting.axes import AxesBox, ticks
 from webots_mcp.plotting.canvas import TEXT_PX, Canvas, width_of, wrapped
 from webots_mcp.plotting.colours import Area, scaled
 
+LINE_PX: Final = 16.0  # from line to line
+SCALE_PX: Final = 78.0  # what a scale of colours takes
+
 
 @dataclass(frozen=True)
 class LegendLayout:
@@ -37,8 +40,6 @@ class LegendLayout:
 
 
 _LEGEND: Final = LegendLayout()
-LINE_PX: Final = 16.0  # from line to line
-SCALE_PX: Final = 78.0  # what a scale of colours takes
 
 
 def _star(outer: float, inner: float) -> str:
@@ -125,7 +126,7 @@ def hatch_sample(pattern: str) -> Sample:
 def rows_of(
     entries: Sequence[LegendEntry], width_px: float, height_px: float
 ) -> list[list[LegendEntry]]:
-    """The entries in rows of that width, up to a quarter of the height; the rest are counted."""
+    """Return the entries in rows, up to a quarter of the height; the rest are counted."""
     most = max(1, int(_LEGEND.height_share * height_px / LINE_PX))
     rows: list[list[LegendEntry]] = []
     for index, entry in enumerate(entries):

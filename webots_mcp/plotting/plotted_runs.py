@@ -117,7 +117,7 @@ def plotted_runs(
 def _named_by_parameters(
     connection: sqlite3.Connection, parts: list[PlottedRun]
 ) -> list[PlottedRun]:
-    """Runs that differ in parameters are told apart by them: run 3 (kp 2)."""
+    """Runs that differ in parameters are reported apart by them: run 3 (kp 2)."""
     had = parameters_of(connection, [part.run.run_id for part in parts])
     unlike = differing(list(had.values()))[:3]
     named: list[PlottedRun] = []
@@ -136,7 +136,7 @@ def _histories(
     points: int,
     deadline_s: float,
 ) -> list[History]:
-    """The same data must look the same: the longest run decides how long a bucket is."""
+    """Return the same data must look the same: the longest run decides how long a bucket is."""
     least_step_s = 0.0
     while True:
         histories = [
@@ -178,7 +178,7 @@ def _seconds(time_s: float) -> str:
 
 
 def range_notes(parts: Sequence[PlottedRun]) -> list[str]:
-    """Where a range reaches outside the recording, and what of it is not drawn."""
+    """Return where a range reaches outside the recording, and what of it is not drawn."""
     notes = [note for part in parts for note in part.notes]
     notes += [f"{unread}: it took too long" for unread in unread_parts(parts)]
     return notes + [
@@ -200,7 +200,7 @@ def unread_parts(parts: Sequence[PlottedRun]) -> list[str]:
 
 
 def known_signals(connection: sqlite3.Connection, ranges: Sequence[TimeRange]) -> Known:
-    """All signals of the robot of the last range, by name.
+    """Return all signals of the robot of the last range, by name.
 
     Raises:
         NothingRecordedError: No range is given.
@@ -212,7 +212,7 @@ def known_signals(connection: sqlite3.Connection, ranges: Sequence[TimeRange]) -
 
 
 def mode_signal(known: Known, wanted: str | None) -> str | None:
-    """The text signal that colours a picture: the one wanted, else one that is named like a mode.
+    """Return the text signal that colours a picture: the one wanted, else a mode.
 
     Raises:
         UnknownSignalError: No signal has the wanted name.
@@ -245,7 +245,7 @@ def event_lanes(
         names: The drawn signals.
         rows: How many lanes have room.
         known: By run, what was searched before in all of it, and told by whoever did.
-        deadline_s: For the search; a note says which kinds were not looked for.
+        deadline_s: For the search; a note says which kinds were not searched for.
     """
     most = min(rows, MOST_LANES)
     drawn = tuple(kind.name for kind in drawn_kinds())
@@ -268,7 +268,7 @@ def event_lanes(
 
 
 def _not_looked_for(verdicts: Verdicts) -> list[str]:
-    """Where a picture shows no number, there is none to be judged: that is no news."""
+    """Return where a picture shows no number, there is none to be judged: that is no news."""
     of_numbers = [kind.name for kind in drawn_kinds() if kind.of_numbers]
     told = {
         kind: reasons
@@ -292,7 +292,7 @@ def _interval(event: Event, part: PlottedRun) -> Interval:
 
 
 def _within(interval: Interval, part: PlottedRun) -> Interval:
-    """What of an event is in the picture: it may have begun before, and gone on."""
+    """Return what of an event is in the picture: it may have begun before, and gone on."""
     start_s = max(interval.start_s, min(part.start_s, interval.end_s))
     return Interval(interval.value, start_s, min(interval.end_s, max(part.end_s, start_s)))
 
@@ -304,7 +304,7 @@ def _found(
     known: Mapping[int, Found],
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> Events:
-    """What is drawn of a run: searched for, or out of what was searched before."""
+    """Return what is drawn of a run: searched for, or out of what was searched before."""
     if (before := known.get(part.run.run_id)) is None:
         return find_events(
             connection, part.range, options, limit=MOST_EVENTS, around=(), group=False,
@@ -318,7 +318,7 @@ def _found(
         if event.kind in options.kinds
         if event.kind not in of_numbers or event.name not in undrawn
     ]
-    return replace(before.only(drawn), context=()).told(connection, MOST_EVENTS)
+    return replace(before.only(drawn), context=()).page(connection, MOST_EVENTS)
 
 
 def stuck_mark(
@@ -328,7 +328,7 @@ def stuck_mark(
     deadline_s: float,
     known: Mapping[int, Found] | None = None,
 ) -> tuple[Lane, list[str]]:
-    """When the robot was stuck, and where that was not looked for."""
+    """Return when the robot was stuck, and where that was not searched for."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
     found = _found(connection, part, options, known or {}, deadline_s)
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]

@@ -74,12 +74,12 @@ class RobotPath:
         return [step for piece in self.pieces() for step in pairwise(thinned(piece))]
 
     def at(self, time_s: float) -> PathPoint:
-        """The place at that time, or the first one."""
+        """Return the place at that time, or the first one."""
         index = bisect_right(self.places, time_s, key=lambda place: place.time_s)
         return self.places[max(0, index - 1)]
 
     def between(self, start_s: float, end_s: float) -> Sequence[PathPoint]:
-        """The places in [start_s, end_s), and the next one, so that pieces touch."""
+        """Return the places in [start_s, end_s), and the next one, so that pieces touch."""
         start = bisect_right(self.places, start_s, key=lambda place: place.time_s)
         end = bisect_right(self.places, end_s, key=lambda place: place.time_s)
         return self.places[max(0, start - 1) : end + 1]
@@ -92,7 +92,7 @@ def read_path(
     y: RegisteredSignal,
     deadline_s: float,
 ) -> RobotPath:
-    """The places of one run: of every row, or of every so many if the rows are many."""
+    """Return the places of one run: of every row, or of every nth one if there are many."""
     (segment,) = part.range.segments
     frame = read_frame(connection, segment, Deadline(deadline_s))
     xs, ys = frame.numbers(x.name), frame.numbers(y.name)
@@ -125,13 +125,13 @@ def _speed(before: PathPoint, after: PathPoint) -> float:
 
 
 def extent(places: Sequence[PathPoint]) -> float:
-    """The larger side of the box around the places."""
+    """Return the larger side of the box around the places."""
     xs, ys = [place.x for place in places], [place.y for place in places]
     return max(max(xs) - min(xs), max(ys) - min(ys)) if places else 0.0
 
 
 def thinned(places: Sequence[PathPoint]) -> list[PathPoint]:
-    """The places without those that would be painted on the same pixel as the one before."""
+    """Return the places without those that would be painted on the same pixel as the one before."""
     least = _LIMITS.pixel_share * extent(places)
     kept = list(places[:1])
     for place in places:
@@ -149,7 +149,7 @@ class Heading(NamedTuple):
 
 
 def headings(path: RobotPath, count: int) -> list[Heading]:
-    """The direction at `count` places that are evenly spread over the length of the path."""
+    """Return the direction at `count` places that are evenly spread over the length of the path."""
     steps = path.steps()
     reached = list(accumulate(math.dist(before[1:], after[1:]) for before, after in steps))
     if not reached or reached[-1] == 0:

@@ -57,6 +57,8 @@ from webots_mcp.signals.naming import listed, spelled_out
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
+_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
+
 
 @dataclass(frozen=True)
 class SignalLayout:
@@ -84,7 +86,6 @@ class SignalLayout:
 
 
 _LAYOUT: Final = SignalLayout()
-_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
 
 
 def plot_signals(
@@ -134,7 +135,7 @@ def compose_signals(
     grouped: Sequence[Sequence[str]] | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[SignalAxes, tuple[str, ...]]:
-    """What `plot_signals` paints, and its notes; arguments and errors as there.
+    """Return what `plot_signals` paints, and its notes; arguments and errors as there.
 
     `found` is what was searched before in the whole of these runs, each event by itself. `room` is
     how much it may be; None for that of a PNG of 900 x 500 pixels. `grouped` are the signals of
@@ -192,7 +193,7 @@ def _curves(part: PlottedRun) -> list[Curve]:
 def _behind_and_below(
     parts: Sequence[PlottedRun], mode: str | None
 ) -> tuple[Lane | None, list[Lane]]:
-    """The mode of a single run stands behind the curves, all else in rows below."""
+    """Return the mode of a single run stands behind the curves, all else in rows below."""
     overlaid = len(parts) > 1
     lanes = [lane for part in parts for lane in _lanes(part, overlaid)]
     behind = next((lane for lane in lanes if lane.name == mode and not overlaid), None)
@@ -366,7 +367,7 @@ class _SignalPainter:
         return canvas, frames
 
     def _left_px(self, scales: Sequence[tuple[float, float]]) -> float:
-        """What labels at the left take; of a long name of a row the end is shown."""
+        """Return what labels at the left take; of a long name of a row the end is shown."""
         most = 0.3 * self._canvas.width_px
         named = [width_of(short(lane.name)) for lane in self._plot.rows]
         labels = [width_of(text) for scale in scales for _, text in ticks(*scale, 5)]
@@ -386,7 +387,7 @@ class _SignalPainter:
     # Panels ---------------------------------------------------------------------------------------
 
     def _head(self, panel: Panel) -> list[LegendEntry]:
-        """What stands above a panel: the name of its signal, or each with a sample of its line."""
+        """Return what stands above a panel: the name of its signal, or a legend of its lines."""
         unit = [f"[{panel.unit}]"] if panel.unit else []
         room = self._canvas.width_px - 90
         if len(panel.names) == 1:
@@ -546,7 +547,7 @@ class _SignalPainter:
     # Legend ---------------------------------------------------------------------------------------
 
     def _entries(self, left: float) -> list[LegendEntry]:
-        """What the legend below the axes has to tell."""
+        """Return what the legend below the axes has to tell."""
         plot = self._plot
         entries: list[LegendEntry] = []
         for index, (run_id, name) in enumerate(plot.colour_by_run.items()):
@@ -578,12 +579,12 @@ def _named(curve: Curve, panel: Panel) -> str:
 
 
 def line_through(x: Any, y: Any) -> str:
-    """The path through places in pixels."""
+    """Return the path through places in pixels."""
     return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
 def _shown(intervals: Sequence[Interval], frame: AxesBox) -> Sequence[Interval]:
-    """The intervals that are drawn: one for each pixel where there are many more than pixels."""
+    """Return the intervals to draw: at most about one for each pixel."""
     if len(intervals) <= 2 * frame.width:
         return intervals
     low, high = frame.x

@@ -58,6 +58,8 @@ from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.signals import RegisteredSignal
 
+_SHAPES: Final = ("circle", "cross", "plus", "triangle", "star")  # the first is around the others
+
 
 @dataclass(frozen=True)
 class TrajectoryLayout:
@@ -86,7 +88,6 @@ class TrajectoryLayout:
 
 
 _LAYOUT: Final = TrajectoryLayout()
-_SHAPES: Final = ("circle", "cross", "plus", "triangle", "star")  # the first is around the others
 
 
 def plot_trajectory(
@@ -97,7 +98,7 @@ def plot_trajectory(
     bands: str | None = None,
     sheet: Sheet | None = None,
 ) -> PlotImage:
-    """The way of the robot in the plane, with start, end, direction, and where it got into trouble.
+    """Draw the path of the robot, with start, end, direction, and where it had trouble.
 
     Args:
         connection: Any.
@@ -129,7 +130,7 @@ def compose_trajectory(
     found: Mapping[int, Found] | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[TrajectoryAxes, tuple[str, ...]]:
-    """What `plot_trajectory` paints, and its notes; arguments and errors as there.
+    """Return what `plot_trajectory` paints, and its notes; arguments and errors as there.
 
     `found` is as in `compose_signals`. `deadline_s` is for all that is read; where a way was cut by
     it, it has no end.
@@ -176,7 +177,7 @@ def position_of(
     named: tuple[str, str] | None = None,
     deadline: Deadline | None = None,
 ) -> tuple[RegisteredSignal, RegisteredSignal]:
-    """The position that is drawn: the one named, else the one of the newest run.
+    """Return the position that is drawn: the one named, else the one of the newest run.
 
     Raises:
         UnknownSignalError: No signal has such a name.
@@ -343,7 +344,7 @@ class _TrajectoryPainter:
         return canvas, frame
 
     def _frame(self, top: float, below: float, right: float) -> AxesBox:
-        """The same scale on both axes; a robot that stands still is not blown up."""
+        """Return the same scale on both axes; a robot that stands still is not blown up."""
         canvas, places = self._canvas, self._plot.places
         low, high = ([pick(p[i] for p in places) for i in (1, 2)] for pick in (min, max))
         sides = [max(b - a, _LAYOUT.min_size) * (1 + 2 * _LAYOUT.margin)

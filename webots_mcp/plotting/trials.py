@@ -48,7 +48,7 @@ def plot_trials(
     *,
     sheet: Sheet | None = None,
 ) -> PlotImage:
-    """The scores of a trial set: each, their mean and their spread; the best is marked.
+    """Return the scores of a trial set: each, their mean and their spread; the best is marked.
 
     Args:
         connection: Any.
@@ -70,7 +70,7 @@ def plot_trials(
 def compose_trials(
     connection: sqlite3.Connection, set_id: int, names: Sequence[str] = ()
 ) -> tuple[TrialAxes, tuple[str, ...]]:
-    """What `plot_trials` paints, and its notes; arguments and errors as there."""
+    """Return what `plot_trials` paints, and its notes; arguments and errors as there."""
     over = [each for each in trials_of(connection, set_id) if each.is_over]
     if not any(each.score is not None for each in over):
         raise NothingRecordedError(f"no trial of set {set_id} has a score yet: nothing to draw")
@@ -86,7 +86,7 @@ def compose_trials(
 
 
 def _varied(trials: Sequence[TrialRecord]) -> list[str]:
-    """The parameters that had more than one value."""
+    """Return the parameters that had more than one value."""
     names = dict.fromkeys(name for each in trials for name in each.values)
     return [name for name in names if len({repr(each.values.get(name)) for each in trials}) > 1]
 
@@ -240,7 +240,7 @@ def _paint_cell(
 
 
 def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[tuple[float, str]]]:
-    """Where each value stands on an axis, and ticks: numbers by what they are, others in a row."""
+    """Return the position of each value on an axis, and ticks; texts stand in a row."""
     if all(isinstance(each, (int, float)) and not isinstance(each, bool) for each in values):
         return {repr(each): float(each) for each in values}, []
     ordered = _ordered(values)

@@ -175,7 +175,7 @@ async def _arm(
 
 
 def _breakpoint_row(view: RobotView, each: stored.StoredBreakpoint) -> list[Any]:
-    """A breakpoint as a row under `BREAKPOINT_COLUMNS`."""
+    """Return a breakpoint as a row under `BREAKPOINT_COLUMNS`."""
     hit = stored.newest_hit(view.connection, each.robot_id, each.id) if each.hit_count else None
     run_id, time_s = hit or (None, None)
     return [

@@ -78,6 +78,7 @@ DIFFERENCE_COLUMNS: Final = (
     "interval", "min", "max",
 )  # fmt: skip
 CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
+_GOING_ON: Final = "going on"
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,6 @@ class ComparisonSizes:
 
 
 _SIZES: Final = ComparisonSizes()
-_GOING_ON: Final = "going on"
 
 
 @question(
@@ -259,7 +259,7 @@ def _values_of(parameters: Mapping[str, Any]) -> Any:
 
 
 def _run_row(run: RunInfo) -> list[Any]:
-    """A run as a row under `RUN_COLUMNS`."""
+    """Return a run as a row under `RUN_COLUMNS`."""
     return [
         run.run_id,
         short_name(run.robot),
@@ -284,19 +284,19 @@ def _run_row(run: RunInfo) -> list[Any]:
 
 
 def started(run: RunInfo) -> str:
-    """When the run began, UTC, as `since` takes it."""
+    """Return when the run began, UTC, as `since` takes it."""
     return datetime.fromtimestamp(run.started_wall_time_s, timezone.utc).strftime(
         "%Y-%m-%dT%H:%M:%SZ"
     )
 
 
 def _file(path: str | None) -> str | None:
-    """The name of a file without its folder, of whichever system."""
+    """Return the name of a file without its folder, of whichever system."""
     return path and PurePath(path.replace("\\", "/")).name
 
 
 def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
-    """Where two runs part, as an answer has it."""
+    """Return where two runs part, as an answer has it."""
     notes, most = notes_of(found.notes), None if is_for_a_person() else _SIZES.diverging
     known = {short_name(n): shown([*pair]) for n, pair in list(found.unlike.items())[:most]}
     names, parted = PartedSignal._fields[1:-1], found.parted[: limit or _SIZES.diverging]
@@ -316,7 +316,7 @@ def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
 
 
 def _cell(name: str, value: Any) -> Any:
-    """A time, or a difference as it is shown, however small; values have all their digits."""
+    """Return a cell: times and differences rounded, values with all their digits."""
     if name.endswith("_s"):
         return seconds(value)
     return float(f"{value:.4g}") if isinstance(value, float) else value
@@ -362,7 +362,7 @@ def _compared(
 
 
 def _differs(difference: Difference) -> bool:
-    """Whether mean or deviation of any group is another one than in the first."""
+    """Return whether mean or deviation of any group is another one than in the first."""
     first, *others = difference.deviation
     return any(each != 0 for each in difference.effect[1:]) or any(each != first for each in others)
 
@@ -372,9 +372,9 @@ def _measure_row(measure: Measure) -> list[Any]:
         short_name(measure.name),
         _medians(measure.spread),
         _ranges(measure.spread),
-        _told(measure.different),
+        _verdicts_against_first(measure.different),
         _intervals(measure.interval),
-        _told(measure.runs_wanted),
+        _verdicts_against_first(measure.runs_wanted),
     ]
 
 
@@ -383,7 +383,7 @@ def _medians(spreads: Sequence[Spread | None]) -> list[float | None]:
 
 
 def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None] | None:
-    """The least and the greatest of each group; None where each group is one run."""
+    """Return the least and the greatest of each group; None where each group is one run."""
     if all(each is None or each.low == each.high for each in spreads):
         return None
     return [None if each is None else figures([each.low, each.high]) for each in spreads]
@@ -415,7 +415,7 @@ def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
 
 
 def _difference_row(difference: Difference, *, with_extremes: bool) -> list[Any]:
-    """A row under `DIFFERENCE_COLUMNS`; only an angle's name leaves its unit open."""
+    """Return a row under `DIFFERENCE_COLUMNS`; only an angle's name leaves its unit open."""
     return [
         short_name(difference.name),
         difference.unit if difference.kind == "angle" else None,
@@ -424,7 +424,7 @@ def _difference_row(difference: Difference, *, with_extremes: bool) -> list[Any]
         _medians(difference.deviation),
         _against_first(figures(difference.effect)),
         _against_first(figures(difference.deviation_ratio)),
-        _told(difference.different),
+        _verdicts_against_first(difference.different),
         _intervals(difference.interval),
         figures(difference.min) if with_extremes else None,
         figures(difference.max) if with_extremes else None,
@@ -432,18 +432,18 @@ def _difference_row(difference: Difference, *, with_extremes: bool) -> list[Any]
 
 
 def _against_first(figures: Sequence[Any]) -> Any:
-    """What is said of each group but the first; of a single one without a list around it."""
+    """Return what is said of each group but the first; of a single one without a list around it."""
     others = list(figures[1:])
     return others[0] if len(others) == 1 else others
 
 
-def _told(verdicts: Sequence[Any]) -> Any:
-    """What is said of each group but the first; None where nothing is said of any."""
+def _verdicts_against_first(verdicts: Sequence[Any]) -> Any:
+    """Return what is said of each group but the first; None where nothing is said of any."""
     return _against_first(verdicts) if any(each is not None for each in verdicts[1:]) else None
 
 
 def _intervals(found: Sequence[tuple[float, float] | None]) -> Any:
-    return _told([None if each is None else figures(each) for each in found])
+    return _verdicts_against_first([None if each is None else figures(each) for each in found])
 
 
 def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: int) -> str | None:
@@ -488,7 +488,8 @@ def webots_check_run(
 ) -> CheckAnswer:
     """Is this run well? Motion against commands, sensors, estimates, pace, log, end, rows, goal.
 
-    Each check passes, warns, fails, is not applicable (what is missing) or was not looked at.
+    Each check passes, warns, fails, is not applicable (what is missing), is not judged (nothing
+    recorded decides it) or was not looked at.
     """
     expected = [read_expectation(each) for each in expect or ()]
     file = file_of(recording.data_dir)
@@ -500,7 +501,7 @@ def webots_check_run(
 def _checked(
     view: RobotView, expected: Sequence[Expectation], project: Sequence[Expected] | None
 ) -> dict[str, Any]:
-    """What became of the checks, the worst first; of those that passed the names."""
+    """Return what became of the checks, the worst first; of those that passed the names."""
     deadline_s = 120.0 if is_for_a_person() else CHECK_DEADLINE_S
     run_id = view.require_run().id
     checked = check_run(

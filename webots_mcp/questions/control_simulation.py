@@ -243,7 +243,7 @@ def _answer(
 
 
 def _then(launched: WebotsLaunch) -> str:
-    """How a start in pause goes on."""
+    """Return how a start in pause goes on."""
     if launched.start.mode != "pause":
         return ""
     by_us = 'webots_simulation_control("resume") plays it'

@@ -187,7 +187,7 @@ class Question:
         return answer if isinstance(answer, type) and issubclass(answer, Answer) else None
 
     def described(self, argument: str) -> str:
-        """What an argument means."""
+        """Return what an argument means."""
         info: FieldInfo = self.arguments.model_fields[argument]
         return info.description or ""
 
@@ -199,7 +199,7 @@ class Question:
     async def ask(
         self, recording: RecordingAccess, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
-        """The answer to valid arguments.
+        """Return the answer to valid arguments.
 
         One that only reads, and fails over a value that no bridge has written, is asked again past
         such rows, which the answer names; one that acts looks past them at once.
@@ -258,14 +258,14 @@ class Question:
         return next(found, None)
 
     def _empty(self, error: WebotsMCPError, left_out: Sequence[str]) -> Reply:
-        """A question that only reads answers that nothing was recorded, instead of failing."""
+        """Answer that nothing was recorded, instead of failing; for questions that only read."""
         if self.answer is None:
             return _with_left_out(Reply(None, [str(error)]), left_out)
         return _with_left_out(_reply(self.answer(status="never seen", hint=str(error))), left_out)
 
 
 def _reply(answer: Any) -> Reply:
-    """What a function has returned; a text that UTF-8 cannot hold fails here."""
+    """Return what a function has returned; a text that UTF-8 cannot hold fails here."""
     if not isinstance(answer, Answer):
         return Reply(None, answer)
     return _in_text(answer.model_dump(mode="json", exclude_none=True), answer.pictures)
@@ -278,7 +278,7 @@ def _in_text(data: dict[str, Any], pictures: Sequence[str | ShownPicture]) -> Re
 
 
 def _with_left_out(reply: Reply, left_out: Sequence[str]) -> Reply:
-    """The reply, which names the rows that were not looked at."""
+    """Return the reply, which names the rows that were not checked."""
     if not left_out:
         return reply
     if reply.data is None:
@@ -357,7 +357,7 @@ class MergedQuestion(Question):
     async def ask(
         self, recording: RecordingAccess, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
-        """The answer of the part that was chosen.
+        """Return the answer of the part that was chosen.
 
         Raises:
             InvalidInputError: An argument is not one of that part, or it lacks one.
@@ -437,7 +437,7 @@ def merged(
 
 
 def listed(questions: Iterable[Question]) -> list[Question]:
-    """Those that a client sees: each merged one in place of its first part, the others gone."""
+    """Return what a client sees: each merged question in place of its parts."""
     every = list(questions)
     merges = [each for each in every if isinstance(each, MergedQuestion)]
     first = {next(iter(each.parts.values())): each for each in merges}
@@ -451,7 +451,7 @@ def _keyword(name: str, kind: Any, default: Any) -> inspect.Parameter:
 
 
 def _or_none(kind: Any) -> Any:
-    """The annotation of an argument that may be left out."""
+    """Return the annotation of an argument that may be left out."""
     if get_origin(kind) is not Annotated:
         return kind | None
     plain, *metadata = get_args(kind)

@@ -40,7 +40,7 @@ def webots_diagnose(recording: RecordingAccess) -> DiagnosisAnswer:
 
 
 def _failed(checked: Sequence[Checked]) -> list[dict[str, str]]:
-    """What is wrong before what might be."""
+    """Return what is wrong before what might be."""
     told: list[dict[str, str]] = []
     left = _BUDGET_TOKENS
     for verdict in ("wrong", "warning"):

@@ -154,7 +154,7 @@ async def _ask(
 
 
 def _find_supervisor(recording: RecordingAccess, robot: str | None) -> str:
-    """The Supervisor to ask: the one that has paused the simulation, as no other loop runs then.
+    """Find the Supervisor to ask: the one that paused the simulation, as no other loop runs then.
 
     Else one with a fresh heartbeat, the named one, an observer (which has no other work), or the
     first, in this order.

@@ -193,7 +193,7 @@ def _timeline(
     cursor: str,
     time_of_day: bool,
 ) -> dict[str, Any]:
-    """A page; a shorter one where it would be too long."""
+    """Return a page; a shorter one where it would be too long."""
     budget_tokens = room_tokens(limit)
     entries = limit or DEFAULT_LIMIT
     while True:

@@ -29,7 +29,7 @@ _AS_DECLARED: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 def faults_of(error: ValidationError, typed: Mapping[str, str] = _AS_DECLARED) -> str:
-    """The first things that are wrong: the argument, what is asked of it, and its value.
+    """Return the first things that are wrong: the argument, what is asked of it, and its value.
 
     Args:
         error: What pydantic said.
@@ -57,7 +57,7 @@ def _fault(error: ErrorDetails, typed: Mapping[str, str]) -> str:
 
 
 def _near(error: ErrorDetails) -> str:
-    """What was perhaps meant."""
+    """Return what was perhaps meant."""
     choices = re.findall(r"'([^']+)'", error["msg"])
     given = str(error["input"])[:_LONGEST_VALUE]
     near = perhaps_meant(given, choices, most=1)
@@ -65,5 +65,5 @@ def _near(error: ErrorDetails) -> str:
 
 
 def shown_value(value: object) -> str:
-    """A value as it was given, if not too long."""
+    """Return a value as it was given, if not too long."""
     return repr(value)[:_LONGEST_VALUE]

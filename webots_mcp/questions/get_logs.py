@@ -156,7 +156,7 @@ def _answer(
 
 
 def _newest_fitting(lines: list[LogLine]) -> list[LogLine]:
-    """The newest ones that fit a model's budget, at least one."""
+    """Return the newest ones that fit a model's budget, at least one."""
     if is_for_a_person():
         return lines
     rows = [[*_row(line).values()] for line in reversed(lines)]

@@ -113,7 +113,7 @@ def webots_list_signals(
 
 
 def _signal_row(info: SignalInfo, rows: int) -> list[Any]:
-    """A signal of a run of that many rows, as a row under `SIGNAL_COLUMNS`."""
+    """Return a signal of a run of that many rows, as a row under `SIGNAL_COLUMNS`."""
     return [
         short_name(info.name),
         info.kind,
@@ -217,7 +217,7 @@ def _series(
     while True:
         history = query_history(view.connection, asked, names, max_points=points)
         runs = [_run_series(run) for run in history.runs if run.rows or run.cut_at_s is not None]
-        tokens = tokens_of([_told(run) for run in runs])
+        tokens = tokens_of([_as_dict(run) for run in runs])
         if tokens <= budget_tokens or points == 1:
             break
         points = max(1, int(points * 0.9 * budget_tokens / tokens))
@@ -242,19 +242,19 @@ def _likely_points(
     return max(1, room // (_SIZES.bucket_tokens * max(numbers, 1)))
 
 
-def _told(part: AnswerPart) -> dict[str, Any]:
+def _as_dict(part: AnswerPart) -> dict[str, Any]:
     return part.model_dump(mode="json", exclude_none=True)
 
 
 def _drop_signals(run: RunSeries, budget_tokens: int) -> list[str]:
     """Leave out the last signals where not even one point of each fits; their names."""
-    over = tokens_of(_told(run)) - budget_tokens
+    over = tokens_of(_as_dict(run)) - budget_tokens
     left_out: list[str] = []
     for series in (run.states or {}, run.numbers or {}):
         for name in [*series][:0:-1]:
             if over <= 0:
                 break
-            over -= tokens_of({name: _told(series.pop(name))})
+            over -= tokens_of({name: _as_dict(series.pop(name))})
             left_out.append(name)
     return left_out[::-1]
 
@@ -290,7 +290,7 @@ def _run_series(run: RunHistory) -> RunSeries:
 
 
 def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
-    """How many values the buckets of most signals have."""
+    """Return how many values the buckets of most signals have."""
     counts = Counter(tuple(columns.count) for columns in numbers)
     return list(counts.most_common(1)[0][0]) if counts else None
 
@@ -327,7 +327,7 @@ def _number_series(
 
 
 def _change_series(columns: ChangeColumns) -> ChangeSeries:
-    """A text or a flag as columns."""
+    """Return a text or a flag as columns."""
     times_s = [seconds(point.sim_time_s) for point in columns.points]
     if columns.since_before and columns.total == len(times_s):
         times_s[:1] = [None]
@@ -349,11 +349,13 @@ def _page(
         view.connection, asked, names, limit=limit or DEFAULT_POINTS, after_id=after_id
     )
     budget_tokens = room_tokens(limit)
-    rows = _most(lambda rows: tokens_of(_told(_row_columns(page, rows, view))), page, budget_tokens)
+    rows = _most(
+        lambda rows: tokens_of(_as_dict(_row_columns(page, rows, view))), page, budget_tokens
+    )
     cursor = page.ids[rows - 1] if 0 < rows < len(page.ids) else page.cursor
     shown = _row_columns(page, rows, view)
     left_out: list[str] = []
-    if tokens_of(_told(shown)) > budget_tokens:  # one row of many signals
+    if tokens_of(_as_dict(shown)) > budget_tokens:  # one row of many signals
         kept = dict(fitting([*shown.signals.items()], budget_tokens))
         left_out = [name for name in shown.signals if name not in kept]
         shown.signals = kept
@@ -376,7 +378,7 @@ def _no_rows(page: StatePage, rows: int, after_id: int) -> str | None:
 
 
 def _most(tokens: Callable[[int], int], page: StatePage, budget_tokens: int) -> int:
-    """How many of the page's first rows fit the budget; at least one."""
+    """Return how many of the page's first rows fit the budget; at least one."""
     rows = len(page.ids)
     while rows > 1 and (now := tokens(rows)) > budget_tokens:
         rows = max(1, min(rows - 1, int(rows * budget_tokens / now)))
@@ -384,7 +386,7 @@ def _most(tokens: Callable[[int], int], page: StatePage, budget_tokens: int) -> 
 
 
 def _row_columns(page: StatePage, rows: int, view: RobotView) -> RowColumns:
-    """The first rows; numbers as they were recorded."""
+    """Return the first rows; numbers as they were recorded."""
     run_ids = page.run_ids[:rows]
     here = view.run.id if view.run else None
     return RowColumns(

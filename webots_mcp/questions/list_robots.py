@@ -61,6 +61,16 @@ from webots_mcp.store.run_rows import (
     real_time_factor,
 )
 
+_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
+_PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
+_RECORDER_COLUMNS: Final = (
+    "row_count", "why", "pace", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
+)  # fmt: skip
+BY_OBSERVER: Final = "the observer, from customData: it has no bridge and takes no commands"
+_ROBOT_COLUMNS: Final = (
+    "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class RobotListSizes:
@@ -84,15 +94,6 @@ class RobotListSizes:
 
 
 _SIZES: Final = RobotListSizes()
-_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
-_PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
-_RECORDER_COLUMNS: Final = (
-    "row_count", "why", "pace", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
-)  # fmt: skip
-BY_OBSERVER: Final = "the observer, from customData: it has no bridge and takes no commands"
-_ROBOT_COLUMNS: Final = (
-    "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
-)  # fmt: skip
 
 
 @question("List the robots", READS, command="status", core=True)
@@ -167,7 +168,7 @@ def webots_get_world_info(
 
 
 def _robots(views: list[RobotView], *, told: bool) -> AnswerTable:
-    """A row for each; what could not be recorded only where there is any, or for a person."""
+    """Return a row for each robot; counts of losses only if there are any, or for a person."""
     columns, rows = [*_ROBOT_COLUMNS], [_row(view) for view in views]
     recorders = [_recorder(view) for view in views]
     for name in _RECORDER_COLUMNS:
@@ -180,7 +181,7 @@ def _robots(views: list[RobotView], *, told: bool) -> AnswerTable:
 
 
 def _recorder(view: RobotView) -> dict[str, Any]:
-    """What a robot's session has recorded of its run, and what it could not."""
+    """Return what a robot's session has recorded of its run, and what it could not."""
     session = view.session
     error = session.last_error if session else None
     return {
@@ -195,10 +196,10 @@ def _recorder(view: RobotView) -> dict[str, Any]:
 
 
 def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
-    """What an observer has seen of the world, robots first."""
+    """Return what an observer has seen of the world, robots first."""
     if world is None:
         return {}
-    bodies = [*world.told.get("robots", ()), *world.told.get("solids", ())]
+    bodies = [*world.content.get("robots", ()), *world.content.get("solids", ())]
     shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
     used = [
         column
@@ -208,10 +209,10 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
     rows = fitting([_in_world(body, used) for body in shown], budget_tokens)
     more = f"the first {len(rows)} of {len(bodies)} bodies are shown"
     return {
-        "title": world.told.get("title"),
+        "title": world.content.get("title"),
         "observer": world.observer,
         "in_world": AnswerTable(columns=used, rows=rows),
-        "hint": more if len(rows) < len(bodies) or world.told.get("more") else None,
+        "hint": more if len(rows) < len(bodies) or world.content.get("more") else None,
     }
 
 
@@ -228,7 +229,7 @@ def _in_world(body: dict[str, Any], columns: list[str]) -> list[Any]:
 
 
 def _retention(recording: RecordingAccess, connection: sqlite3.Connection) -> dict[str, Any]:
-    """What is kept of the recording, how large it is, and which limits of ours do not hold."""
+    """Return the limits of the recording, its size, and which of our limits do not apply."""
     notes = unheeded(connection, recording.limits)
     return {
         "kept": described(connection),
@@ -238,13 +239,13 @@ def _retention(recording: RecordingAccess, connection: sqlite3.Connection) -> di
 
 
 def _liveliest(robots: list[Any]) -> list[Any]:
-    """Those seen last, where there are too many to show; the latest first."""
+    """Return those seen last, where there are too many to show; the latest first."""
     latest = sorted(robots, key=lambda robot: (robot.live, robot.last_seen_wall_time_s))
     return latest[::-1][: _SIZES.robots]
 
 
 def _fitting(views: list[RobotView]) -> list[RobotView]:
-    """The first that fit, in the order of their first appearance."""
+    """Return the first that fit, in the order of their first appearance."""
     fitting_rows = fitting([[*_row(view), *_recorder(view).values()] for view in views])
     return sorted(views[: len(fitting_rows)], key=lambda view: view.robot.id)
 
@@ -264,7 +265,7 @@ def _pace(view: RobotView, run: RunRecord) -> float | None:
 
 
 def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
-    """What the run is; `rows` is as of its last heartbeat."""
+    """Return what the run is; `rows` is as of its last heartbeat."""
     end_reason = run.end_reason or dict(dead_sessions(view.connection)).get(run.session_id)
     ended = {"ended_by": end_reason} if end_reason is not None else {}
     return {

@@ -34,6 +34,8 @@ from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_rang
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 USUAL_DURATION_S: Final = 10.0
+_ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
+_WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,6 @@ class MonitorSizes:
 
 
 _SIZES: Final = MonitorSizes()
-_ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
-_WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 
 @question("Watch the robot", READS, core=True, quotes=True)
@@ -104,7 +104,7 @@ async def webots_monitor(
 
 
 def _start(recording: RecordingAccess, robot: str | None) -> tuple[str, float, bool]:
-    """The robot, since when it is watched, and whether any controller could write meanwhile."""
+    """Return the robot, the start of the window, and whether any controller can write."""
     with recording.view(robot) as view:
         view.require_run()
         is_live = view.session is not None and view.session.is_alive(view.now_s)
@@ -125,7 +125,7 @@ def _watched(recording: RecordingAccess, robot: str, started_s: float) -> Monito
 def look_back(
     recording: RecordingAccess, robot: str | None, lookback_wall_s: float
 ) -> MonitorAnswer:
-    """A report of the wall seconds before the newest row."""
+    """Return a report of the wall seconds before the newest row."""
     with recording.view(robot) as view:
         run = view.require_run()
         newest_s = view.state.wall_time_s if view.state else run.last_wall_time_s
@@ -174,13 +174,13 @@ def _unlooked(verdicts: Verdicts) -> Verdicts:
 
 
 def _of_earlier(told: Sequence[RunTrends]) -> list[str]:
-    """Where the trends of all runs but the newest are."""
+    """Return where the trends of all runs but the newest are."""
     earlier = ", ".join(str(run.run_id) for run in told[: -_SIZES.runs])
     return [f"the trends of run {earlier}: webots_get_trends(run_id)"] if earlier else []
 
 
 def _in_window(event: Event, window: WatchedWindow, wall_start_s: float) -> bool:
-    """Whether it began in the window, or had begun before and lasted into it."""
+    """Return whether it began in the window, or had begun before and lasted into it."""
     starts = (each.start_s for each in window.rows.segments if each.run_id == event.run_id)
     lasted = event.start_s < min(starts, default=math.inf) <= event.end_s
     return event.wall_time_s >= wall_start_s or lasted
@@ -226,7 +226,7 @@ class WatchedWindow:
 
 
 def window_from(view: RobotView, wall_start_s: float) -> WatchedWindow:
-    """The window of a robot from that wall time (Unix) on."""
+    """Return the window of a robot from that wall time (Unix) on."""
     found = find_range(view.connection, Scope(since_wall_time=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
     around = [
@@ -243,7 +243,7 @@ def _from_row_before(connection: sqlite3.Connection, segment: Segment) -> float:
 
 
 def _standing(view: RobotView, wall_start_s: float) -> Segment:
-    """The current run from its newest row on, limited to what was recorded in the window."""
+    """Return the current run from its newest row on, limited to what was recorded in the window."""
     run = view.require_run()
     newest_s = view.state.sim_time_s if view.state else run.started_sim_time_s
     return Segment(run.id, newest_s, math.inf, wall_start_s)

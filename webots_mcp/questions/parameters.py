@@ -69,7 +69,7 @@ async def set_parameters(
 
 
 def settable(recording: RecordingAccess, robot: str | None) -> dict[str, Declared]:
-    """The parameters that a live controller declares.
+    """Return the parameters that a live controller declares.
 
     Raises:
         InvalidInputError, CommandRefusedError, NothingRecordedError: As `set_parameters`.
@@ -154,7 +154,7 @@ def _shown(column: str, value: Any) -> Any:
 
 
 def _meant(patterns: list[str] | None, known: list[str]) -> set[str]:
-    """The known names that match.
+    """Return the known names that match.
 
     Raises:
         InvalidInputError: A pattern matches none.

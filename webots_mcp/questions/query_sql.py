@@ -33,6 +33,12 @@ from webots_mcp.store.sql import (
     require_select,
 )
 
+_LESS: Final = (
+    "retention has deleted {} states (run.purged_rows), which no table or view of states has: "
+    "robot_statistics, webots_query_history and webots_get_trends have what chunks hold of them"
+)
+_turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
+
 
 @dataclass(frozen=True)
 class QuerySizes:
@@ -60,11 +66,6 @@ class QuerySizes:
 
 
 _SIZES: Final = QuerySizes()
-_LESS: Final = (
-    "retention has deleted {} states (run.purged_rows), which no table or view of states has: "
-    "robot_statistics, webots_query_history and webots_get_trends have what chunks hold of them"
-)
-_turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
 
 
 @question(

@@ -56,6 +56,13 @@ from webots_mcp.store.run_rows import (
     select,
 )
 
+PagePath = Annotated[
+    str,
+    Field(max_length=1000, description="Dotted path, as sensors.lidar."),
+]
+Offset = Annotated[int, Field(ge=0, description="First member, item or character at the path.")]
+PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up to 10,000 tokens.")]
+
 
 @dataclass(frozen=True)
 class StateSizes:
@@ -83,12 +90,6 @@ class StateSizes:
 
 
 _SIZES: Final = StateSizes()
-PagePath = Annotated[
-    str,
-    Field(max_length=1000, description="Dotted path, as sensors.lidar."),
-]
-Offset = Annotated[int, Field(ge=0, description="First member, item or character at the path.")]
-PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up to 10,000 tokens.")]
 
 
 @question("Get the robot's state", READS, core=True, quotes=True)
@@ -177,7 +178,7 @@ def webots_get_full_state(
 
 
 def _with_observed_pose(view: RobotView, state: StateRecord) -> dict[str, Any]:
-    """The state, with where an observer saw the robot if it has no position of its own."""
+    """Return the state, with where an observer saw the robot if it has no position of its own."""
     value = state.value()
     if OBSERVED in value:
         return value
@@ -188,7 +189,7 @@ def _with_observed_pose(view: RobotView, state: StateRecord) -> dict[str, Any]:
 
 
 def _nothing_yet(view: RobotView) -> str:
-    """A robot that published before a reset will publish again."""
+    """Return a robot that published before a reset will publish again."""
     run_id = view.run.id if view.run else 0
     (purged_rows,) = view.connection.execute(
         "SELECT purged_rows FROM run WHERE id = ?", (run_id,)
@@ -215,7 +216,7 @@ def _nothing_yet(view: RobotView) -> str:
 
 
 def _page(part: Any, path: str, offset: int, limit: int, budget_tokens: int) -> dict[str, Any]:
-    """What fits of a value; of an object, an array or a text from `offset` on."""
+    """Return what fits of a value; of an object, an array or a text from `offset` on."""
     if not isinstance(part, (dict, list, str)):
         return {  # an answer leaves out a null, so the hint names it
             "path": path,
@@ -256,7 +257,7 @@ def _page(part: Any, path: str, offset: int, limit: int, budget_tokens: int) -> 
 def _fitting_members(
     members: Sequence[tuple[str | int, Any]], budget_tokens: int, *, named: bool
 ) -> dict[str | int, Shortened]:
-    """The first members that fit, at least one.
+    """Return the first members that fit, at least one.
 
     Where all fit once arrays among the longest are summarised, all are shown; else each that is
     not very long is shown whole, and others must be asked for.
@@ -288,7 +289,7 @@ def _fitting_members(
 
 
 def _longest_that_fits(sizes: Collection[int], budget: int) -> int:
-    """The size to which the largest must come down for all of them to fit."""
+    """Return the size to which the largest must come down for all of them to fit."""
     for smaller, size in enumerate(sorted(sizes)):
         share = budget // (len(sizes) - smaller)
         if size > share:
@@ -298,7 +299,7 @@ def _longest_that_fits(sizes: Collection[int], budget: int) -> int:
 
 
 def _events(view: RobotView) -> AnswerTable:
-    """The newest events that fit, the oldest of them first."""
+    """Return the newest events that fit, the oldest of them first."""
     events = newest_events(view.connection, view.require_run().id, _SIZES.events)
     rows = [
         [round(event.sim_time_s, 3), event.kind, event.name, detailed(event.details())]
@@ -309,7 +310,7 @@ def _events(view: RobotView) -> AnswerTable:
 
 
 def _health(view: RobotView) -> dict[str, Any] | None:
-    """The health of the session that recorded the run."""
+    """Return the health of the session that recorded the run."""
     session = view.session
     if view.run is not None and (session is None or session.id != view.run.session_id):
         session = fetch_session(view.connection, view.run.session_id)
@@ -333,7 +334,7 @@ def _health(view: RobotView) -> dict[str, Any] | None:
 
 
 def _kept(view: RobotView) -> str | None:
-    """Which seconds of the run were kept last at full rate, and why."""
+    """Return which seconds of the run were kept last at full rate, and why."""
     newest = newest_kept(view.connection, view.run.id) if view.run else None
     if newest is None or view.run is None:
         return None
@@ -344,7 +345,7 @@ def _kept(view: RobotView) -> str | None:
 
 
 def _replaced_in(state: StateRecord, part: dict[str, Any]) -> dict[str, str] | None:
-    """The replaced values among those members of the state."""
+    """Return the replaced values among those members of the state."""
     replaced = {
         path: kind
         for path, kind in state.replaced_paths().items()
@@ -354,7 +355,7 @@ def _replaced_in(state: StateRecord, part: dict[str, Any]) -> dict[str, str] | N
 
 
 def _some_replaced(replaced: Mapping[str, str]) -> dict[str, str] | None:
-    """The first of them, and how many more there are; None without any."""
+    """Return the first of them, and how many more there are; None without any."""
     shown = dict(list(replaced.items())[: _SIZES.replaced])
     if more := len(replaced) - len(shown):
         shown["…"] = f"{more} more: webots_query_sql has all in column replaced of table state"

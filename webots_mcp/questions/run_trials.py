@@ -60,6 +60,15 @@ from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import robot_name
 
+_Value = float | int | bool | str
+CANCELLED: Final = "it was cancelled"
+_IN_SIMULATORS: Final = (
+    "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
+)
+_FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
+_RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
+_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
+
 
 @dataclass(frozen=True)
 class TrialAnswerSizes:
@@ -85,14 +94,6 @@ class TrialAnswerSizes:
 
 
 _SIZES: Final = TrialAnswerSizes()
-_Value = float | int | bool | str
-CANCELLED: Final = "it was cancelled"
-_IN_SIMULATORS: Final = (
-    "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
-)
-_FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
-_RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
-_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 
 
 def _require_sets(given: Any) -> Any:
@@ -232,7 +233,7 @@ def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: Rob
 def _as_declared(
     declared: Mapping[str, Declared], sets: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """The values in the types of the declared parameters."""
+    """Return the values in the types of the declared parameters."""
     require_known(list({name: None for values in sets for name in values}), list(declared))
     return [
         {name: declared[name].declaration.checked(value) for name, value in values.items()}
@@ -264,7 +265,7 @@ def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, can
 
 
 def _goes_on(found: TrialSetRecord) -> str:
-    """How to continue a set that no robot's simulation runs."""
+    """Return how to continue a set that no robot's simulation runs."""
     return _IN_SIMULATORS if "world" in json.loads(found.plan) else _FROM_ELSEWHERE
 
 
@@ -299,7 +300,7 @@ async def _wait(
 
 
 def set_facts(recording: RecordingAccess, set_id: int | None) -> dict[str, Any]:
-    """The facts of an answer about a set, by default about the newest one.
+    """Return the facts of an answer about a set, by default about the newest one.
 
     Raises:
         InvalidInputError: There is no such set.
@@ -359,7 +360,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
 
 
 def _state(found: TrialSetRecord, left: int, *, at_work: bool) -> tuple[str, str | None]:
-    """The state of a set, and what to do next."""
+    """Return the state of a set, and what to do next."""
     again = f"webots_run_trials(trial_set={found.id})"
     if at_work:
         if found.stop_reason:
@@ -376,7 +377,7 @@ def _state(found: TrialSetRecord, left: int, *, at_work: bool) -> tuple[str, str
 
 
 def _names(ranking: Ranking) -> list[str]:
-    """The parameters as columns, renamed where a column of figures has the same name."""
+    """Return the parameters as columns, renamed where a column of figures has the same name."""
     names = dict.fromkeys(name for each in ranking.sets for name in each.parameters)
     return [f"parameter {name}" if name in _FIGURES else name for name in names]
 

@@ -24,7 +24,7 @@ from webots_mcp.answers.models import (
 )
 from webots_mcp.answers.shortening import cut_text, is_for_a_person, shorten, tokens_of
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
-from webots_mcp.database.queue import Command, list_commands
+from webots_mcp.database.queue import QueuedCommand, list_commands
 from webots_mcp.questions.arguments import Cursor, Id, RobotName, TimeoutS
 from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
 from webots_mcp.steering.command_answer import shown_result
@@ -35,6 +35,11 @@ COMMAND_COLUMNS: Final = (
     "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
 )  # fmt: skip
 _WAIT_S: Final = 10.0
+_MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
+    'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, 201, 200) '
+    "FROM session, json_each(actions) WHERE session.id = {} AND key = 'NAME'\") has more of one"
+)
+NO_BRIDGE: Final = "this robot has no bridge: it takes no commands, and has no parameters"
 
 
 @dataclass(frozen=True)
@@ -56,11 +61,6 @@ class CommandListSizes:
 
 
 _SIZES: Final = CommandListSizes()
-_MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
-    'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, 201, 200) '
-    "FROM session, json_each(actions) WHERE session.id = {} AND key = 'NAME'\") has more of one"
-)
-NO_BRIDGE: Final = "this robot has no bridge: it takes no commands, and has no parameters"
 
 
 @question(
@@ -127,8 +127,8 @@ def webots_list_commands(
         return _answer(view, commands, limit)
 
 
-def _command_row(command: Command, now_s: float) -> list[Any]:
-    """A command as a row under `COMMAND_COLUMNS`."""
+def _command_row(command: QueuedCommand, now_s: float) -> list[Any]:
+    """Return a command as a row under `COMMAND_COLUMNS`."""
     took_s = None
     if command.finished_wall_time_s is not None:
         took_s = round(command.finished_wall_time_s - command.created_wall_time_s, 3)
@@ -144,7 +144,7 @@ def _command_row(command: Command, now_s: float) -> list[Any]:
     ]
 
 
-def _answer(view: RobotView, commands: list[Command], limit: int) -> CommandsAnswer:
+def _answer(view: RobotView, commands: list[QueuedCommand], limit: int) -> CommandsAnswer:
     rows = [_command_row(command, view.now_s) for command in commands]
     rows = fitting(rows, _SIZES.commands_tokens)
     more = len(rows) < len(commands) or len(commands) == limit
@@ -166,7 +166,7 @@ def _answer(view: RobotView, commands: list[Command], limit: int) -> CommandsAns
 
 
 def _shown_actions(actions: Mapping[str, str]) -> dict[str, str]:
-    """The registered actions with as much of their docstrings as fits beside all the names.
+    """Return the registered actions with as much of their docstrings as fits beside all the names.
 
     A controller that registers none sees commands in its loop.
     """

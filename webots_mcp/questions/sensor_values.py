@@ -24,18 +24,18 @@ _WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:
-    """The members of a state that have the name of a sensor of the robot, or a sensor's word."""
+    """Return the members of a state that are named after a sensor, or contain a sensor's word."""
     sensors = _sensor_devices(devices)
     return {key: state[key] for key in state if key in sensors or _has_sensor_word(key)}
 
 
 def _sensor_devices(devices: dict[str, str]) -> dict[str, str]:
-    """The devices that are sensors: name to class."""
+    """Return the devices that are sensors: name to class."""
     return {name: kind for name, kind in devices.items() if kind not in _NO_SENSORS}
 
 
 def unnamed_devices(state: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
-    """The sensor devices whose name is in no name of the published values.
+    """Return the sensor devices whose name is in no name of the published values.
 
     The words of a name may be anywhere in a path: `front left`, `left_front` and `ds0` match
     `front: {left: 1}` and `ds: [1]`.

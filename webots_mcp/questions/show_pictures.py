@@ -32,7 +32,7 @@ from webots_mcp.questions.arguments import (
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.reading.segment import just_after, kept_stretches
+from webots_mcp.store.reading.segment import full_rate_segments, just_after
 from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside, opened
 
@@ -127,12 +127,12 @@ def _far_off(at_s: float | None, found: list[StoredImage]) -> dict[str, Any]:
 
 
 def _told_of(view: RobotView, found: list[StoredImage]) -> dict[str, Any]:
-    """The camera, and the stretch that its frames are kept with."""
+    """Return the camera, and the stretch that its frames are kept with."""
     first, last = found[0], found[-1]
     if first.kind != KEPT_FRAME:
         return {"camera": first.device}
     within = (first.run_id, first.sim_time_s, just_after(last.sim_time_s))
-    reasons = [each.reason for each in kept_stretches(view.connection, *within)]
+    reasons = [each.reason for each in full_rate_segments(view.connection, *within)]
     return {"camera": first.device, "kept": "; ".join(reasons)}
 
 
@@ -189,7 +189,7 @@ def _caption(facts: dict[str, Any]) -> str:
 
 
 def _no_frame(view: RobotView, camera: str) -> str:
-    """Why there is no picture, in the form of a caption."""
+    """Return why there is no picture, in the form of a caption."""
     known = cameras(view.connection, view.robot.id)
     saved = [f"run_id={run_id}: {names}" for run_id, names in known.items()]
     of_it = f" of {camera!r}" if camera else ""
@@ -331,7 +331,7 @@ def _thumbnail(file: Path, side_px: int) -> Image:
 
 
 def _load_picture(file: Path) -> tuple[ShownPicture, str]:
-    """A picture within 1,000 pixels, and a note where it had to be scaled (else empty).
+    """Return a picture within 1,000 pixels, and a note where it had to be scaled (else empty).
 
     Raises:
         InvalidInputError: The file holds no complete picture, or is too large.

@@ -28,12 +28,12 @@ _AGAIN: Final = "'webots-mcp token --new' makes another"
 
 
 def token_file() -> Path:
-    """Where the token of this user is."""
+    """Return where the token of this user is."""
     return full_path("~/.webots-mcp/token")
 
 
 def access_token() -> str:
-    """The token; it is made where there is none yet.
+    """Return the token; it is made where there is none yet.
 
     Raises:
         CommandRefusedError: Other users can read the file, or there is no token in it.
@@ -70,7 +70,7 @@ def new_token() -> str:
 
 
 def is_admitted(authorization: str) -> bool:
-    """Whether the header of that name has the token; how long that takes does not show how nearly.
+    """Return whether a header holds the token, in a time that does not depend on the header.
 
     Raises:
         CommandRefusedError: There is no valid token, so that nobody is admitted.
@@ -91,7 +91,7 @@ def named_host(header: str) -> str | None:
 
 
 def page_key() -> str:
-    """What stands for the token in an address, which browsers keep and show: made from it.
+    """Return what stands for the token in an address, which browsers keep and show: made from it.
 
     Raises:
         CommandRefusedError: There is no valid token.

@@ -85,7 +85,7 @@ class Endpoint(NamedTuple):
 def endpoint_of(
     text: str, allowed: Sequence[str] = (), certificate: Path | None = None, key: Path | None = None
 ) -> Endpoint:
-    """The place that `[HOST:]PORT` names; without a host 127.0.0.1.
+    """Return the place that `[HOST:]PORT` names; without a host 127.0.0.1.
 
     Raises:
         InvalidInputError: It names none, or none that is safe.
@@ -135,12 +135,12 @@ def serve_http(server: MCPServer, place: Endpoint, ready: Callable[[str], object
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Whether a line of the SDK is worth a line on stderr: a client that left is not."""
+    """Return whether a line of the SDK is worth a line on stderr: a client that left is not."""
     return not (record.exc_info and isinstance(record.exc_info[1], ClientDisconnect))
 
 
 def guarded_app(server: MCPServer, place: Endpoint, most_sessions: int = MOST_SESSIONS) -> ASGIApp:
-    """The server as an application for requests that are addressed to it and have the token."""
+    """Return the server as an application that checks host, origin and token."""
     app = server.streamable_http_app(
         transport_security=_allowing(place),
         session_idle_timeout=86_400.0,  # people come back to a conversation after hours
@@ -168,7 +168,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _names(place: Endpoint) -> tuple[str, ...]:
-    """The hosts that requests may be addressed to."""
+    """Return the hosts that requests may be addressed to."""
     own = (place.host,) if _is_loopback(place.host) else ()  # such as 127.0.0.2
     return (*LOOPBACK, *own, *place.allowed)
 
@@ -182,7 +182,7 @@ def _allowing(place: Endpoint) -> TransportSecuritySettings:
 
 
 def gate(app: ASGIApp, place: Endpoint) -> ASGIApp:
-    """The application, for requests that are addressed to it and have the token.
+    """Return the application, for requests that are addressed to it and have the token.
 
     The SDK compares the beginning of Host and Origin only, so that both are read here first.
     """
@@ -214,7 +214,7 @@ def gate(app: ASGIApp, place: Endpoint) -> ASGIApp:
 
 
 def _lowered(scope: Scope) -> Scope:
-    """The request with its hosts in lower case, in which the SDK knows them: they have no case."""
+    """Return the request with its hosts in lower case, as the SDK expects them."""
     headers = [
         (name, value.lower() if name in (b"host", b"origin") else value)
         for name, value in scope["headers"]
@@ -246,7 +246,7 @@ async def _follow(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> N
 
 
 def _request_in(body: bytearray) -> Any:
-    """The id of the request that a body holds; None for a notification or a part of one."""
+    """Return the id of the request that a body holds; None for a notification or a part of one."""
     try:
         message: dict[str, Any] = dict(json.loads(body))
     except (ValueError, TypeError, RecursionError):

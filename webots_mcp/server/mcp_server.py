@@ -43,7 +43,7 @@ from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
-from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, take_in_journals
+from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, ingest_journals
 from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.recording import OpenReaders, RecordingAccess
@@ -74,7 +74,7 @@ def create_server(
     output_schemas: bool = False,
     limits: Asked | None = None,
 ) -> MCPServer:
-    """An MCP server over a recording; it starts whether or not anything was recorded yet.
+    """Return an MCP server over a recording; it starts whether or not anything was recorded yet.
 
     Args:
         database: A file, or a database in memory that a bridge in this process shares.
@@ -141,7 +141,7 @@ def _lifespan(
             ask(connection, unasked)
             unasked.clear()
         if isinstance(recording.database, Path):
-            take_in_journals(connection, recording.database, MAINTAINER_BUDGET_S)
+            ingest_journals(connection, recording.database, MAINTAINER_BUDGET_S)
         project.recompile_if_changed(connection)
         reap_if_dead(connection)
         make_chunks(connection, pause_s=0.002)  # for the robots to write between two short writes
@@ -150,7 +150,7 @@ def _lifespan(
     def make_database() -> None:
         """Where controllers have begun to record that never open it."""
         if isinstance(recording.database, Path) and not recording.database.exists():
-            recording.take_in()
+            recording.ingest()
 
     @asynccontextmanager
     async def lifespan(_: MCPServer) -> AsyncGenerator[Companions]:
@@ -195,7 +195,7 @@ def add_resources(mcp: MCPServer, recording: RecordingAccess) -> None:
 
 
 def _schema_to_come() -> str:
-    """What the database will have when something is recorded."""
+    """Return what the database will have when something is recorded."""
     database = MemoryDatabase()
     with closing(connect(database, "writer")) as connection:
         create_schema(connection)
@@ -255,7 +255,7 @@ class ToolServer(MCPServer):
         arguments: dict[str, Any] | None = None,
         context: Context[Any, Any] | None = None,
     ) -> GetPromptResult | InputRequiredResult:
-        """A prompt; clients give an optional argument that nobody filled in as an empty text.
+        """Return a prompt; clients give optional arguments that nobody filled in as empty texts.
 
         Raises:
             MCPError: There is no such prompt, or an argument is missing or invalid.

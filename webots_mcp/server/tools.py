@@ -55,7 +55,7 @@ _log = logging.getLogger(__name__)
 
 
 def tool_of(question: Question, recording: RecordingAccess, *, output_schema: bool = False) -> Tool:
-    """A question on a recording as a tool; its schemas, which take milliseconds, are made once."""
+    """Return a question as a tool; its schemas, which take milliseconds, are made once."""
     tool = _tool(question, output_schema)
     return tool.model_copy(update={"fn": functools.partial(tool.fn, recording)})
 
@@ -78,7 +78,7 @@ def _tool(question: Question, output_schema: bool) -> Tool:
 
 
 def _answering(question: Question) -> Callable[..., Any]:
-    """The question as the SDK calls it, after a recording; with an answer whatever happens."""
+    """Return the question as the SDK calls it; it answers whatever happens."""
 
     @functools.wraps(question.function)
     async def wrapper(recording: RecordingAccess, ctx: Context[Any], **arguments: Any) -> Any:
@@ -108,7 +108,7 @@ def _answering(question: Question) -> Callable[..., Any]:
 
 
 def _requester(ctx: Context[Any]) -> Requester:
-    """The client, as it has named itself, and the transport that its call came by."""
+    """Return the client, as it has named itself, and the transport that its call came by."""
     asked = ctx.request_context
     client = asked.session.client_params
     name, version = (client.client_info.name, client.client_info.version) if client else ("", "")
@@ -171,7 +171,7 @@ class CheckedTool(Tool):
             raise
 
     def _unknown(self, arguments: dict[str, Any], unknown: Collection[str]) -> str:
-        """Which argument the tool does not have, and what was perhaps meant."""
+        """Return which argument the tool does not have, and what was perhaps meant."""
         names = [name for name in arguments if name in unknown]
         listed, inside = list(self.parameters["properties"]), self.of_controller
         typo = next((name for name in names if perhaps_meant(name, listed)), None)
@@ -184,7 +184,7 @@ class CheckedTool(Tool):
         return f"{said}: there is {', '.join(near) or 'none'}"
 
     def _call(self, own: Mapping[str, Any], inside: str, values: Mapping[str, Any]) -> str:
-        """A call with all that the tool requires; values that would make it too long are dots."""
+        """Return a call with all required arguments; values that make it too long become dots."""
         required = self.parameters.get("required", ())
         lacking = {each: "..." for each in required if each != inside and each not in own}
         given = {name: compact_json(value) for name, value in own.items()}
@@ -207,7 +207,7 @@ def _unboxed(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _slim(schema: dict[str, Any]) -> dict[str, Any]:
-    """A parameter's schema without what says nothing.
+    """Return a parameter's schema without what says nothing.
 
     That is its name once more, null or an empty default for "may be left out", and bounds that only
     an absurd value exceeds.
@@ -226,14 +226,14 @@ def _slim(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_absurd(key: str, value: Any) -> bool:
-    """Whether it is a bound beyond what anybody asks for."""
+    """Return whether it is a bound beyond what anybody asks for."""
     return key == "maximum" and value >= 1_000
 
 
 def _unwrapped(
     arguments: dict[str, Any], own: Collection[str], required: Iterable[str]
 ) -> dict[str, Any]:
-    """The arguments of a tool without the wrapper and the format of the first server's calls.
+    """Return the arguments without the wrapper and the format of the first server's calls.
 
     Raises:
         ToolError: It is no format of that server.
@@ -254,7 +254,7 @@ def _without_format(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_object(value: Any) -> dict[str, Any] | None:
-    """An object, or the JSON text of one."""
+    """Return an object, or the JSON text of one."""
     if isinstance(value, str):
         try:
             value = json.loads(value)
@@ -270,5 +270,5 @@ def _as_meant(value: Any, schema: dict[str, Any]) -> Any:
 
 
 def _is_list(value: object) -> bool:
-    """Whether it is a list, or the JSON text of one, which the SDK reads."""
+    """Return whether it is a list, or the JSON text of one, which the SDK reads."""
     return isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("["))

@@ -41,7 +41,7 @@ class Client(NamedTuple):
 
 
 def clients_of(project: Path) -> list[Client]:
-    """Those that look into the folder of a project."""
+    """Return those that look into the folder of a project."""
     return [
         Client("Claude Code", project / ".mcp.json", variable="${%s}"),
         Client("Cursor", project / ".cursor" / "mcp.json"),
@@ -62,7 +62,7 @@ def claude_desktop(platform: str = sys.platform) -> Client:
 
 
 def server_command(data_dir: Path) -> list[str]:
-    """A command that starts the server from anywhere, whatever PATH the client was given."""
+    """Return a command that starts the server from anywhere, whatever PATH the client was given."""
     script = Path(sysconfig.get_path("scripts")) / "webots-mcp"
     if sys.platform == "win32":
         script = script.with_suffix(".exe")
@@ -71,7 +71,7 @@ def server_command(data_dir: Path) -> list[str]:
 
 
 def server_hindrance() -> str | None:
-    """Why clients could not start this server, now or some day; None where they can."""
+    """Return why clients could not start this server, now or some day; None where they can."""
     if importlib.util.find_spec("mcp") is None:
         return (
             f"the server cannot be started by {sys.executable}, which lacks the package mcp: "
@@ -86,7 +86,7 @@ def server_hindrance() -> str | None:
 
 
 def plan_entry(client: Client, name: str, server: list[str] | str) -> tuple[FileChange, str | None]:
-    """The change that makes a client know the server, and what there is to know about it.
+    """Return the change that makes a client know the server, and what there is to know about it.
 
     An entry of ours that can be started is left as it is, also where it differs: its options are
     the user's. One that cannot be started any more gets the command anew and keeps its options.
@@ -153,7 +153,7 @@ def _with_entry(
 
 
 def is_ours(entry: Any) -> bool:
-    """Whether a server's entry starts `webots-mcp serve`, or gives our token to one that runs."""
+    """Return whether an entry starts `webots-mcp serve`, or gives our token to a server."""
     if not isinstance(entry, dict):
         return False
     words = words_of(cast("dict[str, Any]", entry))
@@ -164,7 +164,7 @@ def is_ours(entry: Any) -> bool:
 
 
 def words_of(entry: dict[str, Any]) -> list[str]:
-    """The command line of an entry; empty where it has none."""
+    """Return the command line of an entry; empty where it has none."""
     command: object = entry.get("command")
     arguments: object = entry.get("args", [])
     if not isinstance(command, str) or not isinstance(arguments, list):
@@ -175,7 +175,7 @@ def words_of(entry: dict[str, Any]) -> list[str]:
 def can_be_started(entry: dict[str, Any]) -> bool:
     """Not by a name alone: a client that was started from the desktop has a poor PATH.
 
-    Of `uvx` and other programs that install first only the program is looked for.
+    Of `uvx` and other programs that install first only the program is searched for.
     """
     if "url" in entry:
         return True
@@ -186,7 +186,7 @@ def can_be_started(entry: dict[str, Any]) -> bool:
 
 
 def policy_file(project: Path) -> FileChange:
-    """The project's file with what is harmless allowed; one that is there is kept."""
+    """Return the project's file with what is harmless allowed; one that is there is kept."""
     file = project / PROJECT_FILE
     before = read(file)
     usual = Path(__file__).with_name("allowed.toml").read_bytes()
@@ -194,7 +194,7 @@ def policy_file(project: Path) -> FileChange:
 
 
 def ignore_file(data_dir: Path) -> FileChange:
-    """The file that keeps the recordings out of a Git repository; one that is there is kept.
+    """Return the file that keeps the recordings out of a Git repository; one that is there is kept.
 
     Raises:
         CommandRefusedError: The data folder is a file.
@@ -207,7 +207,7 @@ def ignore_file(data_dir: Path) -> FileChange:
 
 
 def object_in(text: str) -> dict[str, Any]:
-    """The JSON object that a text holds, perhaps with comments and trailing commas.
+    """Return the JSON object that a text holds, perhaps with comments and trailing commas.
 
     Raises:
         InvalidInputError: It is no such thing; the message names the line and the column.
@@ -227,7 +227,7 @@ def object_in(text: str) -> dict[str, Any]:
 
 
 def _rewritten(text: str, value: dict[str, Any]) -> str:
-    """The text of another value, indented as before.
+    """Return the text of another value, indented as before.
 
     Raises:
         InvalidInputError: The text has comments or trailing commas, which would be lost.
@@ -245,7 +245,7 @@ def _rewritten(text: str, value: dict[str, Any]) -> str:
 
 
 def _blanked(pattern: re.Pattern[str], text: str) -> str:
-    """What the group matches becomes spaces, so that all else stays at its line and column."""
+    """Replace what the group matches by spaces, so that lines and columns stay."""
 
     def blank(found: re.Match[str]) -> str:
         return re.sub(r"[^\n]", " ", found[0]) if found[1] else found[0]

@@ -41,7 +41,7 @@ class FileChange(NamedTuple):
 
 
 def read(file: Path) -> bytes | None:
-    """What the file holds; None where there is none.
+    """Return what the file holds; None where there is none.
 
     Raises:
         OSError: It cannot be read, or is no file.

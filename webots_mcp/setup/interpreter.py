@@ -78,7 +78,7 @@ class Interpreter:
 
 
 def chosen(controller: Path, platform: str = sys.platform) -> Chosen:
-    """The command for a controller's file, by Webots' rules for that system."""
+    """Return the command for a controller's file, by Webots' rules for that system."""
     if platform != "win32" and (line := _first_line(controller)).startswith("#!"):
         return Chosen(tuple(line[2:].split()), f"the #! line of {controller.name}")
     if command := _runtime_command(controller.with_name("runtime.ini")):
@@ -116,7 +116,7 @@ def _ini_value(text: str, sections: tuple[str, ...], key: str) -> str | None:
 
 
 def _preferred(platform: str) -> Chosen | None:
-    """The Python command of Webots' preferences: of the version that is used, else the newest."""
+    """Return the Python command of the preferences of the used Webots, else of the newest."""
     known = _preferences(platform)
     versions = [found.version.split()[0] for found in installations(platform) if found.version]
     for version in [*versions, *sorted(known, reverse=True)]:
@@ -126,7 +126,7 @@ def _preferred(platform: str) -> Chosen | None:
 
 
 def _preferences(platform: str) -> dict[str, str]:
-    """The Python command by version of Webots, as far as one is set."""
+    """Return the Python command by version of Webots, as far as one is set."""
     if platform == "win32":
         return _of_registry()
     if platform == "darwin":
@@ -243,7 +243,7 @@ def _environment() -> dict[str, str]:
 
 
 def _desktop_path() -> str:
-    """The PATH without the virtual environment of this shell.
+    """Return the PATH without the virtual environment of this shell.
 
     Webots that was started from the desktop knows nothing of it.
     """

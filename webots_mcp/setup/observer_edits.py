@@ -35,7 +35,7 @@ _TOKEN: Final = re.compile(rb'"(?:\\.|[^"\\])*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]
 
 
 def with_observer(world: bytes, *, extern: bool = False) -> bytes:
-    """The world with an observer at its end; unchanged where it has one.
+    """Return the world with an observer at its end; unchanged where it has one.
 
     Args:
         world: What its file holds.
@@ -53,7 +53,7 @@ def with_observer(world: bytes, *, extern: bool = False) -> bytes:
 
 
 def without_observer(world: bytes) -> bytes:
-    """The world without its observer, wherever it stands and whatever Webots has made of it.
+    """Return the world without its observer, wherever it stands and whatever Webots has made of it.
 
     Raises:
         InvalidInputError: It is no world of Webots, or has no observer.
@@ -68,17 +68,17 @@ def without_observer(world: bytes) -> bytes:
 
 
 def has_observer(world: bytes) -> bool:
-    """Whether an observer stands at the top of a world."""
+    """Return whether an observer stands at the top of a world."""
     return world.startswith(_HEADER) and _find(world) is not None
 
 
 def copy_of(world: Path) -> Path:
-    """Where the copy with the observer belongs: next to the world, which finds its files there."""
+    """Return where the copy belongs: next to the world, so that it finds its files."""
     return world.with_name(f"{world.stem}{COPY_SUFFIX}{world.suffix}")
 
 
 def world_change(world: Path, *, in_place: bool, extern: bool) -> FileChange:
-    """What is to be written so that a world has an observer.
+    """Return what is to be written so that a world has an observer.
 
     Raises:
         InvalidInputError: It is no world, or has an observer already and is to be copied.
@@ -96,7 +96,7 @@ def world_change(world: Path, *, in_place: bool, extern: bool) -> FileChange:
 
 
 def undo(world: Path) -> FileChange | None:
-    """What is to be written so that a world has none; None where the file is a copy to delete.
+    """Return the change that removes the observer; None if the file is a copy to delete.
 
     Raises:
         InvalidInputError: It has no observer.
@@ -119,7 +119,7 @@ def undo(world: Path) -> FileChange | None:
 
 
 def controller_change(project: Path) -> FileChange:
-    """What is to be written so that the project has the observer's controller.
+    """Return what is to be written so that the project has the observer's controller.
 
     Raises:
         OSError: It cannot be read.
@@ -129,7 +129,7 @@ def controller_change(project: Path) -> FileChange:
 
 
 def python_change(controller: Path, python: str) -> FileChange:
-    """What is to be written so that Webots starts the observer's controller with that Python.
+    """Return the change by which Webots starts the observer with that Python.
 
     Raises:
         OSError: It cannot be read.
@@ -139,7 +139,7 @@ def python_change(controller: Path, python: str) -> FileChange:
 
 
 def unused_controller(project: Path, python: str) -> list[Path]:
-    """The observer's files that no world of the project needs, as far as we have written them.
+    """Return the observer's files that no world needs, if they are as we wrote them.
 
     Raises:
         OSError: They cannot be read.
@@ -161,7 +161,7 @@ def _controller_of(project: Path) -> Path:
 
 
 def _find(world: bytes) -> tuple[int, int] | None:
-    """Where the observer's node begins and ends."""
+    """Return where the observer's node begins and ends."""
     if not world.startswith(_HEADER):
         raise InvalidInputError("it is no world of Webots, which begins with '#VRML_SIM R2025a'")
     for start, end, name in _robots(world):

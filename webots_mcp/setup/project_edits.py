@@ -66,9 +66,9 @@ class _InsertionPoint(NamedTuple):
 
 
 def attaching_place(controller: Path) -> AttachingPlace:
-    """Where a robot is attached: in the controller's file, or in a module that it imports.
+    """Return where a robot is attached: in the controller's file, or in a module that it imports.
 
-    Modules are looked for in the controller's folder, as Python does first.
+    Modules are searched for in the controller's folder, as Python does first.
 
     Raises:
         AlreadyPatchedError: It, or another of the kind, is there.
@@ -105,7 +105,7 @@ def attaching_place(controller: Path) -> AttachingPlace:
 
 
 def is_plain_robot(controller: Path) -> bool:
-    """Whether a controller makes a Robot and no Supervisor, as far as its files can be read."""
+    """Return whether a controller makes a Robot and no Supervisor, as far as it can be read."""
     made = set[str]()
     files = [controller]
     for file in files:
@@ -138,7 +138,7 @@ def _classes_used(nodes: list[ast.AST]) -> set[str]:
 
 
 def _imported(module: ast.Module, file: Path, controller: Path) -> list[Path]:
-    """The files in the controller's folder that a module imports."""
+    """Return the files in the controller's folder that a module imports."""
     names = list[tuple[Path, str]]()
     for node in ast.walk(module):
         if isinstance(node, ast.Import):
@@ -153,7 +153,7 @@ def _imported(module: ast.Module, file: Path, controller: Path) -> list[Path]:
 
 
 def patch(source: bytes) -> bytes:
-    """The controller with the bridge's lines.
+    """Return the controller with the bridge's lines.
 
     Raises:
         AlreadyPatchedError: They, or others of the kind, are there.
@@ -178,7 +178,7 @@ def patch(source: bytes) -> bytes:
 
 
 def unpatch(source: bytes) -> bytes:
-    """The controller as it was before `patch`, to the byte; later changes elsewhere stay.
+    """Return the controller as it was before `patch`, to the byte; later changes elsewhere stay.
 
     Raises:
         InvalidInputError: The lines are not there, or not as `patch` writes them.
@@ -214,7 +214,7 @@ def _parsed(source: bytes) -> ast.Module:
 
 
 def _place(module: ast.Module) -> _InsertionPoint:
-    """Where the robot is attached: after its constructor, or after it was assigned to a name."""
+    """Find where the robot is attached: after its constructor, or after an assignment."""
     nodes = list(ast.walk(module))
     _refuse_bridge(nodes)
     imports = [
@@ -269,7 +269,7 @@ def _line_of(node: ast.AST) -> int:
 
 
 def _bound(node: ast.AST) -> list[str]:
-    """The names that a node binds."""
+    """Return the names that a node binds."""
     if isinstance(node, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
         return [node.name]
     if isinstance(node, (ast.Import, ast.ImportFrom)):
@@ -280,7 +280,7 @@ def _bound(node: ast.AST) -> list[str]:
 
 
 def _robots_imported(node: ast.AST) -> set[str]:
-    """What a statement calls Webots' classes."""
+    """Return what a statement calls Webots' classes."""
     if isinstance(node, ast.ImportFrom) and not node.level:
         robots = _robots_of(node.module or "")
         return {
@@ -300,7 +300,7 @@ def _robots_of(module: str) -> tuple[str, ...]:
 
 
 def _subclasses(nodes: list[ast.AST], classes: set[str]) -> dict[str, ast.ClassDef]:
-    """The module's own classes of robots, by name."""
+    """Return the module's own classes of robots, by name."""
     own: dict[str, ast.ClassDef] = {}
     for node in nodes:
         if isinstance(node, ast.ClassDef) and any(
@@ -324,7 +324,7 @@ def _refuse_rebound(nodes: list[ast.AST], classes: set[str], own: dict[str, ast.
 
 
 def _in_class(own: dict[str, ast.ClassDef]) -> tuple[ast.stmt, str]:
-    """The same of the only class of a robot, which another module makes."""
+    """Return the same of the only class of a robot, which another module makes."""
     bases = {_dotted(base) for cls in own.values() for base in cls.bases}
     last = [name for name in own if name not in bases]
     if not last:
@@ -370,7 +370,7 @@ def _calls_super(statement: ast.stmt, bases: list[str | None]) -> bool:
 
 
 def _assigned(nodes: list[ast.AST], made: ast.Call) -> tuple[ast.stmt, str]:
-    """The statement that assigns the robot to a name, and that name."""
+    """Return the statement that assigns the robot to a name, and that name."""
     for node in nodes:
         if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is made:
             break
@@ -412,7 +412,7 @@ def _insert(lines: list[bytes], after: int, line: bytes) -> None:
 
 
 def _indented(lines: list[bytes], place: _InsertionPoint, encoding: str) -> bytes:
-    """What attaches the robot, indented as the statement before it.
+    """Return what attaches the robot, indented as the statement before it.
 
     Raises:
         InvalidInputError: That statement shares its lines with others.
@@ -433,7 +433,7 @@ def _indented(lines: list[bytes], place: _InsertionPoint, encoding: str) -> byte
 
 
 def _is_proven(before: ast.Module, patched: bytes, attach: str) -> bool:
-    """Whether nothing but the two statements is new."""
+    """Return whether nothing but the two statements is new."""
 
     class Without(ast.NodeTransformer):
         def visit(self, node: ast.AST) -> Any:

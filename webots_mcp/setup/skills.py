@@ -29,7 +29,7 @@ class ManagedText(NamedTuple):
     is_whole: bool
 
     def plan(self) -> tuple[FileChange, str | None]:
-        """The change that brings the text up to date, and what there is to know about it.
+        """Return the change that brings the text up to date, and what there is to know about it.
 
         Raises:
             OSError: The file cannot be read.
@@ -56,7 +56,7 @@ class ManagedText(NamedTuple):
 
 
 def skill_files() -> list[Path]:
-    """The page of each skill, by name."""
+    """Return the page of each skill, by name."""
     return sorted(PLUGIN.glob("skills/*/SKILL.md"))
 
 

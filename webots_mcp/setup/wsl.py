@@ -44,7 +44,7 @@ class Windows(NamedTuple):
 
 
 def is_wsl(proc_version: Path = _PROC_VERSION) -> bool:
-    """Whether this is Linux within Windows: by its name or by its kernel, which Microsoft makes."""
+    """Return whether this is Linux within Windows, by its name or by its kernel."""
     if os.environ.get("WSL_DISTRO_NAME"):
         return True
     try:
@@ -54,7 +54,7 @@ def is_wsl(proc_version: Path = _PROC_VERSION) -> bool:
 
 
 def ask_windows() -> Windows:
-    """What there is on Windows, as PowerShell says.
+    """Return what there is on Windows, as PowerShell says.
 
     Raises:
         CommandRefusedError: It cannot be asked from here.
@@ -72,7 +72,7 @@ def ask_windows() -> Windows:
 
 
 def on_windows(folder: Path) -> str | None:
-    """A folder as Windows writes it, with its drive; None for one of WSL itself.
+    """Return a folder as Windows writes it, with its drive; None for one of WSL itself.
 
     Raises:
         CommandRefusedError: It cannot be asked.
@@ -82,7 +82,7 @@ def on_windows(folder: Path) -> str | None:
 
 
 def in_wsl(path: str) -> str:
-    """A path of Windows as WSL writes it; any other as it is.
+    """Return a path of Windows as WSL writes it; any other as it is.
 
     Raises:
         CommandRefusedError: It cannot be asked.
@@ -91,7 +91,7 @@ def in_wsl(path: str) -> str:
 
 
 def windows_server(project: Path) -> tuple[list[str] | None, str | None]:
-    """The command of Windows' server for a project that is on a drive of Windows, and a note.
+    """Return the command of Windows' server for a project on a drive of Windows, and a note.
 
     Neither where this is not WSL, or the project and Webots are on its own side.
 

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, get_args
 
-from webots_mcp.signals.naming import angle_unit, unit_in, words_of
+from webots_mcp.signals.naming import SOLIDS, WORLD, angle_unit, unit_in, words_of
 
 Quantity = Literal[
     "x", "y", "height", "heading", "roll", "pitch", "speed", "turn rate", "wheel speed",
@@ -34,6 +34,7 @@ SIDES: Final = (
 )  # fmt: skip
 LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is declared for
 _LONGEST_UNIT: Final = 20  # characters
+_OF_OTHERS: Final = (f"{WORLD}.", f"{SOLIDS}.")
 _REMEMBERED: Final = 4096  # names whose words are kept
 
 # -- the words of names ------------------------------------------------------------------------
@@ -212,6 +213,7 @@ class Meaning(NamedTuple):
         return self.role in ("commanded", "target")
 
 
+_OF_POSES: Final[dict[str, Quantity]] = {"x": "x", "y": "y", "z": "height", "yaw": "heading"}
 # A quantity that may be nothing at any time: an actuator is off, a foot is in the air, it is dark.
 CAN_BE_OFF: Final = frozenset[Quantity | None]((
     "speed", "turn rate", "wheel speed", "motor speed", "joint speed", "force", "torque", "current",
@@ -240,6 +242,8 @@ def meaning_by_name(
         names: All names of the robot, of which partners are found.
     """
     base = (register_role or "").rstrip("0123456789")
+    if name.startswith(_OF_OTHERS):
+        return Meaning(why="an observer saw it: it is of a body, not of the robot's own devices")
     if base == "mode":
         return _named("mode", None, name, "its name is one of a mode")
     if kind == "bool":
@@ -248,12 +252,10 @@ def meaning_by_name(
         return _named("text", _role_in(name), name, "it is a text")
     if kind == "null":
         return UNKNOWN
-    of_pose: tuple[tuple[str, Quantity], ...] = (
-        ("x", "x"), ("y", "y"), ("z", "height"), ("yaw", "heading"),
-    )  # fmt: skip
-    for role, quantity in of_pose:
-        if base == role:
-            return _named(quantity, _role_in(name) or "measured", name, "its name is one of a pose")
+    if base in _OF_POSES:
+        return _named(
+            _OF_POSES[base], _role_in(name) or "measured", name, "its name is one of a pose"
+        )
     quantity = _quantity_in(name, kind, base, frozenset(names))
     if quantity is None:
         return UNKNOWN
@@ -525,7 +527,10 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
             return _WORD_QUANTITIES[word]
     if said & _JOINTS and said & {"position", "angle", *_TARGET, *_COMMAND}:
         return "joint position"
-    return None
+    if unit in ("rad/s", "deg/s"):
+        return "angular velocity"
+    # What a robot has in front is a distance: a wheel or a motor there says that it is one.
+    return "distance" if said & {"front", "rear"} and said <= _DIRECTIONS else None
 
 
 def _motion_in(
@@ -562,6 +567,9 @@ def _motion_in(
     return None
 
 
+_DIRECTIONS: Final = frozenset(
+    ("front", "rear", "left", "right", "center", "middle", "side", "sensor", "obstacle")
+)
 _DRIVING: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
 _NO_SPEED: Final = frozenset((
     "position", "angle", "tick", "distance", "torque", "force", "current", "power", "temperature",

@@ -19,6 +19,7 @@ from functools import lru_cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, cast
 
+from webots_mcp.signals.meaning import meaning_by_name
 from webots_mcp.signals.naming import (
     LONGEST_SPREAD_ARRAY,
     METRES,
@@ -303,17 +304,24 @@ def _says_heading(name: str) -> bool:
 
 
 def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
-    """The first commanded speed is no wheel; of the others, a wheel is rather that."""
+    """Speeds and wheels, by what the names mean among each other."""
     by_motion: dict[str, list[str]] = {each: [] for each in _MOTIONS}
-    for name in numbers:
-        for motion in _motions_of(name):
-            by_motion[motion].append(name)
-    commanded = sorted(by_motion["commanded_speed"], key=_shortest)
-    wheels = {name for name in by_motion["wheel"] if name not in roles}.difference(commanded[:1])
-    _line_up(roles, "commanded_speed", [name for name in commanded if name not in wheels])
-    _line_up(roles, "speed", sorted(by_motion["speed"], key=_shortest))
-    roles.update(dict.fromkeys(wheels, "wheel"))
-    roles.update(dict.fromkeys(by_motion["commanded_wheel"], "commanded_wheel"))
+    names = frozenset(numbers)
+    for name in sorted(names, key=_shortest):
+        told = _motions_of(name)
+        meaning = meaning_by_name(name, "num", next(iter(told), None), names)
+        if meaning.role == "limit":
+            continue
+        if meaning.quantity == "speed":
+            by_motion["commanded_speed" if meaning.sets else "speed"].append(name)
+        elif meaning.quantity == "wheel speed":
+            by_motion["commanded_wheel" if meaning.sets else "wheel"].append(name)
+        elif "wheel" in told and meaning.quantity == "motor speed":
+            by_motion["wheel"].append(name)
+    _line_up(roles, "commanded_speed", by_motion["commanded_speed"])
+    _line_up(roles, "speed", by_motion["speed"])
+    for role in ("wheel", "commanded_wheel"):
+        roles.update({name: role for name in by_motion[role] if name not in roles})
 
 
 @lru_cache(maxsize=_KEPT)

@@ -37,6 +37,8 @@ from webots_mcp.simulator.own_webots import own_webots
 from webots_mcp.store.logs import ConsoleRows, Said
 from webots_mcp.store.recording import Job, RecordingAccess
 
+_JOB: Final = "console of "
+
 
 @dataclass(frozen=True)
 class ConsoleTimes:
@@ -71,11 +73,10 @@ class ConsoleTimes:
 
 
 _TIMES: Final = ConsoleTimes()
-_JOB: Final = "console of "
 
 
 def job_of(instance: Instance) -> str:
-    """The name of the lease for following the console of that Webots."""
+    """Return the name of the lease for following the console of that Webots."""
     return f"{_JOB}{instance.name}"
 
 

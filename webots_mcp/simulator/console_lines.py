@@ -94,7 +94,7 @@ class ConsoleLines:
 
 
 def as_row(line: WebotsLine) -> Said:
-    """A line as a row of this moment: its source, and its severity."""
+    """Return a line as a row of this moment: its source, and its severity."""
     # What a terminal shows of a line that was written over, as by a progress bar.
     text = line.text.rstrip("\r").rpartition("\r")[2].replace("\0", "�")
     level, source = _judged(line.stream, text)
@@ -109,10 +109,10 @@ def _judged(stream: str, text: str) -> tuple[LogLevel, LogSource]:
 
 
 def note(lost: str) -> Said:
-    """A line about what was left out."""
+    """Return a line about what was left out."""
     return _about(f"(not recorded: {lost})")
 
 
 def _about(text: str) -> Said:
-    """A line about the lines."""
+    """Return a line about the lines."""
     return Said(time.time(), "warning", "console", text, None)

@@ -59,7 +59,7 @@ class Installation:
 
 
 def installations(platform: str = sys.platform) -> list[Installation]:
-    """All Webots that are found, in the order in which they are used: each of them once."""
+    """Return all Webots that are found, in the order in which they are used: each of them once."""
     found: dict[Path, Installation] = {}
     for each in _search(platform):
         found.setdefault(each.program.resolve(), each)
@@ -67,7 +67,7 @@ def installations(platform: str = sys.platform) -> list[Installation]:
 
 
 def find_webots() -> Installation:
-    """The Webots that is used: of WEBOTS_HOME, else of the PATH, else where installers put it.
+    """Find the Webots to use: WEBOTS_HOME, else the PATH, else where installers put it.
 
     Raises:
         CommandRefusedError: There is none.
@@ -124,7 +124,7 @@ def _of_program(program: Path, platform: str) -> Installation:
 
 
 def _snap_home(program: Path, platform: str) -> list[Path]:
-    """A snap's program is a link to `snap` itself, which does not show where Webots is."""
+    """Return a snap's program is a link to `snap` itself, which does not show where Webots is."""
     is_snap = program.resolve().name == "snap" or "snap" in program.parts
     return [home for home in _default_homes(platform) if is_snap and "snap" in home.parts]
 

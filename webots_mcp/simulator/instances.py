@@ -78,7 +78,7 @@ class Instance:
 
 
 def instances() -> list[Instance]:
-    """The Webots of this machine, as far as its processes may be looked at."""
+    """Return the Webots of this machine, as far as its processes may be checked."""
     import psutil
 
     found: dict[int, list[str]] = {}
@@ -92,12 +92,12 @@ def instances() -> list[Instance]:
 
 
 def instance_at(port: int) -> Instance | None:
-    """The Webots that listens at a port of this machine."""
+    """Return the Webots that listens at a port of this machine."""
     return next((each for each in instances() if each.port == port), None)
 
 
 def _arguments(command_line: Sequence[str]) -> list[str] | None:
-    """What a Webots was started with; None for any other program."""
+    """Return what a Webots was started with; None for any other program."""
     for at, word in enumerate(command_line[:2]):
         name = PurePath(word.replace("\\", "/")).name.lower().removesuffix(".exe")
         if name in _PROGRAMS:
@@ -128,7 +128,7 @@ def _inspect_process(pid: int, arguments: list[str]) -> Instance:
 
 
 def shown_of(pid: int, ask: Callable[[psutil.Process], T], otherwise: T) -> T:
-    """What the system shows of a process; it hides much of another user's."""
+    """Return what the system shows of a process; it hides much of another user's."""
     import psutil
 
     try:

@@ -78,7 +78,7 @@ def press(order: Order, pid: int | None, platform: str = sys.platform) -> None:
 
 
 def macos_command(key: Key, pid: int | None) -> list[str]:
-    """The command that presses a key on macOS, in the window of that process."""
+    """Return the command that presses a key on macOS, in the window of that process."""
     of_pid = (
         'tell application "System Events" to set frontmost of '
         f"(first process whose unix id is {pid}) to true"
@@ -93,7 +93,7 @@ def macos_command(key: Key, pid: int | None) -> list[str]:
 
 
 def windows_command(key: Key, pid: int | None) -> list[str]:
-    """The command that presses a key on Windows; its exit code is 3 where no one window is it."""
+    """Return the command that presses a key on Windows; it exits with 3 without one window."""
     wanted = f"$_.MainWindowTitle -like '*{_TITLE}*'" + (f" -and $_.Id -eq {pid}" if pid else "")
     script = (
         f"$found = @(Get-Process | Where-Object {{ {wanted} }}); "
@@ -116,7 +116,7 @@ def _press_in_x11(key: Key, pid: int | None) -> None:
 
 
 def _x11_window(pid: int | None) -> str:
-    """The only window of Webots, of that process where windows have a process id.
+    """Return the only window of Webots, of that process where windows have a process id.
 
     Raises:
         CommandRefusedError: There is none, or it is not clear which of several.

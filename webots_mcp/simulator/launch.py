@@ -33,7 +33,7 @@ _SINCE: Final = (
 
 
 def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, Path]:
-    """The file of a world, and the project that it lies in.
+    """Return the file of a world, and the project that it lies in.
 
     Args:
         path: Absolute, or from the current folder or the project's; a name alone is that of one of
@@ -53,7 +53,7 @@ def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, 
 
 
 def _found(path: Path, project: Path | None) -> Path:
-    """The file of a world: in a project, a name alone is that of one of its worlds."""
+    """Return the file of a world: in a project, a name alone is that of one of its worlds."""
     around = project or find_project(Path.cwd())
     folders = [project or Path(), *([] if around is None else [around / "worlds"])]
     places = [full_path(folder / path) for folder in folders]
@@ -119,11 +119,11 @@ class WebotsLaunch:
             raise
 
     def first_record(self) -> SessionStart | None:
-        """The first of its controllers that has recorded a state."""
+        """Return the first of its controllers that has recorded a state."""
         return next((each for each in self._begun() if each.run_id is not None), None)
 
     def silence(self) -> str:
-        """Why no controller has recorded yet, as far as that shows."""
+        """Return why no controller has recorded yet, as far as that shows."""
         reasons = [*self._of_webots(), *why_silent(self._begun(), self.world)]
         return "; ".join(reasons) or "no controller has recorded yet"
 
@@ -160,7 +160,7 @@ class WebotsLaunch:
 
 
 def _is_problem(line: WebotsLine) -> bool:
-    """Whether a line is from stderr, or looks so: `xvfb-run` may mix both streams."""
+    """Return whether a line is from stderr, or looks so: `xvfb-run` may mix both streams."""
     if line.stream == "stderr":
         return bool(line.text.strip()) and not line.text.startswith(("INFO:", "DEBUG:"))
     return bool(re.search(r"^(WARNING|ERROR):|\b\w*(Error|Exception)\b", line.text))
@@ -169,7 +169,7 @@ def _is_problem(line: WebotsLine) -> bool:
 def why_silent(
     begun: Sequence[SessionStart], world: Path, extern: str = "start it with webots-controller"
 ) -> list[str]:
-    """Why no controller of a world has recorded yet: what its sessions, or its files, say of it.
+    """Say why no controller of a world has recorded yet, by its sessions or its files.
 
     Args:
         begun: The sessions of its controllers.
@@ -200,14 +200,14 @@ def why_silent(
 
 
 def newest_in(recording: RecordingAccess) -> int:
-    """The newest session of a recording; 0 where there is none yet."""
+    """Return the newest session of a recording; 0 where there is none yet."""
     return next(
         (newest for (newest,) in _read(recording, "SELECT coalesce(max(id), 0) FROM session")), 0
     )
 
 
 def starts_since(recording: RecordingAccess, session: int) -> list[SessionStart]:
-    """The sessions of a recording after that one; those that have recorded first."""
+    """Return the sessions of a recording after that one; those that have recorded first."""
     return [SessionStart(*row) for row in _read(recording, _SINCE, session)]
 
 

@@ -16,10 +16,13 @@ from collections.abc import Callable, Collection, Generator
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
+from webots_mcp.bridge.scene_nodes import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.signals.naming import SEEN_SPEED, SOLIDS, WORLD
 
 DIGITS: Final = 6
+MOST_ROBOTS: Final = 200
+MOST_SOLIDS: Final = 100
+Seen: TypeAlias = "dict[str, dict[str, dict[str, float | None]]]"
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,6 @@ class WalkLimits:
 
 
 _LIMITS: Final = WalkLimits()
-MOST_ROBOTS: Final = 200
-MOST_SOLIDS: Final = 100
-Seen: TypeAlias = "dict[str, dict[str, dict[str, float | None]]]"
 
 
 class BodyPose(NamedTuple):
@@ -60,7 +60,7 @@ class BodyPose(NamedTuple):
     heading_rad: float
 
     def distance_m(self, position: list[float]) -> float:
-        """How far away another position is."""
+        """Return how far away another position is."""
         return math.dist((self.x_m, self.y_m, self.z_m), position)
 
     def signals(self) -> dict[str, float]:
@@ -69,7 +69,7 @@ class BodyPose(NamedTuple):
         return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading}
 
     def is_elsewhere(self, other: BodyPose) -> bool:
-        """Whether a body has moved or turned between the two."""
+        """Return whether a body has moved or turned between the two."""
         turned = abs(math.remainder(self.heading_rad - other.heading_rad, math.tau))
         return self.distance_m([*other[1:4]]) > _LIMITS.moved_m or turned > _LIMITS.turned_rad
 
@@ -118,7 +118,7 @@ class ObservedBody:
         return place is not None
 
     def pose_now(self) -> dict[str, float] | None:
-        """Where it is now, as signals; None where it has no place."""
+        """Return where it is now, as signals; None where it has no place."""
         place = self._seen(0.0)
         return None if place is None else place.signals()
 
@@ -140,14 +140,14 @@ class ObservedBody:
         self.has_moved = self.has_moved or place.is_elsewhere(self._first or place)
 
     def signals(self) -> dict[str, float | None]:
-        """What is recorded of it at a moment."""
+        """Return what is recorded of it at a moment."""
         if self.place is None:
             return {}
         speed = None if self.speed_mps is None else round(self.speed_mps, DIGITS)
         return {**self.place.signals(), SEEN_SPEED: speed}
 
     def describe(self) -> dict[str, object]:
-        """What does not change of it: where it is, too, as long as it has not moved."""
+        """Return what does not change of it: where it is, too, as long as it has not moved."""
         carrier = robot_around(self.scene)
         described = {
             "key": self.key,
@@ -169,12 +169,12 @@ def is_followed(scene: SceneNode) -> bool:
 
 
 def robot_around(scene: SceneNode) -> SceneNode | None:
-    """The robot that a node is a part of, or stands on."""
+    """Return the robot that a node is a part of, or stands on."""
     return _around(scene, lambda each: each.base_type == "Robot")
 
 
 def _around(scene: SceneNode, is_meant: Callable[[SceneNode], bool]) -> SceneNode | None:
-    """The innermost node of a kind that a node stands in."""
+    """Return the innermost node of a kind that a node stands in."""
     around = scene.parent
     while around is not None and not is_meant(around):
         around = around.parent
@@ -182,14 +182,12 @@ def _around(scene: SceneNode, is_meant: Callable[[SceneNode], bool]) -> SceneNod
 
 
 def word_of(name: str, taken: Collection[str]) -> str:
-    """The name as a word that is not taken yet: `2nd robot` becomes `_2nd_robot`.
+    """Return the name as a word that is not taken yet: `2nd robot` becomes `_2nd_robot`.
 
     Conditions and positions can name it without quotes. A number is appended to one that is taken.
     """
-    word = (
-        re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))[: _LIMITS.word_characters]
-        or "robot"
-    )
+    word = re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))
+    word = word[: _LIMITS.word_characters] or "robot"
     if word[0].isdigit() or keyword.iskeyword(word):
         word = f"_{word}"
     number, free = 2, word
@@ -260,7 +258,7 @@ class ObservedWorld:
         self._look_again()
 
     def describe(self) -> dict[str, object]:
-        """What there is, without where it is."""
+        """Return what there is, without where it is."""
         self._is_new = False
         for body in self.bodies.values():
             body.update_pose(float(self._robot.getTime()))
@@ -275,7 +273,7 @@ class ObservedWorld:
         return described | ({"more": True} if self._is_cut else {})
 
     def find(self, name: object) -> ObservedBody | None:
-        """The body of that word, DEF name or name."""
+        """Return the body of that word, DEF name or name."""
         named = [body for body in self.bodies.values() if body.key == name]
         named += [body for body in self.bodies.values() if body.scene.definition == name]
         named += [body for body in self.bodies.values() if body.name == name]
@@ -312,7 +310,7 @@ class ObservedWorld:
         self._check_tracking()
 
     def _is_shown_twice(self, scene: SceneNode) -> bool:
-        """What stands in a slot may be shown in the slot and, with another id, inside the PROTO."""
+        """Return whether a node in a slot is also shown inside its PROTO, with another id."""
         if not scene.hidden or scene.id in self._keys:
             return False
         around, name = _proto_id_around(scene), scene.name
@@ -335,7 +333,7 @@ class ObservedWorld:
         self._is_new = True
 
     def _name(self, scene: SceneNode) -> str:
-        """A word that no other body has now: what was put back is called as before."""
+        """Return a word that no other body has now: what was put back is called as before."""
         key = word_of(scene.definition or scene.name or scene.type_name, self.bodies)
         self._keys = {node: word for node, word in self._keys.items() if word != key}
         self._keys[scene.id] = key
@@ -372,7 +370,7 @@ class ObservedWorld:
 
 
 def _is_stale(body: ObservedBody, before: BodyPose | None) -> bool:
-    """Whether it stood since then by what is tracked, and not by what is asked for."""
+    """Return whether it stood since then by what is tracked, and not by what is asked for."""
     place = body.place
     if place is None or before is None or place.sim_time_s <= before.sim_time_s:
         return False

@@ -34,7 +34,7 @@ _GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to 
 
 
 def checked_period(period_ms: int) -> int:
-    """A period that can be kept to.
+    """Return a period that can be kept to.
 
     Raises:
         InvalidInputError: It cannot.
@@ -126,7 +126,7 @@ class ObserverBridge(MCPBridge):
         return self._session.simulation.mode_name
 
     def read_custom_data(self) -> CustomDataReader:
-        """What records the robots that have no bridge of their own."""
+        """Return what records the robots that have no bridge of their own."""
         own = self._session
         parts = (own.identity, own.simulation, own.clock, own.recorder, own.journal, own.errors)
         return CustomDataReader(ObserverParts(*parts))
@@ -270,7 +270,7 @@ class Observer:
         if is_due and (seen := self.world.read_poses(sim_time_s)):
             self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
             self.bridge.publish(seen)
-        self.custom_data.look(
+        self.custom_data.read_all(
             [body for body in self.world.bodies.values() if body.is_robot], is_due=is_due
         )
 
@@ -327,7 +327,7 @@ def _standing(node: Any, robot: Any) -> dict[str, Any]:
 
 
 def _contact(contact: Any, robot: Any) -> list[Any]:
-    """Where it touches, and with which of its nodes."""
+    """Return where it touches, and with which of its nodes."""
     point = [round(float(value), DIGITS) for value in contact.getPoint()[:3]]
     node = robot.getFromId(contact.getNodeId())
     return [*point, None if node is None else node.getDef() or node.getTypeName()]

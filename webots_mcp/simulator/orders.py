@@ -80,7 +80,7 @@ class OrderReply(NamedTuple):
 
 
 def address_of(instance: str) -> WebotsAddress | None:
-    """Where the Webots of a session listens, by its `instance`; None where that is not known."""
+    """Return where the Webots of a session listens, by its `instance`; None if unknown."""
     host, _, port = instance.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16):
         return None
@@ -113,7 +113,7 @@ class Stream:
             return self._connection.ping()
 
     def receive(self, until_s: float) -> Message | None:
-        """The next message; None if none came by a time of `time.monotonic`.
+        """Return the next message; None if none came by a time of `time.monotonic`.
 
         Raises:
             CommandRefusedError: Webots closed the connection.
@@ -217,7 +217,7 @@ def _give(
 
 
 def why_not_obeyed(address: WebotsAddress, reply: OrderReply) -> str:
-    """Why Webots did not answer an order, as far as that is known."""
+    """Return why Webots did not answer an order, as far as that is known."""
     if reply.other is not None:
         return (
             f"Webots at {address} answered {reply.other!r}, which does not show whether it obeyed: "
@@ -236,10 +236,9 @@ def why_not_obeyed(address: WebotsAddress, reply: OrderReply) -> str:
 
 def begin_console(stream: Stream) -> None:
     """Have Webots send its console to all its clients, from the first line not sent yet."""
-    stream.send(
-        "robot:"
-        + json.dumps({"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":"))
-    )
+    # A robot of this name need not exist: asking for a window begins the logs for this client.
+    request = {"name": "webots-mcp", "message": "init robot window"}
+    stream.send(f"robot:{json.dumps(request, separators=(',', ':'))}")
 
 
 def console_lines(text: str) -> Iterator[WebotsLine]:

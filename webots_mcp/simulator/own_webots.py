@@ -21,7 +21,7 @@ from webots_mcp.store.robots import list_robots
 
 
 def own_webots(recording: RecordingAccess) -> list[Instance]:
-    """Those that run on this machine.
+    """Return those that run on this machine.
 
     Raises:
         DatabaseError: The recording cannot be read.
@@ -31,7 +31,7 @@ def own_webots(recording: RecordingAccess) -> list[Instance]:
 
 
 def belongs(instance: Instance, recording: RecordingAccess) -> bool:
-    """Whether a Webots is of a recording.
+    """Return whether a Webots is of a recording.
 
     Raises:
         DatabaseError: The recording cannot be read.

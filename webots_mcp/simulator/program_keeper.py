@@ -43,7 +43,7 @@ def _lead_a_group() -> None:
 
 
 def _end_with_keeper() -> Callable[[], object] | None:
-    """What the command's process asks for first, so that it does not outlive this one."""
+    """Return what the command's process asks for first, so that it does not outlive this one."""
     if sys.platform != "linux":
         return None
     import ctypes

@@ -74,7 +74,7 @@ class ProjectController(NamedTuple):
 
 
 def project_of(folder: str | None) -> Path:
-    """The project that a folder belongs to, or the current folder.
+    """Return the project that a folder belongs to, or the current folder.
 
     Raises:
         InvalidInputError: There is no such folder, or it belongs to no project.
@@ -94,7 +94,7 @@ def project_of(folder: str | None) -> Path:
 
 
 def controllers_of(project: Path, platform: str = sys.platform) -> list[ProjectController]:
-    """Those that Webots would start, by name; none in a project of extern controllers alone."""
+    """Return the controllers that Webots would start, by name."""
     folder = project / CONTROLLER_FOLDER
     folders = sorted(each for each in folder.glob("*") if each.is_dir())
     return [found for folder in folders for found in _started(folder, platform)]
@@ -126,7 +126,7 @@ def _started(folder: Path, platform: str) -> Iterator[ProjectController]:
 
 
 def _source(folder: Path) -> ProjectController | None:
-    """What a controller is built from: the file of its name, else the first of a language."""
+    """Return the source of a controller: the file of its name, else the first source."""
     files = [*sorted(folder.glob("*.*")), *sorted(folder.glob("src/*.*"))]
     files.sort(key=lambda file: file.stem != folder.name)
     for file in files:
@@ -137,12 +137,12 @@ def _source(folder: Path) -> ProjectController | None:
 
 
 def has_bridge(controller: Path) -> bool:
-    """Whether a file of a controller's folder speaks of the bridge."""
+    """Return whether a file of a controller's folder speaks of the bridge."""
     return any(b"MCPBridge" in file.read_bytes() for file in sorted(controller.glob("*.py")))
 
 
 def writes_states(controller: ProjectController) -> bool:
-    """Whether a controller in another language says what it does: by our header, or customData."""
+    """Return whether a controller in another language records: by our header, or customData."""
     folder = controller.file.parent
     files = [each for each in folder.rglob("*.*") if each.suffix in _ALL_SOURCES]
     return any(
@@ -152,12 +152,12 @@ def writes_states(controller: ProjectController) -> bool:
 
 
 def has_observer(project: Path) -> bool:
-    """Whether the project has an observer's controller."""
+    """Return whether the project has an observer's controller."""
     return (project / CONTROLLER_FOLDER / OBSERVER_NAME).is_dir()
 
 
 def offer_observer(project: Path | None, world: Path | None = None) -> str:
-    """The line that adds an observer to a world of a project, or to the only one that it has."""
+    """Return the line that adds an observer to a world, or to the only one of a project."""
     worlds = sorted((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}")) if project else []
     chosen_world = world or (worlds[0] if len(worlds) == 1 else None)
     name = "WORLD"
@@ -168,7 +168,7 @@ def offer_observer(project: Path | None, world: Path | None = None) -> str:
 
 
 def controllers_in(world: Path) -> list[str]:
-    """The controllers that a world file names, each once; robots of PROTOs may have others.
+    """Return the controllers that a world file names, each once; robots of PROTOs may have others.
 
     Raises:
         OSError: It cannot be read.
@@ -179,7 +179,7 @@ def controllers_in(world: Path) -> list[str]:
 
 
 def names_a_supervisor(world: Path) -> bool:
-    """Whether a world file gives a robot the rights of a Supervisor.
+    """Return whether a world file gives a robot the rights of a Supervisor.
 
     Raises:
         OSError: It cannot be read.

@@ -87,7 +87,7 @@ class Start:
 
 
 def free_port(first: int = DEFAULT_PORT) -> int:
-    """The first free port from there on.
+    """Return the first free port from there on.
 
     Raises:
         CommandRefusedError: All are taken.
@@ -99,7 +99,7 @@ def free_port(first: int = DEFAULT_PORT) -> int:
 
 
 def any_port() -> int:
-    """A port that was free a moment ago, most likely another one at each call."""
+    """Return a port that was free a moment ago, most likely another one at each call."""
     with socket.create_server(("", 0)) as server:
         return int(server.getsockname()[1])
 
@@ -114,7 +114,7 @@ def _is_free(port: int) -> bool:
 
 
 def _virtual_display() -> list[str]:
-    """What gives Webots a display where it has none to show its window on; Linux' is X11 alone."""
+    """Return the command that gives Webots a display if it has none; on Linux that is X11."""
     if sys.platform != "linux" or os.environ.get("DISPLAY"):
         return []
     program = shutil.which("xvfb-run")
@@ -236,7 +236,7 @@ class LaunchedWebots(KeptProgram):
         return self.instance.address if self.instance else None
 
     def address_now(self) -> WebotsAddress | None:
-        """The same, looked for at once."""
+        """Return the same, searched for at once."""
         self._look_again_s = 0.0
         return self.address
 

@@ -17,7 +17,7 @@ from webots_mcp.answers.movement import movement
 from webots_mcp.answers.shortening import WHOLE, cut_text, shorten
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.contract import HEARTBEAT_LATE_S
-from webots_mcp.database.queue import Command
+from webots_mcp.database.queue import QueuedCommand
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.judging.detection.events import search_events
 from webots_mcp.judging.detection.kinds import Event
@@ -38,6 +38,9 @@ from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import RobotView
 from webots_mcp.store.robots import PRESS_PLAY, find_block, handler_at_work
 from webots_mcp.store.run_rows import state_at
+
+# The mode of the simulation after a command; a `run` sets what its `then` says.
+_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
 
 
 @dataclass(frozen=True)
@@ -66,12 +69,10 @@ class RunAnswerSizes:
 
 
 _SIZES: Final = RunAnswerSizes()
-# The mode of the simulation after a command; a `run` sets what its `then` says.
-_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
 
 
-def command_answer(view: RobotView, command: Command, waited_s: float) -> CommandAnswer:
-    """Return the answer about a command after so many wall seconds of waiting."""
+def command_answer(view: RobotView, command: QueuedCommand, waited_s: float) -> CommandAnswer:
+    """Return the answer about a command after that many wall seconds of waiting."""
     failed = command.status != "done" and command.error is not None
     facts: dict[str, Any] = {
         **view.header(),
@@ -89,14 +90,14 @@ def command_answer(view: RobotView, command: Command, waited_s: float) -> Comman
     return answer
 
 
-def shown_result(command: Command, budget_tokens: int = RESULT_BUDGET_TOKENS) -> Any:
+def shown_result(command: QueuedCommand, budget_tokens: int = RESULT_BUDGET_TOKENS) -> Any:
     """Return the result of a command with exact numbers; long values are shortened."""
     if command.result is None:
         return None
     return shorten(command.decoded_result(), budget_tokens, WHOLE).value
 
 
-def correct_mode(view: RobotView, command: Command, answer: CommandAnswer) -> None:
+def correct_mode(view: RobotView, command: QueuedCommand, answer: CommandAnswer) -> None:
     """Correct the mode in the answer about a command that a later command has followed."""
     if command.action not in _MODES or command.status not in ("done", "failed"):
         return
@@ -127,7 +128,7 @@ def correct_mode(view: RobotView, command: Command, answer: CommandAnswer) -> No
 # -- what to do next --------------------------------------------------------------------------
 
 
-def _hint(view: RobotView, command: Command) -> str | None:
+def _hint(view: RobotView, command: QueuedCommand) -> str | None:
     """Say what to do next, where the outcome alone does not say it."""
     if command.status == "pending":
         return "no controller has claimed it yet"
@@ -179,7 +180,7 @@ def _hint_unclaimed(view: RobotView) -> str:
 # -- facts about a run ------------------------------------------------------------------------
 
 
-def _run_facts(view: RobotView, command: Command) -> dict[str, Any]:
+def _run_facts(view: RobotView, command: QueuedCommand) -> dict[str, Any]:
     """Return why a `run` command stopped, its progress, its values and its events."""
     progress, result = find_progress(view.connection, command), result_of(command)
     stopped, why = _stop_reason(command, result)
@@ -202,7 +203,9 @@ def _run_facts(view: RobotView, command: Command) -> dict[str, Any]:
     return facts
 
 
-def _stop_reason(command: Command, result: Mapping[str, Any]) -> tuple[str | None, str | None]:
+def _stop_reason(
+    command: QueuedCommand, result: Mapping[str, Any]
+) -> tuple[str | None, str | None]:
     if command.status == "claimed":
         return "wall time limit reached", "it continues, and ends as requested"
     if command.status == "lost":
@@ -211,7 +214,7 @@ def _stop_reason(command: Command, result: Mapping[str, Any]) -> tuple[str | Non
 
 
 def _what_happened(
-    view: RobotView, command: Command, progress: RunProgress, run_id: int
+    view: RobotView, command: QueuedCommand, progress: RunProgress, run_id: int
 ) -> dict[str, Any]:
     """Return the state at the end, trends and events in between, and the rows before the end."""
     end_s = progress.to_s + SAME_TIME_S
@@ -232,7 +235,7 @@ def _what_happened(
     return facts | _trends_and_events(view, command, asked)
 
 
-def _rows_before_end(view: RobotView, command: Command, run_id: int, end_s: float) -> Any:
+def _rows_before_end(view: RobotView, command: QueuedCommand, run_id: int, end_s: float) -> Any:
     """Return the last rows with the signals of the condition; None without a condition."""
     until = params_of(command).get("until")
     rows = newest_rows(view.connection, run_id, _SIZES.rows, end_s)
@@ -247,7 +250,7 @@ def _rows_before_end(view: RobotView, command: Command, run_id: int, end_s: floa
     return table(("sim_time_s", *names), lines)
 
 
-def _trends_and_events(view: RobotView, command: Command, asked: TimeRange) -> dict[str, Any]:
+def _trends_and_events(view: RobotView, command: QueuedCommand, asked: TimeRange) -> dict[str, Any]:
     (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
     found = search_events(view.connection, asked)
     of_others = found.only([event for event in found.events if not _is_own(event, command)])
@@ -263,7 +266,7 @@ def _trends_and_events(view: RobotView, command: Command, asked: TimeRange) -> d
     }
 
 
-def _is_own(event: Event, command: Command) -> bool:
+def _is_own(event: Event, command: QueuedCommand) -> bool:
     """Return whether an event is the command itself, or the pause that it began or ended."""
     if event.kind == "command":
         return event.details.get("id") == command.id

@@ -19,7 +19,7 @@ from anyio import to_thread
 
 from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.contract import LOOPING
-from webots_mcp.database.queue import Command, CommandQueue, fetch_command
+from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command
 from webots_mcp.steering.command_answer import command_answer, correct_mode
 from webots_mcp.steering.run_command import ACTION, describe_progress
 from webots_mcp.steering.target import find_target, require_parameters
@@ -29,7 +29,6 @@ from webots_mcp.store.robots import BlockedLoop, find_block, robot_name
 
 # Called with what is done, how much there is to do (None where unknown), and a text.
 ProgressReport = Callable[[float, float | None, str], Awaitable[None]]
-
 # A running loop claims a command at once. After this time the block that keeps it is searched for.
 BLOCK_NOTICED_S: Final = 2.0
 _WITHDRAWN: Final = "the command was withdrawn and will not run"
@@ -133,7 +132,7 @@ class Dispatcher:
 
     async def _send(
         self, robot: str | None, action: str, params: Mapping[str, Any], timeout_s: float
-    ) -> Command:
+    ) -> QueuedCommand:
         sending = _Sending(partial(self._enqueue, robot, action, params, timeout_s))
         try:
             sent = await to_thread.run_sync(sending.send)
@@ -146,8 +145,8 @@ class Dispatcher:
             raise
 
     async def _outcome(
-        self, command: Command, claiming_s: float, block_noticed_s: float, until_s: float
-    ) -> Command:
+        self, command: QueuedCommand, claiming_s: float, block_noticed_s: float, until_s: float
+    ) -> QueuedCommand:
         try:
             command = await self._watch(command.id, claiming_s, block_noticed_s, withdraws=True)
             command = await to_thread.run_sync(self._at_the_deadline, command)
@@ -162,7 +161,7 @@ class Dispatcher:
 
     def _enqueue(
         self, robot: str | None, action: str, params: Mapping[str, Any], timeout_s: float
-    ) -> Command:
+    ) -> QueuedCommand:
         request_id = permit(self._recording, action, params)
         with self._recording.reader() as connection:
             view = find_target(connection, robot, action)
@@ -184,7 +183,7 @@ class Dispatcher:
         block_noticed_s: float = BLOCK_NOTICED_S,
         *,
         withdraws: bool = False,
-    ) -> Command:
+    ) -> QueuedCommand:
         started_s = time.monotonic()
         next_report_s, next_search_s = _TIMES.report_s, block_noticed_s
         with self._recording.reader() as connection:
@@ -211,14 +210,14 @@ class Dispatcher:
                 await anyio.sleep(_TIMES.poll_s)
             return command
 
-    def _at_the_deadline(self, command: Command) -> Command:
+    def _at_the_deadline(self, command: QueuedCommand) -> QueuedCommand:
         if command.is_final:
             return command
         self._recording.settle()
         withdraw_if_blocked(self._recording, command)
         return self._cancel(command.id, "no controller claimed it in time; it will not run")
 
-    def _leave(self, command: Command) -> None:
+    def _leave(self, command: QueuedCommand) -> None:
         """The caller has left: cancel the command; a begun `run` or `step` ends now."""
         with self._recording.writer() as connection:
             queue = CommandQueue(connection)
@@ -227,18 +226,18 @@ class Dispatcher:
                 params, asker = {"command_id": command.id}, self._recording.asker
                 queue.enqueue(command.robot_id, "cancel_run", params, requested_by=asker)
 
-    def _cancel(self, command_id: int, why: str) -> Command:
+    def _cancel(self, command_id: int, why: str) -> QueuedCommand:
         with self._recording.writer() as connection:
             CommandQueue(connection).cancel(command_id, why)
             return fetch_command(connection, command_id)
 
-    def _answer(self, command: Command, waited_s: float) -> CommandAnswer:
+    def _answer(self, command: QueuedCommand, waited_s: float) -> CommandAnswer:
         with self._recording.reader() as connection:
             view = view_robot(connection, robot_name(connection, command.robot_id))
             return command_answer(view, command, waited_s)
 
 
-def withdraw_if_blocked(recording: RecordingAccess, command: Command) -> bool:
+def withdraw_if_blocked(recording: RecordingAccess, command: QueuedCommand) -> bool:
     """Cancel a pending command where its loop is known to be blocked; True if it will never run.
 
     A controller that claims it in the meantime runs it, and the outcome is that of the controller.
@@ -251,18 +250,18 @@ def withdraw_if_blocked(recording: RecordingAccess, command: Command) -> bool:
 
 
 def is_withdrawn(answer: CommandAnswer) -> bool:
-    """Whether a command was withdrawn because its loop was known to be blocked."""
+    """Return whether a command was withdrawn because its loop was known to be blocked."""
     return (answer.error or "").endswith(_WITHDRAWN)
 
 
-def is_held_up(recording: RecordingAccess, command: Command) -> bool:
-    """Whether a `step` or `run` that is under way cannot go on, since its loop is blocked."""
+def is_held_up(recording: RecordingAccess, command: QueuedCommand) -> bool:
+    """Return whether a running `step` or `run` cannot continue, since its loop is blocked."""
     if command.status != "claimed" or command.action not in LOOPING:
         return False
     return _block_of(recording, command) is not None
 
 
-def _block_of(recording: RecordingAccess, command: Command) -> BlockedLoop | None:
+def _block_of(recording: RecordingAccess, command: QueuedCommand) -> BlockedLoop | None:
     with recording.reader() as connection:
         name = robot_name(connection, command.robot_id)
     with recording.view(name) as view:
@@ -272,19 +271,19 @@ def _block_of(recording: RecordingAccess, command: Command) -> BlockedLoop | Non
 class _Sending:
     """Sends a command in a thread, which Ctrl-C does not end with the task that waits for it."""
 
-    def __init__(self, enqueue: Callable[[], Command]) -> None:
+    def __init__(self, enqueue: Callable[[], QueuedCommand]) -> None:
         self._enqueue = enqueue
         self._lock = threading.Lock()
-        self._sent: Command | None = None
+        self._sent: QueuedCommand | None = None
         self._stopped = False
 
-    def send(self) -> Command | None:
+    def send(self) -> QueuedCommand | None:
         with self._lock:
             if not self._stopped:
                 self._sent = self._enqueue()
             return self._sent
 
-    def stop(self) -> Command | None:
+    def stop(self) -> QueuedCommand | None:
         """Prevent sending from now on; returns the command if it was already sent."""
         with self._lock:
             self._stopped = True

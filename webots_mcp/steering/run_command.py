@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import MAX_RUN_S
-from webots_mcp.database.queue import Command
+from webots_mcp.database.queue import QueuedCommand
 from webots_mcp.errors import (
     CommandRefusedError,
     ConditionFailedError,
@@ -130,7 +130,7 @@ def newest_rows(
     ).fetchall()
 
 
-def find_progress(connection: sqlite3.Connection, command: Command) -> RunProgress:
+def find_progress(connection: sqlite3.Connection, command: QueuedCommand) -> RunProgress:
     """Return the progress in the bridge's result; until there is one, that of the heartbeat."""
     if result := result_of(command):
         run_id = result.get("run_id") or _run_that_ended(connection, command)
@@ -149,7 +149,7 @@ def find_progress(connection: sqlite3.Connection, command: Command) -> RunProgre
 
 
 def describe_progress(
-    connection: sqlite3.Connection, command: Command
+    connection: sqlite3.Connection, command: QueuedCommand
 ) -> tuple[float, float | None, str]:
     """Return the simulated seconds so far, the wanted ones (None without a limit), and a text."""
     progress, params = find_progress(connection, command), params_of(command)
@@ -161,13 +161,13 @@ def describe_progress(
     return progress.advanced_s, for_s, text
 
 
-def result_of(command: Command) -> dict[str, Any]:
+def result_of(command: QueuedCommand) -> dict[str, Any]:
     """Return the bridge's result of a finished command; empty without one."""
     result = command.decoded_result()
     return cast("dict[str, Any]", result) if isinstance(result, dict) else {}
 
 
-def params_of(command: Command) -> Mapping[str, Any]:
+def params_of(command: QueuedCommand) -> Mapping[str, Any]:
     """Return the parameters of a command."""
     return json.loads(command.params)
 
@@ -200,7 +200,7 @@ def _require_open(view: RobotView, condition: Condition) -> None:
     )
 
 
-def _run_that_ended(connection: sqlite3.Connection, command: Command) -> int | None:
+def _run_that_ended(connection: sqlite3.Connection, command: QueuedCommand) -> int | None:
     """Return the run in which it ended, if the bridge did not know its id: its row was waiting."""
     return connection.execute(
         "SELECT max(id) FROM run WHERE session_id = ? AND started_wall_time_s <= ?",
@@ -209,7 +209,7 @@ def _run_that_ended(connection: sqlite3.Connection, command: Command) -> int | N
 
 
 def _progress_of_newest_run(
-    command: Command, run: tuple[int, float, float], heartbeat_sim_time_s: float
+    command: QueuedCommand, run: tuple[int, float, float], heartbeat_sim_time_s: float
 ) -> RunProgress:
     run_id, last_s, began_wall_s = run
     claimed_wall_s, to_s = command.claimed_wall_time_s or 0.0, max(last_s, heartbeat_sim_time_s)

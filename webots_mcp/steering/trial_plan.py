@@ -216,7 +216,7 @@ def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
 
 
 def stored_plan(text: str) -> TrialPlan:
-    """What the text of a plan says whose trials run in a robot's simulation."""
+    """Return what the text of a plan says whose trials run in a robot's simulation."""
     return TrialPlan(**json.loads(text))
 
 
@@ -266,7 +266,7 @@ def _require_tables(parameters: list[Any]) -> None:
 
 
 def _read_ranges(tables: dict[str, Any]) -> dict[str, ParameterRange]:
-    """The ranges of `[ranges]` in a plan.
+    """Return the ranges of `[ranges]` in a plan.
 
     Raises:
         InvalidInputError: One is none; the text names it.

@@ -111,12 +111,12 @@ class LocalSimulators:
 
 
 def stand_in(world: str) -> CommandLine:
-    """The command of the stand-in."""
+    """Return the command of the stand-in."""
     return CommandLine([sys.executable, "-m", "webots_mcp.standin", world, "--mode", "fast"], [])
 
 
 def webots(world: str) -> CommandLine:
-    """The command of Webots, with a port that was free a moment ago.
+    """Return the command of Webots, with a port that was free a moment ago.
 
     Raises:
         CommandRefusedError: There is no Webots.
@@ -137,7 +137,7 @@ class TrialSimulator(KeptProgram):
         self._folder = folder
 
     def last_line(self) -> str:
-        """What it printed last; empty if nothing."""
+        """Return what it printed last; empty if nothing."""
         text = (self._folder / CONSOLE).read_bytes()[-2000:].decode("utf-8", "replace")
         return next((line for line in reversed(text.splitlines()) if line.strip()), "")
 
@@ -164,7 +164,7 @@ def run_attempt(attempt: TrialAttempt, command: CommandOfWorld) -> TrialResult:
 
 
 def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> TrialResult | None:
-    """The result of a trial that had ended before its process was killed; None where it had not."""
+    """Return the result of a trial that ended before its process was killed, or None."""
     watch = TrialWatch(plan)
     recording = _settled(folder)
     if recording is None:
@@ -206,7 +206,7 @@ def _watched(
 
 
 def _ended(recording: RecordingAccess, watch: TrialWatch) -> str | None:
-    """Why the run cannot continue: its controller's process has ended."""
+    """Return why the run cannot continue: its controller's process has ended."""
     if watch.run_id is None:
         return None
     with recording.reader() as connection:
@@ -260,7 +260,7 @@ def _scored(
 
 
 def _settled(folder: Path) -> RecordingAccess | None:
-    """The recording of a trial whose processes have ended, with all rows that waited next to it."""
+    """Return the recording of a trial that is over, with all rows that waited next to it."""
     try:
         return settled(folder / DATABASE_NAME)
     except NoDatabaseError:

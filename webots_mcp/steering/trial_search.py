@@ -38,7 +38,7 @@ def require_optuna() -> None:
 
 
 def next_parameters(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any] | None:
-    """The parameters of the trial after these; None where there is none.
+    """Return the parameters of the trial after these; None where there is none.
 
     Each set is tried `plan.repeats` times in a row.
     """
@@ -71,7 +71,7 @@ def _suggested(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any]
 
 
 def _sampler(plan: TrialPlan, number: int) -> optuna.samplers.BaseSampler:
-    """A sampler seeded by the trial's number, so that a proposal depends on the trials only."""
+    """Return a sampler seeded by the trial number: a proposal depends on the trials only."""
     import optuna
 
     seed = random.Random(f"{plan.seed} {number}").getrandbits(32)

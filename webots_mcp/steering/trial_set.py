@@ -81,7 +81,7 @@ class SetRun:
             pass
 
     def folder(self, trial: TrialRecord) -> Path:
-        """The data folder of a trial."""
+        """Return the data folder of a trial."""
         return self.recording.data_dir / FOLDER / trial.uuid
 
 

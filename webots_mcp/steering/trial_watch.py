@@ -74,7 +74,7 @@ class TrialWatch:
         return self._by_time(self.reached_s)
 
     def _condition_at(self, state: Any, sim_time_s: float) -> Ending | None:
-        """Which condition holds first; each of them takes in every state."""
+        """Return which condition holds first; each of them takes in every state."""
         held: list[Ending] = [by for by, each in self._evaluators if each.holds(state, sim_time_s)]
         return held[0] if held else None
 

@@ -17,7 +17,7 @@ from contextvars import copy_context
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.database.queue import Command, CommandQueue, fetch_command, find_command
+from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, withdraw_if_blocked
@@ -46,6 +46,9 @@ from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import find_block, robot_name
 
 OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
+_ASKER: Final = "trials"
+_ENDS: Final = {"condition held": "until", "simulation time reached": "for_s", "pruned": "prune"}
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,6 @@ class TrialTimes:
 
 
 _TIMES: Final = TrialTimes()
-_ASKER: Final = "trials"
-_ENDS: Final = {"condition held": "until", "simulation time reached": "for_s", "pruned": "prune"}
-_log = logging.getLogger(__name__)
 
 
 class _StopError(Exception):
@@ -135,7 +135,7 @@ class TrialWorker(threading.Thread):
     # -- one trial -----------------------------------------------------------------------------
 
     def _next(self) -> TrialRecord | None:
-        """The next trial, first one that a killed server has begun; None where the set stops."""
+        """Return the next trial, first one that a killed server began; None if the set stops."""
         if self._stopping.is_set():
             raise _StopError
         with self._recording.reader() as connection:
@@ -159,8 +159,8 @@ class TrialWorker(threading.Thread):
                 "check what it is waiting for, or restart its controller"
             )
 
-    def _sent(self, trial: TrialRecord) -> Command:
-        """The command that runs a trial; one that was sent already is not sent again."""
+    def _sent(self, trial: TrialRecord) -> QueuedCommand:
+        """Return the command that runs a trial; one that was sent already is not sent again."""
         with self._job.writer() as connection:
             known = find_command(connection, _key(trial))
             if known is not None:
@@ -182,7 +182,7 @@ class TrialWorker(threading.Thread):
             )
 
     def _asked(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters of a trial's `run` command.
+        """Return the parameters of a trial's `run` command.
 
         They name every tried parameter, since a reset keeps the values of the trial before.
         """
@@ -197,7 +197,7 @@ class TrialWorker(threading.Thread):
         return {name: value for name, value in asked.items() if value is not None}
 
     def _borrow(self, connection: sqlite3.Connection) -> RobotView:
-        """The robot; the parameters' values are stored first, once for each of its sessions."""
+        """Find the robot, and store the values of its parameters once for each session."""
         view = find_target(connection, self._robot, ACTION)
         noted = fetch_trial_set(connection, self.set_id)
         assert view.session is not None  # it is live
@@ -208,7 +208,7 @@ class TrialWorker(threading.Thread):
             borrow_parameters(connection, self.set_id, view.session.id, former)
         return view
 
-    def _watched(self, command: Command, timeout_s: float) -> Command:
+    def _watched(self, command: QueuedCommand, timeout_s: float) -> QueuedCommand:
         """Wait until the command is final; a run that takes longer is ended."""
         command = self._settled(command.id, timeout_s)
         if not command.is_final:
@@ -216,8 +216,10 @@ class TrialWorker(threading.Thread):
             command = self._settled(command.id, _TIMES.patience_s)
         return command
 
-    def _settled(self, command_id: int, timeout_s: float, *, hurried: bool = False) -> Command:
-        """The command, once it is final or the time is over."""
+    def _settled(
+        self, command_id: int, timeout_s: float, *, hurried: bool = False
+    ) -> QueuedCommand:
+        """Return the command, once it is final or the time is over."""
         until_s, settle_s = time.monotonic() + timeout_s, time.monotonic() + _TIMES.settle_s
         search_s = time.monotonic() + BLOCK_NOTICED_S
         with self._recording.reader() as connection:
@@ -240,7 +242,7 @@ class TrialWorker(threading.Thread):
                     raise _StopError
         return command
 
-    def _cancel(self, command: Command) -> None:
+    def _cancel(self, command: QueuedCommand) -> None:
         """Cancel a pending command, or end a running one."""
         with self._job.writer() as connection:
             queue = CommandQueue(connection)
@@ -250,8 +252,8 @@ class TrialWorker(threading.Thread):
 
     # -- results -------------------------------------------------------------------------------
 
-    def _result(self, trial: TrialRecord, command: Command) -> TrialResult:
-        """The result of a trial.
+    def _result(self, trial: TrialRecord, command: QueuedCommand) -> TrialResult:
+        """Return the result of a trial.
 
         Raises:
             CommandRefusedError: No controller ran it, or another command interrupted it.
@@ -285,7 +287,7 @@ class TrialWorker(threading.Thread):
         run_id: int | None,
         answer: Mapping[str, Any],
     ) -> str:
-        """Why a run ended without having reached its end."""
+        """Return why a run ended without having reached its end."""
         why = str(answer.get("why") or answer.get("ended"))
         if answer.get("ended") == "interrupted":
             if "cancelled" not in why:
@@ -357,8 +359,10 @@ class TrialWorker(threading.Thread):
                 f"its parameters were not restored: {command.error or command.status}"
             )
 
-    def _ask_back(self, connection: sqlite3.Connection, noted: TrialSetRecord) -> Command | None:
-        """The command that restores the parameters; None without any, or without its controller."""
+    def _ask_back(
+        self, connection: sqlite3.Connection, noted: TrialSetRecord
+    ) -> QueuedCommand | None:
+        """Queue the command that restores the parameters; return None if nothing is to do."""
         assert noted.robot_id is not None and noted.former_values is not None
         former = json.loads(noted.former_values)
         if noted.stop_reason is None and not self._stopping.is_set():
@@ -410,17 +414,17 @@ class TrialWorkers:
 
 
 def _new_run_with(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The `run` parameters that begin a new run, so that the last trial's run does not continue."""
+    """Return the `run` parameters that begin a new run, so that the last trial's run ends."""
     return {"for_s": _TIMES.new_run_sim_s, "parameters": values, "by": "trial", **OF_EACH_TRIAL}
 
 
 def _key(trial: TrialRecord) -> str:
-    """The idempotency key of a trial's command; a trial that is begun again has another one."""
+    """Return the idempotency key of a trial's command; it differs if a trial is begun again."""
     return f"trial {trial.uuid} {trial.started_wall_time_s}"
 
 
 def _value(parameter: Mapping[str, Any]) -> Any:
-    """A parameter's value; before the first is recorded, the declared default."""
+    """Return a parameter's value; before the first is recorded, the declared default."""
     return parameter["default"] if parameter["value"] is None else parameter["value"]
 
 

@@ -18,7 +18,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.database.connection import FAILURES, LONGEST_WRITE_S, FrozenConnection, Step
+from webots_mcp.database.connection import (
+    FAILURES,
+    LONGEST_WRITE_S,
+    AtomicStatements,
+    FrozenConnection,
+)
 from webots_mcp.database.liveness import holder_of
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import DatabaseError, warn
@@ -47,10 +52,10 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.recording import RecordingAccess, is_over_a_value
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.run_rows import reading_texts
-from webots_mcp.store.signals import RegisteredSignal, enter_signals, registered, seen_in, tell_more
+from webots_mcp.store.signals import RegisteredSignal, enter_signals, may_widen, registered, seen_in
 
 GROUP_ROWS: Final = 1024
-LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
+MIN_ROWS_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
 _IDS_AT_ONCE: Final = 20_000
 _FIRST_AT_ONCE: Final = 100_000  # bytes
 _STEP_BYTES: Final = 5_000  # a chunk takes as long as so many bytes, and its own besides
@@ -108,7 +113,7 @@ _BEGIN_GROUP: Final = (
     "max_state_id, row_count, stored_row_count, lost_value_count, stored_row_bytes, chunk_bytes, "
     "is_complete) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 0)"
 )
-_STORE: Final = Step(  # unless another process has cleared the group up
+_STORE: Final = AtomicStatements(  # unless another process has cleared the group up
     "store_chunks",
     ("group_id", "first", "last"),
     f"INSERT INTO chunk (group_id, {_LIST}) SELECT NEW.group_id, {_LIST} FROM new_chunk "
@@ -120,7 +125,7 @@ _STORE: Final = Step(  # unless another process has cleared the group up
     "AND (signal.min IS NULL OR c.min < signal.min OR c.max > signal.max)",
     unless="NOT EXISTS (SELECT 1 FROM row_group WHERE id = NEW.group_id)",
 )
-_COMPLETE: Final = Step(  # unless another process has stored these rows meanwhile
+_COMPLETE: Final = AtomicStatements(  # unless another process has stored these rows meanwhile
     "complete_group",
     ("group_id", "run_id", "max_state_id", "chunks"),
     "UPDATE row_group SET is_complete = 1 WHERE id = NEW.group_id",
@@ -139,7 +144,8 @@ _ROWS_OF_GROUP: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id BETWEEN ? AND ? "
     "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s, id LIMIT ?"
 )
-_REPLACE: Final = Step(  # unless rows of the old group were deleted, or it was replaced meanwhile
+# Unless rows of the old group were deleted, or it was replaced meanwhile.
+_REPLACE: Final = AtomicStatements(
     "replace_group",
     ("old_id", "new_id", "chunks"),
     "UPDATE row_group SET is_complete = id = NEW.new_id WHERE id IN (NEW.old_id, NEW.new_id)",
@@ -153,7 +159,7 @@ _DELETE_CHUNKS: Final = (  # unless its maker has ended in the meantime what it 
     "FROM row_group WHERE id = ? AND is_complete = 0) LIMIT 20)"
 )
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
-LEAST_ROWS: Final = 2000  # a question reads fewer as they are
+MIN_ROWS_ON_DEMAND: Final = 2000  # a question reads fewer as they are
 _BATCH_ROWS: Final = 2000
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
 _LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
@@ -261,7 +267,7 @@ class _RunChunks:
         """Make those of rows up to an id; how many rows were put into chunks."""
         rows, least_rows, has_ended = 0, self._least_rows, self._has_ended()
         if has_ended:
-            least_rows = min(least_rows, LEAST_AT_END)
+            least_rows = min(least_rows, MIN_ROWS_AT_END)
         at = reached(self._connection, self._run_id)
         # Once a later group is stored, the ids of rows that came late would no longer show them.
         while rows < budget_rows and len(late := self._late(at, last_id)):
@@ -453,11 +459,11 @@ def _signals_of(
 ) -> dict[str, RegisteredSignal]:
     """The robot's signals by name; what some rows tell of them is entered."""
     known = registered(connection, robot_id)
-    room = max(0, MAX_SIGNALS - len(known))
-    fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
-    # A state may have many times more names than there is room for.
+    budget = max(0, MAX_SIGNALS - len(known))
+    fresh = [name for name, each in columns.values.items() if may_widen(known.get(name), each)]
+    # A state may have many times more names than there is budget for.
     entered = [name for name in fresh if name in known]
-    entered += islice((name for name in fresh if name not in known), room)
+    entered += islice((name for name in fresh if name not in known), budget)
     if entered:
         known = enter_signals(connection, robot_id, seen_in(columns, entered))
     return known
@@ -562,7 +568,7 @@ def make_missing_chunks(
         total = left = _rows_left(connection)
         holder = holder_of(connection, "maintainer") or ""
         is_frozen = isinstance(connection, FrozenConnection)
-    if total < LEAST_ROWS:
+    if total < MIN_ROWS_ON_DEMAND:
         return ""
     if holder.startswith("server ") and not is_frozen:
         return _say(total, "the server that maintains the recording makes them")
@@ -583,7 +589,7 @@ def make_missing_chunks(
                     why = "ask again to continue"
     except (DatabaseError, *FAILURES) as error:
         why = str(error)
-    return _say(left, why) if left >= LEAST_ROWS else ""
+    return _say(left, why) if left >= MIN_ROWS_ON_DEMAND else ""
 
 
 def _rows_left(connection: sqlite3.Connection) -> int:
@@ -627,18 +633,18 @@ def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
         payloads: Bytes of the record of each row.
         page_bytes: Of the database.
     """
-    room = page_bytes - _PAGE_HEAD_BYTES
+    space = page_bytes - _PAGE_HEAD_BYTES
     full_pages = own_bytes = filled = used = rows = 0
     for payload in payloads:
         local, own = _cell(payload, page_bytes)
         own_bytes += own
-        if used + local > room:
+        if used + local > space:
             full_pages, filled, used, rows = full_pages + 1, filled + used, 0, 0
         used, rows = used + local, rows + 1
     if not rows:
         return 0.0
     # The last page goes on with other rows: it will be as full as the others.
-    per_byte = page_bytes / (room - used / rows / 2)
+    per_byte = page_bytes / (space - used / rows / 2)
     if full_pages:
         per_byte = full_pages * page_bytes / filled
     return full_pages * page_bytes + used * per_byte + own_bytes
@@ -649,8 +655,8 @@ def _cell(payload: int, page_bytes: int) -> tuple[int, int]:
     most, least = page_bytes - 35, (page_bytes - 12) * 32 // 255 - 23
     if payload <= most:
         return payload + _CELL_HEAD_BYTES, 0
-    link_room = page_bytes - _LINK_BYTES
-    local = least + (payload - least) % link_room
+    overflow_space = page_bytes - _LINK_BYTES
+    local = least + (payload - least) % overflow_space
     local = local if local <= most else least
-    pages = -(-(payload - local) // link_room)
+    pages = -(-(payload - local) // overflow_space)
     return local + _CELL_HEAD_BYTES + _LINK_BYTES, pages * page_bytes

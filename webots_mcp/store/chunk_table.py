@@ -27,7 +27,7 @@ from webots_mcp.store.chunks import (
     Replaced,
 )
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.segment import Deadline, Segment, kept_parts
+from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts
 from webots_mcp.store.signals import registered
 
 Kind = Literal["null", "bool", "int", "num", "text"]
@@ -96,7 +96,7 @@ def _part(
     if (
         waiting > MOST_NEW_ROWS
         or connection.execute(_INCOMPLETE, asked).fetchone()[0]
-        or kept_parts(connection, run_id, segment.start_s, segment.end_s)
+        or full_rate_parts(connection, run_id, segment.start_s, segment.end_s)
     ):
         return None
     frame = read_frame(connection, segment, Deadline(math.inf), full_rate=False)

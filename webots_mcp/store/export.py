@@ -41,7 +41,7 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 from webots_mcp.store.reading.frame import deleted_part
 from webots_mcp.store.reading.ranges import Segment, TimeRange
-from webots_mcp.store.reading.segment import kept_parts
+from webots_mcp.store.reading.segment import full_rate_parts
 from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.run_rows import put_back
 from webots_mcp.store.signals import RegisteredSignal, registered
@@ -484,7 +484,7 @@ class StateTable(ExportTable):
             "after_id": 0, "after_wall_s": -math.inf, "limit": CHUNK_ROWS,
         }  # fmt: skip
         query = _CHUNK
-        if kept_parts(self.connection, segment.run_id, segment.start_s, segment.end_s):
+        if full_rate_parts(self.connection, segment.run_id, segment.start_s, segment.end_s):
             query = _CHUNK_WITH_KEPT
         while chunk := self.connection.execute(query, values).fetchall():
             yield chunk

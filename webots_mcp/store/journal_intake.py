@@ -44,7 +44,14 @@ from webots_mcp.contract import (
 )
 from webots_mcp.database import liveness, waiting_file
 from webots_mcp.database.connection import identify_files, in_transaction
-from webots_mcp.database.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, journal_parts
+from webots_mcp.database.waiting_file import (
+    FORMAT,
+    STATEMENTS,
+    Kind,
+    Taken,
+    WaitingEntry,
+    journal_parts,
+)
 from webots_mcp.errors import warn
 from webots_mcp.signals import register as signal_register
 from webots_mcp.signals.naming import flatten
@@ -159,14 +166,14 @@ class _Line(NamedTuple):
     """
 
     end: int
-    entry: Entry | None
+    entry: WaitingEntry | None
     state: dict[str, Any] | None = None
     fault: str = ""
     lost_run: dict[str, Any] | None = None
 
 
-class _Looks:
-    """What is looked for in the states of a session.
+class _JournalState:
+    """What the states of a session have shown so far.
 
     Attributes:
         run: UUID of the newest run.
@@ -183,7 +190,7 @@ class _Looks:
 
 _lock = threading.Lock()
 _places: dict[Path, _JournalPosition] = {}
-_looks: dict[str, _Looks] = {}
+_states: dict[str, _JournalState] = {}
 _kept: dict[Path, str] = {}  # of which nothing fits, and why
 
 
@@ -222,7 +229,7 @@ def _identity(status: os.stat_result, database: Path) -> tuple[int, ...]:
     return (status.st_dev, status.st_ino, *identify_files(database)[:2])
 
 
-def take_in_journals(
+def ingest_journals(
     connection: sqlite3.Connection, database: Path, budget_s: float = math.inf
 ) -> None:
     """Take in what controllers have written up to now, as far as there is time.
@@ -247,7 +254,7 @@ def take_in_journals(
         for uuid, parts in journals.items():
             # In order, and no part before those ahead of it are in: of its entries only those that
             # are newer than the last one that is in are taken.
-            all(_take_in_part(connection, database, uuid, path, until_s) for path in parts)
+            all(_ingest_part(connection, database, uuid, path, until_s) for path in parts)
             if time.monotonic() > until_s:
                 return
 
@@ -264,7 +271,7 @@ def _turn(budget_s: float) -> Generator[bool]:
             _lock.release()
 
 
-def _take_in_part(
+def _ingest_part(
     connection: sqlite3.Connection, database: Path, uuid: str, path: Path, until_s: float
 ) -> bool:
     """Take in a part, and delete it if it is complete; False where some of it is left."""
@@ -279,7 +286,7 @@ def _take_in_part(
             if header is not None and status.st_nlink:
                 identity = _identity(status, database)
                 reading = _Reading(connection, uuid, path, file, identity, not is_complete)
-                if not reading.take_in(header, until_s):
+                if not reading.ingest(header, until_s):
                     return False
                 is_complete = is_complete and path not in _kept
             if is_complete and os.name != "nt":
@@ -289,7 +296,7 @@ def _take_in_part(
     except FileNotFoundError:  # another process has taken in all of it
         return True
     except Exception as error:  # noqa: BLE001  (raised again where it is not the file's)
-        _looks.pop(uuid, None)
+        _states.pop(uuid, None)
         waiting_file.report_strange(path, error)
         _kept[path] = str(error)
         return False
@@ -309,7 +316,7 @@ class _Reading:
     faults: _Faults = _NO_FAULTS
     begun: tuple[str, ...] = ()  # lost runs that this transaction has made
 
-    def take_in(self, header: dict[str, Any], until_s: float) -> bool:
+    def ingest(self, header: dict[str, Any], until_s: float) -> bool:
         """Take in all complete lines from where it was left; False where time is up."""
         start = self.file.tell()
         session_id, robot_id, number, *newest = self._enter(header)
@@ -317,15 +324,19 @@ class _Reading:
         if place is None or place.file != self.identity or place.number > number:
             offset = _skip(self.file, start, number)
             place = _JournalPosition(self.identity, offset, number, offset > start, self.faults)
-            _looks[self.uuid] = _Looks(*newest)  # another process may have read on meanwhile
-        looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(*newest))
+            _states[self.uuid] = _JournalState(
+                *newest
+            )  # another process may have read on meanwhile
+        session_state = _states.get(self.uuid) or _states.setdefault(
+            self.uuid, _JournalState(*newest)
+        )
         while lines := _read_lines(self.file, place.offset):
             self.faults = place.faults
             lost = [each.lost_run for each in lines if each.lost_run is not None]
-            looks.lost_runs |= {run.get("uuid") or "": run for run in lost}
+            session_state.lost_runs |= {run.get("uuid") or "": run for run in lost}
             if entries := self._entries(lines, session_id):
-                finish = partial(self._finish, session_id, robot_id, looks, lines)
-                begin = partial(self._begin, looks)
+                finish = partial(self._finish, session_id, robot_id, session_state, lines)
+                begin = partial(self._begin, session_state)
                 taken = waiting_file.take_in(self.connection, session_id, entries, finish, begin)
                 done = _until(lines, taken.number)[-1].end
                 place = _JournalPosition(self.identity, done, taken.number, True, self.faults)
@@ -338,7 +349,7 @@ class _Reading:
         _places[self.path] = self._counted(session_id, place)
         return True
 
-    def _entries(self, lines: Sequence[_Line], session_id: int) -> list[Entry]:
+    def _entries(self, lines: Sequence[_Line], session_id: int) -> list[WaitingEntry]:
         """Their entries; the end of a session adds its count to what was dropped here."""
         entries = [each.entry for each in lines if each.entry]
         for entry in entries:
@@ -362,7 +373,9 @@ class _Reading:
             self._drop(session_id, place.faults)
             if run := self.connection.execute(_NEWEST_RUN, (session_id,)).fetchone():
                 uuid, *times = run
-                self._drop_event(Entry(place.number, "event", uuid, tuple(times)), place.faults)
+                self._drop_event(
+                    WaitingEntry(place.number, "event", uuid, tuple(times)), place.faults
+                )
 
         in_transaction(self.connection, act)
         warn(f"{lines} lines or values of {self.path} were dropped: {first}")
@@ -392,9 +405,9 @@ class _Reading:
         in_transaction(connection, act)
         return connection.execute(_KNOWN, (self.uuid,)).fetchone()
 
-    def _begin(self, looks: _Looks, entry: Entry) -> dict[str, Any] | None:
+    def _begin(self, session_state: _JournalState, entry: WaitingEntry) -> dict[str, Any] | None:
         """The values of the run of an entry that none has begun, if its line was lost."""
-        lost = looks.lost_runs.get(entry.run or "", looks.lost_runs.get(""))
+        lost = session_state.lost_runs.get(entry.run or "", session_state.lost_runs.get(""))
         if lost is None or isinstance(entry.values, dict) or not entry.run:
             return None
         sim_time_s, wall_time_s, *_ = entry.values
@@ -407,7 +420,7 @@ class _Reading:
         self,
         session_id: int,
         robot_id: int,
-        looks: _Looks,
+        session_state: _JournalState,
         lines: Sequence[_Line],
         taken: Taken,
     ) -> None:
@@ -416,21 +429,21 @@ class _Reading:
         faults = list(taken.unfit)
         begun_here, self.begun = self.begun, ()
         runs, ends = dict[str, tuple[float, float, int]](), dict[Kind, dict[str, Any]]()
-        last: Entry | None = None
+        last: WaitingEntry | None = None
         for _, entry, state, fault, _ in _until(lines, taken.number):
             if entry is None or entry.number in written:
                 faults.append(fault)
             if entry is None:
                 continue
-            begins = entry.run if entry.run in begun_here else looks.run
+            begins = entry.run if entry.run in begun_here else session_state.run
             if isinstance(entry.values, dict):
-                begins = entry.values.get("uuid", looks.run)
-            if begins != looks.run:
-                looks.run = begins
-                looks.changes.forget()
+                begins = entry.values.get("uuid", session_state.run)
+            if begins != session_state.run:
+                session_state.run = begins
+                session_state.changes.forget()
                 if entry.run in begun_here:
                     ends["run"] = {"uuid": begins}
-            changed = looks.changes.compare(state) if state is not None else ()
+            changed = session_state.changes.compare(state) if state is not None else ()
             if entry.number not in written:  # taken in by another process, or refused
                 continue
             if isinstance(entry.values, dict):  # a run or an end, after which others are over
@@ -442,7 +455,9 @@ class _Reading:
             seen_s = min(wall_time_s, time.time())  # what is dated later than now was seen now
             runs[run] = sim_time_s, seen_s, rows + (entry.kind == "state")
             if state is not None:
-                looks.names.register(state, entry.values[2], partial(self._enter_names, robot_id))
+                session_state.names.register(
+                    state, entry.values[2], partial(self._enter_names, robot_id)
+                )
             for name, before, after in changed:
                 data = json.dumps({"from": before, "to": after}, ensure_ascii=False)
                 self._event(entry, "change", name[:200], data)
@@ -465,7 +480,7 @@ class _Reading:
         values = {"count": dropped.lines, "why": why, "session": session_id}
         self.connection.execute(_DROP, values)
 
-    def _drop_event(self, entry: Entry, dropped: _Faults) -> None:
+    def _drop_event(self, entry: WaitingEntry, dropped: _Faults) -> None:
         data = {"row_count": dropped.lines, "why": f"{self.path.name}: {dropped.first}"}
         self._event(entry, "dropped", None, json.dumps(data))
 
@@ -474,7 +489,7 @@ class _Reading:
         signal_register.write_changes(self.connection, robot_id, changes)
         return True
 
-    def _event(self, entry: Entry, kind: str, name: str | None, data: str) -> None:
+    def _event(self, entry: WaitingEntry, kind: str, name: str | None, data: str) -> None:
         (run_id,) = self.connection.execute(_RUN_ID, (entry.run,)).fetchone()
         values = (run_id, *cast("tuple[Any, ...]", entry.values)[:2], kind, name, data)
         self.connection.execute(STATEMENTS["event"], values)
@@ -613,7 +628,7 @@ def _line(line: bytes, end: int) -> _Line:
         if kind == "run" and None in (given["uuid"], given["wall_time"], given["sim_time"]):
             raise ValueError(unfit)
         state = _state(given, text, line) if kind == "state" else None
-        entry = Entry(number, kind, run, _bound(kind, given))
+        entry = WaitingEntry(number, kind, run, _bound(kind, given))
     except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
         return _Line(end, None, fault=_fault(text, error), lost_run=_lost_run(text, given))
     return _Line(end, entry, state, _fault(text, unfit) if unfit else "")

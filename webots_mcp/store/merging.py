@@ -46,7 +46,7 @@ from webots_mcp.store.chunks import (
     statistics_of,
 )
 from webots_mcp.store.export import Progress
-from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.journal_intake import ingest_journals
 from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
@@ -242,10 +242,10 @@ def merge(
             for run, run_uuid in runs:
                 _copy_pictures(connection, data_dir, pictures or source.parent, run, run_uuid)
             with transaction(connection):
-                _take_in(connection, wanted, uuid, robot_id, runs)
+                _ingest_run_rows(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
             connection.execute(_RUN_OF_REQUESTS)
-            _take_in_trials(connection, run_id)
+            _ingest_trials(connection, run_id)
         return dict(connection.execute(_RUNS).fetchall())
 
 
@@ -260,7 +260,7 @@ def settled(database: Path) -> RecordingAccess:
     recording = RecordingAccess(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
-        take_in_journals(connection, database)
+        ingest_journals(connection, database)
         now_s = time.time()
         silent = (host_name(), now_s - REMOTE_SILENCE_S)  # their processes cannot be asked
         for (session_id,) in connection.execute(_SILENT_ELSEWHERE, silent).fetchall():
@@ -299,7 +299,7 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
         )
 
 
-def _take_in(
+def _ingest_run_rows(
     connection: sqlite3.Connection,
     wanted: dict[str, int | None],
     uuid: str,
@@ -339,20 +339,20 @@ def _copy_meanings(connection: sqlite3.Connection, there: int, here: int) -> Non
     connection.execute(_COPY_MEANINGS, {"there": there, "here": here})
 
 
-def _take_in_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
+def _ingest_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
     """Trial sets and trials that are not there, each with its run as it is called here.
 
     No process works on them here: their simulators and controllers have ended.
     Trials of a set that is here as well keep their results; those that wait take the ones from
     there, unless a process is about to run them.
     """
-    gone: dict[str, Any] = dict.fromkeys(
+    missing: dict[str, Any] = dict.fromkeys(
         ("host", "pid", "process", "robot_id", "session_id", "former_values")
     )
     for set_id, uuid in connection.execute(_TRIAL_SETS, {"run": run_id}).fetchall():
         here = _id_of(connection, "trial_set", uuid)
         if here is None:
-            here = _insert(connection, "trial_set", "id = ?", set_id, gone)
+            here = _insert(connection, "trial_set", "id = ?", set_id, missing)
         asked = {"set": set_id, "run": run_id}
         for trial_id, trial_uuid, run in connection.execute(_TRIALS, asked).fetchall():
             if _id_of(connection, "trial", trial_uuid) is None:
@@ -400,7 +400,7 @@ def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id
     (is_purged,) = connection.execute(_IS_PURGED, (run,)).fetchone()
     shift = None
     if is_purged:
-        shift = take_in_chunks(connection, run_id, run, robot_id)
+        shift = ingest_chunks(connection, run_id, run, robot_id)
     elif _number(connection, _RESERVED_HERE) > _number(connection, _NEWEST_HERE):
         shift = _reserve_ids(connection, run_id)  # SQLite would give ids that other rows had
     _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)
@@ -641,7 +641,7 @@ def _is_link(entry: zipfile.ZipInfo) -> bool:
 # alike here, beyond those that were ever given, and what came before what remains so.
 
 
-def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> int:
+def ingest_chunks(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> int:
     """Take in the row groups and chunks of a run, and the names of their signals.
 
     Args:

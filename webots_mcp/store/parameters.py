@@ -14,7 +14,7 @@ from webots_mcp.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.liveness import (
-    Lease,
+    JobLease,
     give_back,
     holder_of,
     lease_of,
@@ -456,7 +456,7 @@ def trials_of(connection: sqlite3.Connection, set_id: int) -> list[TrialRecord]:
     return [TrialRecord(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
 
 
-def take_up(connection: sqlite3.Connection, set_id: int) -> Lease:
+def take_up(connection: sqlite3.Connection, set_id: int) -> JobLease:
     """Become the process that works on a set, as long as it renews the lease.
 
     Raises:
@@ -477,7 +477,7 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> Lease:
     return lease
 
 
-def lay_down(connection: sqlite3.Connection, set_id: int, lease: Lease) -> None:
+def lay_down(connection: sqlite3.Connection, set_id: int, lease: JobLease) -> None:
     """Let others work on a set: at once, where this is in the transaction of a `Job`."""
     connection.execute(_WORK, (None, None, None, set_id))
     give_back(connection, lease)

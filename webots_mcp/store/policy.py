@@ -280,14 +280,14 @@ def read_policy(file: Path) -> Policy | None:
         NotAllowedError: It is invalid: which line, and why.
     """
     try:
-        text, told = load_toml(file)
-        if unknown := sorted(set(told) - {ALLOW, "expect", "signals"}):
+        text, content = load_toml(file)
+        if unknown := sorted(set(content) - {ALLOW, "expect", "signals"}):
             raise InvalidInputError(
                 f"{file}: {unknown[0]!r} is unknown; there is allow, expect and signals"
             )
-        if ALLOW not in told:
+        if ALLOW not in content:
             return None
-        if (wrong := next(_faults(told[ALLOW]), None)) is not None:
+        if (wrong := next(_faults(content[ALLOW]), None)) is not None:
             key, why = wrong
             raise InvalidInputError(f"{file}, line {line_of(text, key)}: {why}")
     except InvalidInputError as error:
@@ -296,7 +296,7 @@ def read_policy(file: Path) -> Policy | None:
             "recording and reading go on",
             str(error),
         ) from error
-    return Policy(file, text, told[ALLOW])
+    return Policy(file, text, content[ALLOW])
 
 
 def _faults(allow: Any) -> Iterator[tuple[str, str]]:

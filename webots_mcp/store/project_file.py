@@ -96,13 +96,15 @@ def read_project(file: Path) -> ProjectFile:
     Raises:
         InvalidInputError: It cannot be read, or something in it is invalid: which line, and why.
     """
-    text, told = load_toml(file)
-    told.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
-    signals = told.pop("signals", {})
-    entries: list[Any] = told.pop("expect", [])
+    text, content = load_toml(file)
+    content.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
+    signals = content.pop("signals", {})
+    entries: list[Any] = content.pop("expect", [])
     is_list = type(entries) is list and all(type(each) is dict for each in entries)
-    if told or not is_list:
-        found = f"{next(iter(told))!r} is unknown" if told else "'expect' is no list of tables"
+    if content or not is_list:
+        found = (
+            f"{next(iter(content))!r} is unknown" if content else "'expect' is no list of tables"
+        )
         raise InvalidInputError(
             f"{file}: {found}; it holds tables [[expect]], [signals] and [allow]"
         )

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import KEPT_FRAME
-from webots_mcp.database.connection import LONGEST_WRITE_S, Step, is_busy
+from webots_mcp.database.connection import LONGEST_WRITE_S, AtomicStatements, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks, remake_if_damaged
 from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force
-from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, plan, rows_of
+from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, ids_of, plan
 from webots_mcp.store.run_rows import inside
 
 BATCH_ROWS: Final = 500
@@ -42,14 +42,14 @@ _HIDE_GROUP: Final = (
 _CHUNKS: Final = "SELECT id FROM chunk WHERE group_id = ?"
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
 _GROUPS_WITH_ROWS: Final = (
-    "SELECT id, stored_row_count, max_state_id FROM row_group WHERE run_id = ? AND is_complete = 1 "
+    "SELECT id, stored_row_count FROM row_group WHERE run_id = ? AND is_complete = 1 "
     "AND stored_row_count > 0 ORDER BY max_state_id"
 )
 _SET_STORED: Final = (  # what others deleted was not counted
     "UPDATE row_group SET stored_row_count = (SELECT count(*) FROM json_each(?) j "
     "CROSS JOIN state s ON s.id = j.value) WHERE id = ?"
 )
-# Many rows go at once, in one statement: see `Step`. What is left in `going` went.
+# Many rows go at once, in one statement: see `AtomicStatements`. What is left in `going` went.
 _GOING: Final = "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
 _NOT_GOING: Final = (
     "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
@@ -89,7 +89,7 @@ _BEFORE_DELETION: Final = {
 }
 _DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
 _STEPS: Final = {
-    table: Step(
+    table: AtomicStatements(
         f"purge_{table}",
         ("group_id",),
         _NOT_GOING.format(table=table, kept=KEPT),
@@ -110,11 +110,9 @@ _PATHS: Final = {  # of the pictures that go with rows
 }
 _IN_USE: Final = "SELECT 1 FROM image WHERE path = ? LIMIT 1"
 _MOST_FAILURES: Final = 200
-INTERVAL_S: Final = 2.0
-PLANNING_SHARE: Final = 0.02  # of the time: looking at ten million rows takes a second
+INTERVAL_S: Final = 60.0  # between two checks; one of ten million rows takes about a second
 BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
-# What stays free in the file for the rows to come: a fortieth of it, but no more than 10 MB.
-SPARE_SHARE: Final = 40
+# A fortieth of the file stays free for the rows to come, but no more than 10 MB.
 MOST_SPARE_PAGES: Final = 2500
 
 
@@ -254,23 +252,21 @@ class _Purge:
             elif step.table == "chunk":
                 yield from self._chunks(step, step.portion)
             elif step.table == "state" and not step.portion.group_id:
-                yield from self._in_no_group(step, step.portion)
+                yield from self._in_no_group(step.portion)
             else:
                 group_id = step.portion.group_id
                 if step.table == "state":  # its rows are needed to make a damaged group anew
                     group_id = remake_if_damaged(self._connection, group_id)
-                yield from self._rows(step.portion._replace(group_id=group_id), step.bound)
+                yield from self._rows(step.portion._replace(group_id=group_id))
 
-    def _in_no_group(self, step: Going, portion: Portion) -> Iterator[Purged]:
-        """States that are in no group become one first."""
-        run_id = step.owner_id
-        while not self._unless_locked(lambda: self._chunked(run_id)):
+    def _in_no_group(self, portion: Portion) -> Iterator[Purged]:
+        """Delete states that are in no group; they become one first."""
+        while not self._unless_locked(lambda: self._chunked(portion.run_id)):
             yield self.purged
-        found = self._connection.execute(_GROUPS_WITH_ROWS, (run_id,)).fetchall()
-        for group_id, rows, last_id in found:
-            group = portion._replace(group_id=group_id, rows=rows, last_id=last_id)
-            yield from self._rows(group, step.bound)
-        yield from self._rows(portion, step.bound)  # what no bridge writes is in no chunk
+        found = self._connection.execute(_GROUPS_WITH_ROWS, (portion.run_id,)).fetchall()
+        for group_id, rows in found:
+            yield from self._rows(portion._replace(group_id=group_id, rows=rows))
+        yield from self._rows(portion)  # what no bridge writes is in no chunk
 
     def _chunked(self, run_id: int) -> bool:
         """Put rows into chunks for a moment; whether all rows of a run are in one."""
@@ -278,12 +274,13 @@ class _Purge:
             return False
         return chunk_whole_run(self._connection, run_id)
 
-    def _rows(self, portion: Portion, bound: int) -> Iterator[Purged]:
-        """Rows of a portion up to an id, in the order of their ids."""
-        ids = [int(row_id) for row_id in rows_of(self._connection, portion)[0] if row_id <= bound]
-        keys = [(row_id, portion.run_id) for row_id in ids]
-        yield from self._delete(portion.table, keys, portion.group_id)
-        if portion.group_id and bound >= portion.last_id:
+    def _rows(self, portion: Portion) -> Iterator[Purged]:
+        """Delete the rows of a portion, in the order of their ids, but none that came since."""
+        ids = [row_id for row_id in ids_of(self._connection, portion) if row_id <= portion.last_id]
+        yield from self._delete(
+            portion.table, [(row_id, portion.run_id) for row_id in ids], portion.group_id
+        )
+        if portion.group_id:
             self._execute(_SET_STORED, json.dumps(ids), portion.group_id)
 
     def _chunks(self, step: Going, portion: Portion) -> Iterator[Purged]:
@@ -401,19 +398,16 @@ class _Purge:
         return int(self._connection.execute(f"PRAGMA {name}").fetchone()[0])
 
 
-# Retention as a maintainer's work: a plan every few seconds, carried out a little at a time.
-
-
 class Upkeep:
-    """Called once in each round of the maintainer, which alone does this work.
+    """Retention as the work of a maintainer, which calls it once in each of its rounds.
 
         Maintainer(database, "server", work=Upkeep(data_dir))
 
     Args:
         data_dir: The folder that the paths of pictures are relative to.
         limits: Returns the limits in force.
-        interval_s: Between two plans at least; more where planning takes long.
-        budget_s: How long a call may last, rests included; a write more at most.
+        interval_s: Time between two plans; limits that change are planned for at once.
+        budget_s: How long a call may last, rests included; one write may go on after that.
     """
 
     def __init__(
@@ -429,6 +423,7 @@ class Upkeep:
         self._interval_s = interval_s
         self._budget_s = budget_s
         self._next_plan_s = 0.0
+        self._planned: Retention | None = None
         self._connection: sqlite3.Connection | None = None
         self._under_way: Iterator[Purged] | None = None
 
@@ -439,30 +434,26 @@ class Upkeep:
             sqlite3.Error, DatabaseError: The next call begins with a new plan.
         """
         if connection is not self._connection:
-            self._connection, self._under_way, self._next_plan_s = connection, None, 0.0
+            self._connection, self._under_way, self._planned = connection, None, None
         try:
             self._work(connection)
         except BaseException:
-            self._under_way = None
+            self._under_way = self._planned = None
             raise
 
     def _work(self, connection: sqlite3.Connection) -> None:
         started_s = time.monotonic()
         if self._under_way is None:
-            if started_s < self._next_plan_s:
+            limits = self._limits(connection)
+            if limits == self._planned and started_s < self._next_plan_s:
                 return
-            self._under_way = self._planned(connection)
+            self._planned, self._next_plan_s = limits, started_s + self._interval_s
+            pages = int(connection.execute("PRAGMA page_count").fetchone()[0])
+            spare_pages = min(pages // 40, MOST_SPARE_PAGES)
+            wanted = plan(connection, limits)
+            self._under_way = purge(connection, wanted, self._data_dir, spare_pages)
         for purged in self._under_way:
             if time.monotonic() - started_s > self._budget_s:
                 return
             time.sleep(purged.rest_s)
         self._under_way = None
-
-    def _planned(self, connection: sqlite3.Connection) -> Iterator[Purged]:
-        started_s = time.monotonic()
-        wanted = plan(connection, self._limits(connection))
-        took_s = time.monotonic() - started_s
-        self._next_plan_s = started_s + max(self._interval_s, took_s / PLANNING_SHARE)
-        pages = int(connection.execute("PRAGMA page_count").fetchone()[0])
-        spare_pages = min(pages // SPARE_SHARE, MOST_SPARE_PAGES)
-        return purge(connection, wanted, self._data_dir, spare_pages)

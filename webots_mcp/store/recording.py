@@ -34,7 +34,7 @@ from webots_mcp.database.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.database.liveness import Lease, still_held
+from webots_mcp.database.liveness import JobLease, still_held
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.queue import any_unfinished
@@ -52,9 +52,9 @@ from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.journal_intake import (
     BUDGET_S,
     has_news,
+    ingest_journals,
     journals_behind,
     kept_journals,
-    take_in_journals,
 )
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
@@ -267,7 +267,7 @@ class RecordingAccess:
 
         What controllers wrote into journals is taken in first.
         """
-        self.take_in()
+        self.ingest()
         if self.readers is None or not isinstance(self.database, Path):
             with self._opened("reader") as connection:
                 shadow_if_asked(connection)
@@ -311,7 +311,7 @@ class RecordingAccess:
                     adopt(connection, self.database)  # a command's result may wait there
                 liveness.reap(connection, time.time())
 
-    def take_in(self) -> None:
+    def ingest(self) -> None:
         """Take in what controllers wrote into journals; nothing where the asker may not write."""
         database = self.database
         if not isinstance(database, Path) or (self.read_only and self.asker == "mcp"):
@@ -325,7 +325,7 @@ class RecordingAccess:
                 with self.writer() as connection:
                     if left:
                         adopt(connection, database, until_s)
-                    take_in_journals(connection, database, until_s - time.monotonic())
+                    ingest_journals(connection, database, until_s - time.monotonic())
 
     def create(self) -> None:
         """Make the database where there is none, with its folder; one that is there is kept.
@@ -420,12 +420,12 @@ def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     if isinstance(connection, FrozenConnection):
         waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
         said.insert(0, f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}")
-    elif beside := rows_beside(connection):
+    elif beside := waiting_rows_note(connection):
         said.insert(0, beside)
     return {"storage": "; ".join(said)} if said else {}
 
 
-def rows_beside(connection: sqlite3.Connection) -> str:
+def waiting_rows_note(connection: sqlite3.Connection) -> str:
     """What waits next to a database although its controller has ended or there was time; or ""."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     if not file:
@@ -494,7 +494,7 @@ class Job:
     """
 
     recording: RecordingAccess
-    lease: Lease
+    lease: JobLease
 
     @contextmanager
     def writer(self) -> Generator[sqlite3.Connection]:

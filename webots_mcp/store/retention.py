@@ -44,15 +44,18 @@ _ROWS: Final = {"row": 1, "rows": 1}
 
 @dataclass(frozen=True)
 class Limit:
-    """How much of one kind is kept; None is not a limit. What is oldest goes first.
+    """How much of one kind is kept. None means no limit. The oldest goes first.
+
+    What goes are whole row groups, or blocks of rows. The newest of them stays even if it exceeds
+    the limit alone, unless the limit is 0.
 
     Attributes:
-        size_bytes: So much on the disk, with the free room on the pages and the indexes. Of
-            pictures their files.
-        rows: So many rows; of chunks so many states that they stand for.
-        age_s: So long after they were written, in wall time.
-        spared_rows: So many of the newest rows, of all runs together, do not go because of their
-            age: runs of abandoned work do not all vanish. Size and rows always hold.
+        size_bytes: Size on the disk, with indexes and what is free on the pages; for pictures the
+            size of their files.
+        rows: Number of rows; for chunks the number of states they stand for.
+        age_s: Seconds of wall time since they were written.
+        spared_rows: Number of the newest rows, over all runs, that age alone does not delete, so
+            that runs of abandoned work do not all vanish. Size and rows always hold.
     """
 
     size_bytes: int | None = None
@@ -84,22 +87,22 @@ class Retention:
     """The limits of each kind of row.
 
     They hold for the whole database, over all robots: rows go in the order in which they were
-    recorded, whatever their run, about a thousand of a run at once. Runs with a label (but that of
-    a trial), a note or `keep` lose nothing and do not count.
+    recorded, whatever their run. Runs that a person labelled (trials do not count), described or
+    marked lose nothing and are not counted.
 
     Attributes:
-        state: The full rows. They go only after their values were put into chunks.
-        chunk: The values of each signal, compressed, of about 1,024 states at once. They go only
-            after those states, and with them what their run still says of that time.
+        state: State rows. They go only after their values were put into chunks.
+        chunk: The values of each signal, compressed, in groups of about 1,024 states. A group goes
+            only after its states, and with it what answers say of that time.
         log: Log lines.
-        event: Events; its age also holds for finished commands.
+        event: Events. Their age also holds for finished commands.
         image: Pictures, with their files.
-        outlive: When this many times the limits of `chunk` and of `state` was recorded after a run,
-            or it ended that many times their age ago (and as many states as an age spares were
-            recorded since), all that is left of it goes, and with the last run of that time the
-            commands. 0 keeps runs for ever.
-        kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
-            from `state`. A stretch that loses a row is none any more.
+        outlive: What is left of a run goes once this many times the limits of `chunk` and `state`
+            was recorded after it, or it ended this many times their age ago and as many states as
+            an age spares were recorded since. Its commands go with the last run of that time. 0
+            keeps runs for ever.
+        kept_state: Rows of full-rate segments: those that the throttle dropped, and those that were
+            deleted from `state`. A segment that loses a row is removed.
     """
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)

@@ -50,7 +50,7 @@ from webots_mcp.database.pauses import (
 )
 from webots_mcp.database.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
 from webots_mcp.database.waiting_file import (
-    Entry,
+    WaitingEntry,
     count_rows,
     next_entries,
     read_header,
@@ -328,12 +328,12 @@ class WorldSeen:
 
     Attributes:
         observer: Its name.
-        told: What there is: title, robots, solids.
+        content: What there is: title, robots, solids.
         places: Where each is, by the word that it has in signals; its newest of the run.
     """
 
     observer: str
-    told: dict[str, Any]
+    content: dict[str, Any]
     places: dict[str, dict[str, float | None]]
 
 
@@ -705,8 +705,8 @@ def _left_stacks(connection: sqlite3.Connection, session: SessionRecord) -> str 
     """Where a dead process had hung, as the file has it that nobody has taken in yet."""
     path = _path_of(connection, session, stacks_path)
     stacks = stacks_at(path) if path else None
-    is_told = stacks and stacks.is_hang and stacks.began_after(session.last_seen_wall_time_s)
-    return f"{stacks.log_values(None)['message']}" if stacks and is_told else None
+    is_current = stacks and stacks.is_hang and stacks.began_after(session.last_seen_wall_time_s)
+    return f"{stacks.log_values(None)['message']}" if stacks and is_current else None
 
 
 def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:
@@ -917,7 +917,7 @@ def _path_of(
     return path if path and path.is_file() else None  # a FIFO would wait for a writer
 
 
-def _oldest_s(entries: list[tuple[int, Entry]]) -> float:
+def _oldest_s(entries: list[tuple[int, WaitingEntry]]) -> float:
     """When the first state, log line or event came; infinite where there is none."""
     stamped = ("state", "log", "event")
     times = (entry.values for _, entry in entries if entry.kind in stamped)

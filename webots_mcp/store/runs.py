@@ -215,21 +215,21 @@ def pace(duration_s: float, wall_s: float) -> float | None:
 
 
 def _infos(connection: sqlite3.Connection, rows: Sequence[tuple[Any, ...]]) -> list[RunInfo]:
-    gone = dict(dead_sessions(connection))
+    ended = dict(dead_sessions(connection))
     parameters = notable_parameters(connection, [row[0] for row in rows])
-    return [_info(connection, row, gone, parameters[row[0]]) for row in rows]
+    return [_info(connection, row, ended, parameters[row[0]]) for row in rows]
 
 
 def _info(
     connection: sqlite3.Connection,
     row: tuple[Any, ...],
-    gone: dict[int, str],
+    ended: dict[int, str],
     parameters: dict[str, Value | str],
 ) -> RunInfo:
-    """One run; `gone` says how sessions ended that still look open."""
+    """One run; `ended` says how sessions ended that still look open."""
     *what, started_wall_s, last_wall_s, started_s, last_s = row
     named = dict(zip(_WHAT, what, strict=True))
-    named["end_reason"] = named["end_reason"] or gone.get(named["session_id"])
+    named["end_reason"] = named["end_reason"] or ended.get(named["session_id"])
     return RunInfo(
         **named,
         started_wall_time_s=started_wall_s,

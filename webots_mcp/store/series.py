@@ -337,15 +337,15 @@ def query_rows(
     signals = signals_of(connection, time_range, names)
     deadline = Deadline(deadline_s)
     parts: list[Frame] = []
-    room, cut = limit + 1, False  # one more, to know whether there is a next page
+    budget, cut = limit + 1, False  # one more, to know whether there is a next page
     for segment in time_range.segments:
-        if room <= 0 or cut:
+        if budget <= 0 or cut:
             break
         frame = read_frame(connection, segment, deadline)
         start = _place_after(frame, after_id)
-        parts.append(frame.rows(start, start + room))
-        room -= len(parts[-1])
-        cut = frame.cut_at_s is not None and room > 0
+        parts.append(frame.rows(start, start + budget))
+        budget -= len(parts[-1])
+        cut = frame.cut_at_s is not None and budget > 0
     return _page(connection, time_range, signals, parts, limit, cut=cut)
 
 

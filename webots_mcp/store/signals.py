@@ -130,7 +130,7 @@ def enter_signals(
     return registered(connection, robot_id)
 
 
-def tell_more(signal: RegisteredSignal | None, values: Iterable[object]) -> bool:
+def may_widen(signal: RegisteredSignal | None, values: Iterable[object]) -> bool:
     """Whether values may widen what is known of their signal; of most a look at types shows it."""
     if signal is None or signal.kind == "angle" or signal.is_choice:
         return True
@@ -181,7 +181,7 @@ def seen_with(
     known: dict[str, RegisteredSignal], robot_id: int, columns: StateColumns
 ) -> dict[str, RegisteredSignal]:
     """Signals as they are known after these rows, also those that are not registered."""
-    fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
+    fresh = [name for name, each in columns.values.items() if may_widen(known.get(name), each)]
     found = dict(known)
     for name, seen in seen_in(columns, fresh).items():
         before = known.get(name) or RegisteredSignal(None, robot_id, name, "null", None, *seen[:2])

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
-from webots_mcp.database.queue import Command, fetch_command
+from webots_mcp.database.queue import QueuedCommand, fetch_command
 
 _UNFINISHED: Final = {
     "pending": "no get_command() of its controller has come to it yet",
@@ -75,12 +75,12 @@ class RecordedCommand:
         """Return why it failed, or what in its result had to be replaced; else None."""
         return self._fetch().error
 
-    def _fetch(self) -> Command:
+    def _fetch(self) -> QueuedCommand:
         with closing(connect(self._database, "reader")) as connection:
             return fetch_command(connection, self.id)
 
 
-def _why_not_done(command: Command) -> str:
+def _why_not_done(command: QueuedCommand) -> str:
     """Return why a command is not done; an empty text if it is."""
     if command.status == "done":
         return ""

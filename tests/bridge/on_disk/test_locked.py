@@ -49,7 +49,7 @@ def test_rows_that_meet_a_lock_wait_and_are_written_in_order(
         started_s = time.perf_counter()
         for n in range(1, 100):
             bridge.publish({"n": n})
-        assert time.perf_counter() - started_s < 1  # a single wait for the lock would be five
+        assert time.perf_counter() - started_s < 4  # a single wait for the lock would take 5 s
         assert bridge.stats().rows_waiting == 99
         assert numbers(filed) == [0]
     bridge.publish({"n": 100})

@@ -23,7 +23,7 @@ from tests.bridge.conftest import (
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
 from webots_mcp.bridge.recorder import ConnectionLock
-from webots_mcp.database.waiting_file import Entry, WaitingFile
+from webots_mcp.database.waiting_file import WaitingEntry, WaitingFile
 from webots_mcp.standin import InProcessSupervisor
 
 
@@ -100,13 +100,13 @@ def test_a_row_of_which_the_disk_took_a_part_is_not_in_the_file(tmp_path: Path) 
     import resource
 
     file = WaitingFile(tmp_path / "waiting", lambda: {})
-    file.append([Entry(1, "log", None, ("whole",))])
+    file.append([WaitingEntry(1, "log", None, ("whole",))])
     size = file.path.stat().st_size
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size + 5, limits[1]))
     try:
         with pytest.raises(OSError, match="the disk is full"):
-            file.append([Entry(2, "log", None, ("cut",))])
+            file.append([WaitingEntry(2, "log", None, ("cut",))])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert file.path.stat().st_size == size

@@ -164,12 +164,42 @@ def leaps(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     return driving.moved(run, first, (away, -away))
 
 
+def falls(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """It tips over to one side within a second, and stays down."""
+    side = float(rng.choice([-1, 1]) * rng.uniform(1.2, 1.6))
+    at_s = float(rng.uniform(0.3, 0.7)) * run.duration_s
+    roll = side * np.clip(run.times - at_s, 0, 1) + rng.normal(0, 0.01, len(run.times))
+    return replace(run, columns={**run.columns, "imu_roll_rad": roll.tolist()})
+
+
+def noisy(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """From the middle on a distance has ten times as much noise."""
+    rows = len(run.times)
+    noise = rng.normal(0, 0.005, rows) * np.where(np.arange(rows) < rows // 2, 1, 10)
+    depth = 2 + 0.4 * np.sin(run.times / 9) + noise
+    return replace(run, columns={**run.columns, "depth_m": depth.tolist()})
+
+
+def creeps(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """It turns slowly while it stands, although no command says so."""
+    phases = driving.drive_of(rng, 20.0, 0.25, "cruise")
+    phases += [driving.phase(30.0, 0.0, "idle", 0.02), *driving.drive_of(rng, 20.0, 0.25, "cruise")]
+    made = driving.driven(rng, phases, 0.064, 0.0, "commanded", "gps")
+    course = driving.way_of(phases, made.times)[2]
+    yaw = np.angle(np.exp(1j * course)).tolist()
+    columns = {"imu": [{"yaw": each} for each in yaw], "cmd_turn_rad_s": [0.0] * len(made.times)}
+    return replace(made, columns={**made.columns, **columns})
+
+
 FAULTS: Final[dict[str, tuple[Fault, str]]] = {
     "held": (held, "moves when commanded"),
     "slips": (slips, "wheels grip"),
     "jammed": (jammed, "follows its targets"),
     "odometry drifts": (drifts, "estimates agree"),
     "leaps": (leaps, "stays in place"),
+    "falls": (falls, "stays upright"),
+    "noisy": (noisy, "sensors keep their noise"),
+    "creeps": (creeps, "rests when commanded"),
     "NaN": (silent, "sensors speak"),
     "null": (null, "sensors speak"),
     "frozen": (frozen, "sensors live"),

@@ -81,7 +81,7 @@ FOOLING: list[tuple[State, float, str, str]] = [
     ),
     (
         lambda row: {"arm": {"target": 1.0, "position": 0.2}}, 1.0,
-        "follows its targets", "fail: arm.position: up to 29.9 s",
+        "follows its targets", "fail: arm.position: 80 % off arm.target for",
     ),
     (
         lambda row: {"arm": {"target": -(row < 99), "position": max(-1, min(0, row / 200 - 1))}},

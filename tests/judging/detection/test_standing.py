@@ -96,7 +96,7 @@ def test_a_slow_drift_in_much_noise_is_not_called_a_standstill(empty: sqlite3.Co
     random = np.random.default_rng(7)
 
     def drifts_then_runs_aground(time_s: float) -> dict[str, Any]:
-        x_m = 0.15 * min(200.0, time_s)
+        x_m = 0.15 * (min(200.0, time_s) + max(0.0, time_s - 280.0))
         return {"gps": [x_m + random.normal(0, 0.3), random.normal(0, 0.3)], "mode": "drift"}
 
     found = ask(empty, drifts_then_runs_aground, 0.5, 300.0)
@@ -110,6 +110,11 @@ def test_a_slow_drift_in_much_noise_is_not_called_a_standstill(empty: sqlite3.Co
 def drives(time_s: float, aside_m: float = 0.0) -> dict[str, Any]:
     """30 s at 0.2 m/s, then it stands."""
     return {"pose": {"x": 0.2 * min(30.0, time_s) + aside_m, "y": 0.0}}
+
+
+def drives_on(time_s: float) -> dict[str, Any]:
+    """As `drives`, and at the end it drives on."""
+    return {"pose": {"x": 0.2 * (min(30.0, time_s) + max(0.0, time_s - 58.5)), "y": 0.0}}
 
 
 def turns(time_s: float, speed: float) -> float:
@@ -141,17 +146,22 @@ EVIDENCE: dict[str, tuple[Callable[[float], dict[str, Any]], str, str, Any]] = {
     },
     **{
         mode: (
-            lambda t, m=mode: drives(t) | {"mode": m}, "stuck", "evidence_for", MOVED.format(mode),
+            lambda t, m=mode: drives_on(t) | {"mode": m},
+            "stuck", "evidence_for", MOVED.format(mode),
         )
         for mode in ("returning", "threshold_wait", "forest", "already_home", "idle")
     },
     "measured speed of 0": (
-        lambda t: drives(t) | {"speed": 0.2 * (t < 30), "mode": "go"},
+        lambda t: drives_on(t) | {"speed": 0.2 * (t < 30), "mode": "go"},
         "stuck", "evidence_for", MOVED.format("go"),
     ),
     "command for a moment": (
-        lambda t: drives(t) | {"speed": 0.2 * (t < 30.05), "mode": "go"},
+        lambda t: drives_on(t) | {"speed": 0.2 * (t < 30.05), "mode": "go"},
         "stuck", "evidence_for", MOVED.format("go"),
+    ),
+    "until its mode ends": (
+        lambda t: drives(t) | {"mode": "go"}, "standstill", "why_not_stuck",
+        "it stood until mode go ended, as a robot does that has arrived",
     ),
     "told to stand": (
         lambda t: drives(t) | {"commanded_m_s": 0.2 * (t < 30), "mode": "drive"},
@@ -174,7 +184,7 @@ EVIDENCE: dict[str, tuple[Callable[[float], dict[str, Any]], str, str, Any]] = {
         "stuck", "evidence_for", "wheels at 5",
     ),
     "wheels at rest": (
-        lambda t: drives(t) | {"mode": "drive", "wheels": [5.0 * (t < 30)] * 2},
+        lambda t: drives_on(t) | {"mode": "drive", "wheels": [5.0 * (t < 30)] * 2},
         "stuck", "evidence_against", "wheels at rest",
     ),
     "wheels against each other": (
@@ -227,7 +237,7 @@ def test_wheels_that_come_to_rest_as_it_does_are_no_reason_to_call_it_stuck(
     empty: sqlite3.Connection,
 ) -> None:
     (event,) = ask(
-        empty, lambda t: drives(t) | {"mode": "drive", "wheels": [5.0 * (t < 30.25)] * 2}
+        empty, lambda t: drives_on(t) | {"mode": "drive", "wheels": [5.0 * (t < 30.25)] * 2}
     ).events
     assert event.details["evidence_for"] == MOVED.format("drive"), "of a row no wheels turn"
     (told,) = [each for each in check_run(empty, 1).findings if each.name == "moves when commanded"]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.judging.asking import ask, spans
-from tests.recordings.rover import WALL_START_S, Recorder, start_run
+from tests.recordings.rover import start_run
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.kinds import Event, EventOptions
 from webots_mcp.judging.detection.search import ModeUses, RunNoise, Search
@@ -30,13 +30,17 @@ def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tupl
 
 
 def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.Connection) -> None:
-    publish_stuck(empty, mode=("S3", "S3"))
-    recorder = Recorder(empty, WALL_START_S + 1000)
+    recorder = start_run(empty)
+    for run in range(3):
+        if run:
+            recorder.run(1, 1)
+        for step in range(200):
+            recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 0.02 * step, "y": 0}})
     recorder.run(1, 1)
     for step in range(100):
         recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 1, "y": 0}})
-    (stuck,) = ask(empty, "stuck", bounds={"run_id": 2}).events
-    assert stuck.details["evidence_for"] == "in mode S3, in which it moved at 0.2 m/s in run 1"
+    (stuck,) = ask(empty, "stuck", bounds={"run_id": 4}).events
+    assert stuck.details["evidence_for"] == "in mode S3, in which it moved at 0.2 m/s in run 3"
 
 
 @pytest.mark.parametrize("period_s", [0.6, 1.5, 2.0])

@@ -25,18 +25,24 @@ from webots_mcp.store.chunk_making import make_chunks
 __all__ = ["chromium"]
 NAME = "<img src=x onerror=hacked=1>"
 LINE = "<script>window.hacked = 1</script>"
+_VIEW = """
+from webots_mcp.cli import main
+from webots_mcp.plugins.page import page_server
+page_server._REQUEST_S = {}
+raise SystemExit(main())
+"""
 
 
 class Server:
     """`webots-mcp view` on a data folder."""
 
-    def __init__(self, data_dir: Path, *options: str) -> None:
+    def __init__(self, data_dir: Path, *options: str, request_s: float = 10) -> None:
         where = ["--data-dir", str(data_dir)]
         arguments = ["view", "--port", "0", "--no-browser", "--json", *where, *options]
         self.data_dir = data_dir
         self._home = {**os.environ, "HOME": str(data_dir), "USERPROFILE": str(data_dir)}
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "webots_mcp", *arguments],
+            [sys.executable, "-c", _VIEW.format(request_s), *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -70,8 +76,8 @@ def serve() -> Iterator[Callable[..., Server]]:
     """Start servers, which end with the tests."""
     running: list[Server] = []
 
-    def start(data_dir: Path, *options: str) -> Server:
-        running.append(Server(data_dir, *options))
+    def start(data_dir: Path, *options: str, **limits: float) -> Server:
+        running.append(Server(data_dir, *options, **limits))
         return running[-1]
 
     yield start

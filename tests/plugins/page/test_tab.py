@@ -17,7 +17,7 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.page_data import draw, page_request
-from webots_mcp.store.chunk_making import LEAST_ROWS
+from webots_mcp.store.chunk_making import MIN_ROWS_ON_DEMAND
 from webots_mcp.store.chunks import watermark
 from webots_mcp.store.recording import RecordingAccess
 
@@ -89,7 +89,7 @@ def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
 
 
 def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> None:
-    build(tmp_path / DATABASE_NAME, 2 * LEAST_ROWS, chunked=False)
+    build(tmp_path / DATABASE_NAME, 2 * MIN_ROWS_ON_DEMAND, chunked=False)
     recording = RecordingAccess(tmp_path / DATABASE_NAME, tmp_path, read_only=True)
     chunk_maker = ChunkMaker(recording)
     chunk_maker.start()
@@ -97,7 +97,7 @@ def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> N
     chunk_maker.stop()
     assert chunk_maker.says == ""
     with recording.reader() as connection:
-        assert watermark(connection) == 2 * LEAST_ROWS
+        assert watermark(connection) == 2 * MIN_ROWS_ON_DEMAND
 
 
 def test_of_a_page_without_a_recording_no_chunk_is_made(tmp_path: Path) -> None:

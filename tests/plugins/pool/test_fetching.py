@@ -145,6 +145,7 @@ def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
     assert fetched == recorded
 
 
+@pytest.mark.slow
 @IN_EACH_POOL
 @pytest.mark.parametrize("full", [True, False])
 def test_a_fetched_run_has_the_answers_of_the_recording(lab: Lab, rounds: Path, full: bool) -> None:

@@ -113,7 +113,7 @@ def test_a_kept_state_that_retention_moved_stays_in_the_pool_as_it_was(
     shipped.keep(run_id, 2, 4)
     shipped.ship(full=full)
     before = shipped.pooled()["state"]
-    shipped.recorded.prune(states(rows=10))
+    shipped.recorded.prune(states(rows=0))
     assert shipped.rows()["kept_state"]
     shipped.ship(full=full)
     assert shipped.pooled()["state"] == before
@@ -137,7 +137,7 @@ def test_kept_states_that_were_moved_before_anything_was_shipped_are_in_the_pool
 ) -> None:
     run_id = shipped.add_run(60)
     shipped.keep(run_id, 2, 4)
-    shipped.recorded.prune(states(rows=10))
+    shipped.recorded.prune(states(rows=0))
     shipped.ship()
     assert shipped.pooled()["kept_state"] == shipped.rows()["kept_state"] != []
 
@@ -158,7 +158,7 @@ def test_rows_that_retention_deleted_too_early_are_counted(shipped: Shipped) -> 
     shipped.add_run(60)
     shipped.add_run(60)
     shipped.recorded.prune(states(rows=70))
-    assert shipped.ship(full=True).lost == {"state": 50}
+    assert shipped.ship(full=True).lost == {"state": 60}
 
 
 def test_a_run_that_another_recording_has_shipped_stays_that_ones(
@@ -406,7 +406,7 @@ def test_states_that_retention_moved_while_no_shipper_ran_are_in_the_pool(
     for i in range(20, 60):
         shipped.recorded.publish(i / 2, {"x": i, "mode": "c"})
     shipped.make_chunks()
-    shipped.recorded.prune(states(rows=5))
+    shipped.recorded.prune(states(rows=0))
     assert shipped.ship(full=full).lost.keys() <= {"state"}
     pooled = shipped.pooled()
     in_state = [row[2] for row in pooled["state"]]

@@ -9,8 +9,8 @@ from pathlib import Path
 from tests.setup.doctor.conftest import found
 from webots_mcp.setup.doctor import (
     PAGE,
-    Check,
     Diagnosis,
+    DoctorCheck,
     Examined,
     all_checks,
     diagnose,
@@ -42,9 +42,11 @@ def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None
         raise PermissionError("nobody may look there")
 
     subject = subject_of(RecordingAccess(tmp_path / "webots.db", tmp_path), "the test")
-    well = Check("Two", lambda _: iter(()), well="all well")
-    several = Check("Three", lambda _: iter([Diagnosis("ok", "a"), Diagnosis("wrong", "b", "x")]))
-    first, second, third = diagnose(subject, (Check("One", fails), well, several))
+    well = DoctorCheck("Two", lambda _: iter(()), well="all well")
+    several = DoctorCheck(
+        "Three", lambda _: iter([Diagnosis("ok", "a"), Diagnosis("wrong", "b", "x")])
+    )
+    first, second, third = diagnose(subject, (DoctorCheck("One", fails), well, several))
     assert first.finding.verdict == "not checked"
     assert "nobody may look there" in first.finding.seen
     assert second.is_well

@@ -73,7 +73,7 @@ class Robots:
 
     def look_for_bridges(self) -> None:
         """As after half a second."""
-        self.watching.observer.custom_data._look_again_s = 0.0  # pyright: ignore[reportPrivateUsage]
+        self.watching.observer.custom_data._check_sessions_s = 0.0  # pyright: ignore[reportPrivateUsage]
 
 
 @pytest.fixture

@@ -107,7 +107,7 @@ def test_the_pose_at_each_row_lies_between_those_that_were_seen(
     frame = seen.frame()
     wanted = [x_m(time_s) for time_s in frame.times.tolist()]
     assert frame.numbers("observer.x_m").tolist() == pytest.approx(wanted, abs=1e-9)
-    assert frame.zones("observer.x_m").value_count.sum() == len(frame)
+    assert frame.zone_map("observer.x_m").value_count.sum() == len(frame)
     turned = zip(frame.numbers("observer.heading_rad"), map(yaw, frame.times), strict=True)
     assert max(abs(math.remainder(is_s - was, math.tau)) for is_s, was in turned) < 0.05
 

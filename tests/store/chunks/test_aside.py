@@ -16,7 +16,7 @@ from tests import unprivileged
 from tests.recordings.long import build
 from webots_mcp.database.connection import connect
 from webots_mcp.judging.trends import trends
-from webots_mcp.store.chunk_making import LEAST_ROWS, make_missing_chunks
+from webots_mcp.store.chunk_making import MIN_ROWS_ON_DEMAND, make_missing_chunks
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -24,7 +24,7 @@ from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.recording import OpenReaders, RecordingAccess
 from webots_mcp.store.retention import Limit, Retention
 
-ROWS = 3 * LEAST_ROWS
+ROWS = 3 * MIN_ROWS_ON_DEMAND
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_readers_see_chunks_that_the_file_has_not(recording: RecordingAccess) ->
 
 def test_they_are_made_once_and_what_broke_off_goes_on(recording: RecordingAccess) -> None:
     assert "ask again" in make_missing_chunks(recording, called_off=lambda: True, write=False)
-    assert LEAST_ROWS <= in_chunks(recording) < ROWS
+    assert MIN_ROWS_ON_DEMAND <= in_chunks(recording) < ROWS
     assert make_missing_chunks(recording, write=False) == ""
     assert in_chunks(recording) == ROWS
     told: list[tuple[int, int]] = []

@@ -427,4 +427,4 @@ def test_late_rows_of_several_runs_at_once_come_into_their_chunks(
         assert frame.values("x") == [step * 0.25 for step in range(ROWS)]
         assert len(set(frame.ids.tolist())) == ROWS
         waiting = len(frame.new_rows)
-        assert waiting < chunk_making.LEAST_AT_END
+        assert waiting < chunk_making.MIN_ROWS_AT_END

@@ -13,10 +13,10 @@ import pytest
 from tests.recordings.long import build
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
-from webots_mcp.store.chunk_making import LEAST_ROWS, make_missing_chunks
+from webots_mcp.store.chunk_making import MIN_ROWS_ON_DEMAND, make_missing_chunks
 from webots_mcp.store.recording import RecordingAccess
 
-ROWS = 4 * LEAST_ROWS
+ROWS = 4 * MIN_ROWS_ON_DEMAND
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_what_is_called_off_or_interrupted_goes_on_with_the_next_question(
 ) -> None:
     assert "ask again" in make_missing_chunks(recording, called_off=lambda: True)
     first = in_chunks(recording)
-    assert LEAST_ROWS <= first < ROWS
+    assert MIN_ROWS_ON_DEMAND <= first < ROWS
 
     def interrupt(_done: int, _of: int) -> None:
         raise KeyboardInterrupt

@@ -193,7 +193,7 @@ def test_no_number_and_no_text_crashes_a_function_or_makes_a_line_that_does_not_
         command = [program, seed, "12", "150"]
         done = subprocess.run(command, env=environment, capture_output=True, check=False)
         assert (done.returncode, done.stdout, done.stderr) == (0, b"well\n", b"")
-        RecordingAccess(folder / "webots.db", folder).take_in()
+        RecordingAccess(folder / "webots.db", folder).ingest()
         assert journal_parts(folder / "webots.db") == {}
         assert read(folder, "SELECT count(*) > 0 FROM state") == [(1,)]
         whys = read(folder, "SELECT json_extract(data, '$.why') FROM event WHERE kind = 'dropped'")
@@ -244,7 +244,7 @@ from webots_mcp.store.recording import RecordingAccess
 folder = Path(sys.argv[1])
 print("ready", flush=True)
 while True:
-    RecordingAccess(folder / "webots.db", folder).take_in()
+    RecordingAccess(folder / "webots.db", folder).ingest()
     time.sleep(0.001)
 """
 
@@ -271,7 +271,7 @@ def test_kills_lose_nothing_and_double_nothing(start: Start, tmp_path: Path) -> 
         for reader in readers:
             reader.communicate()
         while journal_parts(folder / "webots.db"):  # one answer has no time for thousands of rows
-            RecordingAccess(folder / "webots.db", folder).take_in()
+            RecordingAccess(folder / "webots.db", folder).ingest()
         found = [
             n for (n,) in read(folder, "SELECT json_extract(data, '$.i') FROM state ORDER BY id")
         ]

@@ -20,7 +20,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.database.waiting_file import journal_parts
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.journal_intake import ingest_journals
 from webots_mcp.store.recording import RecordingAccess, view_of
 from webots_mcp.store.robots import list_robots
 
@@ -53,7 +53,7 @@ def require_rows(folder: Path, expected: dict[str, Any]) -> None:
     assert "dropped" in expected or rows(folder, "dropped") == [[0]]
 
 
-@pytest.mark.parametrize("pieces", [1, 2, 211])
+@pytest.mark.parametrize("pieces", [1, 2, pytest.param(211, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_a_journal_comes_to_its_rows(
     file: Path, pieces: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -67,12 +67,12 @@ def test_a_journal_comes_to_its_rows(
         for start in range(0, len(data), max(size, 1)):
             journal.write(data[start : start + max(size, 1)])
             if pieces > 1:
-                recording.take_in()
+                recording.ingest()
                 assert part(tmp_path).exists()
-    recording.take_in()  # its writer is gone
+    recording.ingest()  # its writer is gone
     for _ in range(2):
         with recording.writer() as connection:
-            take_in_journals(connection, tmp_path / "webots.db")  # as a server does each second
+            ingest_journals(connection, tmp_path / "webots.db")  # as a server does each second
     require_rows(tmp_path, expected)
     assert part(tmp_path).exists() == expected.get("left", False)
     assert ("cannot be taken in" in capsys.readouterr().err) == expected.get("left", False)
@@ -89,7 +89,7 @@ def test_parts_are_taken_in_one_after_the_other_and_deleted_when_they_are_comple
     recording = RecordingAccess(tmp_path / "webots.db", tmp_path)
     with part(tmp_path, 10).open("ab") as living:
         fcntl.flock(living, fcntl.LOCK_EX)
-        recording.take_in()
+        recording.ingest()
         assert [json.loads(data)["x"] for _, data, _ in rows(tmp_path, "state")] == [*range(2, 12)]
         assert journal_parts(tmp_path / "webots.db") == {SESSION: [part(tmp_path, 10)]}
 
@@ -98,10 +98,10 @@ def test_no_part_is_read_before_one_that_cannot_be(tmp_path: Path) -> None:
     text = (FILES[0].parent / "cut_line.jsonl").read_text()
     part(tmp_path, 1).write_text(text.replace('waiting":1', 'waiting":9'))
     part(tmp_path, 2).write_text(text)
-    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).ingest()
     assert rows(tmp_path, "state") == []
     part(tmp_path, 1).unlink()
-    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).ingest()
     assert len(rows(tmp_path, "state")) == 1
 
 
@@ -111,7 +111,7 @@ def test_a_reader_that_may_not_write_says_what_waits(tmp_path: Path) -> None:
         fcntl.flock(living, fcntl.LOCK_EX)
         living.write(text)
         living.flush()
-        RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
+        RecordingAccess(tmp_path / "webots.db", tmp_path).ingest()
         living.write(text.splitlines()[-2].replace("[2,", "\n[3,") + "\n")
         living.flush()
         with RecordingAccess(tmp_path / "webots.db", tmp_path, read_only=True).view() as view:
@@ -149,7 +149,7 @@ def test_what_there_is_no_time_for_waits_also_where_there_are_many_journals(
     with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
         create_schema(connection)
         for begun in (1, 1, 2, 2, 3, 3, 4, 4):  # read, and then found to be at its end
-            take_in_journals(connection, tmp_path / "webots.db", budget_s=0.0)
+            ingest_journals(connection, tmp_path / "webots.db", budget_s=0.0)
             assert len(rows(tmp_path, "session")) == begun
     assert journal_parts(tmp_path / "webots.db") == {}
 
@@ -170,7 +170,7 @@ def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(
         lines = (header, [1, "run", None, run], state, end)
         path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
         os.utime(path, (value, value))  # in this order
-    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).ingest()
     assert [data for _, data, _ in rows(tmp_path, "state")] == ['{"x":1}']
     assert rows(tmp_path, "run") == [["1", "start", 1.0, 1, "finished"]]
 
@@ -187,7 +187,7 @@ def test_what_a_journal_dates_in_the_future_was_seen_when_it_was_taken_in(tmp_pa
         living.write("".join(f"{json.dumps(line)}\n" for line in lines))
         living.flush()
         recording = RecordingAccess(tmp_path / "webots.db", tmp_path)
-        recording.take_in()
+        recording.ingest()
         with recording.reader() as connection:
             (robot,) = list_robots(connection, in_a_minute_s := time.time() + 60)
             status = view_of(connection, robot, in_a_minute_s).status.text
@@ -204,7 +204,7 @@ def test_a_journal_with_the_uuid_of_a_bridges_session_is_left_and_reported(
     header = {"webots_mcp_waiting": 1, "robot": {"name": "rover"}, "session": session}
     end = [9, "session end", None, {"reason": "finished", "now": 1.0}]
     journal.write_text(f"{json.dumps(header)}\n{json.dumps(end)}\n")
-    RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
+    RecordingAccess(tmp_path / "webots.db", tmp_path).ingest()
     assert journal.exists() and rows(tmp_path, "session") == [[None, 0]]
     assert "its session is that of a bridge" in capsys.readouterr().err
     bridge.close()

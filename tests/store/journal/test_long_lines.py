@@ -20,7 +20,7 @@ from tests.store.journal.test_conformance import part
 from tests.store.journal.test_unfit_values import HEADER, RUN, RUN_VALUES
 from tests.waiting import wait_for
 from webots_mcp.errors import DatabaseError
-from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.journal_intake import ingest_journals
 from webots_mcp.store.recording import RecordingAccess
 
 LINES = 30
@@ -49,7 +49,7 @@ def test_an_intake_ends_with_its_budget_goes_on_later_and_says_what_is_left(fold
     with recording.writer() as connection:
         counts = [0]
         for _ in range(6):
-            take_in_journals(connection, folder / "webots.db", budget_s=0.0)
+            ingest_journals(connection, folder / "webots.db", budget_s=0.0)
             counts.append(states(folder))
     assert all(after - before in (0, 1) for before, after in pairwise(counts))
     assert 0 < counts[-1] < LINES
@@ -81,7 +81,7 @@ def test_an_intake_waits_for_that_of_another_thread_no_longer_than_its_budget(
     def take_in_all() -> None:
         with suppress(DatabaseError), recording.writer() as connection:
             connection.set_progress_handler(ending.is_set, 100)
-            take_in_journals(connection, folder / "webots.db")
+            ingest_journals(connection, folder / "webots.db")
 
     ending = threading.Event()
     other = threading.Thread(target=take_in_all)
@@ -89,7 +89,7 @@ def test_an_intake_waits_for_that_of_another_thread_no_longer_than_its_budget(
     try:
         wait_for(lambda: states(folder) > 0)
         with recording.writer() as connection:
-            take_in_journals(connection, folder / "webots.db", budget_s=0.0)
+            ingest_journals(connection, folder / "webots.db", budget_s=0.0)
         taken_in.append(states(folder))
     finally:
         ending.set()

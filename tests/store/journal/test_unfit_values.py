@@ -14,7 +14,7 @@ import pytest
 
 from tests.store.journal.test_conformance import SESSION, part, rows
 from webots_mcp.cli import main
-from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.journal_intake import ingest_journals
 from webots_mcp.store.recording import RecordingAccess
 
 RUN = "11111111-2222-4333-8444-555555555555"
@@ -55,7 +55,7 @@ def state(number: int, run: str = RUN) -> str:
 
 def take_in(folder: Path, *lines: str, start: bytes = b"") -> None:
     part(folder).write_bytes(start + "".join(f"{line}\n" for line in lines).encode())
-    RecordingAccess(folder / "webots.db", folder).take_in()
+    RecordingAccess(folder / "webots.db", folder).ingest()
 
 
 def query(folder: Path, sql: str) -> list[Any]:
@@ -178,7 +178,7 @@ def test_a_part_of_which_nothing_fits_is_kept_and_those_after_it_are_read(
     run = f'[1,"run",null,{json.dumps(RUN_VALUES)}]'
     part(tmp_path, 2).write_text(f"{json.dumps(HEADER)}\n{run}\n{state(2)}\n")
     for _ in range(2):
-        RecordingAccess(tmp_path / "webots.db", tmp_path).take_in()
+        RecordingAccess(tmp_path / "webots.db", tmp_path).ingest()
     assert numbers(tmp_path) == [2]
     assert part(tmp_path, 1).exists() and not part(tmp_path, 2).exists()
     main(["status", "--data-dir", str(tmp_path)])
@@ -257,9 +257,9 @@ def test_no_state_that_fits_is_lost_among_lines_that_do_not(seed: int, tmp_path:
         fcntl.flock(journal, fcntl.LOCK_EX)
         for start in range(0, len(data), len(data) // pieces + 1):
             journal.write(data[start : start + len(data) // pieces + 1])
-            recording.take_in()
+            recording.ingest()
     with recording.writer() as connection:  # its writer is gone
-        take_in_journals(connection, tmp_path / "webots.db")
+        ingest_journals(connection, tmp_path / "webots.db")
     found = numbers(tmp_path)
     assert [n for n in found if n in set(fitting)] == fitting
     assert not part(tmp_path).exists()

@@ -34,7 +34,7 @@ STATES = st.lists(
 def short_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Groups of eight rows, so that a short recording has several."""
     monkeypatch.setattr(chunk_making, "GROUP_ROWS", 8)
-    monkeypatch.setattr(chunk_making, "LEAST_AT_END", 8)
+    monkeypatch.setattr(chunk_making, "MIN_ROWS_AT_END", 8)
 
 
 def recorded(connection: sqlite3.Connection, states: list[dict[str, Any]]) -> None:
@@ -86,7 +86,7 @@ def test_zones_are_what_the_values_come_to(
         make_chunks(connection, 1000)
         frame = framed(connection).rows(start, stop)
         for name in ("a", "b", "c"):
-            zones = frame.zones(name)
+            zones = frame.zone_map(name)
             assert int(zones.row_count.sum()) == len(frame)
             for number, first in enumerate(zones.first_row.tolist()):
                 end = first + int(zones.row_count[number])

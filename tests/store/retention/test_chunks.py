@@ -17,7 +17,7 @@ from tests.store.retention.test_size import bytes_by_name
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.signals import register as signal_register
 from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
-from webots_mcp.store.purge import prune
+from webots_mcp.store.purge import prune, purge
 from webots_mcp.store.reading.catalogue import list_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, whole_run
@@ -75,11 +75,27 @@ def test_numbers_flags_and_texts_are_read_as_before_where_all_states_are_gone(
     assert recorded.connection.execute("SELECT purged_rows FROM run").fetchone() == (rows,)
 
 
+def test_states_go_by_whole_groups_and_nothing_is_read_twice(recorded: Recorded) -> None:
+    record(recorded, 3 * GROUP_ROWS)
+    before = contents(recorded.connection)
+    recorded.prune(states(rows=GROUP_ROWS * 5 // 2))
+    assert recorded.rows() == {1: 2 * GROUP_ROWS}
+    assert contents(recorded.connection) == before
+
+
 def test_where_half_of_a_group_is_left_in_state_nothing_is_read_twice(recorded: Recorded) -> None:
     record(recorded, 2 * GROUP_ROWS)
     before = contents(recorded.connection)
-    recorded.prune(states(rows=GROUP_ROWS // 2))
-    assert recorded.rows() == {1: GROUP_ROWS // 2}
+    make_chunks(recorded.connection, 10_000)
+    limits = states(rows=0)
+    wanted = plan(recorded.connection, limits, recorded.wall_s)
+    for done in purge(recorded.connection, wanted, recorded.folder):
+        if done.rows["state"] > GROUP_ROWS // 2:  # as after a kill
+            break
+    assert 0 < recorded.rows()[1] < 2 * GROUP_ROWS
+    assert contents(recorded.connection) == before
+    recorded.prune(limits)
+    assert recorded.rows() == {}
     assert contents(recorded.connection) == before
 
 
@@ -117,8 +133,8 @@ def test_a_state_is_deleted_only_once_it_is_in_a_chunk_also_of_a_run_that_goes_o
     for step in range(60):
         recorded.publish(step * ROW_S, {"x": step})
         if step % 20 == 19:
-            recorded.prune(states(rows=5))
-    assert recorded.rows() == {run_id: 5}
+            recorded.prune(states(rows=0))
+    assert recorded.rows() == {}
     frame = framed(recorded.connection, run_id)
     assert frame.numbers("x").tolist() == list(range(60))
     assert frame.unread == ()

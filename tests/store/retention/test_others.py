@@ -9,18 +9,23 @@ import pytest
 
 from tests.recordings.runs import Recorded
 from tests.store.retention.conftest import TABLES
+from webots_mcp.store import retention_plan
 from webots_mcp.store.retention import Limit, Retention
 
 
-def test_logs_events_and_pictures_have_limits_of_their_own(recorded: Recorded) -> None:
+def test_logs_events_and_pictures_have_limits_of_their_own(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = {"kept_state": 1, "log": 5, "event": 5, "image": 1}
+    monkeypatch.setattr(retention_plan, "_BLOCK_IDS", blocks)
     for _ in range(3):
         recorded.add_run(40)
     before = Counter({table: recorded.count(table) for table in TABLES})
-    few = Limit(rows=25, spared_rows=0)
+    few = Limit(rows=26, spared_rows=0)
     limits = Retention(Limit(), Limit(), few, few, Limit(rows=2, spared_rows=0), outlive=0)
     done = recorded.prune(limits)
-    assert [recorded.count(table) for table in ("log", "event", "image")] == [25, 25, 2]
-    assert done.rows == Counter(log=35, event=35, image=1)
+    assert [recorded.count(table) for table in ("log", "event", "image")] == [26, 26, 2]
+    assert done.rows == Counter(log=34, event=34, image=1)
     assert done.files == 1
     assert recorded.count("state") == before["state"]
 

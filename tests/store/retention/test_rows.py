@@ -16,16 +16,26 @@ from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.conftest import TABLES
 from webots_mcp.database.liveness import end_session
 from webots_mcp.errors import InvalidInputError, UnknownRunError
+from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.purge import purge
 from webots_mcp.store.retention import Limit, Retention, mark_kept
 from webots_mcp.store.retention_plan import plan
 
 
-def test_finished_runs_lose_their_oldest_rows_first(recorded: Recorded) -> None:
+@pytest.fixture
+def short_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups of ten rows."""
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 10)
+    monkeypatch.setattr(chunk_making, "MIN_ROWS_AT_END", 10)
+
+
+def test_the_oldest_groups_go_first_until_the_rest_fits(
+    short_groups: None, recorded: Recorded
+) -> None:
     for rows in (100, 50, 30):
         recorded.add_run(rows)
-    recorded.prune(states(rows=100, spared_rows=0))
+    recorded.prune(states(rows=105, spared_rows=0))
     assert recorded.rows() == {1: 20, 2: 50, 3: 30}
     oldest = recorded.connection.execute("SELECT min(sim_time_s) FROM state WHERE run_id = 1")
     assert oldest.fetchone() == (80 * ROW_S,)
@@ -36,39 +46,54 @@ def test_finished_runs_lose_their_oldest_rows_first(recorded: Recorded) -> None:
 def test_a_crashed_run_is_counted_with_its_purged_rows(recorded: Recorded) -> None:
     recorded.add_run(100, end=None)
     recorded.connection.execute("UPDATE session SET host = 'elsewhere'")
-    recorded.prune(states(rows=40, spared_rows=0))
+    recorded.prune(states(rows=0, spared_rows=0))
     end_session(recorded.connection, 1, "crashed")
     sql = "SELECT row_count, purged_rows FROM run"
-    assert recorded.connection.execute(sql).fetchone() == (100, 60)
+    assert recorded.connection.execute(sql).fetchone() == (100, 100)
 
 
-def test_rows_go_in_the_order_in_which_they_were_recorded_whatever_their_run(
-    recorded: Recorded,
+def test_groups_go_in_the_order_in_which_they_were_recorded_whatever_their_run(
+    short_groups: None, recorded: Recorded
 ) -> None:
     first = recorded.add_run(0, end=None)
     second = recorded.add_run(0, robot_id=recorded.robot("other"), end=None)
     for i in range(40):
         recorded.run_id = (first, second)[i % 2]
         recorded.publish(i * ROW_S, {"x": i})
-    recorded.prune(states(rows=10))
-    assert recorded.connection.execute("SELECT min(id), count(*) FROM state").fetchone() == (31, 10)
-    assert recorded.rows() == {first: 5, second: 5}
+    recorded.prune(states(rows=20))
+    assert recorded.connection.execute("SELECT min(id), count(*) FROM state").fetchone() == (21, 20)
+    assert recorded.rows() == {first: 10, second: 10}
 
 
-def test_a_size_and_a_number_of_rows_hold_for_the_current_run_too(recorded: Recorded) -> None:
+def test_a_size_and_a_number_of_rows_hold_for_the_current_run_too(
+    short_groups: None, recorded: Recorded
+) -> None:
     recorded.add_run(100)
     recorded.add_run(100, end=None)
     recorded.prune(states(rows=30, spared_rows=50))
     assert recorded.rows() == {2: 30}
 
 
+def test_of_a_limit_below_the_size_of_a_group_the_newest_group_stays_but_of_0_none(
+    short_groups: None, recorded: Recorded
+) -> None:
+    recorded.add_run(100, end=None)
+    recorded.prune(states(rows=1))
+    assert recorded.rows() == {1: 10}
+    recorded.prune(states(size_bytes=1))
+    assert recorded.rows() == {1: 10}
+    recorded.prune(states(size_bytes=0))
+    assert recorded.rows() == {}
+
+
 def test_the_newest_rows_of_all_runs_together_do_not_go_because_of_their_age(
-    recorded: Recorded,
+    short_groups: None, recorded: Recorded
 ) -> None:
     other = recorded.robot("other")
     for _ in range(2):
         recorded.add_run(20, robot_id=other)
         recorded.add_run(20)
+    make_chunks(recorded.connection)
     limits = states(age_s=0, spared_rows=30)
     (spared,) = plan(recorded.connection, limits, recorded.wall_s + 1).spared
     assert (spared.table, spared.rows) == ("state", 30)
@@ -81,7 +106,7 @@ def test_the_newest_rows_of_all_runs_together_do_not_go_because_of_their_age(
 
 @pytest.mark.parametrize("column", ["started_wall_time_s", "last_wall_time_s"])
 def test_a_run_whose_times_are_no_numbers_stays_and_holds_up_nothing(
-    recorded: Recorded, column: str
+    short_groups: None, recorded: Recorded, column: str
 ) -> None:
     for _ in range(3):
         recorded.add_run(50)
@@ -135,15 +160,13 @@ def test_a_run_that_was_named_described_or_marked_loses_nothing(
     assert not (recorded.folder / "camera" / "2.png").exists()
 
 
-def test_rows_go_by_age_also_within_a_run(recorded: Recorded) -> None:
+def test_groups_go_by_age_also_within_a_run(short_groups: None, recorded: Recorded) -> None:
     recorded.add_run(100, end=None)
     start_s = recorded.connection.execute("SELECT min(wall_time_s) FROM state").fetchone()[0]
     kept_s = 40 * ROW_S * 0.5  # wall time passes half as fast as simulation time here
     now_s = start_s + 99 * ROW_S * 0.5
     recorded.prune(states(age_s=kept_s, spared_rows=0), now_s)
-    oldest_s = recorded.connection.execute("SELECT min(wall_time_s) FROM state").fetchone()[0]
-    assert oldest_s >= now_s - kept_s
-    assert recorded.rows() == {1: 41}
+    assert recorded.rows() == {1: 50}  # 41 are young enough, and the rest of their group stays
 
 
 def test_a_run_that_is_marked_after_the_plan_was_made_loses_nothing_more(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 import sqlite3
 from contextlib import closing
@@ -13,7 +12,7 @@ import pytest
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.store import purge as upkeep_work
+from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.retention import Limit, Retention
@@ -34,6 +33,10 @@ def mixed(low: int, high: int) -> list[int]:
     return [low + number * 7919 % (high - low) for number in range(97)]
 
 
+def shown(value: list[int] | int) -> str:
+    return f"{min(value)} to {max(value)} bytes" if isinstance(value, list) else f"{value} runs"
+
+
 @pytest.mark.parametrize(
     ("lengths", "runs"),
     [
@@ -43,7 +46,7 @@ def mixed(low: int, high: int) -> list[int]:
         (mixed(200, 3000), 6),
         (mixed(1300, 9000), 1),
     ],
-    ids=lambda each: f"{min(each)} to {max(each)} bytes" if isinstance(each, list) else f"{each}",
+    ids=shown,
 )
 def test_what_states_take_is_known_within_a_twentieth_of_what_sqlite_says(
     tmp_path: Path, lengths: list[int], runs: int
@@ -66,7 +69,10 @@ def test_what_states_take_is_known_within_a_twentieth_of_what_sqlite_says(
 
 
 @pytest.mark.parametrize("length", [1300, 1500, 2500, 3000, 6000])
-def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int) -> None:
+def test_the_file_of_long_rows_shrinks_to_the_limit(
+    tmp_path: Path, length: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 16)
     file = tmp_path / "webots.db"
     with closing(connect(file, "writer", create=True)) as connection:
         create_schema(connection)
@@ -88,9 +94,8 @@ def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int)
 
 
 def test_the_file_of_a_recording_that_goes_on_stays_within_a_twentieth_of_its_limits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(upkeep_work, "PLANNING_SHARE", math.inf)  # on a slow machine too
     file, noise = tmp_path / "webots.db", random.Random(5)
     sizes_of = {"state": 2_000_000, "chunk": 1_200_000, "log": 600_000}
     of_states, of_chunks, of_logs = (Limit(size_bytes=each) for each in sizes_of.values())

@@ -40,7 +40,7 @@ from webots_mcp.store.project_file import ALL, Expected
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot
-from webots_mcp.store.recording import rows_beside
+from webots_mcp.store.recording import waiting_rows_note
 from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import run_info
@@ -184,7 +184,7 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
     if run.info.end_reason and waiting:
         left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
         return Finding("warn", left)
-    if beside := rows_beside(run.search.connection):
+    if beside := waiting_rows_note(run.search.connection):
         return Finding("warn", beside)
     rows = f"all {run.info.row_count} rows {verb}" if run.info.row_count > 1 else "its only row is"
     return Finding("pass", f"{rows} recorded")
@@ -266,7 +266,7 @@ def understands_signals(run: RunUnderCheck) -> Finding:
     changes: Counter[str] = Counter()
     understood = 0
     for name, signal in run.search.known.items():
-        zones = run.frame.zones(name)
+        zones = run.frame.zone_map(name)
         if not signal.is_number or not zones.value_count.any():
             continue
         if run.meanings[name].quantity is not None:

@@ -132,6 +132,8 @@ class RunUnderCheck:
         for kind in check.kinds:
             if why := self.found.verdicts.unlooked(kind):
                 raise NotSearchableError(why)
+            if not self.found.verdicts.knows(kind):
+                raise NotSearchableError(check.needs)
         if check.of_values and not len(self.frame):
             none = f"run {self.info.run_id} has no state row: call bridge.publish"
             raise NotSearchableError("; ".join(map(str, self.frame.unread)) or none)

@@ -93,7 +93,9 @@ def rests_when_commanded(run: RunUnderCheck) -> Finding:
 def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
     """How it moved in some rows, beyond the noise of its heading and position."""
     ends = max(1, min(len(part) // 4, 50))
-    if (heading := run.motion.heading) is not None:
+    motion = run.motion
+    may_turn = motion.turn_command is None and not motion.wheel_commands  # by a command unknown
+    if (heading := motion.heading) is not None and not may_turn:
         turn = heading.turn or math.tau
         course = part.numbers(heading.name)
         course = unwrap(course[np.isfinite(course)], turn) * math.tau / turn
@@ -102,8 +104,8 @@ def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
             noise = run.noise.of(heading.name) * math.tau / turn
             if abs(turned) > max(TURNED_RAD, _NOISE * noise):
                 yield f"turned by {turned:.2g} rad in {part.bounds_s[1] - part.bounds_s[0]:.3g} s"
-    if run.motion.position is not None:
-        rows, x, y = places_in(part, run.motion.position)
+    if motion.position is not None and (motion.commanded or motion.wheel_commands):
+        rows, x, y = places_in(part, motion.position)
         if len(rows) > 2 * ends:
             way_m = math.hypot(*(median(each[-ends:]) - median(each[:ends]) for each in (x, y)))
             if way_m > max(run.search.options.stuck_m, _NOISE * run.noise.position_m):

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 from webots_mcp.analysis.arrays import np, runs_of
 from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times
@@ -77,8 +77,7 @@ def _missing_items(run: RunUnderCheck) -> Finding | None:
         items = [
             [value is None for value in values]
             for state, replaced in states
-            if _FAULTY in str(replaced.get(f"{name}.*", ""))
-            and isinstance(values := value_at(state, name), list)
+            if _FAULTY in str(replaced.get(f"{name}.*", "")) and (values := _array_at(state, name))
         ]
         if not items or len(items) < len(states) or len({len(each) for each in items}) > 1:
             continue
@@ -91,13 +90,12 @@ def _missing_items(run: RunUnderCheck) -> Finding | None:
     return None
 
 
-def value_at(state: Any, name: str) -> Any:
-    """Return the value of a dotted name in a state; None where there is none."""
+def _array_at(state: dict[str, Any], name: str) -> list[Any]:
+    """Return the array of a dotted name in a state; an empty one where there is none."""
+    value: Any = state
     for key in name.split("."):
-        if not isinstance(state, dict) or key not in state:
-            return None
-        state = state[key]
-    return state
+        value = cast("dict[str, Any]", value).get(key) if isinstance(value, dict) else None
+    return cast("list[Any]", value) if isinstance(value, list) else []
 
 
 def sensors_live(run: RunUnderCheck) -> Finding:
@@ -214,7 +212,7 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
             or run.meanings[name].quantity == "distance"
         ):
             continue
-        zones = run.frame.zones(name)
+        zones = run.frame.zone_map(name)
         if zones.change_count.sum() < _MANY_VALUES:
             continue
         clock, values = run.frame.usable(name)
@@ -256,7 +254,7 @@ def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
     if quantity in INERT:
         return True
     if quantity == "distance":  # other things may pass a sensor, but not at its very ends
-        zones = run.frame.zones(jump.name or "")
+        zones = run.frame.zone_map(jump.name or "")
         ends = (0.0, float(np.nanmin(zones.min)), float(np.nanmax(zones.max)))
         return float(jump.details["after"]) in ends
     return False

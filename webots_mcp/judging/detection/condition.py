@@ -46,7 +46,7 @@ from webots_mcp.signals.naming import FARTHEST_M, NO_POSITION, Value, find_posit
 from webots_mcp.store.reading.catalogue import say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import recorded_share
-from webots_mcp.store.reading.segment import Segment, just_after, kept_parts
+from webots_mcp.store.reading.segment import Segment, full_rate_parts, just_after
 from webots_mcp.store.signals import RegisteredSignal
 
 _MOST_VALUES: Final = 8
@@ -115,7 +115,7 @@ def _read(search: Search, segment: Segment, condition: Condition) -> Frame:
     before = search.whole.rows(place - _ROWS_BEFORE, place)
     known_from_s = before.bounds_s[0] if len(before) else start_s
     longer = replace(segment, start_s=min(known_from_s, start_s - condition.remembers_s))
-    every_call = bool(kept_parts(search.connection, run_id, longer.start_s, segment.end_s))
+    every_call = bool(full_rate_parts(search.connection, run_id, longer.start_s, segment.end_s))
     frame = read_frame(search.connection, longer, search.deadline, every_call=every_call)
     if not len(frame) and frame.unread:
         raise NotSearchableError("; ".join(map(str, frame.unread)))
@@ -156,7 +156,7 @@ def _require_known(condition: Condition, search: Search) -> None:
 def _require_values(condition: Condition, frame: Frame, position: tuple[str, str] | None) -> None:
     """Of what is never there a condition can ask only whether it is missing."""
     lost = condition.asks_position and position is None
-    missing = [name for name in condition.signals if not frame.zones(name).value_count.any()]
+    missing = [name for name in condition.signals if not frame.zone_map(name).value_count.any()]
     if "missing(" in condition.text or not (lost or missing):
         return
     names = ", ".join(sorted([*missing, *["the position"] * lost]))
@@ -386,7 +386,7 @@ class _OnArrays(Nodes):
         return self._frame.numbers(name)
 
     def _texts(self, name: str) -> Texts | None:
-        zones = self._frame.zones(name)
+        zones = self._frame.zone_map(name)
         if not ((zones.value_count < zones.held_count) | np.isnan(zones.min)).any():
             return None
         texts = Texts(*self._frame.texts(name))
@@ -398,7 +398,7 @@ def compared(frame: Frame, name: str, op: type[ast.cmpop], limit: float) -> Flag
 
     Decoded is only where the extremes of a chunk leave it open.
     """
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     is_full = zones.value_count == zones.row_count
     always, never = _verdicts(op, zones.min, zones.max, limit)
     holds = np.repeat(always & is_full, zones.row_count)
@@ -414,7 +414,7 @@ def position_in(frame: Frame, known: Mapping[str, RegisteredSignal]) -> tuple[st
     """The names of x and y of a robot, as far as they have values in a frame; None without any."""
     numbers = [name for name, signal in known.items() if signal.is_number]
     while (found := find_position(numbers)) is not None:
-        lacking = [name for name in found if not frame.zones(name).value_count.any()]
+        lacking = [name for name in found if not frame.zone_map(name).value_count.any()]
         if not lacking:
             return found
         numbers = [name for name in numbers if name not in lacking]

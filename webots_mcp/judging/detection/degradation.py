@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, noise_of, np
-from webots_mcp.judging.detection.kinds import Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.kinds import Event, EventKind, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.search import Search, places_in
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.signals import RegisteredSignal
@@ -40,6 +41,8 @@ def degradation_events(search: Search) -> Iterator[Event]:
     wanted = {each.name for each in search.signals}
     signals = [each for each in signals if each.name in wanted and not each.is_index]
     if not signals:
+        if "degradation" not in search.options.kinds:
+            raise NotAskedError
         raise NotSearchableError("no sensor is known whose noise does not depend on motion")
     for signal in search.in_time("degradation", signals):
         found = _change_of(search, signal)
@@ -58,7 +61,7 @@ def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, 
     if blocks < 2 * _LEAST_SIDE:
         return None
     edges = np.linspace(0, len(values), blocks + 1).astype(np.intp)
-    noises = np.array([noise_of(values[a:b]) for a, b in zip(edges, edges[1:], strict=False)])
+    noises = np.array([noise_of(values[a:b]) for a, b in pairwise(edges.tolist())])
     if noises.min() <= _ROUNDING * float(np.abs(values).max()):
         return None
     best: tuple[float, int] | None = None

@@ -166,7 +166,7 @@ class Found:
         verdicts = replace(self.verdicts, found=found)
         return replace(self, entries=tuple(placed(events)), verdicts=verdicts)
 
-    def told(self, connection: sqlite3.Connection, limit: int) -> Events:
+    def page(self, connection: sqlite3.Connection, limit: int) -> Events:
         """An answer of at most `limit` events: see `choose`.
 
         Args:
@@ -222,7 +222,7 @@ def find_events(
         connection, time_range, options, around=around, group=group, after=after,
         deadline_s=deadline_s,
     )  # fmt: skip
-    return found.told(connection, limit)
+    return found.page(connection, limit)
 
 
 @in_one_snapshot

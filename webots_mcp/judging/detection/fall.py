@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
-from webots_mcp.judging.detection.kinds import Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.kinds import Event, EventKind, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.reading.frame import Frame
@@ -28,6 +28,8 @@ def fall_events(search: Search) -> Iterator[Event]:
     """From where the tilt leaves the upright range to where the robot stands again, if ever."""
     signals = {quantity: _signal(search, quantity) for quantity in ("roll", "pitch")}
     if not any(signals.values()):
+        if "fall" not in search.options.kinds:
+            raise NotAskedError
         raise NotSearchableError(NO_ATTITUDE)
     times, tilt = tilt_of(search.frame, signals["roll"], signals["pitch"])
     if len(times) < 2:
@@ -87,15 +89,15 @@ def tilt_of(
     up = np.stack((-np.sin(along), np.sin(across) * np.cos(along), np.cos(across) * np.cos(along)))
     first = np.median(up[:, times <= times[0] + SETTLED_S], axis=1)
     first /= np.linalg.norm(first) or 1.0
-    return times, np.arccos(np.clip(first @ up, -1.0, 1.0))
+    return times, np.arccos(np.minimum(np.maximum(first @ up, -1.0), 1.0))
 
 
 def _signal(search: Search, quantity: Quantity) -> RegisteredSignal | None:
     """The first signal of that quantity that has values and is measured."""
     for name, meaning in search.meanings.items():
-        if meaning.quantity == quantity and meaning.is_sensed:
-            if search.whole.zones(name).value_count.any():
-                return search.known[name]
+        is_one = meaning.quantity == quantity and meaning.is_sensed
+        if is_one and search.whole.zone_map(name).value_count.any():
+            return search.known[name]
     return None
 
 

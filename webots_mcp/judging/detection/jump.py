@@ -30,7 +30,7 @@ from webots_mcp.judging.detection.kinds import (
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.meaning import ANGLES, Meaning
 from webots_mcp.signals.naming import metres_in
-from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.reading.frame import Frame, ZoneMap
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
 MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
@@ -46,7 +46,7 @@ POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percen
 WHOLE_TURNS: Final = (math.tau, 360.0)
 COUNTERS: Final = tuple(float(2**bits) for bits in (8, 10, 12, 14, 15, 16, 24, 32))
 NEARLY_A_TURN: Final = 0.9
-LEAST_UNITS: Final = 3.0  # of the last digit: fewer may be its rounding
+LEAST_UNITS: Final = 1.5  # of the last digit: a single one is its rounding
 MOST_DIGITS: Final = 9
 SAME_END: Final = 0.9  # of the pulses of a signal: so many go to one end of its range
 SWING_PERIOD_S: Final = 5.0  # of a longer one no single step is as a jump
@@ -78,7 +78,7 @@ def jump_events(search: Search) -> Iterator[Event]:
             unit = f" {signal.unit}" if signal.unit else ""
             near = f"{signal.name}: steps up to {largest:.2g}{unit}, a jump is one over {least:.2g}"
             search.note_nearest("jump", largest / least, near + unit)
-        rows = int(frame.zones(signal.name).value_count.sum())
+        rows = int(frame.zone_map(signal.name).value_count.sum())
         if len(jumps) > max(3, MOST_JUMPS_SHARE * rows):
             dropouts = _to_one_end(jumps, frame, signal.name)
             yield from (_event(search, signal.name, each) for each in dropouts)
@@ -125,7 +125,7 @@ def _above_resolution(jumps: Sequence[Jump], frame: Frame, name: str) -> Sequenc
     """Those of more than a few units of the last digit that the signal has."""
     if not jumps:
         return jumps
-    spans = _sampled(frame.zones(name), frame.zones(name).value_count, 1)
+    spans = _sampled(frame.zone_map(name), frame.zone_map(name).value_count, 1)
     values = np.concatenate([np.zeros(0), *(frame.rows(*span).usable(name)[1] for span in spans)])
     unit = resolution_of(values)
     return [each for each in jumps if each.size > LEAST_UNITS * unit]
@@ -134,10 +134,9 @@ def _above_resolution(jumps: Sequence[Jump], frame: Frame, name: str) -> Sequenc
 def resolution_of(values: Array) -> float:
     """The unit of the last decimal digit of some values; 0 of those that are not rounded."""
     for digits in range(MOST_DIGITS + 1):
-        scaled = values * 10**digits
-        if np.all(
-            np.abs(scaled - np.round(scaled)) <= 1e-6 * np.maximum(1.0, np.abs(scaled) * 1e-6)
-        ):
+        scaled: Array = values * 10.0**digits
+        off: Array = np.abs(scaled - np.rint(scaled))
+        if np.all(off <= 1e-6 * np.maximum(1.0, np.abs(scaled) * 1e-6)):
             return float(10**-digits)
     return 0.0
 
@@ -147,7 +146,7 @@ def _to_one_end(jumps: Sequence[Jump], frame: Frame, name: str) -> Sequence[Jump
     pulses = [each for each in jumps if each.back is not None]
     if not pulses:
         return []
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     ends = (float(np.nanmin(zones.min)), float(np.nanmax(zones.max)))
     found: list[Jump] = []
     for end in ends:
@@ -204,7 +203,7 @@ def find_jumps(
         score: How much larger than usual a step has to be.
         turns: Where its values may begin again at 0.
     """
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     changes, largest = _steps_of(zones)
     for most in (1, SAMPLED_CHUNKS):
         parts = [frame.rows(*span).usable(name) for span in _sampled(zones, changes, most)]
@@ -240,7 +239,7 @@ def _interval_s(parts: Sequence[Array]) -> float:
     return usual_interval_s(max(parts, key=len, default=np.zeros(0))) or math.inf
 
 
-def _steps_of(zones: Zones) -> tuple[Indexes, Array]:
+def _steps_of(zones: ZoneMap) -> tuple[Indexes, Array]:
     """How often a signal changes in each chunk, and its largest step, with those into the chunk."""
     changes: Indexes = np.array(zones.change_count)
     largest = np.nan_to_num(zones.largest_step)
@@ -251,7 +250,7 @@ def _steps_of(zones: Zones) -> tuple[Indexes, Array]:
     return changes, largest
 
 
-def _sampled(zones: Zones, weights: Indexes, most: int) -> list[tuple[int, int]]:
+def _sampled(zones: ZoneMap, weights: Indexes, most: int) -> list[tuple[int, int]]:
     """Rows of some chunks, at equal shares of all weights; all that have one, if these are few."""
     sampled = weights > 0
     if np.count_nonzero(sampled) > most:
@@ -412,7 +411,7 @@ def find_leaps(frame: Frame, x: str, y: str, at_least_m: float) -> list[tuple[fl
         y: That of the other.
         at_least_m: Shorter ones are none.
     """
-    zones, of_y = frame.zones(x), frame.zones(y)
+    zones, of_y = frame.zone_map(x), frame.zone_map(y)
     along = _steps_of(zones)[1] * metres_in(x), _steps_of(of_y)[1] * metres_in(y)
     has_gaps: Flags = zones.value_count + of_y.value_count < 2 * zones.row_count
     # After a row that lacks one of them, the step is that of several rows.

@@ -320,6 +320,10 @@ class Verdicts:
         looked = kind in self.found or kind in self.not_found
         return None if looked else self.not_searched.get(kind)
 
+    def knows(self, kind: str) -> bool:
+        """Whether a kind was searched, or is said not to have been."""
+        return kind in self.found or kind in self.not_found or kind in self.reasons
+
     def unread(self, kind: str) -> list[str]:
         """What of the range could not be read for a kind: its count is that of the rest."""
         return [each for each in self.reasons.get(kind, ()) if each.startswith(NOT_READ)]

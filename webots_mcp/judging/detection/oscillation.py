@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, gap_borders, np, usual_interval_s
-from webots_mcp.analysis.fast_swings import Course, course_of, find_fast_swings
+from webots_mcp.analysis.fast_swings import SwingCourse, course_of, find_fast_swings
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.analysis.swings import (
     SLOW_HALF_SWINGS,
@@ -25,7 +25,7 @@ from webots_mcp.judging.detection.kinds import (
 )
 from webots_mcp.judging.detection.search import MOST_NAMED, Search
 from webots_mcp.signals.naming import in_snake_case, listed
-from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.signals import RegisteredSignal
 
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
@@ -86,13 +86,15 @@ def _longest_period_s(search: Search) -> float:
     return max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
 
 
-def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tuple[str, Course]]:
+def _found(
+    search: Search, signals: Sequence[RegisteredSignal]
+) -> Iterator[tuple[str, SwingCourse]]:
     """The swings of each signal, in the chunks in which it changes."""
     frame, least = search.frame, search.options.min_half_periods
     asked = least, _longest_period_s(search)
     shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
     for signal in search.in_time("oscillation", signals):
-        for span in _changing(frame.zones(signal.name), least):
+        for span in _changing(frame.zone_map(signal.name), least):
             if span not in shared:
                 part = frame.rows(*span)
                 shared[span] = part, EvenRows.of(part.times)
@@ -101,13 +103,16 @@ def _found(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[tupl
             rows = rows if len(times) == len(part) else EvenRows.of(times)
             if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
                 numbers = unwrap(numbers, signal.turn)
-            for swing in swings_in(rows, numbers, *asked):
-                yield signal.name, _course(swing, times, numbers)
-            for swing in find_fast_swings(rows, numbers, least):
-                yield signal.name, Course(swing, swing.amplitude, swing.amplitude)
+            found = [_course(swing, times, numbers) for swing in swings_in(rows, numbers, *asked)]
+            fast = (
+                SwingCourse(swing, swing.amplitude, swing.amplitude)
+                for swing in find_fast_swings(rows, numbers, least)
+                if not any(_overlap(swing, each.swing) for each in found)
+            )
+            yield from ((signal.name, each) for each in (*found, *fast))
 
 
-def _course(swing: Swing, times: Array, values: Array) -> Course:
+def _course(swing: Swing, times: Array, values: Array) -> SwingCourse:
     """The whole of an oscillation, in the rows around it without a gap."""
     gaps = gap_borders(times, usual_interval_s(times) or 0.0)
     edges = np.concatenate(([0], gaps, [len(times)]))
@@ -115,11 +120,15 @@ def _course(swing: Swing, times: Array, values: Array) -> Course:
     at = int(np.searchsorted(edges, row, "right")) - 1
     part = slice(int(edges[at]), int(edges[at + 1]))
     if swing.end_s > times[part][-1]:  # it goes on after a gap
-        return Course(swing, swing.amplitude, swing.amplitude)
+        return SwingCourse(swing, swing.amplitude, swing.amplitude)
     return course_of(swing, times[part], values[part])
 
 
-def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:
+def _overlap(one: Swing, other: Swing) -> bool:
+    return one.start_s <= other.end_s and other.start_s <= one.end_s
+
+
+def _changing(zones: ZoneMap, least: int) -> list[tuple[int, int]]:
     """Rows of the chunks in which the value changes, and of those next to them."""
     if int(zones.change_count.sum()) < least:
         return []

@@ -360,8 +360,8 @@ class ModeUses:
         self._known: dict[str, ModeUse] = {}
 
     def of(self, mode: str) -> ModeUse:
-        """What it did in a mode; runs are read until one of them shows that it moved."""
-        while not self._known.get(mode, ModeUse()).moving:
+        """What it did in a mode; runs are read until it moved in a few visits of it."""
+        while self._known.get(mode, ModeUse()).moving < LEAST_VISITS:
             if (frame := next(self._frames, None)) is None:
                 break
             self.is_cut |= frame.cut_at_s is not None
@@ -619,7 +619,7 @@ class Search:
             self.not_searched(kind, why)
 
     def _is_large(self, signal: RegisteredSignal) -> bool:
-        zones = self.frame.zones(signal.name)
+        zones = self.frame.zone_map(signal.name)
         spans = zones.spans(zones.value_count < zones.held_count)
         parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)
         return any((np.abs(part) > LARGEST).any() for part in parts)

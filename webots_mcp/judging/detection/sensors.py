@@ -16,16 +16,16 @@ from webots_mcp.analysis.arrays import (
     Flags,
     RowSpan,
     Runs,
+    constant_runs,
     noise_of,
     np,
-    runs_alike,
     runs_of,
 )
 from webots_mcp.judging.detection.kinds import Alike, Event, EventKind
 from webots_mcp.judging.detection.search import MOST_NAMED, Search
 from webots_mcp.signals.naming import find_targets, listed
 from webots_mcp.store.reading.catalogue import other_form
-from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.reading.segment import just_after
 from webots_mcp.store.signals import RegisteredSignal
 
@@ -55,7 +55,7 @@ def flat_events(search: Search) -> Iterator[Event]:
     resting: dict[str, _Resting] = {}
     frozen: list[tuple[_Resting, RowSpan]] = []
     for signal in search.in_time("flat", signals):
-        zones = (frame.zones(signal.name) for frame in (search.frame, search.whole))
+        zones = (frame.zone_map(signal.name) for frame in (search.frame, search.whole))
         if not any(changes_in(each) >= LEAST_CHANGES for each in zones):
             continue
         # Rests of others count where they cover most of one that counts.
@@ -82,7 +82,7 @@ def flat_events(search: Search) -> Iterator[Event]:
             yield shown.event(rest)
 
 
-def changes_in(zones: Zones) -> int:
+def changes_in(zones: ZoneMap) -> int:
     """Values unlike the one before, those at the borders of chunks too."""
     there = np.flatnonzero(~np.isnan(zones.first))
     over_borders = np.count_nonzero(zones.first[there[1:]] != zones.last[there[:-1]])
@@ -94,7 +94,7 @@ def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[RowSpan]:
 
     Opened are only the chunks with so many rows that repeat the one before, and their neighbours.
     """
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     # Of a rest across a border one of both chunks has at least half.
     lasts_s = np.maximum(zones.end_s - zones.start_s, least_s)
     least_rows = np.maximum(2, least_s / 2 * zones.row_count / lasts_s)
@@ -103,7 +103,7 @@ def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[RowSpan]:
     for first, stop in zones.spans(may_rest):
         part = frame.rows(first, stop)
         numbers = part.numbers(name)
-        runs = runs_alike(numbers, part.times)
+        runs = constant_runs(numbers, part.times)
         for run in runs.only(runs.durations_s >= least_s).spans():
             rows = {"start": first + run.start, "stop": first + run.stop}
             yield run._replace(**rows, value=float(numbers[run.start]))
@@ -129,7 +129,7 @@ class _Resting:
     @cached_property
     def changes(self) -> int:
         """Values unlike the one before, in all rows."""
-        return changes_in(self.search.frame.zones(self.signal.name))
+        return changes_in(self.search.frame.zone_map(self.signal.name))
 
     def changes_but_for(self, rests: Sequence[RowSpan]) -> bool:
         """Whether it changed in most of the rows outside of those rests, and in ten at least.
@@ -137,7 +137,7 @@ class _Resting:
         What goes from one of them right to the next, as a counter does, has not changed otherwise.
         """
         frame = self.search.frame
-        present = int(frame.zones(self.signal.name).value_count.sum())
+        present = int(frame.zone_map(self.signal.name).value_count.sum())
         first_s, last_s = frame.bounds_s
         flat_s = sum(rest.duration_s for rest in rests)
         outside = max(0.0, 1 - flat_s / (last_s - first_s)) if last_s > first_s else 0.0
@@ -225,7 +225,7 @@ class _Resting:
 
     def _extremes(self, signal: RegisteredSignal) -> tuple[float, float]:
         """Of the whole run."""
-        zones = self.search.whole.zones(signal.name)
+        zones = self.search.whole.zone_map(signal.name)
         low, high = (each[~np.isnan(each)] for each in (zones.min, zones.max))
         return float(low.min(initial=np.inf)), float(high.max(initial=-np.inf))
 
@@ -268,7 +268,7 @@ def is_noisy(values: Array) -> bool:
 
 def is_lively(run: Frame, name: str) -> bool:
     """Whether it mostly changed for 10 s somewhere in the run."""
-    zones = run.zones(name)
+    zones = run.zone_map(name)
     for chunk in np.argsort(-zones.change_count, kind="stable")[:MOST_OPENED].tolist():
         first = int(zones.first_row[chunk])
         times, values = run.rows(first, first + int(zones.row_count[chunk])).usable(name)
@@ -362,7 +362,7 @@ def _silences(search: Search, signal: RegisteredSignal) -> Runs:
 
 def rows_without_value(frame: Frame, name: str) -> Flags | None:
     """The rows that have no value of a signal; None where all have one, by the statistics."""
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     is_lacking = zones.value_count < zones.row_count
     if not is_lacking.any():
         return None
@@ -378,7 +378,7 @@ def _have_begun(search: Search, signals: Sequence[RegisteredSignal], runs: Runs)
     begun = (runs.starts_s > search.began_s) & (signals[0].kind != "null")
     if len(runs) and begun[0] and runs.starts[0] == 0:
         before = search.whole.between(search.began_s, float(runs.starts_s[0]))
-        begun[0] = any(before.zones(each.name).value_count.any() for each in signals)
+        begun[0] = any(before.zone_map(each.name).value_count.any() for each in signals)
     return begun
 
 
@@ -397,7 +397,7 @@ def _are_shorter(search: Search, signal: RegisteredSignal, runs: Runs) -> Flags:
 def _least_silence_s(search: Search, signal: RegisteredSignal, runs: Runs) -> float:
     """Longer for an intermittent signal: three times its usual interval between values."""
     least_s = search.options.missing_s
-    zones = search.frame.zones(signal.name)
+    zones = search.frame.zone_map(signal.name)
     is_usual = zones.value_count.sum() >= MOSTLY * zones.row_count.sum()
     if is_usual or len(runs) < MANY_SILENCES:
         return least_s

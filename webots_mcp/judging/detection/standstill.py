@@ -84,7 +84,7 @@ class Judged(NamedTuple):
     details: dict[str, Any]
 
 
-class Place(NamedTuple):
+class StandstillRows(NamedTuple):
     """Where it stood, and the rows of the frame in which it did: those with a position.
 
     Attributes:
@@ -123,7 +123,7 @@ class Standings:
         frame: Frame,
         motion: Motion,
         options: EventOptions,
-        places: Sequence[Place],
+        places: Sequence[StandstillRows],
         noise: RunNoise,
         uses: ModeUses,
     ) -> None:
@@ -258,7 +258,7 @@ class Standings:
         """The modes in some of the rows."""
         return np.flatnonzero(np.bincount(self.modes[rows])).tolist()
 
-    def facts(self, place: Place, rows: slice) -> dict[str, Any]:
+    def facts(self, place: StandstillRows, rows: slice) -> dict[str, Any]:
         """What is told of rows of a standstill, whether it was stuck or not."""
         facts: dict[str, Any] = {"x_m": place.x_m, "y_m": place.y_m}
         if self.motion.mode is not None:
@@ -392,7 +392,7 @@ class Standings:
             return True
         code = int(np.argmax(np.bincount(self.modes[rows])))
         use = self._use(code)
-        if use.moving >= LEAST_VISITS and not use.standing:
+        if use.moving >= LEAST_VISITS and use.standing <= 1:  # this visit is one of them
             return True
         last = int(self._frame_rows[rows.stop - 1])
         later = self._all_modes[last + 1 : last + 2]
@@ -569,7 +569,7 @@ def _nothing_says(motion: Motion, open_s: Sequence[float], count: int) -> str:
     return f"{which} from {min(open_s):.3f} s on cannot be judged: {lacking}"
 
 
-def _batches(places: Sequence[Place]) -> Iterator[Sequence[Place]]:
+def _batches(places: Sequence[StandstillRows]) -> Iterator[Sequence[StandstillRows]]:
     """The standstills in order, each time so many that they have about `JUDGED_AT_ONCE` rows."""
     start, rows = 0, 0
     for at, place in enumerate(places):
@@ -579,7 +579,9 @@ def _batches(places: Sequence[Place]) -> Iterator[Sequence[Place]]:
             start, rows = at + 1, 0
 
 
-def _places(track: SmoothedTrack, rows: Indexes, frame: Frame, search: Search) -> Iterator[Place]:
+def _places(
+    track: SmoothedTrack, rows: Indexes, frame: Frame, search: Search
+) -> Iterator[StandstillRows]:
     """The standstills of a track, in parts where it climbs or sinks in between."""
     motion, options = search.motion, search.options
     limits = options.stuck_m, options.stuck_s
@@ -591,7 +593,7 @@ def _places(track: SmoothedTrack, rows: Indexes, frame: Frame, search: Search) -
         for start, stop in ends:
             part = slice(start, stop)
             course = track.times[part], track.x[part], track.y[part]
-            yield Place(rows[part], *course, each.x_m, each.y_m, track.left_m)
+            yield StandstillRows(rows[part], *course, each.x_m, each.y_m, track.left_m)
 
 
 def _at_one_height(

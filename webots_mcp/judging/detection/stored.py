@@ -27,7 +27,7 @@ from webots_mcp.store.reading.frame_summary import (
     frame_around,
     rhythm_in,
 )
-from webots_mcp.store.reading.segment import Segment, kept_stretches
+from webots_mcp.store.reading.segment import Segment, full_rate_segments
 from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.run_rows import count_kept_frames
 
@@ -211,7 +211,7 @@ def kept_events(search: Search) -> Iterator[Event]:
     """The stretches that the segment touches; one that is not over reaches up to the newest row."""
     segment = search.segment
     span = (segment.holds_from_s, segment.holds_to_s)
-    for each in kept_stretches(search.connection, segment.run_id, *span):
+    for each in full_rate_segments(search.connection, segment.run_id, *span):
         end_s = max(each.start_s, min(each.end_s, search.ended_s))
         frames = count_kept_frames(search.connection, segment.run_id, each.start_s, each.end_s)
         details = {"reason": each.reason} | ({"frames": frames} if frames else {})  # of cameras

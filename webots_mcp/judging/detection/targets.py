@@ -10,7 +10,13 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
-from webots_mcp.judging.detection.kinds import Alike, Event, EventKind, NotSearchableError
+from webots_mcp.judging.detection.kinds import (
+    Alike,
+    Event,
+    EventKind,
+    NotAskedError,
+    NotSearchableError,
+)
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.meaning import HOLDING, targets_in, words_in
 from webots_mcp.store.signals import RegisteredSignal
@@ -42,15 +48,15 @@ def pursuits_in(search: Search) -> list[Pursuit]:
     there = {
         name: meaning
         for name, meaning in search.meanings.items()
-        if known[name].kind in ("num", "angle") and frame.zones(name).value_count.any()
+        if known[name].kind in ("num", "angle") and frame.zone_map(name).value_count.any()
     }
     found: list[Pursuit] = []
     for measured, target in targets_in(there):
-        zones = frame.zones(target)
+        zones = frame.zone_map(target)
         is_set = (zones.min < 0).any() or (zones.max > 0).any()
-        if is_set and there[measured].quantity not in _PLACES:
-            if HOLDING.isdisjoint(words_in(measured)):
-                found.append(Pursuit(known[measured], known[target]))
+        follows = there[measured].quantity not in _PLACES
+        if is_set and follows and HOLDING.isdisjoint(words_in(measured)):
+            found.append(Pursuit(known[measured], known[target]))
     return found
 
 
@@ -58,6 +64,8 @@ def off_target_events(search: Search) -> Iterator[Event]:
     """Where the median of each second is off the target, and not on its way to it, for 3 s."""
     pursuits = pursuits_in(search)
     if not pursuits:
+        if "off_target" not in search.options.kinds:
+            raise NotAskedError
         raise NotSearchableError(
             "no target, other than always 0, is published next to what it is the target of"
         )
@@ -74,9 +82,10 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
         return
     cells = _cells_of(frame.times[there])
     values, aims = values[there][cells.order], aims[there][cells.order]
-    off = values - aims
+    low, high = _recent_range(frame.times[there], aims)
     if turn := measured.turn:
-        off = np.remainder(off + turn / 2, turn) - turn / 2
+        values = aims + np.remainder(values - aims + turn / 2, turn) - turn / 2
+    off = np.maximum(values - high, 0.0) - np.maximum(low - values, 0.0)
     error = cells.medians(off)
     noise = max(search.noise.of(measured.name), search.noise.of(target.name))
     margin = _ERRORS * _MEDIAN_ERROR * noise / np.sqrt(cells.counts)
@@ -87,7 +96,12 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
     nearer = np.abs(before) - np.abs(error)
     approaches = nearer > np.maximum(_NEARER_SHARE * np.abs(before), 2 * margin)
     approaches &= np.append(False, cells.follows)
-    for run in runs_of(is_off & ~approaches, cells.starts_s).spans():
+    runs = (
+        run
+        for sign in (-1, 1)
+        for run in runs_of(is_off & ~approaches & (np.sign(error) == sign), cells.starts_s).spans()
+    )
+    for run in sorted(runs, key=lambda each: each.start_s):
         start_s = float(cells.starts_s[run.start])
         end_s = float(cells.ends_s[run.stop - 1])
         if end_s - start_s < OFF_S:
@@ -103,6 +117,19 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
             off_by=round(middle, 6),
             off_percent=round(100 * abs(middle) / size, 1),
         )
+
+
+def _recent_range(times: Array, aims: Array) -> tuple[Array, Array]:
+    """The minimum and maximum of a target in the last 3 s, in which a follower may lag."""
+    first = np.searchsorted(times, times - OFF_S)
+    low, high = np.array(aims), np.array(aims)
+    steps = np.flatnonzero(np.diff(aims)) + 1
+    if not len(steps):
+        return low, high
+    width = int(np.max(np.arange(len(times)) - first)) + 1
+    padded = [np.concatenate((np.full(width - 1, each), aims)) for each in (np.inf, -np.inf)]
+    windows = [np.lib.stride_tricks.sliding_window_view(each, width) for each in padded]
+    return windows[0].min(axis=1), windows[1].max(axis=1)
 
 
 class _Cells(NamedTuple):

@@ -341,7 +341,7 @@ def _findings(verdicts: Verdicts) -> list[str]:
 def _events(connection: sqlite3.Connection, found: Found) -> Grid:
     """Return events. Commands that were done have their own table."""
     matter = [each for each in found.events if each.kind != "command" or _mark(each)]
-    answer = found.only(matter).told(connection, _LIMITS.events)
+    answer = found.only(matter).page(connection, _LIMITS.events)
     rows = [
         GridRow(
             [time_at(each.start_s), _lasted(each), each.kind, describe_event(each), _around(each)],
@@ -360,7 +360,7 @@ def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
     matter = [each for each in matter if each.details.get("what") not in _ORDINARY]
     failed = [each for each in found.events if _mark(each)]
     chosen = choose(matter, _LIMITS.event_contexts) or choose(failed, _LIMITS.event_contexts)
-    return list(found.only(chosen).told(connection, _LIMITS.event_contexts).events)
+    return list(found.only(chosen).page(connection, _LIMITS.event_contexts).events)
 
 
 def _moment(event: Event, stored: Found) -> EventContext:
@@ -390,7 +390,7 @@ def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
     if len(stored.events) > _LIMITS.timeline_entries:
         stored = stored.only([e for e in stored.events if e.kind != "log" or _mark(e)])
         notes = ["Of the log only warnings and errors stand here."]
-    answer = stored.told(connection, _LIMITS.timeline_entries)
+    answer = stored.page(connection, _LIMITS.timeline_entries)
     rows = [
         GridRow(
             [time_at(each.start_s), _lasted(each), each.kind, describe_event(each)], _mark(each)
@@ -403,7 +403,7 @@ def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
 
 def _commands(connection: sqlite3.Connection, stored: Found) -> Grid:
     commands = stored.only([each for each in stored.events if each.kind == "command"])
-    answer = commands.told(connection, _LIMITS.events)
+    answer = commands.page(connection, _LIMITS.events)
     rows = [
         GridRow([
             time_at(each.start_s), str(each.details.get("id", "")), each.name or "",

@@ -88,7 +88,7 @@ def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
 
 def _seen(connection: sqlite3.Connection, run: RunRecord) -> tuple[Obstacle, ...]:
     world = world_seen(connection, run)
-    solids = world.told.get("solids", ()) if world else ()
+    solids = world.content.get("solids", ()) if world else ()
     places = world.places if world else {}
     told = [(each["key"], each | places.get(each["key"], {})) for each in solids]
     return tuple(

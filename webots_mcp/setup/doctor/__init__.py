@@ -47,7 +47,7 @@ class Diagnosis:
 
 
 def ok(seen: str) -> Diagnosis:
-    """Nothing is to be mended."""
+    """Nothing is to be fixed."""
     return Diagnosis("ok", seen)
 
 
@@ -57,12 +57,12 @@ def warning(seen: str, fix: str) -> Diagnosis:
 
 
 def wrong(seen: str, fix: str) -> Diagnosis:
-    """It has to be mended."""
+    """It has to be fixed."""
     return Diagnosis("wrong", seen, fix)
 
 
 def unclear(seen: str) -> Diagnosis:
-    """It could not be looked at, and why."""
+    """It could not be checked, and why."""
     return Diagnosis("not checked", seen)
 
 
@@ -121,7 +121,7 @@ class Examined:
 
 
 @dataclass(frozen=True)
-class Check:
+class DoctorCheck:
     """A link of the chain.
 
     Attributes:
@@ -147,7 +147,7 @@ class Check:
 class Checked(NamedTuple):
     """A check and what it found."""
 
-    check: Check
+    check: DoctorCheck
     finding: Diagnosis
 
     @property
@@ -158,20 +158,20 @@ class Checked(NamedTuple):
 
 def check(
     name: str, **options: Any
-) -> Callable[[Callable[[Examined], Iterator[Diagnosis]]], Check]:
-    """Declare a function as a check; a `Check` has the options."""
-    return lambda run: Check(name, run, **options)
+) -> Callable[[Callable[[Examined], Iterator[Diagnosis]]], DoctorCheck]:
+    """Declare a function as a check; a `DoctorCheck` has the options."""
+    return lambda run: DoctorCheck(name, run, **options)
 
 
-def all_checks(*, with_server: bool = False) -> list[Check]:
-    """All that the modules declare, in the order of the chain.
+def all_checks(*, with_server: bool = False) -> list[DoctorCheck]:
+    """Return all that the modules declare, in the order of the chain.
 
     Args:
         with_server: Those as well that start a process of their own.
     """
     modules = [import_module(f"{__package__}.{name}") for name in _IN_ORDER]
     declared = [each for module in modules for each in vars(module).values()]
-    checks = [each for each in declared if isinstance(each, Check)]
+    checks = [each for each in declared if isinstance(each, DoctorCheck)]
     return [each for each in checks if with_server or not each.starts_process]
 
 
@@ -185,21 +185,21 @@ def worst(findings: Sequence[Diagnosis]) -> Diagnosis:
 
 
 def last_seen_s(view: RobotView) -> float:
-    """When a robot last gave a sign of life, Unix time."""
+    """Return when a robot last gave a sign of life, Unix time."""
     seen_s = view.robot.last_seen_wall_time_s
     return max(seen_s, view.session.last_seen_wall_time_s) if view.session else seen_s
 
 
 def ago(seconds: float) -> str:
-    """How long ago something was, in the unit in which a person thinks of it."""
+    """Return how long ago something was, in the unit in which a person thinks of it."""
     for size, unit in ((86_400, "days"), (3_600, "hours"), (120, "minutes")):
         if seconds >= 2 * size or (unit == "minutes" and seconds >= size):
             return f"{seconds / (60 if unit == 'minutes' else size):.0f} {unit} ago"
     return f"{max(seconds, 0.0):.1f} s ago"
 
 
-def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[Checked]:
-    """Run the checks, all but those that start a process; what cannot be looked at says why."""
+def diagnose(subject: Examined, checks: Sequence[DoctorCheck] | None = None) -> list[Checked]:
+    """Run the checks, all but those that start a process; what cannot be checked says why."""
     with ExitStack() as stack:
         try:
             connection = stack.enter_context(subject.recording.reader())
@@ -209,7 +209,7 @@ def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[C
         return [Checked(each, _run_check(each, subject)) for each in checks or all_checks()]
 
 
-def _run_check(check: Check, subject: Examined) -> Diagnosis:
+def _run_check(check: DoctorCheck, subject: Examined) -> Diagnosis:
     """Run one check; one that fails reports that, and the others still run."""
     if check.needs_recording and subject.connection is None:
         return unclear("there is no recording that can be read")
@@ -228,11 +228,11 @@ def _run_check(check: Check, subject: Examined) -> Diagnosis:
 
 
 def subject_of(recording: RecordingAccess, chosen_by: str) -> Examined:
-    """What is looked at of a recording: also the folder that the asker is in."""
+    """Return what is checked of a recording: also the folder that the asker is in."""
     return Examined(replace(recording, read_only=True), chosen_by, _project(recording))
 
 
 def _project(recording: RecordingAccess) -> Path:
-    """The folder above `mcp_data/`, where a project's recording lies, else the current one."""
+    """Return the folder above `mcp_data/`, else the current one."""
     folder = full_path(recording.data_dir)
     return folder.parent if folder.name == PROJECT_DATA_FOLDER else Path.cwd()

@@ -131,7 +131,7 @@ def _of_project(project: Path) -> Iterator[Diagnosis]:
 
 
 def _of_robot(view: RobotView) -> Diagnosis:
-    """What a robot that records now lacks."""
+    """Return what a robot that records now lacks."""
     name = view.robot.name
     observer = live_observer(view.connection, view.session, view.now_s)
     if observer is not None:

@@ -31,6 +31,21 @@ from webots_mcp.setup.doctor import (
 )
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 
+_WAL_RESET_FIXED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
+# Names of file systems as the operating systems have them; in none does SQLite share memory.
+_NETWORK: Final = (
+    "nfs", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afpfs", "webdav", "ncpfs", "afs", "ceph",
+    "glusterfs", "lustre", "beegfs", "fuse.sshfs", "fuse.glusterfs", "fuse.s3fs", "fuse.rclone",
+)  # fmt: skip
+_SHARED_WITH_HOST: Final = ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs")
+_WINDOWS_FROM_WSL: Final = ("9p", "drvfs")
+_WSL_FROM_WINDOWS: Final = ("//wsl$/", "//wsl.localhost/")
+_IN_MEMORY: Final = "the recording is in memory"
+_LOCAL: Final = (
+    f"record in a folder of this machine's own disk: {DATA_DIR_VARIABLE}, --data-dir, or "
+    "MCPBridge(robot, data_dir=...), the same for controllers and server"
+)
+
 
 @dataclass(frozen=True)
 class MachineLimits:
@@ -53,20 +68,6 @@ class MachineLimits:
 
 
 _LIMITS: Final = MachineLimits()
-_WAL_RESET_FIXED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
-# Names of file systems as the operating systems have them; in none does SQLite share memory.
-_NETWORK: Final = (
-    "nfs", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afpfs", "webdav", "ncpfs", "afs", "ceph",
-    "glusterfs", "lustre", "beegfs", "fuse.sshfs", "fuse.glusterfs", "fuse.s3fs", "fuse.rclone",
-)  # fmt: skip
-_SHARED_WITH_HOST: Final = ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs")
-_WINDOWS_FROM_WSL: Final = ("9p", "drvfs")
-_WSL_FROM_WINDOWS: Final = ("//wsl$/", "//wsl.localhost/")
-_IN_MEMORY: Final = "the recording is in memory"
-_LOCAL: Final = (
-    f"record in a folder of this machine's own disk: {DATA_DIR_VARIABLE}, --data-dir, or "
-    "MCPBridge(robot, data_dir=...), the same for controllers and server"
-)
 
 
 @check("Python")
@@ -96,7 +97,7 @@ def sqlite(_: Examined) -> Iterator[Diagnosis]:
 
 
 def judge_sqlite(version: tuple[int, ...]) -> Diagnosis:
-    """Whether a version can be used."""
+    """Return whether a version can be used."""
     seen = ".".join(map(str, version))
     if version < OLDEST_SQLITE:
         fix = "use a Python with a newer one (python.org, conda and Debian 12 have it)"
@@ -160,7 +161,7 @@ def file_system(subject: Examined) -> Iterator[Diagnosis]:
 
 
 def judge_file_system(folder: str, mounts: Iterable[Mount], *, in_wsl: bool) -> Diagnosis:
-    """Whether a recording may lie in a folder, on a machine with these file systems."""
+    """Return whether a recording may lie in a folder, on a machine with these file systems."""
     path = folder.replace("\\", "/")
     if path.lower().startswith(_WSL_FROM_WINDOWS):
         return _across_the_border(folder, "a folder of WSL, seen from Windows")

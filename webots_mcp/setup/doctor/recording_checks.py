@@ -165,7 +165,7 @@ def _left_waiting(path: Path) -> Iterator[Diagnosis]:
 
 
 def _is_empty(path: Path) -> bool:
-    """Whether not even its header could be written, which is left where rows were taken in."""
+    """Return whether not even its header could be written; an ingested file keeps it."""
     try:
         return path.stat().st_size == 0
     except OSError:  # another process has just deleted it

@@ -37,6 +37,13 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 
+_SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
+_MEND_LINE: Final = f"mend that line; else {_SEE_PAGE}"
+_PRESS_PLAY: Final = "press play in Webots"
+_RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
+_OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
+
+
 @dataclass(frozen=True)
 class WatchLimits:
     """How processes of a simulation are watched.
@@ -60,11 +67,6 @@ class WatchLimits:
 
 
 _LIMITS: Final = WatchLimits()
-_SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
-_MEND_LINE: Final = f"mend that line; else {_SEE_PAGE}"
-_PRESS_PLAY: Final = "press play in Webots"
-_RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
-_OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
 
 
 @check("Simulation", needs_recording=True, well="no robot has been recorded yet")
@@ -84,7 +86,7 @@ def simulation(subject: Examined) -> Iterator[Diagnosis]:
 
 
 def _ran_last(views: list[RobotView]) -> list[RobotView]:
-    """The robots of the simulation that was seen last: one of them may have crashed before."""
+    """Return the robots of the newest simulation: one of them may have crashed earlier."""
     newest = max(views, key=last_seen_s, default=None)
     if newest is None or newest.session is None:
         return [] if newest is None else [newest]
@@ -93,7 +95,7 @@ def _ran_last(views: list[RobotView]) -> list[RobotView]:
 
 
 def _is_unclear(view: RobotView) -> bool:
-    """Whether only the machine's processes can show which controller blocks the world."""
+    """Return whether only the machine's processes can show which controller blocks the world."""
     return (view.status.why or "").startswith((SILENT, WAITING_IN_STEP, SEEN_RUNNING))
 
 
@@ -164,13 +166,13 @@ def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
 
 
 def _also_by_websocket(fix: str, order: str, webots: Instance | None) -> str:
-    """What a person can do, and what a client can where Webots was started with `--stream`."""
+    """Return what a person can do, and what a client can if Webots was started with --stream."""
     is_open = webots is not None and webots.streams and webots.is_listening
     return _OBEYS.format(fix, order) if is_open else fix
 
 
 def _webots_of(subject: Examined, session: SessionRecord) -> Instance | None:
-    """The Webots that a session belongs to, where it runs here."""
+    """Return the Webots that a session belongs to, where it runs here."""
     address = address_of(session.instance)
     return next((w for w in subject.running_webots if address and w.port == address.port), None)
 
@@ -205,7 +207,7 @@ def _controllers_beside(
 
 
 def _started_for(instance: str) -> dict[int, int]:
-    """The processes that have that simulator in their environment, each with its parent's.
+    """Return the processes that have that simulator in their environment, each with its parent's.
 
     So have controllers that a simulator starts and extern ones, and what these start themselves.
     """
@@ -230,13 +232,13 @@ def _listed(pids: list[int]) -> str:
 
 
 def _named(pid: int) -> str:
-    """A controller by its robot, its program and its process."""
+    """Return a controller by its robot, its program and its process."""
     robot = shown_of(pid, lambda process: process.environ().get("WEBOTS_ROBOT_NAME"), None)
     return f"{f'{robot}: ' if robot else ''}{_program_of(pid)} (process {pid})"
 
 
 def _computing(pids: set[int]) -> list[int]:
-    """Those of the processes that compute now.
+    """Return those of the processes that compute now.
 
     One that waits for its next step needs no processor. One that computes wants to continue at each
     look, also where a busy machine gives it little; only Linux shows that.
@@ -263,7 +265,7 @@ def _processor_s(pid: int) -> float:
 
 
 def _program_of(pid: int) -> str:
-    """What it runs: the file of a Python controller, else the program."""
+    """Return what it runs: the file of a Python controller, else the program."""
     words = shown_of(pid, lambda process: process.cmdline(), list[str]())
     file = next((word for word in words[1:] if word.endswith(".py")), None)
     return Path(file).name if file else shown_of(pid, lambda p: p.name(), "a controller")
@@ -278,13 +280,8 @@ def _missing_externs(
     count = 0
     with suppress(OSError):
         if world is not None and world.stat().st_size <= _LIMITS.world_bytes:
-            count = len(
-                re.findall(
-                    r'^\s*controller\s+"<extern>"',
-                    world.read_text("utf-8", "replace"),
-                    re.MULTILINE,
-                )
-            )
+            text = world.read_text("utf-8", "replace")
+            count = len(re.findall(r'^\s*controller\s+"<extern>"', text, re.MULTILINE))
     alive = [session, *companions(view.connection, session, view.now_s)]
     here = sum(each.extern for each in alive)
     if world is None or count <= here:

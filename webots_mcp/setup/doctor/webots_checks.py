@@ -150,7 +150,7 @@ def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Diagnosis:
 
 
 def _over_http(name: str, url: str) -> Diagnosis:
-    """Whether a server asks for the token there; it is not sent, as anybody may have written it."""
+    """Check that a server asks for the token there; it is not sent, for anybody may listen."""
     try:
         with urlopen(url, timeout=3) as answer:
             status: int = answer.status
@@ -166,7 +166,7 @@ def _over_http(name: str, url: str) -> Diagnosis:
 
 
 def _other_place(subject: Examined, arguments: list[str]) -> str | None:
-    """The recording that the arguments name, if it is another one."""
+    """Return the recording that the arguments name, if it is another one."""
     words = [part for word in arguments for part in word.split("=", 1)]
     for option, value in pairwise(words):
         if option in ("--data-dir", "--database") and "$" not in value:
@@ -209,7 +209,7 @@ def server(subject: Examined) -> Iterator[Diagnosis]:
 
 
 async def _converse(line: list[str], complaints: TextIO) -> tuple[int, str]:
-    """How many tools it has, and why it refuses a question; empty where it answers it."""
+    """Return how many tools it has, and why it refuses a question; empty where it answers it."""
     import anyio
     from mcp import Client, StdioServerParameters
     from mcp.client.stdio import stdio_client

@@ -1,8 +1,9 @@
-"""A condition: its tree as closures, and whether it holds as one state follows another.
+"""A condition: its tree as one function, and whether it holds as one state follows another.
 
 And an expectation: a condition with a name that shall hold, always or while another one does.
 
-Each node that is allowed has one place here, no other has any. Nothing is evaluated as Python.
+Each node that is allowed has one place here, no other has any. The function is written from the
+checked tree; no text that a person gave is evaluated as Python.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ import operator
 import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from typing import Any, Final, TypeAlias, cast
 
-from webots_mcp.errors import InvalidConditionError
+from webots_mcp.errors import ConditionFailedError, InvalidConditionError
+from webots_mcp.signals.conditions.generated_code import FunctionWriter
 from webots_mcp.signals.conditions.signal_values import (
     SAME_TIME_S,
     Changed,
@@ -47,9 +48,6 @@ MAX_DURATION_S: Final = 3600.0
 _MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a place that is so many times as old
 
 Number: TypeAlias = "int | float"
-Holds: TypeAlias = Callable[[State], bool]
-Compare: TypeAlias = Callable[[Value, Value], bool]
-ReadNumber: TypeAlias = Callable[[State], "Number | None"]
 
 COMPARISONS: Final[dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]]] = {
     ast.Lt: ("<", operator.lt),
@@ -64,6 +62,12 @@ ARITHMETIC: Final[dict[type[ast.operator], Callable[[Any, Any], Any]]] = {
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: lambda a, b: a / b,
+}
+_SIGNS: Final[dict[type[ast.operator], str]] = {
+    ast.Add: "+",
+    ast.Sub: "-",
+    ast.Mult: "*",
+    ast.Div: "/",
 }
 OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max": max}
 GIVING_FLAGS: Final = ("changed", "missing")
@@ -209,7 +213,7 @@ def _nearest(name: str, known: Collection[str]) -> str:
 
 
 class Compiler(Nodes):
-    """Makes closures of the nodes of one condition, or of one number within a score.
+    """Makes a function of the nodes of one condition, or of one number within a score.
 
     Attributes:
         readers: What reads each signal that is named, by its name.
@@ -230,8 +234,11 @@ class Compiler(Nodes):
         self.memories: list[Memory[Any]] = []
         self.position: PositionReader | None = None
         self.remembers_s = 0.0
+        self._code = FunctionWriter()
+        self._constants = {"True", "False"}
         self._require_shallow(tree)
-        self.root: Any = self._number(tree) if number else self._condition(tree)
+        write = self._number if number else self._condition
+        self.root: Callable[[State], Any] = self._code.function(lambda: write(tree))
         for place in self._durations:
             self._refuse_at(place, "`for` follows a condition: put parentheses around both")
         if not self.readers and self.position is None:
@@ -239,14 +246,13 @@ class Compiler(Nodes):
             self._refuse(tree, f"no signal is named: {same if number else _ALWAYS_OR_NEVER}")
 
     # -- conditions ----------------------------------------------------------------------------
+    # Each method writes the lines that evaluate a node, and returns the expression for its result.
 
-    def _condition(self, node: ast.expr) -> Holds:
+    def _condition(self, node: ast.expr) -> str:
         if isinstance(node, ast.BoolOp):
-            parts = tuple(self._condition(value) for value in node.values)
-            return reduce(_both if isinstance(node.op, ast.And) else _either, parts)
+            return self._combination(node)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-            inner = self._condition(node.operand)
-            return lambda state: not inner(state)
+            return f"(not {self._condition(node.operand)})"
         if isinstance(node, ast.Compare):
             return self._comparison(node)
         if isinstance(node, ast.Tuple):
@@ -259,36 +265,48 @@ class Compiler(Nodes):
             self._refuse(node, self._unknown_function(node))
         self._refuse(node, "this is a value; a condition compares it, as in `x < 1`")
 
-    def _comparison(self, node: ast.Compare) -> Holds:
-        sides = [node.left, *node.comparators]
+    def _combination(self, node: ast.BoolOp) -> str:
+        """`and` and `or`: what follows is evaluated only where it decides."""
+        code = self._code
+        holds = code.assign(self._condition(node.values[0]))
+        undecided = holds if isinstance(node.op, ast.And) else f"not {holds}"
+        for value in node.values[1:]:
+            with code.block(f"if {undecided}:"):
+                code.line(f"{holds} = {self._condition(value)}")
+        return holds
+
+    def _comparison(self, node: ast.Compare) -> str:
+        """`0 < x < 1`: each value is read once, and none after the first that does not fit."""
+        code, sides = self._code, [node.left, *node.comparators]
         for op in node.ops:
             if type(op) not in COMPARISONS:
                 self._refuse(node, "compare with < <= > >= == !=; there is no `in` and no `is`")
-        reads = [self._value(side) for side in sides]
-        steps = [
-            (read, self._compare(op, side))
-            for read, op, side in zip(reads[1:], node.ops, sides, strict=False)
-        ]
-        if len(steps) > 1:
-            return _chain(reads[0], tuple(steps))
-        left, (right, compare) = reads[0], steps[0]
-        return lambda state: compare(left(state), right(state))
-
-    def _compare(self, op: ast.cmpop, left: ast.expr) -> Compare:
-        sign, compare = COMPARISONS[type(op)]
-        column = self._column(left)
-
-        def holds(a: Value, b: Value) -> bool:
-            if a is None or b is None:
-                return False
-            try:
-                return compare(a, b)
-            except TypeError:
-                raise self._failure(column, f"{_shown(a)} {sign} {_shown(b)}?") from None
-
+        left, right = self._value(sides[0]), self._value(sides[1])
+        holds = code.assign("False")
+        self._compare(holds, left, node.ops[0], right, sides[0])
+        for op, before, side in zip(node.ops[1:], sides[1:], sides[2:], strict=False):
+            with code.block(f"if {holds}:"):
+                left, right = right, self._value(side)
+                code.line(f"{holds} = False")
+                self._compare(holds, left, op, right, before)
         return holds
 
-    def _lasting(self, node: ast.Tuple) -> Holds:
+    def _compare(
+        self, holds: str, left: str, op: ast.cmpop, right: str, left_node: ast.expr
+    ) -> None:
+        (sign, _), column = COMPARISONS[type(op)], self._column(left_node)
+
+        def fail(a: Value, b: Value) -> ConditionFailedError:
+            return self._failure(column, f"{_shown(a)} {sign} {_shown(b)}?")
+
+        code = self._code
+        with code.block(f"if {self._are_there(left, right)}:"):
+            with code.block("try:"):
+                code.line(f"{holds} = {left} {sign} {right}")
+            with code.block("except TypeError:"):
+                code.line(f"raise {code.refer_to(fail)}({left}, {right}) from None")
+
+    def _lasting(self, node: ast.Tuple) -> str:
         """A pair whose comma is a `for`; no other comma stands outside a call."""
         places = self._durations_between(node)
         if not places:
@@ -297,133 +315,135 @@ class Compiler(Nodes):
             self._refuse_at(places[-1], "`for` takes one number of seconds; use parentheses")
         self._durations.difference_update(places)
         condition, seconds = node.elts
-        held = self._keep(Lasting(self._condition(condition), self._seconds(seconds, "for")))
-        return held.read
+        holds = self._code.function(lambda: self._condition(condition))
+        return self._keep(Lasting(holds, self._seconds(seconds, "for")))
 
-    def _flag_of(self, node: ast.Call) -> Holds:
-        value = self._value(self._only(node))
+    def _flag_of(self, node: ast.Call) -> str:
+        value = self._only(node)
         if function_of(node) == "missing":
-            return lambda state: value(state) is None
-        return self._keep(Changed(value)).read
+            return f"({self._value(value)} is None)"
+        return self._keep(Changed(self._code.function(lambda: self._value(value))))
 
-    def _flag(self, node: ast.expr) -> Holds:
+    def _flag(self, node: ast.expr) -> str:
         """A signal by itself: a flag that is true, or a number other than 0."""
-        read, column = self._signal(node), self._column(node)
+        value = self._text_refused(node, "{} by itself is no condition")
+        return f"({value} is not None and {value} != 0)"
 
-        def holds(state: State) -> bool:
-            value = read(state)
-            if value.__class__ is str:
-                raise self._failure(column, f"{_shown(value)} by itself is no condition")
-            return bool(value)
+    def _text_refused(self, node: ast.expr, why: str) -> str:
+        """Read a signal; its error where it is a text."""
+        code, value, column = self._code, self._signal(node), self._column(node)
 
-        return holds
+        def fail(text: Value) -> ConditionFailedError:
+            return self._failure(column, why.format(_shown(text)))
+
+        with code.block(f"if {value}.__class__ is {code.refer_to(str)}:"):
+            code.line(f"raise {code.refer_to(fail)}({value})")
+        return value
 
     # -- values --------------------------------------------------------------------------------
 
-    def _value(self, node: ast.expr) -> Read:
+    def _value(self, node: ast.expr) -> str:
         """A number, a flag, a text or None."""
         if isinstance(node, ast.Name) and node.id in FLAGS:
-            return _constant(FLAGS[node.id])
+            return str(FLAGS[node.id])
         if isinstance(node, ast.Constant):
-            return _constant(self._constant(node))
+            return self._constant_name(node)
         return self._signal(node) if is_signal(node) else self._number(node)
 
-    def _number(self, node: ast.expr) -> ReadNumber:
+    def _number(self, node: ast.expr) -> str:
         if isinstance(node, ast.Constant):
             value = self._constant(node)
-            return (
+            if isinstance(value, (str, bool)):
                 self._refuse(node, "a number is needed here")
-                if isinstance(value, (str, bool))
-                else _constant(value)
-            )
+            return self._constant_name(node)
         if is_signal(node):
-            return self._number_of(self._signal(node), node)
+            return self._text_refused(node, "{} is no number")
         if isinstance(node, ast.BinOp):
             return self._arithmetic(node)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
             number = self._number(node.operand)
             if isinstance(node.op, ast.UAdd):
                 return number
-            return lambda state: None if (value := number(state)) is None else -value
+            return self._code.assign(f"-{number} if {self._are_there(number)} else None")
         if isinstance(node, ast.Call):
             return self._call(node)
         self._refuse(node, "a number, a text or a signal is needed here")
 
-    def _number_of(self, read: Read, node: ast.expr) -> ReadNumber:
-        column = self._column(node)
-
-        def number(state: State) -> Number | None:
-            value = read(state)
-            if value.__class__ is str:
-                raise self._failure(column, f"{_shown(value)} is no number")
-            return value  # pyright: ignore[reportReturnType]
-
-        return number
-
-    def _arithmetic(self, node: ast.BinOp) -> ReadNumber:
+    def _arithmetic(self, node: ast.BinOp) -> str:
         if type(node.op) not in ARITHMETIC:
             self._refuse_at(self._operator_column(node), "only + - * / are possible")
+        code, sign = self._code, _SIGNS[type(node.op)]
         left, right = self._number(node.left), self._number(node.right)
-        apply = ARITHMETIC[type(node.op)]
+        result = code.assign("None")
+        with code.block(f"if {self._are_there(left, right)}:"):
+            with code.block("try:"):
+                code.line(f"{result} = {left} {sign} {right}")
+            with code.block(f"except {code.refer_to((ZeroDivisionError, OverflowError))}:"):
+                code.line("pass")
+            with code.block("else:"):
+                infinity = code.refer_to(math.inf)
+                with code.block(f"if not -{infinity} < {result} < {infinity}:"):
+                    code.line(f"{result} = None")
+        return result
 
-        def number(state: State) -> Number | None:
-            a, b = left(state), right(state)
-            if a is None or b is None:
-                return None
-            try:
-                result = apply(a, b)
-            except (ZeroDivisionError, OverflowError):
-                return None
-            return result if -math.inf < result < math.inf else None
-
-        return number
-
-    def _call(self, node: ast.Call) -> ReadNumber:
+    def _call(self, node: ast.Call) -> str:
         name = function_of(node)
         if name in GIVING_FLAGS:
             self._refuse(node, f"{name}(...) is a condition, not a number")
         if name == "rate":
-            return self._keep(Rate(self._number(self._only(node)))).read
+            value = self._only(node)
+            return self._keep(Rate(self._code.function(lambda: self._number(value))))
         if name == "displacement":
             return self._displacement(self._only(node))
         if name in OF_NUMBERS:
             return self._of_numbers(node, name)
         self._refuse(node, self._unknown_function(node))
 
-    def _displacement(self, node: ast.expr) -> ReadNumber:
+    def _displacement(self, node: ast.expr) -> str:
         if self.position is None:
             self.position = PositionReader(self._plain)
         seconds = self._seconds(node, "displacement")
-        return self._keep(Displacement(self.position.read, seconds)).read
+        return self._keep(Displacement(self.position.read, seconds))
 
-    def _of_numbers(self, node: ast.Call, name: str) -> ReadNumber:
+    def _of_numbers(self, node: ast.Call, name: str) -> str:
         self._require_plain_call(node)
         if (len(node.args) == 1) != (name == "abs") or not node.args:
             count = "one value" if name == "abs" else "two or more values"
             hint = "" if name == "abs" else f"; of a long array there is ranges.{name}"
             self._refuse(node, f"{name} takes {count}{hint}")
-        numbers = tuple(self._number(each) for each in node.args)
-        function = OF_NUMBERS[name]
+        numbers = [self._number(each) for each in node.args]
+        function = self._code.refer_to(OF_NUMBERS[name])
+        applied = f"{function}({', '.join(numbers)})"
+        return self._code.assign(f"{applied} if {self._are_there(*numbers)} else None")
 
-        def applied(state: State) -> Number | None:
-            values = [number(state) for number in numbers]
-            return None if None in values else function(*values)
-
-        return applied
-
-    def _keep(self, memory: Memory[Any]) -> Memory[Any]:
-        """After those that it is made of: they are up to date when it is its turn."""
+    def _keep(self, memory: Memory[Any]) -> str:
+        """Add it after those that it is made of: they are up to date when it is its turn."""
         self.memories.append(memory)
-        return memory
+        code = self._code
+        name = code.refer_to(memory)
+        with code.block(f"if {name}.error is not None:"):
+            code.line(f"raise {name}.error")
+        return code.assign(f"{name}.result")
 
     # -- signals and constants -----------------------------------------------------------------
 
-    def _signal(self, node: ast.expr) -> Read:
+    def _signal(self, node: ast.expr) -> str:
         name = self._signal_name(node)
         if name not in self.readers:
             self.readers[name] = reader(name, self._plain)
             self.columns[name] = self._column(node)
-        return self.readers[name]
+        code = self._code
+        return code.assign(f"{code.refer_to(self.readers[name])}(state)")
+
+    def _constant_name(self, node: ast.Constant) -> str:
+        name = self._code.refer_to(self._constant(node))
+        self._constants.add(name)
+        return name
+
+    def _are_there(self, *values: str) -> str:
+        """Write a test whether all values are there; constants always are."""
+        tests = [f"{each} is not None" for each in values if each not in self._constants]
+        return " and ".join(tests) or "True"
 
     def _seconds(self, node: ast.expr, of: str) -> float:
         value = node.value if isinstance(node, ast.Constant) else None
@@ -447,33 +467,6 @@ def _shown(value: Value) -> str:
     if isinstance(value, bool):
         return f"the flag {str(value).lower()}"
     return f"the text {value[:50]!r}" if isinstance(value, str) else f"the number {value}"
-
-
-def _constant(value: Any) -> Callable[[State], Any]:
-    return lambda state: value
-
-
-def _chain(first: Read, steps: tuple[tuple[Read, Compare], ...]) -> Holds:
-    """`0 < x < 1`: each value is read once."""
-
-    def holds(state: State) -> bool:
-        left = first(state)
-        for read, compare in steps:
-            right = read(state)
-            if not compare(left, right):
-                return False
-            left = right
-        return True
-
-    return holds
-
-
-def _both(left: Holds, right: Holds) -> Holds:
-    return lambda state: left(state) and right(state)
-
-
-def _either(left: Holds, right: Holds) -> Holds:
-    return lambda state: left(state) or right(state)
 
 
 # -- what shall hold -------------------------------------------------------------------------------
@@ -550,6 +543,7 @@ class Violated:
 
     def __init__(self, expectation: Expectation, plain: Plain) -> None:
         self._expectation = expectation
+        self._within_s = expectation.within_s
         self._expected: Evaluator = expectation.expected.evaluator(plain)
         self._during = expectation.during and expectation.during.evaluator(plain)
         self._since_s: float | None = None
@@ -562,11 +556,14 @@ class Violated:
             ConditionFailedError: See `Evaluator.holds`.
         """
         is_meant = self._during is None or self._during.holds(state, sim_time_s)
-        is_met, asked = self._expected.holds(state, sim_time_s), self._expectation
-        is_first = self._since_s is None or sim_time_s < self._since_s - SAME_TIME_S
-        if is_first or self._since_s is None:
-            self._since_s, self._reached = sim_time_s, False
-        elapsed_s = sim_time_s - self._since_s
+        is_met, since_s = self._expected.holds(state, sim_time_s), self._since_s
+        is_first = since_s is None or sim_time_s < since_s - SAME_TIME_S
+        if is_first or since_s is None:
+            self._since_s = since_s = sim_time_s
+            self._reached = False
+        if is_met and self._within_s is None:  # as a rule
+            return False
+        asked, elapsed_s = self._expectation, sim_time_s - since_s
         decides = (
             is_met is (asked.within_s is not None)
             and is_meant

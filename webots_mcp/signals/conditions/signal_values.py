@@ -16,6 +16,7 @@ from contextlib import suppress
 from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from webots_mcp.errors import ConditionFailedError
+from webots_mcp.signals.conditions.generated_code import FunctionWriter
 from webots_mcp.signals.naming import (
     FARTHEST_M,
     INDEXES,
@@ -33,6 +34,7 @@ State: TypeAlias = Any  # what a controller publishes: usually a dict, with anyt
 Read: TypeAlias = Callable[[State], Value]
 Plain: TypeAlias = Callable[[Any], Any]
 
+_MISSING: Final = "Ellipsis"  # stands for a key that is not there
 _LEAVES: Final = frozenset((float, int, str, bool, type(None)))
 _NUMBERS: Final = frozenset((float, int))
 _LONGEST_TEXT: Final = 10_000  # characters; a row may hold less of a longer one
@@ -58,8 +60,44 @@ def reader(name: str, plain: Plain) -> Read:
         name: Dotted.
         plain: The counterpart that a row holds, in JSON's terms, of what is not plain JSON.
     """
+    return _shortcut(name, _careful_reader(name, plain))
+
+
+def _shortcut(name: str, careful: Read) -> Read:
+    """Read a signal with the lookups of its name alone; leave whatever is unusual to another."""
+    code = FunctionWriter()
+    other_way = f"{code.refer_to(careful)}(state)"
+
+    def write() -> str:
+        parts, value = name.split("."), "state"
+        for place, part in enumerate(parts):
+            others = _other_keys(".".join(parts[place:]))
+            index = INDEXES.index(part) if part in INDEXES else -1
+            if index >= 0:
+                usual = f"{index} < len({value}) <= {LONGEST_SPREAD_ARRAY}"
+                unusual = [f"{value}.__class__ is not list", f"not {usual}"]
+                read = f"{value}[{index}]"
+            else:
+                unusual = [f"{value}.__class__ is not dict"]
+                unusual += [f"{code.refer_to(other)} in {value}" for other in others]
+                read = f"{value}.get({code.refer_to(part)}, {_MISSING})"
+            with code.block(f"if {' or '.join(unusual)}:"):
+                code.line(f"return {other_way}")
+            value = code.assign(read)
+        infinity = code.refer_to(math.inf)
+        with code.block(f"if {value}.__class__ is {code.refer_to(float)}:"):
+            code.line(f"return {value} if -{infinity} < {value} < {infinity} else None")
+        with code.block(f"if {value} is True or {value} is False or {value} is None:"):
+            code.line(f"return {value}")
+        return other_way
+
+    return code.function(write)
+
+
+def _careful_reader(name: str, plain: Plain) -> Read:
+    """Read a signal from whatever a state may be made of."""
     part, _, rest = name.partition(".")
-    deeper = reader(rest, plain) if rest else None
+    deeper = _careful_reader(rest, plain) if rest else None
     others = _other_keys(name)
     index = INDEXES.index(part) if part in INDEXES else -1
 
@@ -232,12 +270,17 @@ def _may_be_number(value: Value) -> bool:
 
 
 class Memory(ABC, Generic[Answer]):
-    """Something that is asked of every state, and what follows from the answers."""
+    """Something that is asked of every state, and what follows from the answers.
+
+    Attributes:
+        result: As of the state that was taken in last.
+        error: Why that state could not be asked; None where it could.
+    """
 
     def __init__(self, ask: Callable[[State], Answer]) -> None:
         self._ask = ask
-        self._error: ConditionFailedError | None = None
-        self._result: Any = None
+        self.error: ConditionFailedError | None = None
+        self.result: Any = None
         self.forget()
 
     @abstractmethod
@@ -249,20 +292,14 @@ class Memory(ABC, Generic[Answer]):
         """Keep what follows from an answer."""
 
     def update(self, state: State, sim_time_s: float) -> None:
-        """Take in a state; why it could not be asked is raised when the result is read."""
-        self._error = None
+        """Take in a state; why it could not be asked is raised where the result is used."""
+        self.error = None
         try:
             answer = self._ask(state)
         except ConditionFailedError as error:
-            self._error = error
+            self.error = error
         else:
             self._take_in(answer, sim_time_s)
-
-    def read(self, state: State) -> Any:
-        """The result as of the state that was taken in last; else the error says why not."""
-        if self._error is not None:
-            raise self._error
-        return self._result
 
 
 class Changed(Memory[Value]):
@@ -271,11 +308,11 @@ class Changed(Memory[Value]):
     def forget(self) -> None:
         """What comes first is no change."""
         self._last: Value = None
-        self._result = False
+        self.result = False
 
     def _take_in(self, answer: Value, sim_time_s: float) -> None:
         """A missing value is not a change, and neither is the return of the value before."""
-        self._result = answer is not None and self._last is not None and answer != self._last
+        self.result = answer is not None and self._last is not None and answer != self._last
         if answer is not None:
             self._last = answer
 
@@ -286,17 +323,17 @@ class Rate(Memory["int | float | None"]):
     def forget(self) -> None:
         """There is a rate from the second value on."""
         self._last: tuple[float, float] | None = None
-        self._result = None
+        self.result = None
 
     def _take_in(self, answer: int | float | None, sim_time_s: float) -> None:
         """While time stands still the rate stays as it is."""
         if answer is None:
-            self._result = None
+            self.result = None
         elif self._last is None:
             self._last = (sim_time_s, answer)
         elif (passed_s := sim_time_s - self._last[0]) > SAME_TIME_S:
             rate = (answer - self._last[1]) / passed_s
-            self._result = rate if -math.inf < rate < math.inf else None
+            self.result = rate if -math.inf < rate < math.inf else None
             self._last = (sim_time_s, answer)
 
 
@@ -313,11 +350,11 @@ class Displacement(Memory["tuple[float, float] | None"]):
     def forget(self) -> None:
         """There is a displacement once the run has lasted for that time."""
         self._places: deque[tuple[float, float, float]] = deque()
-        self._result = None
+        self.result = None
 
     def _take_in(self, answer: tuple[float, float] | None, sim_time_s: float) -> None:
         """Keeps 200 places at most; the one it compares with is older by half a percent at most."""
-        self._result = None
+        self.result = None
         if answer is None:
             return
         places = self._places
@@ -329,7 +366,7 @@ class Displacement(Memory["tuple[float, float] | None"]):
         was_s, was_x, was_y = places[0]
         older_s = sim_time_s - was_s - self._seconds
         if -SAME_TIME_S <= older_s <= self._seconds + SAME_TIME_S:
-            self._result = math.hypot(answer[0] - was_x, answer[1] - was_y)
+            self.result = math.hypot(answer[0] - was_x, answer[1] - was_y)
 
 
 class Lasting(Memory[bool]):
@@ -342,14 +379,14 @@ class Lasting(Memory[bool]):
     def forget(self) -> None:
         """It holds since no time at all."""
         self._since_s: float | None = None
-        self._result = False
+        self.result = False
 
     def _take_in(self, answer: bool, sim_time_s: float) -> None:
         """Between two states in both of which it holds it counts as unbroken."""
         if not answer:
             self._since_s = None
-            self._result = False
+            self.result = False
             return
         if self._since_s is None:
             self._since_s = sim_time_s
-        self._result = sim_time_s - self._since_s >= self._seconds - SAME_TIME_S
+        self.result = sim_time_s - self._since_s >= self._seconds - SAME_TIME_S

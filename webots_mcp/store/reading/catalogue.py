@@ -272,7 +272,7 @@ def list_signals(
 
 
 def _info(frame: Frame, signal: RegisteredSignal, meaning: Meaning) -> SignalInfo:
-    zones = frame.zones(signal.name)
+    zones = frame.zone_map(signal.name)
     counts, is_usable = zones.value_count, bool(zones.value_count.any())
     if not is_usable and signal.is_number:  # all beyond 1e100, or null
         counts = np.add.reduceat(~np.isnan(frame.numbers(signal.name)), zones.first_row, dtype=int)
@@ -299,7 +299,7 @@ def _bound(frame: Frame, name: str, held: Indexes, at: int) -> float | None:
     """When a signal first, or last, had a value; a chunk is opened where not all of it has one."""
     if not len(held):
         return None
-    zones, place = frame.zones(name), int(held[at])
+    zones, place = frame.zone_map(name), int(held[at])
     start, rows = int(zones.first_row[place]), int(zones.row_count[place])
     if zones.value_count[place] == rows:
         return float((zones.start_s if at == 0 else zones.end_s)[place])

@@ -2,7 +2,7 @@
 
 A frame has the times of its rows, and gives the values of each signal that is asked for: from
 chunks, which are decompressed then, and from the newest rows, which are in no chunk yet. What a
-chunk comes to (`Frame.zones`) is known without opening it.
+chunk comes to (`Frame.zone_map`) is known without opening it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,13 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.reading.frame_source import Column, FrameSource, no_statistics
 from webots_mcp.store.reading.observed_pose import MARGIN_S, Derived, find_observed, poses_of
-from webots_mcp.store.reading.segment import HAS_LOST_ROWS, MOST_ROWS, Deadline, Segment, kept_parts
+from webots_mcp.store.reading.segment import (
+    HAS_LOST_ROWS,
+    MOST_ROWS,
+    Deadline,
+    Segment,
+    full_rate_parts,
+)
 from webots_mcp.store.reading.unchunked_rows import read_rows, rows_in_no_chunk
 from webots_mcp.store.reading.unread import Unread
 
@@ -75,7 +81,7 @@ class Coded(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Zones:
+class ZoneMap:
     """What the chunks of a signal come to, those of the newest rows included, in order.
 
     All are arrays with an item for each chunk; NaN where a chunk has no usable number.
@@ -247,7 +253,7 @@ class Frame:
 
     def replaced(self, name: str) -> Counter[str]:
         """How often each value that JSON cannot hold (nan, inf, ...) stood there."""
-        zones, found = self.zones(name), Counter[str]()
+        zones, found = self.zone_map(name), Counter[str]()
         for span in zones.spans(zones.held_count > zones.value_count):
             values = self.rows(*span)._decoded(name)
             for code, label in enumerate(values.labels, FIRST_LABEL):
@@ -255,10 +261,10 @@ class Frame:
                     found[label.why] += int(np.count_nonzero(values.codes == code))
         return +found
 
-    def zones(self, name: str) -> Zones:
+    def zone_map(self, name: str) -> ZoneMap:
         """What the chunks of a signal come to; those that the frame cuts come to what is in it."""
         key = ("zones", name, self._start, self._stop)
-        return self._source.cached(key, lambda: self._make_zones(name))
+        return self._source.cached(key, lambda: self._make_zone_map(name))
 
     def opened(self, name: str, wanted: Flags) -> Iterator[tuple[int, Array]]:
         """The numbers of some of its chunks, each with its first row; of those that have any."""
@@ -364,7 +370,7 @@ class Frame:
         edges = self._source.first_rows[parts.start : parts.stop + 1]
         return np.minimum(np.maximum(edges, self._start), self._stop) - self._start
 
-    def _make_zones(self, name: str) -> Zones:
+    def _make_zone_map(self, name: str) -> ZoneMap:
         source, edges = self._source, self._edges
         if source.order is None:
             parts = source.parts(self._start, self._stop)
@@ -385,7 +391,7 @@ class Frame:
         held: Indexes = figures.pop("row_count").astype(np.intp)
         present: Indexes = figures.pop("value_count").astype(np.intp)
         changed: Indexes = figures.pop("change_count").astype(np.intp)
-        return Zones(
+        return ZoneMap(
             edges[:-1], np.diff(edges), held, present, changed, starts_s, ends_s, **figures
         )
 
@@ -466,7 +472,7 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
     if segment.full_rate:
         return None
     bounds = (segment.run_id, segment.start_s, segment.end_s)
-    if not kept_parts(connection, *bounds):
+    if not full_rate_parts(connection, *bounds):
         return None
     columns = StateColumns()
     cut_at_s = read_rows(connection, _KEPT, (*bounds, MOST_ROWS), columns, deadline)

@@ -30,8 +30,8 @@ from webots_mcp.analysis.summary import (
 )
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
-from webots_mcp.store.reading.frame import Frame, Unread, Zones, read_frame
-from webots_mcp.store.reading.segment import Deadline, Segment, just_after, kept_parts
+from webots_mcp.store.reading.frame import Frame, Unread, ZoneMap, read_frame
+from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts, just_after
 from webots_mcp.store.signals import RegisteredSignal
 
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
@@ -48,7 +48,7 @@ def reads_values(frame: Frame, signal: RegisteredSignal) -> bool:
     """Whether every value is looked at: of few rows, and where turns of an angle are counted."""
     if len(frame) <= FULL_ROWS or signal.turn is None:
         return len(frame) <= FULL_ROWS
-    zones = frame.zones(signal.name)
+    zones = frame.zone_map(signal.name)
     held = ~np.isnan(zones.sum)
     if not held.any():
         return False
@@ -72,7 +72,7 @@ def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None
         numbers = frame.usable(signal.name)
         rows = int(np.count_nonzero(frame.was_read(signal.name)))
         return summarise_numbers(*numbers, rows=rows, turn=signal.turn)
-    found = _summary_of_zones(frame, signal.name)
+    found = _summary_of_zone_map(frame, signal.name)
     if signal.turn is None or not found.present:
         return found
     angles = frame.numbers(signal.name) * (math.tau / signal.turn)
@@ -80,14 +80,14 @@ def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None
     return found._replace(sines=float(np.sin(angles).sum()), cosines=float(np.cos(angles).sum()))
 
 
-def _summary_of_zones(frame: Frame, name: str) -> Summary:
+def _summary_of_zone_map(frame: Frame, name: str) -> Summary:
     """The same from chunks; only those with the ends and the extremes are opened.
 
     The squares are combined by the formula of T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms
     for computing the sample variance", The American Statistician 37 (1983): each chunk's own plus
     count * (its mean - the mean) ** 2.
     """
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     held = np.flatnonzero(~np.isnan(zones.sum))
     if not len(held):
         return Summary(len(frame))
@@ -115,7 +115,7 @@ def _summary_of_zones(frame: Frame, name: str) -> Summary:
 
 
 def _time_of(
-    frame: Frame, name: str, zones: Zones, place: int, value: float | None, *, last: bool = False
+    frame: Frame, name: str, zones: ZoneMap, place: int, value: float | None, *, last: bool = False
 ) -> float:
     """When a chunk first had a value, or any; or its last one."""
     start = int(zones.first_row[place])
@@ -254,7 +254,7 @@ def _parts(frame: Frame, signal: RegisteredSignal, buckets: Buckets) -> _Parts:
     name = signal.name
     if len(frame) <= FULL_ROWS or signal.turn is not None:
         return _of_rows(0, frame.numbers(name))
-    zones = frame.zones(name)
+    zones = frame.zone_map(name)
     edges = buckets.edges[buckets.edges < len(frame)]
     borders = np.searchsorted(zones.first_row, edges, "right") - 1
     cut: Flags = np.zeros(len(zones), np.bool_)
@@ -443,7 +443,7 @@ def _in_force(
         at_begin = next(iter(_points_in(before.rows(rows - 1, rows), signal)), None)
     if at_begin is None:
         return None
-    row = _first_alike(before, signal, at_begin.value) if since else rows
+    row = _first_of_last_equal(before, signal, at_begin.value) if since else rows
     return at_begin if row == rows else Point(float(before.times[row]), at_begin.value)
 
 
@@ -453,7 +453,7 @@ def _is_hidden(before: Frame, signal: RegisteredSignal, time_s: float) -> bool:
     return row > 0 and not before.rows(row - 1, row).was_read(signal.name).all()
 
 
-def _first_alike(frame: Frame, signal: RegisteredSignal, value: str | bool | None) -> int:
+def _first_of_last_equal(frame: Frame, signal: RegisteredSignal, value: str | bool | None) -> int:
     """The first of the last rows that all have this value; the number of rows if none has it."""
     stop, rows = len(frame), _FIRST_ROWS_BACK
     while stop > 0:
@@ -501,7 +501,7 @@ def _splice_kept(
     points: dict[str, list[Point]],
 ) -> None:
     """In kept stretches the points are those of each call: to the very step, none missed."""
-    for each in kept_parts(connection, segment.run_id, segment.start_s, segment.end_s):
+    for each in full_rate_parts(connection, segment.run_id, segment.start_s, segment.end_s):
         start_s = max(each.start_s, segment.start_s)
         end_s = min(just_after(each.end_s), segment.end_s)
         stretch = Segment(segment.run_id, start_s, end_s, full_rate=True)

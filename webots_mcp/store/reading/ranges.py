@@ -35,9 +35,9 @@ from webots_mcp.store.reading.segment import (
     Segment,
     Subject,
     choose,
+    full_rate_parts,
     just_after,
     kept_notes,
-    kept_parts,
     moment_of,
     require_run,
     rows_in,
@@ -82,7 +82,7 @@ _RUNS_IN: Final = (
     "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?"
 )
 # What was stored just before a bound and is shown as of it; commands know no run but their robot's.
-_SHOWN_ALIKE: Final = "SELECT min(time_s) FROM ({})".format(
+_SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
     " UNION ALL ".join(
         f"SELECT min({time}) AS time_s FROM {table} WHERE {subject} "
         f"AND {time} >= :moment AND {time} < :bound"
@@ -287,12 +287,12 @@ def _require_order(start_s: float, end_s: float, start_name: str, end_name: str)
     if start_s >= end_s:
         what = "empty" if start_s == end_s else "reversed"
         raise InvalidRangeError(
-            f"the range is {what}: {start_name}={_told(start_s)} must be less than "
-            f"{end_name}={_told(end_s)}"
+            f"the range is {what}: {start_name}={_seconds(start_s)} must be less than "
+            f"{end_name}={_seconds(end_s)}"
         )
 
 
-def _told(time_s: float) -> str:
+def _seconds(time_s: float) -> str:
     return f"{shown_time(time_s):.13g}"
 
 
@@ -332,7 +332,7 @@ def _rated(connection: sqlite3.Connection, segment: Segment) -> Segment:
     It is where it holds nothing but rows of one stretch, and not too many of them.
     """
     run_id, span = segment.run_id, (segment.start_s, segment.end_s)
-    for each in kept_parts(connection, run_id, *span):
+    for each in full_rate_parts(connection, run_id, *span):
         outside = ((span[0], each.start_s), (each.after_s, span[1]))
         if not any(_has_rows(connection, run_id, part) for part in outside):
             both = ("state", "kept_state")
@@ -368,7 +368,8 @@ def _in_simulation_time(
     end = just_after(max(newest_s, start)) if end_s is None else _bound(connection, subject, end_s)
     if start_s is None and end <= first_s:
         raise InvalidRangeError(
-            f"run {run_id} has no row before end_s={_told(end)}: its first is at {_told(first_s)} s"
+            f"run {run_id} has no row before end_s={_seconds(end)}: "
+            f"its first is at {_seconds(first_s)} s"
         )
     _require_order(start, end, "start_s", "end_s")
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
@@ -396,7 +397,7 @@ def _too_young(
     if last_s is None or moment_of(last_s) <= age_s:
         return []
     before, began_by = connection.execute(_RUN_BEFORE, (subject.run_id,)).fetchone()
-    young = f"run {subject.run_id} (started by {began_by}) has lasted only {_told(age_s)} s"
+    young = f"run {subject.run_id} (started by {began_by}) has lasted only {_seconds(age_s)} s"
     return [young if before is None else f"{young}; the time before is in run {before}"]
 
 
@@ -404,7 +405,7 @@ def _bound(connection: sqlite3.Connection, subject: Subject, time_s: float) -> f
     """Where a bound lies: at the first thing that is shown as of this time, or of a later one."""
     names = {"run": subject.run_id, "robot": subject.robot_id}
     times = {"moment": moment_of(time_s), "bound": shown_time(time_s)}
-    (before_s,) = connection.execute(_SHOWN_ALIKE, names | times).fetchone()
+    (before_s,) = connection.execute(_SHOWN_AS_BOUND, names | times).fetchone()
     row_s = _row_from(connection, subject.run_id, times["moment"])
     return min(each for each in (before_s, row_s, times["bound"]) if each is not None)
 

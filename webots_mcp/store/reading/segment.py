@@ -25,12 +25,12 @@ HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is
     "WHERE run_id = r.id AND is_complete = 1), 0)"
 )
 QUESTION_DEADLINE_S: Final = 2.0
-_STEPS_PER_LOOK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
-MOST_STRETCHES: Final = 200  # newest of a range that are looked at
+_STEPS_PER_CHECK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
+MOST_FULL_RATE_SEGMENTS: Final = 200  # newest of a range that are looked at
 MOST_ROWS: Final = 30_000  # of a range that is answered from each call
 _NAMED: Final = 2
 _IS_NUMBER: Final = "IN ('real', 'integer')"
-_STRETCHES: Final = (
+_FULL_RATE_SEGMENTS: Final = (
     "SELECT start_sim_time_s, end_sim_time_s, CAST(reason AS TEXT), wall_time_s FROM kept_stretch "
     "WHERE run_id = ? AND end_sim_time_s >= ? AND start_sim_time_s < ? "
     f"AND typeof(start_sim_time_s) {_IS_NUMBER} AND typeof(end_sim_time_s) {_IS_NUMBER} "
@@ -145,7 +145,7 @@ class Deadline:
         An interrupted statement raises `sqlite3.OperationalError`; `passed` distinguishes it from
         other errors. A connection has one progress handler, so these blocks do not nest.
         """
-        connection.set_progress_handler(lambda: self.passed, _STEPS_PER_LOOK)
+        connection.set_progress_handler(lambda: self.passed, _STEPS_PER_CHECK)
         try:
             yield
         finally:
@@ -204,17 +204,19 @@ class FullRateSegment(NamedTuple):
         return self.end_s + 1e-9
 
 
-def kept_stretches(
+def full_rate_segments(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[FullRateSegment]:
     """The stretches that touch [start_s, end_s) of a run, in order, as far as they are written."""
-    rows = connection.execute(_STRETCHES, (run_id, start_s, end_s, MOST_STRETCHES)).fetchall()
+    rows = connection.execute(
+        _FULL_RATE_SEGMENTS, (run_id, start_s, end_s, MOST_FULL_RATE_SEGMENTS)
+    ).fetchall()
     return [_as_written(connection, run_id, FullRateSegment(*row)) for row in reversed(rows)]
 
 
 def newest_kept(connection: sqlite3.Connection, run_id: int) -> FullRateSegment | None:
     """The stretch of a run that begins last."""
-    row = connection.execute(_STRETCHES, (run_id, -math.inf, math.inf, 1)).fetchone()
+    row = connection.execute(_FULL_RATE_SEGMENTS, (run_id, -math.inf, math.inf, 1)).fetchone()
     return row and _as_written(connection, run_id, FullRateSegment(*row))
 
 
@@ -230,11 +232,11 @@ def _as_written(
     return stretch._replace(end_s=until_s, reason=reason)
 
 
-def kept_parts(
+def full_rate_parts(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[FullRateSegment]:
     """Of those the ones that have rows of their own."""
-    found = kept_stretches(connection, run_id, start_s, end_s)
+    found = full_rate_segments(connection, run_id, start_s, end_s)
     spans = [(each, (each.start_s, each.after_s)) for each in found]  # the last row is in it
     return [each for each, span in spans if rows_in("kept_state", connection, run_id, span, 1)]
 
@@ -243,7 +245,7 @@ def kept_notes(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[str]:
     """Which parts of a range are kept at full rate, and why."""
-    found = kept_parts(connection, run_id, start_s, end_s)
+    found = full_rate_parts(connection, run_id, start_s, end_s)
     if not found:
         return []
     named = [f"{each.start_s:.3f}-{each.end_s:.3f} s ({each.reason})" for each in found[-_NAMED:]]

@@ -1,6 +1,6 @@
 """Ways to record a state in each step of one loop: what each costs, and what a kill leaves of it.
 
-`python -m tests.accuracy.recorders WAY FOLDER` records without end, and says how many rows by now.
+`python -m tests.benchmarks.recorders WAY FOLDER` records without end, and prints the rows so far.
 """
 
 from __future__ import annotations
@@ -291,7 +291,7 @@ it."""
 
 def _killed(name: str, folder: Path, life_s: float) -> int:
     """Let a process record, kill it, and give how many states it had written by its own account."""
-    line = [sys.executable, "-m", "tests.accuracy.recorders", name, str(folder)]
+    line = [sys.executable, "-m", "tests.benchmarks.recorders", name, str(folder)]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=environment()) as process:
         assert process.stdout is not None
         first = process.stdout.readline()

@@ -68,9 +68,12 @@ def test_an_attached_robot_has_them_after_its_first_step_and_asks_once(
 ) -> None:
     asked: list[Any] = []
     get = robot.getFromDevice
-    monkeypatch.setattr(
-        type(robot), "getFromDevice", lambda _, tag: (asked.append(tag), get(tag))[1]
-    )
+
+    def count(_: Any, tag: int) -> Any:
+        asked.append(tag)
+        return get(tag)
+
+    monkeypatch.setattr(type(robot), "getFromDevice", count)
     robot.getDevice("ds_left").enable(STEP_MS)
     with MCPBridge.attach(robot, database=database, throttle_interval=1):
         for _ in range(5):
@@ -199,9 +202,11 @@ def node(type_name: str, position: Any = None, **fields: Any) -> Any:
         value = fields.get(name)
         if value is None:
             return None
-        return SimpleNamespace(
-            getSFNode=lambda: value, getSFVec3f=lambda: value, getMFNode=lambda at: value[at]
-        )
+
+        def entry(at: int) -> Any:
+            return value[at]
+
+        return SimpleNamespace(getSFNode=lambda: value, getSFVec3f=lambda: value, getMFNode=entry)
 
     return SimpleNamespace(
         getTypeName=lambda: type_name,
@@ -230,10 +235,12 @@ def turned_in(nodes: dict[str, Any], **motor: Any) -> dict[str, tuple[str | None
     motors = {name: device("Motor", getType=0, **motor) for name in nodes}
     for tag, each in enumerate(motors.values()):
         each._tag = tag
+
+    def node_of(tag: int) -> Any:
+        return [*nodes.values()][tag]
+
     robot = SimpleNamespace(
-        devices=motors,
-        getSelf=lambda: node("Robot", [0.0, 0.0, 0.0]),
-        getFromDevice=lambda tag: [*nodes.values()][tag],
+        devices=motors, getSelf=lambda: node("Robot", [0.0, 0.0, 0.0]), getFromDevice=node_of
     )
     found = {said.name: said for said, _ in describe_devices(robot, is_supervisor=True)}
     named = {name: found[f"motors.{name}.target_velocity_rad_s"] for name in nodes}

@@ -47,7 +47,7 @@ def rover(empty: sqlite3.Connection) -> RecordedRobot:
 def test_an_assistant_counts_before_the_project_before_the_code_before_the_device(
     empty: sqlite3.Connection, rover: RecordedRobot
 ) -> None:
-    sources = [
+    sources: list[tuple[str, dict[str, Any]]] = [
         ("bridge", {"source": "device", "quantity": "distance"}),
         ("controller", {"quantity": "force"}),
         ("project", {"quantity": "light", "robot_name": "*", "robot_id": None}),

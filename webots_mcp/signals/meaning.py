@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, get_args
 
@@ -164,8 +163,7 @@ def short_forms() -> dict[str, str]:
 # -- meanings ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Meaning:
+class Meaning(NamedTuple):
     """What a signal means.
 
     Attributes:

@@ -231,9 +231,9 @@ class SignalMeaning(SQLModel, table=True):
     unit: str | None = _text()
     target_of: str | None = _text("the signal whose target it is")
     same_as: str | None = _text("the signal that measures the same")
-    side: str | None = _text("left, right, front left, ...")
-    low: float | None = _number("the lowest value it can have")
-    high: float | None = _number("the highest value it can have")
+    side: str | None = _text()
+    low: float | None = _number()
+    high: float | None = _number()
     set_wall_time_s: float = _number(nullable=False)
     set_by: str = _text(
         "mcp, cli, project (its file), controller (its code), bridge (the device)", nullable=False

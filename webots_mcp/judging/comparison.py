@@ -396,10 +396,10 @@ def compare_runs(
                 summaries[-1].append(_summarise(connection, part, signals, deadline, unread))
             outcomes[-1].append(outcome_of(connection, part, options, deadline))
             part.rows.frame.forget()
-    run_ids = [[run.run_id for run in group.runs] for group in compared]
+    compared_ids = [[run.run_id for run in group.runs] for group in compared]
     tests = 2 * len(signals)
     differences = [
-        replace(difference_of(each, summaries, run_ids, tests, min_effect_sd), asked=is_named)
+        replace(difference_of(each, summaries, compared_ids, tests, min_effect_sd), asked=is_named)
         for each in signals
         if len(runs.durations_s) > 1
     ]

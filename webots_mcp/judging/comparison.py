@@ -25,7 +25,6 @@ from webots_mcp.analysis.summary import (
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
-from webots_mcp.judging.even_rows import EvenRows, shared_interval_s
 from webots_mcp.judging.run_measures import (
     MOST_SEARCHED,
     OUT_OF_TIME,
@@ -38,6 +37,7 @@ from webots_mcp.judging.run_measures import (
     outcomes_of,
     reasons_of,
 )
+from webots_mcp.judging.run_sampling import SampledRun, shared_interval_s
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import listed
 from webots_mcp.signals.parameter import Value
@@ -523,7 +523,7 @@ class _Runs:
             segment,
             known,
             motion_in(frame, known, self._options),
-            EvenRows(frame, self._interval_s, segment.end_s),
+            SampledRun(frame, self._interval_s, segment.end_s),
             self.goals.get(run.run_id),
             searched,
         )

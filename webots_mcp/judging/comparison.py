@@ -25,7 +25,6 @@ from webots_mcp.analysis.summary import (
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
-from webots_mcp.judging.even_rows import EvenRows, shared_interval_s
 from webots_mcp.judging.run_measures import (
     MOST_SEARCHED,
     OUT_OF_TIME,
@@ -38,6 +37,7 @@ from webots_mcp.judging.run_measures import (
     outcomes_of,
     reasons_of,
 )
+from webots_mcp.judging.run_sampling import SampledRun, shared_interval_s
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import listed
 from webots_mcp.signals.parameter import Value
@@ -396,10 +396,10 @@ def compare_runs(
                 summaries[-1].append(_summarise(connection, part, signals, deadline, unread))
             outcomes[-1].append(outcome_of(connection, part, options, deadline))
             part.rows.frame.forget()
-    of_groups = [[run.run_id for run in group.runs] for group in compared]
+    compared_ids = [[run.run_id for run in group.runs] for group in compared]
     tests = 2 * len(signals)
     differences = [
-        replace(difference_of(each, summaries, of_groups, tests, min_effect_sd), asked=is_named)
+        replace(difference_of(each, summaries, compared_ids, tests, min_effect_sd), asked=is_named)
         for each in signals
         if len(runs.durations_s) > 1
     ]
@@ -523,7 +523,7 @@ class _Runs:
             segment,
             known,
             motion_in(frame, known, self._options),
-            EvenRows(frame, self._interval_s, segment.end_s),
+            SampledRun(frame, self._interval_s, segment.end_s),
             self.goals.get(run.run_id),
             searched,
         )

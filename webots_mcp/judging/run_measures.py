@@ -26,7 +26,7 @@ from webots_mcp.judging.detection.condition import VIOLATION, expectations_of
 from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
-from webots_mcp.judging.even_rows import EvenRows
+from webots_mcp.judging.run_sampling import SampledRun
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed
 from webots_mcp.store.reading.frame import Frame
@@ -98,7 +98,7 @@ def way_in(frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal]) ->
     return Way(frame.times[there], x[there], y[there], frame.cut_at_s, frame.unread)
 
 
-def _way_in_even_rows(rows: EvenRows, position: tuple[RegisteredSignal, RegisteredSignal]) -> Way:
+def _way_in_even_rows(rows: SampledRun, position: tuple[RegisteredSignal, RegisteredSignal]) -> Way:
     x, y = (in_metres(each, rows.numbers(each.name)) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
     frame = rows.frame
@@ -145,7 +145,7 @@ class RunPart:
     segment: Segment
     known: dict[str, RegisteredSignal]
     motion: Motion
-    rows: EvenRows
+    rows: SampledRun
     goal: RunGoal | None
     searched: bool = True
 

@@ -26,7 +26,7 @@ _SAME_INTERVAL: Final = 0.01  # of the interval
 
 
 @dataclass(frozen=True)
-class EvenRows:
+class SampledRun:
     """The rows that are in force at even moments of a run, from its first row on.
 
     Attributes:

@@ -311,7 +311,7 @@ def test_a_pattern_with_many_stars_is_decided_at_once_of_any_name(project: Path)
 
 def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() -> None:
     """A new caller has to be looked at, and entered here."""
-    doing = re.compile(r"\.enqueue\(|\bLaunch\(|\bgive_order,|\bload_world, address|\bpress,")
+    doing = re.compile(r"\.enqueue\(|\bWebotsLaunch\(|\bgive_order,|\bload_world, address|\bpress,")
     functions = dict[str, str]()
     for file in [*(PACKAGE / "steering").glob("*.py"), *PACKAGE.glob("*.py"),
                  *(PACKAGE / "questions").glob("*.py"), *(PACKAGE / "cli").glob("*.py"),
@@ -325,11 +325,11 @@ def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() 
                     functions[f"{file.name}:{node.name}"] = source
     # What ends or undoes something, `_by_websocket`'s part, and `prove` in a project of its own.
     free = {"dispatch.py:_leave", "trial_worker.py:_cancel", "trial_worker.py:_ask_back",
-            "routes.py:_give", "bench.py:webots"}  # fmt: skip
+            "routes.py:_give_order", "bench.py:webots"}  # fmt: skip
     asking = {name for name, source in functions.items() if "permit(" in source}
     own = {name for name in functions if name.startswith(("testing.py", "queue.py"))}
     assert functions.keys() - asking - own == free, "who does it without asking?"
-    assert {"dispatch.py:_enqueue", "routes.py:begin", "serving.py:launch"} <= asking
+    assert {"dispatch.py:_enqueue", "launcher.py:begin", "serving.py:launch"} <= asking
 
 
 async def test_texts_of_a_recording_come_marked_as_data_once_in_an_answer(

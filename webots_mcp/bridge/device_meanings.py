@@ -39,7 +39,7 @@ def describe_devices(robot: Any, *, is_supervisor: bool) -> list[Described]:
     """
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
     motors = {name: each for name, each in devices.items() if type(each).__name__ == "Motor"}
-    turned = _turned_by(robot, motors) if is_supervisor and motors else {}
+    moved_by_motor = _moved_by(robot, motors) if is_supervisor and motors else {}
     sensors = {name: _ask(motor, "getPositionSensor") for name, motor in motors.items()}
     found: list[Described] = []
     joints: dict[str, str] = {}
@@ -51,13 +51,13 @@ def describe_devices(robot: Any, *, is_supervisor: bool) -> list[Described]:
         describe = _SENSORS.get(type(device).__name__)
         if name in motors:
             partner = next((sensor for sensor, motor in joints.items() if motor == name), None)
-            said = _of_motor(name, device, partner, turned.get(name))
+            said = _of_motor(name, device, partner, moved_by_motor.get(name))
         elif type(device).__name__ == "PositionSensor":
             joint = joints.get(name, "")
-            said = _of_position_sensor(name, device, motors.get(joint), turned.get(joint))
+            said = _of_position_sensor(name, device, motors.get(joint), moved_by_motor.get(joint))
         else:
             said = describe(name, device) if describe is not None else iter(())
-        why = _why(device, turned.get(joints.get(name, name)))
+        why = _why(device, moved_by_motor.get(joints.get(name, name)))
         found += [(each, why) for each in said if _is_storable(each.name)]
     return found
 
@@ -76,12 +76,12 @@ def _number(value: object) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _why(device: Any, turned: _Turned | None) -> str:
+def _why(device: Any, moved_by_motor: _MovedBody | None) -> str:
     """The device in words: its type, model and sampling period, and what its motor turns."""
     model, period_ms = _ask(device, "getModel"), _ask(device, "getSamplingPeriod")
     words = [f"Webots device {type(device).__name__}"]
-    if turned is not None:
-        words.append(f"its joint turns a {'wheel' if turned.side else 'propeller'}")
+    if moved_by_motor is not None:
+        words.append(f"its joint turns a {'wheel' if moved_by_motor.side else 'propeller'}")
     if isinstance(model, str) and model and _is_storable(model):
         words.append(f"model {model:.80}")
     if isinstance(period_ms, int) and period_ms > 0:
@@ -216,7 +216,7 @@ _SENSORS: Final[dict[str, Callable[[str, Any], Iterator[DeclaredMeaning]]]] = {
 # -- motors and their joints -------------------------------------------------------------------
 
 
-class _Turned(NamedTuple):
+class _MovedBody(NamedTuple):
     """What a motor turns, as the scene shows it: its speed, and the side of a wheel."""
 
     quantity: Quantity
@@ -235,15 +235,15 @@ def _limits_of(motor: Any) -> _Limits:
 
 
 def _of_motor(
-    name: str, motor: Any, sensor: str | None, turned: _Turned | None
+    name: str, motor: Any, sensor: str | None, moved_by_motor: _MovedBody | None
 ) -> Iterator[DeclaredMeaning]:
     linear = _is_linear(motor)
     unit, limits = "m" if linear else "rad", _limits_of(motor)
     fastest = _number(_ask(motor, "getMaxVelocity"))
-    quantity: Quantity | None = turned.quantity if turned else None
+    quantity: Quantity | None = moved_by_motor.quantity if moved_by_motor else None
     if quantity is None and (linear or limits.low is not None):
         quantity = "joint speed"  # a wheel or a propeller turns without end
-    side = turned.side if turned else None
+    side = moved_by_motor.side if moved_by_motor else None
     yield DeclaredMeaning(
         f"motors.{name}.target_position_{unit}", "joint position", "target", unit,
         target_of=None if sensor is None else f"sensors.{sensor}", side=side,
@@ -260,11 +260,11 @@ def _of_motor(
 
 
 def _of_position_sensor(
-    name: str, sensor: Any, motor: Any, turned: _Turned | None
+    name: str, sensor: Any, motor: Any, moved_by_motor: _MovedBody | None
 ) -> Iterator[DeclaredMeaning]:
     unit = "m" if _ask(sensor, "getType") == getattr(sensor, "LINEAR", "none") else "rad"
     low, high = _Limits() if motor is None else _limits_of(motor)
-    side = turned.side if turned else None
+    side = moved_by_motor.side if moved_by_motor else None
     yield _measured(f"sensors.{name}", "joint position", unit, side=side, low=low, high=high)
 
 
@@ -289,17 +289,17 @@ class _Wheel(NamedTuple):
         )
 
 
-def _turned_by(robot: Any, motors: dict[str, Any]) -> dict[str, _Turned]:
+def _moved_by(robot: Any, motors: dict[str, Any]) -> dict[str, _MovedBody]:
     """What those motors turn of which the scene shows it: propellers, and pairs of wheels."""
     own = _ask(robot, "getSelf")
-    turned: dict[str, _Turned] = {}
+    moved_by_motor: dict[str, _MovedBody] = {}
     wheels: dict[str, _Wheel] = {}
     for name, motor in list(motors.items())[:_MOST_MOTORS]:
         node = _ask(robot, "getFromDevice", getattr(motor, "_tag", None))
         joint = _ask(node, "getParentNode")
         kinds = (_ask(joint, "getTypeName"), _ask(joint, "getBaseTypeName"))
         if "Propeller" in kinds:
-            turned[name] = _Turned("motor speed", None)
+            moved_by_motor[name] = _MovedBody("motor speed", None)
         elif "HingeJoint" in kinds and _limits_of(motor).low is None:
             try:
                 wheel = _wheel_on(own, joint)
@@ -311,8 +311,8 @@ def _turned_by(robot: Any, motors: dict[str, Any]) -> dict[str, _Turned]:
     for name, wheel in wheels.items():
         is_low = wheel.z - lowest <= max(abs(wheel.y), 0.01)
         if is_low and any(wheel.is_partner_of(other) for other in wheels.values()):
-            turned[name] = _Turned("wheel speed", "left" if wheel.y > 0 else "right")
-    return turned
+            moved_by_motor[name] = _MovedBody("wheel speed", "left" if wheel.y > 0 else "right")
+    return moved_by_motor
 
 
 def _wheel_on(own: Any, joint: Any) -> _Wheel | None:
@@ -324,15 +324,15 @@ def _wheel_on(own: Any, joint: Any) -> _Wheel | None:
     end = joint.getField("endPoint").getSFNode()
     parameters = joint.getField("jointParameters").getSFNode()
     axis = parameters.getField("axis").getSFVec3f()
-    turn = own.getOrientation()
-    axle = _inverse(turn, _turned(joint.getParentNode().getOrientation(), axis))
+    whole_rad = own.getOrientation()
+    axle = _inverse(whole_rad, _turned(joint.getParentNode().getOrientation(), axis))
     length = math.hypot(*axle)
     if not length or not abs(axle[1]) >= _AXLE * length:  # also where it is NaN
         return None
     if not _is_round(end.getField("boundingObject").getSFNode()):
         return None
     offset = [a - b for a, b in zip(end.getPosition(), own.getPosition(), strict=True)]
-    place = _Wheel(*_inverse(turn, offset))
+    place = _Wheel(*_inverse(whole_rad, offset))
     return place if all(map(math.isfinite, place)) else None
 
 
@@ -350,10 +350,10 @@ def _is_round(node: Any) -> bool:
 
 
 def _turned(matrix: Sequence[float], vector: Sequence[float]) -> list[float]:
-    """A vector turned by a rotation matrix, which is given by rows."""
+    """A vector moved_by_motor by a rotation matrix, which is given by rows."""
     return [sum(matrix[3 * row + i] * vector[i] for i in range(3)) for row in range(3)]
 
 
 def _inverse(matrix: Sequence[float], vector: Sequence[float]) -> list[float]:
-    """A vector turned back."""
+    """A vector moved_by_motor back."""
     return [sum(matrix[3 * i + row] * vector[i] for i in range(3)) for row in range(3)]

@@ -61,6 +61,7 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "what just happened": ("webots_monitor", {"lookback_wall_s": 60}),
     "signals": ("webots_list_signals", {}),
     "signals of a pattern": ("webots_list_signals", {"pattern": "X"}),
+    "meanings": ("webots_list_meanings", {}),
     "history": ("webots_query_history", {"signals": ["*"], "max_points": 6}),
     "history of the mode": ("webots_query_history", {"signals": ["mode"]}),
     "history in rows": ("webots_query_history", {"signals": ["X"], "raw": True, "last_s": 0.3}),
@@ -107,6 +108,10 @@ NEEDS_A_SIMULATION: Final = ("scene", "field of a node")
 ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "label a run": ("webots_annotate_run", {"label": "golden", "note": "asked in a test"}),
     "write a report": ("webots_report", {"file": "report.html"}),
+    "say what a signal means": (
+        "webots_describe_signals",
+        {"signals": ["X"], "quantity": "x"},
+    ),
     "set a breakpoint": ("webots_breakpoint", {"condition": "X > 1e6"}),
     "breakpoints": ("webots_list_breakpoints", {}),
     "remove a breakpoint": ("webots_remove_breakpoint", {"breakpoint_id": 1}),

@@ -324,15 +324,15 @@ def _wheel_on(own: Any, joint: Any) -> _Wheel | None:
     end = joint.getField("endPoint").getSFNode()
     parameters = joint.getField("jointParameters").getSFNode()
     axis = parameters.getField("axis").getSFVec3f()
-    whole_rad = own.getOrientation()
-    axle = _inverse(whole_rad, _turned(joint.getParentNode().getOrientation(), axis))
+    orientation = own.getOrientation()
+    axle = _inverse(orientation, _turned(joint.getParentNode().getOrientation(), axis))
     length = math.hypot(*axle)
     if not length or not abs(axle[1]) >= _AXLE * length:  # also where it is NaN
         return None
     if not _is_round(end.getField("boundingObject").getSFNode()):
         return None
     offset = [a - b for a, b in zip(end.getPosition(), own.getPosition(), strict=True)]
-    place = _Wheel(*_inverse(whole_rad, offset))
+    place = _Wheel(*_inverse(orientation, offset))
     return place if all(map(math.isfinite, place)) else None
 
 

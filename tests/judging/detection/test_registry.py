@@ -14,8 +14,8 @@ from tests.recordings.rover import Recorder
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection import events
 from webots_mcp.judging.detection.events import find_events, timeline
-from webots_mcp.judging.detection.kinds import Event, EventKind, EventOptions
-from webots_mcp.judging.detection.search import Search
+from webots_mcp.judging.detection.kinds import Event, EventOptions
+from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.plotting.plotted_runs import event_lanes, plotted_runs
 from webots_mcp.store.reading.ranges import Scope, find_range
 

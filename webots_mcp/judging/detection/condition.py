@@ -26,11 +26,10 @@ from webots_mcp.errors import (
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
-    EventKind,
     NotAskedError,
     NotSearchableError,
 )
-from webots_mcp.judging.detection.search import Search
+from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.conditions import Condition, Evaluator, parse_condition
 from webots_mcp.signals.conditions.compiler import (
     ARITHMETIC,

@@ -13,8 +13,8 @@ from itertools import pairwise
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, noise_of, np
-from webots_mcp.judging.detection.kinds import Event, EventKind, NotAskedError, NotSearchableError
-from webots_mcp.judging.detection.search import Search, places_in
+from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
+from webots_mcp.judging.detection.search import EventKind, Search, places_in
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.signals import RegisteredSignal
 

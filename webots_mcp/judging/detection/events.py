@@ -26,13 +26,12 @@ from webots_mcp.judging.detection import (
 )
 from webots_mcp.judging.detection.kinds import (
     Event,
-    EventKind,
     EventOptions,
     Ledger,
     Verdicts,
     count_by_kind,
 )
-from webots_mcp.judging.detection.search import Search, events_touching, find_motion
+from webots_mcp.judging.detection.search import EventKind, Search, events_touching, find_motion
 from webots_mcp.signals.naming import flatten
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
@@ -258,7 +257,7 @@ def search_events(
     return Found(
         time_range.robot,
         tuple(entry for entry in entries if not after or _is_left(entry[0], borders)),
-        ledger.verdicts(kinds, found),
+        ledger.verdicts([kind.name for kind in kinds], found),
         ledger.all_notes,
         tuple(context),
         borders,

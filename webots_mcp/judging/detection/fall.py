@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
-from webots_mcp.judging.detection.kinds import Event, EventKind, NotAskedError, NotSearchableError
-from webots_mcp.judging.detection.search import Search
+from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
+from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal

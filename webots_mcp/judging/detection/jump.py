@@ -25,9 +25,8 @@ from webots_mcp.analysis.swings import (
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
-    EventKind,
 )
-from webots_mcp.judging.detection.search import Search
+from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.meaning import ANGLES, Meaning
 from webots_mcp.signals.naming import metres_in
 from webots_mcp.store.reading.frame import Frame, ZoneMap

@@ -8,16 +8,13 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from webots_mcp.analysis.swings import LEAST_HALF_SWINGS
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.reading.unread import NOT_READ
-
-if TYPE_CHECKING:
-    from webots_mcp.judging.detection.search import Search
 
 LEVELS: Final = LOG_LEVELS
 MOST_TIMES: Final = 3  # of a group that are named
@@ -178,46 +175,6 @@ class Alike:
         return replace(first, **ends, details=details, count=len(alike))
 
 
-@dataclass(frozen=True)
-class EventKind:
-    """A kind of event. One of these, entered in `events.KINDS`, is all that a new kind takes.
-
-    Attributes:
-        name: Its name in questions and answers.
-        means: What the name leaves open, in a few words; empty where it leaves nothing open.
-        find: Finds the events in the segment of a search. It reports to the search what it could
-            not search (`not_searched`) and what came nearest to an event (`note_nearest`), and
-            raises `NotSearchableError` where it cannot search at all.
-        stored: It was stored when it happened: nothing is judged, and a timeline shows it.
-        usual: Whether it is looked for where no kinds are named.
-        lasts: It has a begin and an end, which are followed out of the range.
-        least_s: How long it has to last; a shorter range has to be widened by as much.
-        around_s: How far around a range it has to be looked for, where it may be shorter than that.
-        ends_within_s: How exactly its begin and end are known: nearer to the end of what was
-            looked at it may go on there.
-        of_numbers: The numeric signals are looked at.
-        routine: It happens all the time; it is shown in the room that all other kinds leave.
-        counted: Comparisons of runs count it.
-        drawn: Its place among the rows below a plot, the least first; None if it has none there.
-        alike: How similar ones are reported as one; None where each is reported by itself.
-    """
-
-    name: str
-    means: str
-    find: Callable[[Search], Iterable[Event]]
-    stored: bool = False
-    usual: Callable[[EventOptions], bool] = lambda options: True
-    lasts: bool = False
-    least_s: Callable[[EventOptions], float] = lambda options: 0.0
-    around_s: Callable[[EventOptions], float] = lambda options: 0.0
-    ends_within_s: Callable[[Event], float] = lambda event: 0.0
-    of_numbers: bool = False
-    routine: bool = False
-    counted: bool = True
-    drawn: int | None = None
-    alike: Alike | None = None
-
-
 def _lengths(lengths_s: Sequence[float]) -> str:
     """How long they lasted, where they did."""
     least_s, most_s, middle_s = min(lengths_s), max(lengths_s), median(lengths_s)
@@ -367,9 +324,9 @@ class Ledger:
         """Note what came near to an event, as a share of what would be one; the most counts."""
         self._nearest[kind] = max(self._nearest.get(kind, (0.0, "")), (share, what))
 
-    def verdicts(self, kinds: Sequence[EventKind], events: Iterable[Event]) -> Verdicts:
-        """On each of the kinds, in their order, given all that was found."""
-        counts, names = count_by_kind(events), [kind.name for kind in kinds]
+    def verdicts(self, names: Sequence[str], events: Iterable[Event]) -> Verdicts:
+        """Return what became of each kind of these names, in their order, given all events."""
+        counts = count_by_kind(events)
         not_found = [name for name in names if name in self.searched and not counts[name]]
         return Verdicts(
             {name: counts[name] for name in names if counts[name]},

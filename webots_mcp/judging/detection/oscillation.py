@@ -19,11 +19,10 @@ from webots_mcp.analysis.swings import (
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
-    EventKind,
     EventOptions,
     NotSearchableError,
 )
-from webots_mcp.judging.detection.search import MOST_NAMED, Search
+from webots_mcp.judging.detection.search import MOST_NAMED, EventKind, Search
 from webots_mcp.signals.naming import in_snake_case, listed
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.signals import RegisteredSignal

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import math
 import sqlite3
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
@@ -17,8 +17,8 @@ from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.analysis.track import PathLength, SmoothedTrack, tracks_of
 from webots_mcp.judging.detection.kinds import (
+    Alike,
     Event,
-    EventKind,
     EventOptions,
     Ledger,
     NotAskedError,
@@ -628,6 +628,46 @@ class Search:
         """Note what came near to an event, as a share of what would be one."""
         where = f" (run {self.segment.run_id})" if self.ledger.of_several_runs else ""
         self.ledger.note_nearest(kind, share, what + where)
+
+
+@dataclass(frozen=True)
+class EventKind:
+    """A kind of event. One of these, entered in `events.KINDS`, is all that a new kind takes.
+
+    Attributes:
+        name: Its name in questions and answers.
+        means: What the name leaves open, in a few words; empty where it leaves nothing open.
+        find: Finds the events in the segment of a search. It reports to the search what it could
+            not search (`not_searched`) and what came nearest to an event (`note_nearest`), and
+            raises `NotSearchableError` where it cannot search at all.
+        stored: It was stored when it happened: nothing is judged, and a timeline shows it.
+        usual: Whether it is looked for where no kinds are named.
+        lasts: It has a begin and an end, which are followed out of the range.
+        least_s: How long it has to last; a shorter range has to be widened by as much.
+        around_s: How far around a range it has to be looked for, where it may be shorter than that.
+        ends_within_s: How exactly its begin and end are known: nearer to the end of what was
+            looked at it may go on there.
+        of_numbers: The numeric signals are looked at.
+        routine: It happens all the time; it is shown in the room that all other kinds leave.
+        counted: Comparisons of runs count it.
+        drawn: Its place among the rows below a plot, the least first; None if it has none there.
+        alike: How similar ones are reported as one; None where each is reported by itself.
+    """
+
+    name: str
+    means: str
+    find: Callable[[Search], Iterable[Event]]
+    stored: bool = False
+    usual: Callable[[EventOptions], bool] = lambda options: True
+    lasts: bool = False
+    least_s: Callable[[EventOptions], float] = lambda options: 0.0
+    around_s: Callable[[EventOptions], float] = lambda options: 0.0
+    ends_within_s: Callable[[Event], float] = lambda event: 0.0
+    of_numbers: bool = False
+    routine: bool = False
+    counted: bool = True
+    drawn: int | None = None
+    alike: Alike | None = None
 
 
 def events_touching(search: Search) -> list[Event]:

@@ -19,13 +19,13 @@ from webots_mcp.analysis.track import SmoothedTrack, track_of
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
-    EventKind,
     EventOptions,
     NotSearchableError,
 )
 from webots_mcp.judging.detection.search import (
     LEAST_VISITS,
     NO_TIME,
+    EventKind,
     ModeUse,
     ModeUses,
     Motion,

@@ -15,11 +15,10 @@ from webots_mcp.judging.detection.kinds import (
     LEVELS,
     Alike,
     Event,
-    EventKind,
     NotSearchableError,
     but_for_numbers,
 )
-from webots_mcp.judging.detection.search import Search
+from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,
     Point,

@@ -13,11 +13,10 @@ from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
-    EventKind,
     NotAskedError,
     NotSearchableError,
 )
-from webots_mcp.judging.detection.search import Search
+from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.meaning import HOLDING, targets_in, words_in
 from webots_mcp.store.signals import RegisteredSignal
 

@@ -78,10 +78,13 @@ def events(bench: Bench) -> Iterator[str]:
     score = EventOptions().jump_min_score
     yield _WHY.format(score=score, jump_m=(1 + score / 0.6745) * _USUAL_STEP * READING_NOISES_M[2])
     measured = {kind for kind, _ in MEASURES.values()}
+    measured |= set(CHECKED)
     others = ", ".join(f"`{each.name}`" for each in KINDS if each.name not in measured)
     yield f"Not measured, since they are what rows and tables say, without an estimate: {others}."
+    yield f"Measured by their checks: {', '.join(f'`{kind}`' for kind in CHECKED)}."
 
 
+CHECKED: Final = ("off_target", "fall", "degradation")  # kinds that labelled runs of checks show
 _EVENTS: Final = """\
 For each row interval and each level of noise recordings of {recordings} kinds are drawn, {cases}
 of each: drives, stops, docking, creeping, robots that are held, sensors that fail, values that

@@ -93,7 +93,10 @@ MaxPoints = Annotated[
 ShownLimit = Annotated[int | None, Field(ge=1, le=500, description="Most shown.")]
 LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="Most shown.")]
-RunIds = Annotated[list[Id] | None, Field(max_length=300, description="From webots_list_runs.")]
+RunIds = Annotated[list[Id] | None, Field(max_length=10, description="From webots_list_runs.")]
+ComparedRunIds = Annotated[
+    list[Id] | None, Field(max_length=300, description="From webots_list_runs.")
+]
 Position = Annotated[
     list[str] | None,
     Field(min_length=2, max_length=2, description="Signals of x and y, if not found."),

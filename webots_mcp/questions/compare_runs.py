@@ -45,13 +45,13 @@ from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
 from webots_mcp.judging.run_measures import WHOLE_RUNS, Measure
 from webots_mcp.questions.arguments import (
     AnyNames,
+    ComparedRunIds,
     Cursor,
     Limit,
     Mode,
     Position,
     RobotName,
     RunId,
-    RunIds,
     ShownLimit,
     TrialSetId,
     Value,
@@ -168,7 +168,7 @@ def webots_list_runs(
 )
 def webots_compare_runs(
     recording: RecordingAccess,
-    run_ids: RunIds = None,
+    run_ids: ComparedRunIds = None,
     signals: AnyNames = None,
     limit: ShownLimit = None,
     trial_set: TrialSetId = None,

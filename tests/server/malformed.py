@@ -129,6 +129,11 @@ def record(file: Path) -> None:
         assert chunk_whole_run(recorded.connection, run_id)
     recorded.connection.execute("INSERT INTO lease VALUES ('maintenance', 'x', 1.0)")
     set_limits(recorded.connection, {"log": Limit(rows=5)}, "retain")
+    insert(recorded.connection, "meaning", {
+        "robot_id": 1, "name": "pose.0", "source": "declared", "quantity": "x", "role": "measured",
+        "unit": "m", "target_of": "target.x", "same_as": "pose.1", "side": "left", "low": -1.0,
+        "high": 1.0, "set_wall_time_s": 1000.0, "set_by": "mcp", "why": "because",
+    })  # fmt: skip
     insert(recorded.connection, "console_line", {
         "instance": "webots-1", "wall_time_s": time.time(), "level": "error", "source": "console",
         "message": "it waits for a run", "logger": "stderr",

@@ -23,7 +23,7 @@ TRIED = (b"\x00\xff\x01", '{"x": ', "[1, 2]", '{"x": "\\ud800"}')
 TABLES = ("robot", "session", "run", "state", "event", "command", "log", "image", "signal",
           "breakpoint", "parameter", "parameter_value", "trial_set", "trial", "kept_stretch",
           "kept_state", "console_line", "recording", "retention_limit", "row_group", "chunk",
-          "watermark", "request")  # fmt: skip
+          "watermark", "request", "meaning")  # fmt: skip
 KEPT_BY_OTHERS = {"alembic_version", "lease"}  # of Alembic; of who maintains, tested there
 
 

@@ -26,9 +26,9 @@ from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
 )
-from webots_mcp.judging.detection.search import EventKind, Search
+from webots_mcp.judging.detection.search import MOST_NAMED, EventKind, Search
 from webots_mcp.signals.meaning import ANGLES, Meaning
-from webots_mcp.signals.naming import metres_in
+from webots_mcp.signals.naming import listed, metres_in
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
@@ -67,6 +67,7 @@ def jump_events(search: Search) -> Iterator[Event]:
         for each in numbers
         if each.kind != "angle" and not each.is_index and each not in position
     ]
+    seldom = list[str]()
     for signal in search.in_time("jump", signals):
         meaning = search.meanings[signal.name]
         turns = _turns_of(meaning)
@@ -87,9 +88,11 @@ def jump_events(search: Search) -> Iterator[Event]:
             search.not_searched("jump", many)
             continue
         if not jumps and largest and least == math.inf and not (meaning.sets or _steps(meaning)):
-            few = f"not in {signal.name}: it changed too seldom to tell what is usual"
-            search.not_searched("jump", few)
+            seldom.append(signal.name)
         yield from (_event(search, signal.name, each) for each in jumps)
+    if seldom:
+        few = f"not in {listed(seldom, MOST_NAMED)}: changed too seldom to tell what is usual"
+        search.not_searched("jump", few)
     if position:
         x, y = (each.name for each in position)
         for time_s, length_m in find_leaps(frame, x, y, search.options.jump_m):

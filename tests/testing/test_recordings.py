@@ -181,7 +181,7 @@ def test_what_the_values_show_can_be_asked_for(
 ) -> None:
     for step in range(120):
         webots_robot.step(96)
-        webots_bridge.publish({"pose": [min(step, 60) * 0.1, 0.0], "mode": "cruise"})
+        webots_bridge.publish({"pose": [min(step, 60) * 0.1, 0.0], "commanded_m_s": 1.0})
     (stuck,) = webots_recording.find_events("stuck", stuck_s=4.0)
     assert (stuck.start_s, stuck.end_s) == pytest.approx((61 * 0.096, 120 * 0.096), abs=0.1)
     assert stuck.ongoing

@@ -77,7 +77,8 @@ def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Conn
 def test_a_deadline_that_passed_is_admitted(rover: sqlite3.Connection) -> None:
     found = find_range(rover, Scope(run_id=1))
     (run,) = query_history(rover, found, ["lidar.min"], deadline_s=0.0).runs
-    is_whole = max(run.sim_time_s, default=0) >= 117  # by the statistics of chunks, which take no time
+    # The statistics of chunks take no time.
+    is_whole = max(run.sim_time_s, default=0) >= 117
     assert is_whole is (run.cut_at_s is None)
 
 

@@ -125,14 +125,14 @@ def test_the_newest_change_goes_on_only_where_it_was_looked_at_to_the_end(
         (event,) = _look(unsummed, found.segments[0], options, ledger, looks)[-1:] or [None]
         if event is not None and event.end_s != 1500.0:
             assert not event.ongoing
-            assert "time limit reached" in ledger.verdicts(asked_kinds(options), []).gaps["change"]
+            assert "time limit reached" in ledger.verdicts(["change"], []).gaps["change"]
 
 
 def _verdicts(connection: sqlite3.Connection, looks: int) -> Verdicts:
     ledger, options = Ledger(), EventOptions(kinds=("gap", "change"))
     (segment,) = find_range(connection, Scope()).segments
     events = _look(connection, segment, options, ledger, looks)
-    return ledger.verdicts(asked_kinds(options), events)
+    return ledger.verdicts([kind.name for kind in asked_kinds(options)], events)
 
 
 def _look(

@@ -67,7 +67,7 @@ class GoldenRecording:
 
 
 def draw_drive(folder: Path) -> None:
-    """A rover that drives a circle and does what it is told, recorded by the bridge."""
+    """A rover that drives a circle and runs commands, recorded by the bridge."""
     robot = InProcessSupervisor("rover")
     bridge = MCPBridge(robot, throttle_interval=2, database=folder / "webots.db")
     camera = robot.getDevice("camera")

@@ -71,7 +71,7 @@ def _score_interval(having: int, runs: int) -> tuple[float, float]:
 
 
 def may_shares_differ(groups: Sequence[Sequence[float]]) -> bool:
-    """Return whether any split of so many runs with an event would show that shares differ.
+    """Return whether any split of the runs with an event could show that shares differ.
 
     See `summary.may_differ`.
     """

@@ -1,6 +1,6 @@
 """What the devices of a robot say of the signals that `auto_publish` makes of them.
 
-It is asked once, at the first reading. A method that a release of Webots lacks, or that fails,
+It is asked once, at the first reading. A method that is missing in a release of Webots, or that fails,
 leaves out what it would say. Where the robot is a supervisor, the scene shows which motors turn a
 propeller and which a wheel.
 """

@@ -195,12 +195,11 @@ class Recorder:
             ):
                 try:
                     connection.execute(_INSERT_STATE, (run.id, *values))
-                except Exception:  # noqa: BLE001  (below it is tried again, and says why)
-                    pass
-                else:
-                    self.rows_written += 1
-                    run.rows += 1
-                    return 1
+                except Exception:  # noqa: BLE001  (written again, and reported where it fails)
+                    return self._write(kind, run, values)
+                self.rows_written += 1
+                run.rows += 1
+                return 1
             return self._write(kind, run, values)
         except BaseException:
             if run is not None:

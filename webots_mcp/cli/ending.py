@@ -62,7 +62,7 @@ def ending_by_event(stopping: threading.Event) -> Generator[None]:
         if came:
             _exit(number)
         came.append(number)
-        threading.Thread(target=stopping.set).start()  # whoever holds its lock was interrupted here
+        threading.Thread(target=stopping.set).start()  # this thread may hold the lock already
 
     try:
         with _handling(end, *_WORDS):

@@ -21,7 +21,7 @@ from webots_mcp.store.retention import Limit, Retention
 def around_a_purge(
     connection: sqlite3.Connection, folder: Path, left: int, asked: Callable[[], Any]
 ) -> tuple[Any, Any]:
-    """The answer before rows are deleted, and where at most so many are left."""
+    """The answer before rows are deleted, and after a limit of rows was applied."""
     before = asked()
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(chunk_making, "GROUP_ROWS", 10)

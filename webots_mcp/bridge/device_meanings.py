@@ -1,8 +1,8 @@
 """What the devices of a robot say of the signals that `auto_publish` makes of them.
 
-It is asked once, at the first reading. A method that is missing in a release of Webots, or that fails,
-leaves out what it would say. Where the robot is a supervisor, the scene shows which motors turn a
-propeller and which a wheel.
+Devices are asked once, at the first reading. Where a method fails or is missing in a release of
+Webots, its part of the description is left out. For a supervisor, the scene shows which motors turn
+a propeller and which a wheel.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,15 @@ from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.log_handler import LogHandler
+from webots_mcp.bridge.output_channel import OutputChannel
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.printed_lines import PrintedLines
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.redirection import Redirection
 from webots_mcp.bridge.registration import identify
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_changes import SceneActions
@@ -213,3 +219,53 @@ def test_a_watchdog_writes_its_file_next_to_the_database(base: Base) -> None:
     assert [each.name for each in base.folder.iterdir() if base.recorder.uuid in each.name]
     watchdog.close()
     assert not [each.name for each in base.folder.iterdir() if base.recorder.uuid in each.name]
+
+
+def test_printed_lines_are_whole_and_the_rest_becomes_one_at_the_end() -> None:
+    lines = PrintedLines()
+    lines.take(b"one\n\ntwo\nth")
+    assert lines.remove() == ["one", "two"]
+    lines.take(b"ree")
+    lines.end()
+    assert lines.remove() == ["three"]
+
+
+def test_a_redirected_descriptor_is_read_until_it_is_restored(tmp_path: Path) -> None:
+    with (tmp_path / "output").open("w+b", buffering=0) as file:
+        redirection = Redirection(file.fileno(), blocking=True)
+        file.write(b"into the pipe")
+        redirection.restore()
+        file.write(b"into the file")
+        assert os.read(redirection.read_end, 100) == b"into the pipe"
+        redirection.close()
+        assert (tmp_path / "output").read_bytes() == b"into the file"
+
+
+def test_an_output_channel_forwards_and_records(tmp_path: Path) -> None:
+    recorded = list[tuple[str, str]]()
+    with (tmp_path / "output").open("w+b", buffering=0) as file:
+        channel = OutputChannel(
+            "stdout",
+            Redirection(file.fileno(), blocking=os.name != "posix"),
+            PrintedLines(),
+            lambda name, lines: recorded.extend((name, line) for line in lines),
+            writes_to_descriptor=False,
+        )
+        print("of Python")
+        file.write(b"of C code\n")
+        channel.close()
+    assert sorted(recorded) == [("stdout", "of C code"), ("stdout", "of Python")]
+    assert (tmp_path / "output").read_bytes() == b"of C code\n"
+
+
+def test_a_log_handler_records_level_and_logger_and_ignores_lines_of_the_recording() -> None:
+    logger, recorded = logging.Logger("wheels"), list[object]()
+
+    def record(text: object, level: object, name: str | None) -> None:
+        recorded.append((text, level, name))
+        logger.error("written while recording")
+
+    logger.addHandler(LogHandler(record, "info"))
+    logger.debug("too low")
+    logger.warning("slip %s", "left")
+    assert recorded == [("slip left", logging.WARNING, "wheels")]

@@ -326,7 +326,7 @@ class MCPBridge:
         Args:
             level: The handler records this level and those above it.
         """
-        from webots_mcp.bridge.capture import LogHandler  # `logging` costs a tenth of a start
+        from webots_mcp.bridge.log_handler import LogHandler  # `logging` is a tenth of a start
 
         return LogHandler(self._log, level)
 

@@ -37,8 +37,8 @@ from tests.benchmarks.ways import (
     make_states,
 )
 from webots_mcp import MCPBridge
-from webots_mcp.bridge.keeping import scale_down
-from webots_mcp.bridge.pictures import encode_png
+from webots_mcp.bridge.camera_frames import scale_down
+from webots_mcp.bridge.picture_files import encode_png
 from webots_mcp.contract import KEEP_LAST_S
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.simulator.observer import Observer

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast, get_args
 
 from webots_mcp.bridge.encoding import plain
 from webots_mcp.bridge.error_report import cut, describe, storable
+from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
@@ -105,14 +105,14 @@ class Breakpoints:
         recorder: Recorder,
         journal: Journal,
         pause: Pause,
-        keeper: Keeper,
+        full_rate: FullRateRecorder,
     ) -> None:
         self._simulation = simulation
         self._clock = clock
         self._recorder = recorder
         self._journal = journal
         self._pause = pause
-        self._keeper = keeper
+        self._full_rate = full_rate
         self.run: CurrentRun | None = (
             None  # in which the stored ones were read; None: to be read again
         )
@@ -295,7 +295,7 @@ class Breakpoints:
         """Record the hits, keep the seconds around them, and pause where one demands it."""
         for each in hit:
             if each.action in _KEEPING:
-                self._keeper.keep(f"{each.called}: {each.condition.text}")
+                self._full_rate.keep(f"{each.called}: {each.condition.text}")
             if each.hit_count - each.after_hits < MOST_EVENTS:
                 self._record_hit(each, state)
         pausing = [each for each in hit if each.action == "pause"]
@@ -312,8 +312,8 @@ class Breakpoints:
         }
         if each.action == "pause" and not self._simulation.supervisor:
             data["not_paused"] = _CANNOT_PAUSE
-        if each.action == "keep" and not self._keeper.enabled:
-            data["not_kept"] = self._keeper.why_not
+        if each.action == "keep" and not self._full_rate.enabled:
+            data["not_kept"] = self._full_rate.why_not
         if each.expectation is None:
             self._journal.event("breakpoint", data, each.condition.text)
         else:

@@ -28,7 +28,7 @@ from webots_mcp.bridge.registration import Identity, same_simulation
 from webots_mcp.bridge.scene_nodes import SceneNode, find_field
 from webots_mcp.bridge.simulation import Clock, LoopMeter, Simulation
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
-from webots_mcp.database.liveness import is_living
+from webots_mcp.database.processes import is_living
 from webots_mcp.signals.register import SignalNames, StateChanges
 
 TEXT: Final = "custom_data"  # the signal of a text that is no JSON object

@@ -12,7 +12,7 @@ from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S
-from webots_mcp.database.liveness import LoopStatus
+from webots_mcp.database.heartbeat import LoopStatus
 from webots_mcp.database.pauses import PAUSED
 
 MOST_LOG_CHARACTERS: Final = 10_000

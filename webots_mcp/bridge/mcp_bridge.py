@@ -14,7 +14,7 @@ from webots_mcp.bridge.commands import ClaimedCommand, Handler
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport, describe
 from webots_mcp.bridge.parameters import Parameter, V
-from webots_mcp.bridge.pictures import MOST_FRAMES
+from webots_mcp.bridge.picture_files import MOST_FRAMES
 from webots_mcp.bridge.session import BridgeSession
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.throttle import Throttle
@@ -274,7 +274,7 @@ class MCPBridge:
             reason: Why they are kept; it is stored with the stretch.
         """
         try:
-            self._session.keeper.keep(text_of(reason))
+            self._session.full_rate.keep(text_of(reason))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep", error)
 
@@ -296,10 +296,10 @@ class MCPBridge:
                 the camera's sampling period allows. A later call for the same camera changes it.
         """
         try:
-            keeper = self._session.keeper
-            if not keeper.enabled:
-                raise CommandRefusedError(keeper.why_not)
-            keeper.frames.watch(camera, frames_per_s)
+            full_rate = self._session.full_rate
+            if not full_rate.enabled:
+                raise CommandRefusedError(full_rate.why_not)
+            full_rate.frames.watch(camera, frames_per_s)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep_camera", error)
 
@@ -339,7 +339,7 @@ class MCPBridge:
             text = text_of(message)
             self._session.journal.log(known or "info", "controller", text, logger)
             if known in _KEEPING:
-                self._session.keeper.ask(f"{known}: {text}")
+                self._session.full_rate.ask(f"{known}: {text}")
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
@@ -354,7 +354,7 @@ class MCPBridge:
             The file's path relative to the data folder; None where there is no image yet.
         """
         try:
-            return self._session.album.save_frame(camera, max_frames)
+            return self._session.picture_files.save_frame(camera, max_frames)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("save_camera_frame", error)
             return None
@@ -564,7 +564,7 @@ class MCPBridge:
             publish_mean_us=1e6 * publisher.total_s / max(1, publisher.recorded),
             publish_max_us=1e6 * publisher.longest_s,
             ring_interval=publisher.devices.ring_interval,
-            frames_missed=self._session.keeper.frames.missed,
+            frames_missed=self._session.full_rate.frames.missed,
             failures=self._errors.failures,
             last_error=self._errors.last_error,
         )

@@ -16,8 +16,8 @@ from webots_mcp.bridge.commands import Reloads
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut
+from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.bridge.throttle import Throttle
@@ -48,7 +48,7 @@ class Publisher:
         throttle: Throttle,
         breakpoints: Breakpoints,
         watch: Watch,
-        keeper: Keeper,
+        full_rate: FullRateRecorder,
         devices: DeviceReader,
         reloads: Reloads,
         begin_run: Callable[[], None],
@@ -60,7 +60,7 @@ class Publisher:
         self._throttle = throttle
         self._breakpoints = breakpoints
         self._watch = watch
-        self._keeper = keeper
+        self._full_rate = full_rate
         self._reloads = reloads
         self._begin_run = begin_run
         self._changes = StateChanges()
@@ -76,7 +76,7 @@ class Publisher:
         """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
         if self._clock.update():
             self._begin_run()
-        wanted, hit, keeper, breakpoints = force, None, self._keeper, self._breakpoints
+        wanted, hit, full_rate, breakpoints = force, None, self._full_rate, self._breakpoints
         # Tested here, since even an empty call would slow down every `publish`.
         if breakpoints.armed or breakpoints.run is not self._clock.run:
             hit = breakpoints.evaluate(state)
@@ -85,14 +85,14 @@ class Publisher:
             wanted = self._watch.evaluate(state) or wanted
         if self._throttle.admits(wanted or hit or self._heartbeat.loop):
             self._record(state)
-        elif keeper.fills:
-            keeper.add(state, own_bytes)
-        if keeper.frames.cameras:
+        elif full_rate.fills:
+            full_rate.add(state, own_bytes)
+        if full_rate.frames.cameras:
             self._take_camera_frames(at_once=bool(hit))
         if hit:
             breakpoints.act(hit, state)  # after recording: a pause must show the state of the hit
-        if keeper.busy:
-            keeper.go_on()
+        if full_rate.busy:
+            full_rate.go_on()
 
     def publish_devices(
         self, extra: Mapping[Any, Any], include_time: bool, force: bool = False
@@ -108,8 +108,8 @@ class Publisher:
         state = None
         if self._clock.update():
             self._begin_run()
-        keeper, throttle = self._keeper, self._throttle
-        due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
+        full_rate, throttle = self._full_rate, self._throttle
+        due = full_rate.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
         if due or self._breakpoints.ask_states() or self._watch.asks_states:
             state = self._read(extra, include_time)
             # What the devices say is made anew each time: nothing else can change it.
@@ -118,12 +118,12 @@ class Publisher:
         if throttle.admits(force or self._heartbeat.loop is not None):
             state = self._read(extra, include_time)
             self._record(state)
-        elif keeper.fills:
-            keeper.leave_out(self.devices.why)
-        if keeper.frames.cameras:
+        elif full_rate.fills:
+            full_rate.leave_out(self.devices.why)
+        if full_rate.frames.cameras:
             self._take_camera_frames(at_once=False)
-        if keeper.busy:
-            keeper.go_on()
+        if full_rate.busy:
+            full_rate.go_on()
         return state
 
     def unread(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
@@ -132,9 +132,9 @@ class Publisher:
 
     def _take_camera_frames(self, *, at_once: bool) -> None:
         """Hold due camera frames with the states; at a hit take one of each camera."""
-        keeper = self._keeper
-        if at_once or keeper.frames.is_due(self._clock.sim_time_s):
-            keeper.take_camera_frames(at_once=at_once)
+        full_rate = self._full_rate
+        if at_once or full_rate.frames.is_due(self._clock.sim_time_s):
+            full_rate.take_camera_frames(at_once=at_once)
 
     def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
         return self.devices.read() | self.unread(extra, include_time)

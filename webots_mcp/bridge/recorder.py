@@ -54,7 +54,7 @@ from webots_mcp.database.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.database.liveness import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
+from webots_mcp.database.heartbeat import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.database.location import Database
 from webots_mcp.database.waiting_file import (
     STATEMENTS,

@@ -1,4 +1,4 @@
-"""The built-in actions on the scene tree, above all those that change it.
+"""The built-in actions that change the scene tree: set_field, add_node, remove_node.
 
 Webots sets a field with the next step, so the answer has the field's value after that step. Each
 change is an event, and is remembered, so that a reset undoes it.
@@ -13,7 +13,7 @@ import time
 from collections.abc import Generator
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.field_values import (
     MOST_ENTRIES,
@@ -34,7 +34,6 @@ from webots_mcp.bridge.scene_edits import (
 )
 from webots_mcp.bridge.scene_nodes import children, label
 from webots_mcp.bridge.scene_paths import PathTarget, find, find_node
-from webots_mcp.bridge.scene_reading import get_field, get_scene
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
@@ -48,10 +47,10 @@ _ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
 _SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
 
 
-class SceneActions:
-    """The built-in actions on the scene tree: read it, set fields, add and remove nodes.
+class SceneChanges:
+    """Sets fields, and adds and removes nodes.
 
-    They ask Webots from within the controller's loop, for a few milliseconds per round.
+    Each change asks Webots from within the controller's loop, for a few milliseconds per round.
     """
 
     def __init__(
@@ -62,23 +61,9 @@ class SceneActions:
         self._journal = journal
         self._edits = edits
 
-    def by_name(self) -> dict[str, Action]:
-        """Return the functions by the name of their action."""
-        return {
-            "get_scene": self.get_scene,
-            "get_field": self.get_field,
-            "set_field": self.set_field,
-            "add_node": self.add_node,
-            "remove_node": self.remove_node,
-        }
-
-    def get_scene(self, command: ClaimedCommand) -> Progress:
-        """Find nodes of the tree, see `scene_reading.get_scene`."""
-        return get_scene(self._simulation.robot, command.params)
-
-    def get_field(self, command: ClaimedCommand) -> Progress:
-        """Read a field or the fields of a node, see `scene_reading.get_field`."""
-        return get_field(self._simulation.robot, command.params)
+    def begin_run(self) -> None:
+        """After a reset, undo the changes that Webots has not undone."""
+        self._edits.begin_run()
 
     def set_field(self, command: ClaimedCommand) -> Progress:
         """Set the field, or the entry of a field, at a `path` to a `value`."""

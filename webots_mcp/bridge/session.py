@@ -12,22 +12,20 @@ from webots_mcp.bridge.breakpoints import Breakpoints, Watch
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.controller_actions import ControllerActions
-from webots_mcp.bridge.device_meanings import describe_devices
 from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.meanings import SignalMeanings
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.picture_actions import PictureActions
-from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.picture_files import PictureFiles
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.running_actions import RunningActions
-from webots_mcp.bridge.scene_changes import SceneActions
-from webots_mcp.bridge.scene_edits import SceneEdits
+from webots_mcp.bridge.scene_actions import SceneActions
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog
@@ -67,10 +65,16 @@ class BridgeSession:
         self.journal = journal = Journal(recorder, clock)
         self.heartbeat = Heartbeat(recorder, clock)
         self.reloads = Reloads(errors.failed)
-        self.album = Album(recorder, clock, data_dir)
-        self.keeper = Keeper(clock, recorder, journal, self.album, throttle, keep_last_s)
+        self.picture_files = PictureFiles(recorder, clock, data_dir)
+        self.full_rate = FullRateRecorder(
+            clock, recorder, journal, self.picture_files, throttle, keep_last_s
+        )
         self.pause = Pause(
-            simulation, journal, self.heartbeat, self.keeper.write_all, self.check_clock_after_step
+            simulation,
+            journal,
+            self.heartbeat,
+            self.full_rate.write_all,
+            self.check_clock_after_step,
         )
         self.handlers = Handlers(recorder, journal, self.pause)
         self.parameters = Parameters(
@@ -78,7 +82,7 @@ class BridgeSession:
         )
         self.meanings = SignalMeanings(recorder)
         self.breakpoints = Breakpoints(
-            simulation, clock, recorder, journal, self.pause, self.keeper
+            simulation, clock, recorder, journal, self.pause, self.full_rate
         )
         self.watch = Watch(clock, simulation.basic_time_step_s / 100)
         self.publisher = Publisher(
@@ -89,13 +93,13 @@ class BridgeSession:
             throttle,
             self.breakpoints,
             self.watch,
-            self.keeper,
+            self.full_rate,
             DeviceReader(simulation, journal, errors, self._describe_devices),
             self.reloads,
             self.begin_run,
         )
         self.unseen = UnseenSteps(simulation, journal, errors)
-        self._scene_edits = SceneEdits(simulation, journal, errors)
+        self._scene = SceneActions(simulation, clock, journal, errors)
         self.control = self._build_control()
         self._watchdog = Watchdog(simulation, clock, recorder, journal, database, hang_after_s)
         self._began_s: float | None = time.monotonic()  # None once `_on_tick` has judged it
@@ -120,10 +124,10 @@ class BridgeSession:
         actions = (
             running,
             world,
-            PictureActions(simulation, clock, self.album),
-            SceneActions(simulation, clock, self.journal, self._scene_edits),
+            PictureActions(simulation, clock, self.picture_files),
+            self._scene,
             ControllerActions(
-                clock, pause, self.reloads, self.parameters, self.breakpoints, self.keeper
+                clock, pause, self.reloads, self.parameters, self.breakpoints, self.full_rate
             ),
         )
         by_name = {name: action for part in actions for name, action in part.by_name().items()}
@@ -132,6 +136,10 @@ class BridgeSession:
 
     def _describe_devices(self) -> None:
         """Record what the devices say of the signals that are made of them."""
+        from webots_mcp.bridge.device_meanings import (
+            describe_devices,  # only where devices are read
+        )
+
         simulation = self.simulation
         known = describe_devices(simulation.robot, is_supervisor=simulation.supervisor)
         self.meanings.record_devices(known)
@@ -193,8 +201,8 @@ class BridgeSession:
         if simulation.over:
             return None
         self.parameters.take_wanted()
-        if self.keeper.busy:
-            self.keeper.go_on()
+        if self.full_rate.busy:
+            self.full_rate.go_on()
         command = self.control.serve()
         self.heartbeat.poll()
         if simulation.over:
@@ -225,7 +233,7 @@ class BridgeSession:
         self.journal.event("reset")
         # Before the callbacks, which may read values that waited for the reset, and set others.
         self.parameters.begin_run()
-        self._scene_edits.begin_run()
+        self._scene.begin_run()
         restart_motors(self.simulation.robot, self.journal, self.errors.failed)
         self.reloads.fire()
         self.heartbeat.beat()
@@ -234,7 +242,7 @@ class BridgeSession:
         """Write the waiting rows and end, for the given or the known reason."""
         # The maintainer first: its thread uses the recorder too.
         stop = () if self._maintainer is None else (self._maintainer.stop,)
-        for close in (*stop, self._watchdog.close, self.keeper.close):
+        for close in (*stop, self._watchdog.close, self.full_rate.close):
             try:
                 close()
             except Exception as error:  # noqa: BLE001, PERF203  (the session ends whatever fails)
@@ -251,7 +259,7 @@ class BridgeSession:
         """In a forked child: leave the recording to the parent."""
         self._watchdog.abandon()
         self.recorder.abandon()
-        self.keeper.abandon()
+        self.full_rate.abandon()
 
     @property
     def _end_reason(self) -> str:
@@ -263,7 +271,7 @@ class BridgeSession:
         The session stays usable, since the loop may also continue for a last few statements.
         """
         self.control.report_end(extern=self.identity.extern)
-        self.keeper.write_all()
+        self.full_rate.write_all()
         self._watchdog.close()
         self.recorder.end(self._end_reason, self.clock.sim_time_s)
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.liveness import LoopTimes
+from webots_mcp.database.heartbeat import LoopTimes
 from webots_mcp.database.stacks import STEPPING
 from webots_mcp.errors import CommandRefusedError
 

@@ -51,22 +51,22 @@ _ABOUT_A_VALUE: Final = (
 # All that a statement may raise because of the database.
 FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemError)
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
-_MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
-_TOKENS: Final = re.compile(
-    r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
+# Patterns are texts, which `re` compiles when they are needed: most are for foreign objects only.
+_MADE: Final = r'(?i)CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)'
+_TOKENS: Final = (
+    r"(?s)('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])"
 )
-_OF_COLUMNS: Final = re.compile(
-    r'CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
-    r'(, ?"?\w+"?( (ASC|DESC))?)*\)',
-    re.IGNORECASE,
+_OF_COLUMNS: Final = (
+    r'(?i)CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
+    r'(, ?"?\w+"?( (ASC|DESC))?)*\)'
 )
-_INDEX: Final = re.compile(r"CREATE (UNIQUE )?INDEX")
+_INDEX: Final = r"CREATE (UNIQUE )?INDEX"
 _OBJECTS: Final = (
     "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
     "FROM {}.sqlite_master WHERE sql IS NOT NULL"
 )
 # SQLite's own, which our questions use: a table or view of that name would be read in their place.
-_OF_SQLITE: Final = re.compile(r"pragma_|json_(each|tree)$|sqlite_")
+_OF_SQLITE: Final = r"pragma_|json_(each|tree)$|sqlite_"
 _OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
 _NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
@@ -339,7 +339,7 @@ def shipped_objects() -> dict[str, str]:
 @cache
 def _objects_of(statements: tuple[str, ...]) -> dict[str, str]:
     """Return by their names the statements that make tables, views, indexes and triggers."""
-    made = ((_MADE.match(each), each.rstrip()) for each in statements)
+    made = ((re.match(_MADE, each), each.rstrip()) for each in statements)
     return {match[1].lower(): each for match, each in made if match}
 
 
@@ -366,7 +366,7 @@ def require_shipped(
     found = connection.execute(_OBJECTS.format(schema)).fetchall()
     names = {name.lower() for _, name, _, _ in found}
     for name, sql in shipped.items():
-        if name not in names and not _INDEX.match(sql):  # without one, all is slower, and true
+        if name not in names and not re.match(_INDEX, sql):  # without one, all is slower, and true
             raise ForeignDatabaseError(
                 f"{_file(connection, schema)} has no {name!r}, which webots-mcp makes in each "
                 "recording: use a copy from before it was removed"
@@ -395,11 +395,11 @@ def _why_refused(
     """Why an object is refused; None where it is harmless, or ours in another spelling."""
     if (ours := shipped.get(name.lower())) is not None:
         return None if _spelled(sql) == _spelled(ours) else "stands where another is in recordings"
-    if _OF_SQLITE.match(name.lower()) and not sql.startswith(_OF_SQLITE_MADE):
+    if re.match(_OF_SQLITE, name.lower()) and not sql.startswith(_OF_SQLITE_MADE):
         return "has a name of SQLite's own"
     if kind == "trigger" and (table.lower() in shipped or table.lower() in referring):
         return f"runs when {table[:60]!r} is written to"
-    if kind == "index" and table.lower() in shipped and not _OF_COLUMNS.fullmatch(sql.strip()):
+    if kind == "index" and table.lower() in shipped and not re.fullmatch(_OF_COLUMNS, sql.strip()):
         return f"computes when {table[:60]!r} is written to"
     return None
 
@@ -413,7 +413,7 @@ def _spelled(sql: str) -> list[str]:
     """The words of a statement: versions of SQLite and ours differ in spaces and comments."""
     return [
         each if each.startswith("'") else each.strip('"').lower()
-        for each in _TOKENS.findall(sql)
+        for each in re.findall(_TOKENS, sql)
         if not each.startswith(("/*", "--"))
     ]
 

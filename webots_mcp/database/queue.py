@@ -141,7 +141,7 @@ _NEWEST: Final = (
 # -- the controller that it is for -------------------------------------------------------------
 
 
-# -- processes that see that none will finish it (`liveness.reap`) ----------------------------
+# -- processes that see that none will finish it (`dead_sessions.reap`) ----------------------------
 
 
 class CommandQueue:
@@ -261,7 +261,7 @@ def list_commands(
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:
-    """Whether `liveness.reap` could have anything to say about commands."""
+    """Whether `dead_sessions.reap` could have anything to say about commands."""
     return bool(connection.execute(_UNFINISHED).fetchone()[0])
 
 

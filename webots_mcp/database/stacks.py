@@ -24,18 +24,18 @@ FORMAT: Final = 1
 LOGGER: Final = "stacks"  # of the log rows
 SIGNAL: Final = getattr(signal, "SIGRTMAX", 5) - 5  # 0, none, but on Linux
 STEPPING: Final = ("step", "stepBegin", "stepEnd")  # methods in which a controller waits for Webots
-_THREAD: Final = re.compile(
-    r"^(?:Current thread|Thread) 0x([0-9a-f]+)[^\n]*\(most recent call first\):\n((?:  .*\n?)*)",
-    re.MULTILINE,
+# Patterns are texts, which `re` compiles when they are needed: rarely in a controller.
+_THREAD: Final = (
+    r"(?m)^(?:Current thread|Thread) 0x([0-9a-f]+)[^\n]*\(most recent call first\):"
+    r"\n((?:  .*\n?)*)"
 )
-_CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
-_FOLDERS: Final = re.compile(r".*[/\\]")
+_CALL: Final = r'(?m)^  File "(.*)", line (\S+) in (.*)$'
 # Folders whose files are no controller's own: this package's, and Python's.
 LIBRARIES: Final = (f"{Path(__file__).parents[1]}{os.sep}", f"{Path(os.__file__).parent}{os.sep}")
-INSTALLED: Final = re.compile(
+INSTALLED: Final = (
     r"[/\\](?:site|dist)-packages[/\\]|[/\\]lib[/\\]controller[/\\]python[/\\]|^<frozen "
 )
-_DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
+_DEBUGGER: Final = r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)"
 _BY_PERSON: Final = "waitForUserInputEvent"  # of Webots' Robot: a key or a click is waited for
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
 _UNTOUCHED_S: Final = 3.0  # the maintainer's thread touches the file each second
@@ -55,7 +55,8 @@ class Call(NamedTuple):
     function: str
 
     def __str__(self) -> str:
-        place = f"{_cut(_FOLDERS.sub('', self.file))}:{self.line}"
+        name = re.split(r"[/\\]", self.file)[-1]
+        place = f"{_cut(name)}:{self.line}"
         return place if self.function == "<module>" else f"{place}, {_cut(self.function)}()"
 
     @property
@@ -119,8 +120,8 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     try:
         about = json.loads(head)
         run, limit_s = str(about["run"]), float(about["limit_s"])
-        threads = {int(thread, 16): calls for thread, calls in _THREAD.findall(text)}
-        calls = [Call(*call) for call in _CALL.findall(threads[about["thread"]])]
+        threads = {int(thread, 16): calls for thread, calls in re.findall(_THREAD, text)}
+        calls = [Call(*call) for call in re.findall(_CALL, threads[about["thread"]])]
         steps, libraries = (tuple(map(str, about[name])) for name in ("step_files", "libraries"))
         run.encode()
     except _STRANGE:
@@ -131,7 +132,7 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     own = [call for call in calls if call not in waits and not is_library(call.file, libraries)]
     inner = calls[: calls.index(own[0])] if own else calls
     is_in_step = any(call in waits for call in inner)
-    is_held = any(_DEBUGGER.search(call.file) or call.function == _BY_PERSON for call in calls)
+    is_held = any(re.search(_DEBUGGER, call.file) or call.function == _BY_PERSON for call in calls)
     hangs = not (is_in_step or is_held)
     written_s = os.fstat(file.fileno()).st_mtime
     return Stacks(written_s, run, limit_s, calls, own, hangs, is_in_step, text)
@@ -139,7 +140,7 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
 
 def is_library(file: str, libraries: tuple[str, ...] = LIBRARIES) -> bool:
     """Whether a file is no controller's own, but Python's, Webots', this package's or installed."""
-    return file.startswith(libraries) or INSTALLED.search(file) is not None
+    return file.startswith(libraries) or re.search(INSTALLED, file) is not None
 
 
 def stacks_at(path: Path) -> Stacks | None:

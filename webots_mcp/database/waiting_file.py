@@ -245,9 +245,7 @@ _OF_THE_FILE: Final = (
     OSError, ValueError, TypeError, LookupError, RecursionError, SessionGoneError,
 )  # fmt: skip
 # At the end of the name of a journal's part: the session's UUID and the number of the part.
-_PART: Final = re.compile(
-    r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
-)
+_PART: Final = r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
 
 
 class WaitingEntry(NamedTuple):
@@ -284,7 +282,7 @@ def waiting_path(database: Path, session_uuid: str) -> Path:
 def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_path) -> list[Path]:
     """The files in which entries of bridges wait, of living sessions too; or those of a kind."""
     names = _names(database, kind)
-    return [database.with_name(name) for name in sorted(names) if not _PART.search(name)]
+    return [database.with_name(name) for name in sorted(names) if not re.search(_PART, name)]
 
 
 def left_waiting(database: Path) -> list[Path]:
@@ -306,7 +304,7 @@ def journal_parts(database: Path) -> dict[str, list[Path]]:
     """
     found: dict[str, list[tuple[int, Path]]] = {}
     for name in _names(database, waiting_path):
-        if part := _PART.search(name):
+        if part := re.search(_PART, name):
             found.setdefault(part[1], []).append((int(part[2]), database.with_name(name)))
     return {
         uuid: [path for _, path in sorted(parts)]

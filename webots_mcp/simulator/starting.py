@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final, Literal, NamedTuple
 
-from webots_mcp.database.liveness import process_alive
+from webots_mcp.database.processes import process_alive
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator import program_keeper
 from webots_mcp.simulator.installations import find_webots

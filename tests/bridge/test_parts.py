@@ -11,7 +11,7 @@ import pytest
 
 from tests.bridge.conftest import send
 from webots_mcp import MemoryDatabase
-from webots_mcp.bridge.breakpoints import Breakpoints, Watch, read_goal
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.devices import DeviceReader
@@ -28,6 +28,7 @@ from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.redirection import Redirection
 from webots_mcp.bridge.registration import identify
+from webots_mcp.bridge.run_goal import Watch, read_goal
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_actions import SceneActions
 from webots_mcp.bridge.simulation import Clock, Simulation

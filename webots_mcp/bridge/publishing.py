@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from itertools import islice
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.breakpoints import Breakpoints, Watch
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.commands import Reloads
 from webots_mcp.bridge.devices import DeviceReader
@@ -19,6 +19,7 @@ from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.signals.register import SignalNames, StateChanges

@@ -9,10 +9,11 @@ import time
 from collections.abc import Callable, Generator
 from typing import Final
 
-from webots_mcp.bridge.breakpoints import Breakpoints, Goal, Watch, read_goal
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.parameters import Parameters, setter_of
 from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.run_goal import Goal, Watch, read_goal
 from webots_mcp.bridge.simulation import Clock, Simulation, mode_now
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import MAX_STEPS, Then

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.bridge.attachment import Attachment, UnseenSteps
-from webots_mcp.bridge.breakpoints import Breakpoints, Watch
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.controller_actions import ControllerActions
@@ -24,6 +24,7 @@ from webots_mcp.bridge.picture_files import PictureFiles
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
+from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_actions import SceneActions
 from webots_mcp.bridge.simulation import Clock, Simulation

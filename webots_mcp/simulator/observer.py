@@ -26,7 +26,7 @@ from webots_mcp.bridge.custom_data import CustomDataReader, ObserverParts
 from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.simulator.observed_world import DIGITS, ObservedBody, ObservedWorld
+from webots_mcp.simulator.observed_bodies import DIGITS, ObservedBodies, ObservedBody
 
 PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
 LONGEST_PERIOD_MS: Final = 60_000
@@ -240,7 +240,7 @@ class Observer:
         self._robot = robot
         self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
         self.bridge.count_steps_by_time()
-        self.world = ObservedWorld(robot, self._period_ms, self._warn)
+        self.world = ObservedBodies(robot, self._period_ms, self._warn)
         self.custom_data = self.bridge.read_custom_data()
         self._pace = StepPace(robot, self._period_ms, world_waits=self.bridge.world_waits)
         self._due_s = -math.inf

@@ -196,7 +196,7 @@ def word_of(name: str, taken: Collection[str]) -> str:
     return free
 
 
-class ObservedWorld:
+class ObservedBodies:
     """The bodies of a world, as far as they have been found.
 
     Args:

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from webots_mcp.signals.conditions import Condition, Evaluator
     from webots_mcp.signals.conditions.compiler import Expectation, Violated
 
-MOST_EVENTS: Final = 1000  # of one breakpoint in one run: a flickering condition fills no database
-_UNPUBLISHED_S: Final = 1.0  # a signal that was not published for so long is reported
+MOST_EVENTS: Final = 1000  # of one breakpoint in one run, lest a flickering condition fill the disk
+_UNPUBLISHED_S: Final = 1.0  # simulation time after which an unpublished signal is reported
 _MOST_ERROR_CHARACTERS: Final = 1000
 
 
 # Condition, action, hits; of an expectation its name, what is expected, and during what.
 Asks = tuple[str, str, int, "str | None", "str | None", "str | None"]
-_KEEPING: Final = ("pause", "keep")  # a pause is for looking at what led to it
+_KEEPING: Final = ("pause", "keep")  # after a pause, a person wants to see what led to it
 _CANNOT_PAUSE: Final = (
     "the robot is not a Supervisor: set its field `supervisor` to TRUE in the world file"
 )
@@ -110,10 +110,9 @@ class Breakpoints:
         self._journal = journal
         self._pause = pause
         self._full_rate = full_rate
-        self.run: CurrentRun | None = (
-            None  # in which the stored ones were read; None: to be read again
-        )
-        self.reaches = False  # the newest state meets what is expected within a time
+        # The run in which the stored breakpoints were read; None: they have to be read again.
+        self.run: CurrentRun | None = None
+        self.reaches = False  # the newest state meets an expectation that has a time limit
         self._begun = clock.run
         self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
@@ -159,12 +158,12 @@ class Breakpoints:
         return True
 
     def _read_later(self) -> tuple[()]:
-        """A new database was begun: read its breakpoints with the next state. Adds no entries."""
+        """Read the breakpoints of a new database with the next state; add no entries to it."""
         self.run = None
         return ()
 
     def _move(self, stored: list[ArmedBreakpoint]) -> None:
-        """Move to another database: what is armed and not there is stored in it."""
+        """Store in another database what is armed here and missing there."""
         there = {each.asks: each for each in stored}
         for each in self.armed:
             same = there.pop(each.asks, None)
@@ -193,15 +192,14 @@ class Breakpoints:
         return _armed(number, *asked)
 
     def set(self, text: str, action: str, after_hits: int) -> int | None:
-        """Arm one of the controller's code, for as long as its session lasts.
+        """Arm a breakpoint of the controller's code, for as long as its session lasts.
 
         Returns:
-            Its id; None while the database cannot take it: it is armed all the same, and stored
-            when it is set again, or the next run begins.
+            Its id; None while the database cannot be written. It is armed all the same, and stored
+            when it is set again or the next run begins.
 
         Raises:
-            InvalidInputError: The condition is not of the language, there is no such action, or
-                there are too many.
+            InvalidInputError: If the condition or the action is invalid, or too many are armed.
         """
         from webots_mcp.signals.conditions import parse_condition
 
@@ -210,10 +208,10 @@ class Breakpoints:
         return self._arm(_armed(None, condition, action, after_hits))
 
     def expect(self, text: str, during: str | None, name: str | None) -> int | None:
-        """Arm an expectation of the controller's code; as `set`.
+        """Arm an expectation of the controller's code; it is stored like a breakpoint.
 
         Raises:
-            InvalidInputError: As of `set`.
+            InvalidInputError: If a condition or the name is invalid, or too many are armed.
         """
         from webots_mcp.signals.conditions.compiler import parse_expectation
 
@@ -242,7 +240,7 @@ class Breakpoints:
         return int(rows[0][0]) if rows else None
 
     def describe(self) -> dict[str, object]:
-        """The armed ones and those that are off, by id; and why a pause is not possible."""
+        """Describe which are armed or off, by id, and why a pause is not possible."""
         armed = [each.id for each in self.armed if each.id is not None]
         answer: dict[str, object] = {"armed": armed}
         if self._off:
@@ -253,14 +251,14 @@ class Breakpoints:
 
     # -- evaluating ----------------------------------------------------------------------------
 
-    def ask_states(self) -> bool:
-        """Whether the next state has to be evaluated; reads the stored ones if that is due."""
+    def must_evaluate(self) -> bool:
+        """Read the stored breakpoints if due; return whether the next state must be evaluated."""
         if self.run is not self._clock.run:
             self.load()
         return bool(self.armed)
 
     def evaluate(self, state: Any) -> list[ArmedBreakpoint]:
-        """The breakpoints whose condition begins to hold and whose action is due; usually none."""
+        """Evaluate all conditions; return the breakpoints whose action is due, usually none."""
         clock, hit, self.reaches = self._clock, list[ArmedBreakpoint](), False
         if self.run is not clock.run:
             self.load()

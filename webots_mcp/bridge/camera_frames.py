@@ -33,7 +33,7 @@ class _Camera:
         self.missed = 0
 
     def frame(self, now_s: float) -> HeldFrame:
-        """Its newest image, scaled down; the next frame is due no sooner than its next image."""
+        """Return the newest image, scaled down, and set when the next frame is due."""
         self.taken_s = now_s
         period_s = self.device.getSamplingPeriod() / 1000
         # Summed floating-point steps may fall a little short.
@@ -65,8 +65,8 @@ class CameraFrames:
         """Take this many frames of a camera per second of simulation time.
 
         Raises:
-            TypeError: It is not a camera.
-            ValueError: The number is out of bounds.
+            TypeError: If the device is not a camera.
+            ValueError: If the number is out of bounds.
         """
         methods = ("getName", "getSamplingPeriod", "getWidth", "getHeight", "getImage")
         missing = [name for name in methods if not callable(getattr(device, name, None))]
@@ -81,11 +81,11 @@ class CameraFrames:
         self._due_s = -math.inf
 
     def is_due(self, now_s: float) -> bool:
-        """Whether a frame is due, or simulation time has gone back."""
+        """Return whether a frame is due, or simulation time has gone back."""
         return not self._taken_s <= now_s < self._due_s
 
     def take_due(self, now_s: float, *, at_once: bool) -> list[HeldFrame]:
-        """The frames that are due; `at_once` one of each camera."""
+        """Take and return the frames that are due; with `at_once` one of each camera."""
         again = now_s < self._taken_s  # a new run
         due = [
             each
@@ -104,13 +104,13 @@ class CameraFrames:
         self._held.append(frame)
 
     def take(self, start_s: float) -> list[HeldFrame]:
-        """The frames taken since a simulation time; all held frames are forgotten."""
+        """Return the frames taken since a simulation time, and forget all held frames."""
         frames = [frame for frame in self._held if frame.sim_time_s >= start_s]
         self._held.clear()
         return frames
 
     def _frame_of(self, camera: _Camera, now_s: float) -> HeldFrame | None:
-        """A frame of a camera, or None where it has none; its second failure is logged."""
+        """Return a frame of a camera; None if it has none, which is logged the second time."""
         try:
             return camera.frame(now_s)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
@@ -122,10 +122,13 @@ class CameraFrames:
 
 
 def scale_down(bgra: bytes, width: int, height: int) -> tuple[int, int, bytes]:
-    """Width, height and pixels of an image reduced to 160 pixels per side, by each n-th pixel.
+    """Reduce an image to 160 pixels per side at most, by keeping each n-th pixel.
+
+    Returns:
+        Width, height and pixels of the reduced image.
 
     Raises:
-        ValueError: The image does not have 4 * width * height bytes.
+        ValueError: If the image does not have 4 * width * height bytes.
     """
     if len(bgra) != 4 * width * height:
         raise ValueError(f"{len(bgra)} bytes are not an image of {width} x {height} pixels")

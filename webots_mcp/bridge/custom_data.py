@@ -1,4 +1,4 @@
-"""Recordings of robots without a bridge, made by an observer from their field `customData`.
+"""Records robots without a bridge: an observer reads their field `customData`.
 
 A controller in any language publishes with one call (`wb_robot_set_custom_data` in C). The field
 holds one text, which supervisors see a step later. A JSON object gives the signals of a state, any
@@ -36,7 +36,7 @@ MISSED: Final = "seq_missed"  # how many messages of this run were overwritten b
 SEEN: Final = "seen"  # the branch of the pose where a robot publishes one of its keys itself
 LONGEST_TEXT: Final = 65_536  # characters that are taken for JSON, and sent with each step
 _LONGEST_SIGNAL: Final = 1_000  # characters of a text that is not JSON
-_READ_LONG_AGAIN_S: Final = 1.0  # of wall time
+_READ_LONG_AGAIN_S: Final = 1.0  # wall time between two readings of a long text
 _MOST_FOUND: Final = 10  # new robots whose fields are searched in one round
 _STALE_S: Final = 1.0  # of simulation time in which a text from before a reset is not believed
 _EPSILON_S: Final = 1e-9
@@ -252,7 +252,7 @@ class _Robot:
             self._field.enableSFTracking(self._step_ms)
 
     def _read_text(self, now_s: float) -> str:
-        """Return the text of the field; a long one is read once a second, not sent with steps."""
+        """Read the text of the field; a long one is read once a second, not sent with steps."""
         if self._read_again_s is not None and now_s < self._read_again_s:
             return self._text
         try:

@@ -47,20 +47,20 @@ _PICTURES: Final[dict[str, Callable[[Any], Picture]]] = {
 
 
 def take_picture(device: Any) -> Picture:
-    """The picture of a device that `find_pictured` found.
+    """Return the picture of a device that `find_pictured` found.
 
     Raises:
-        CommandRefusedError: It has none yet.
+        CommandRefusedError: If it has none yet.
     """
     return _PICTURES[type(device).__name__](device)
 
 
 def find_pictured(robot: Any, name: str) -> Any:
-    """The enabled device of that name, or (for "") the first one: cameras come first.
+    """Return the enabled device of that name, or (for "") the first one: cameras come first.
 
     Raises:
-        InvalidInputError: There is no such device, or it takes no pictures.
-        CommandRefusedError: It is disabled, or all are.
+        InvalidInputError: If there is no such device, or it takes no pictures.
+        CommandRefusedError: If it is disabled, or all devices are.
     """
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
     order = list(_PICTURES)
@@ -91,10 +91,10 @@ def _kind(device: Any) -> str:
 
 
 def draw_depths(device: Any) -> tuple[PixelCanvas, str]:
-    """A range finder's image in colours, and the scale in words.
+    """Return a range finder's image in colours, and the scale in words.
 
     Raises:
-        CommandRefusedError: It has no image yet.
+        CommandRefusedError: If it has no image yet.
     """
     ranges, width, height = _ranges_of(device), device.getWidth(), device.getHeight()
     near_m, far_m = device.getMinRange(), device.getMaxRange()
@@ -114,10 +114,10 @@ def draw_depths(device: Any) -> tuple[PixelCanvas, str]:
 
 
 def draw_from_above(device: Any) -> tuple[PixelCanvas, str]:
-    """A lidar's points as seen from above with distance rings, and the scale in words.
+    """Return a lidar's points as seen from above with distance rings, and the scale in words.
 
     Raises:
-        CommandRefusedError: It has no scan yet.
+        CommandRefusedError: If it has no scan yet.
     """
     ranges = _ranges_of(device)
     points = _points(ranges, device)
@@ -139,7 +139,7 @@ def draw_from_above(device: Any) -> tuple[PixelCanvas, str]:
 
 
 def _ranges_of(device: Any) -> Sequence[float]:
-    """A device's ranges; a null pointer is tested first, since reading it can crash Python."""
+    """Return a device's ranges, unless they are a null pointer, which can crash Python."""
     if not device.range_image:
         raise CommandRefusedError(
             f"{device.getName()!r} has not measured anything yet: ask again after a step"
@@ -148,7 +148,7 @@ def _ranges_of(device: Any) -> Sequence[float]:
 
 
 def _points(ranges: Sequence[float], lidar: Any) -> list[tuple[float, float]]:
-    """The points as metres ahead and to the left; layer after layer, each from left to right."""
+    """Return the points as metres ahead and to the left, layer after layer."""
     columns, layers = lidar.getHorizontalResolution(), lidar.getNumberOfLayers()
     fov_rad, vertical_rad = lidar.getFov(), lidar.getVerticalFov()
     points: list[tuple[float, float]] = []
@@ -166,7 +166,7 @@ def _points(ranges: Sequence[float], lidar: Any) -> list[tuple[float, float]]:
 
 
 def _shades() -> list[int]:
-    """The colours of distances from near to far."""
+    """Return the colours of distances from near to far."""
     ramp = ((220, 30, 30), (250, 220, 40), (40, 190, 80), (30, 60, 200))  # near to far
     parts = len(ramp) - 1
     shades: list[int] = []
@@ -183,7 +183,7 @@ def _shade_of(shades: list[int], place: float) -> int:
 
 
 def _round_number(length_m: float) -> float:
-    """The next larger 1, 2 or 5 times a power of ten."""
+    """Return the next larger 1, 2 or 5 times a power of ten."""
     power = 10 ** math.floor(math.log10(max(length_m, 1e-3)))
     return next(power * each for each in (1, 2, 5, 10) if power * each >= length_m * (1 - 1e-9))
 

@@ -51,7 +51,7 @@ class _MemoryBytes:
     ROW: Final = 400  # a tuple, three numbers, its place
 
 
-class FullRateSegment:
+class KeptSegment:
     """A segment of a run of which every call is kept.
 
     Attributes:
@@ -89,8 +89,8 @@ class FullRateRecorder:
 
     Attributes:
         frames: Takes and holds small frames of cameras.
-        fills: Each throttled call has to be added.
-        busy: `go_on` has to be called with each round of the loop.
+        fills: Whether each throttled call has to be added.
+        busy: Whether `go_on` has to be called in each round of the loop.
         enabled: Whether anything is held at all.
     """
 
@@ -115,11 +115,11 @@ class FullRateRecorder:
         self._ring.begin(clock.sim_time_s)
         self._kept_s = 0.0
         self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
-        self._segment: FullRateSegment | None = None
+        self._segment: KeptSegment | None = None
         self._going_on = False
         self._asked: deque[tuple[CurrentRun, str]] = deque(maxlen=_MOST_REASONS)
         self._unwritten: deque[tuple[CurrentRun, RingRow]] = deque()
-        self._unwritten_frames: deque[tuple[FullRateSegment, HeldFrame]] = deque()
+        self._unwritten_frames: deque[tuple[KeptSegment, HeldFrame]] = deque()
         self._lock = threading.RLock()  # of all that is held: any thread may publish
         self.frames = CameraFrames(journal, last_s)
         self.enabled = last_s > 0
@@ -132,8 +132,8 @@ class FullRateRecorder:
         """Add a call of `publish` that is not recorded.
 
         Args:
-            state: Is copied, unless it is known that nothing will change it.
-            own_bytes: The memory that such a state takes, about; 0 where it has to be copied.
+            state: The state; it is copied, unless it is known that nothing will change it.
+            own_bytes: Approximate memory of a state that nothing will change; 0 to copy the state.
         """
         clock, replaced = self._clock, None
         held: object
@@ -178,7 +178,7 @@ class FullRateRecorder:
                     self.frames.add(frame)
 
     def leave_out(self, why: str) -> None:
-        """Note that a call is neither recorded nor held; its segment then names the reason."""
+        """Note that a call is neither recorded nor held, so that its segment names the reason."""
         with self._lock:
             if self._clock.run is not self._run:
                 self._begin_run()
@@ -202,7 +202,7 @@ class FullRateRecorder:
     # -- keeping -------------------------------------------------------------------------------
 
     def ask(self, reason: str) -> None:
-        """Request a segment, which the next round of the loop begins; from any thread."""
+        """Request a segment, which the next round of the loop begins; any thread may call this."""
         if self.enabled:
             self._asked.append((self._clock.run, reason))
             self.busy = True
@@ -229,13 +229,13 @@ class FullRateRecorder:
             self._write_some()
 
     def close(self) -> None:
-        """The session ends: write everything, and end the segment that is being recorded."""
+        """Write everything, and end the segment that is being recorded, when the session ends."""
         self.write_all()
         with self._lock:
             self._end_stretch(self._clock.sim_time_s)
 
     def abandon(self) -> None:
-        """In a forked child: the thread that may have had the lock was not forked."""
+        """Replace the lock in a forked child: the thread that may have held it was not forked."""
         self._lock = threading.RLock()
 
     # -- inside --------------------------------------------------------------------------------
@@ -247,7 +247,7 @@ class FullRateRecorder:
         before_s = min(now_s - self._last_s, rows[0].sim_time_s if rows else now_s)
         start_s, segment = max(self._ring.starts_s, before_s), self._segment
         if segment is None or start_s > segment.end_s:
-            segment = self._segment = FullRateSegment(self._run, start_s)
+            segment = self._segment = KeptSegment(self._run, start_s)
         self._kept_s += now_s + KEEP_AFTER_S - max(start_s, segment.end_s)
         segment.end_s = now_s + KEEP_AFTER_S
         segment.add_reason(reason)
@@ -275,7 +275,7 @@ class FullRateRecorder:
         return False
 
     def _begin_run(self) -> None:
-        """A new run has begun: keep what was asked for in the last one, and forget its ring."""
+        """Keep what was requested in the last run, and forget its ring: a new run has begun."""
         ended_s = self._clock.ended_sim_time_s
         while self._asked and self._asked[0][0] is self._run:
             self._keep_around(ended_s, self._asked.popleft()[1])
@@ -296,7 +296,7 @@ class FullRateRecorder:
             segment.end_s = at_s
             self._record(segment)
 
-    def _record(self, segment: FullRateSegment) -> None:
+    def _record(self, segment: KeptSegment) -> None:
         values = {
             "uuid": segment.uuid,
             "start": segment.start_s,
@@ -306,7 +306,7 @@ class FullRateRecorder:
         }
         self._recorder.record("kept stretch", segment.run, values)
 
-    def _keep_frame(self, segment: FullRateSegment, frame: HeldFrame) -> None:
+    def _keep_frame(self, segment: KeptSegment, frame: HeldFrame) -> None:
         if len(self._unwritten_frames) < 2 * MOST_FRAMES:
             self._unwritten_frames.append((segment, frame))
         else:  # frames arrive faster than one file per call can be written
@@ -318,7 +318,7 @@ class FullRateRecorder:
             if self._unwritten_frames:
                 self._write_frame(*self._unwritten_frames[0])
 
-    def _write_frame(self, segment: FullRateSegment, frame: HeldFrame) -> None:
+    def _write_frame(self, segment: KeptSegment, frame: HeldFrame) -> None:
         """Write one frame: to compress and write a file takes about a millisecond."""
         try:
             self._files.add_kept(segment.run, segment.uuid, frame)
@@ -347,7 +347,7 @@ class FullRateRecorder:
 
 
 def _copied(state: object) -> tuple[str | bytes | None, str | None]:
-    """A copy of a state, or its text with what was replaced; None of what is no dict."""
+    """Return a copy of a state, or its text with what was replaced; None if it is not a dict."""
     from webots_mcp.bridge.state_pickles import copy_or_encode  # few controllers need pickle
 
     held = copy_or_encode(state)

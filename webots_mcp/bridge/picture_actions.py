@@ -43,7 +43,7 @@ class PictureActions:
         """Ask for the picture; Webots writes the file some time later, or never."""
         quality = whole_number(command.params, "quality", 1, 100, default=100)
         path = f"{SCREENSHOT_FOLDER}/command-{command.id:06d}.png"
-        file = self._files.make_room(path)
+        file = self._files.prepare_file(path)
         self._simulation.robot.exportImage(str(file), quality)
         size = yield from _wait_for_picture(file)
         return self._files.add_screenshot(path, *size)

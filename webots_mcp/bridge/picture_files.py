@@ -43,11 +43,11 @@ class PictureFiles:
         self._kept: dict[str, deque[str]] = {}
 
     def save_frame(self, camera: Any, max_frames: int) -> str:
-        """Write the camera's image as PNG; returns its path relative to the data folder.
+        """Write the camera's image as PNG; return its path relative to the data folder.
 
         Raises:
-            CommandRefusedError: The camera is disabled or has no image yet.
-            OSError: The file cannot be written.
+            CommandRefusedError: If the camera is disabled or has no image yet.
+            OSError: If the file cannot be written.
         """
         frame = self.add_frame(str(camera.getName()), *image_of(camera), max_frames)
         return str(frame["path"])
@@ -55,10 +55,10 @@ class PictureFiles:
     def add_frame(
         self, device: str, bgra: bytes, width: int, height: int, max_frames: int = MOST_FRAMES
     ) -> dict[str, object]:
-        """Write a picture of a device; returns the result of its command.
+        """Write a picture of a device; return the result of its command.
 
         Raises:
-            OSError: The file cannot be written.
+            OSError: If the file cannot be written.
         """
         name = self._name_of(device)
         kept = self._kept_of(name)
@@ -84,41 +84,41 @@ class PictureFiles:
         row = (*times, KEPT_FRAME, frame.device, path, frame.width, frame.height, size)
         self._recorder.record("image", run, row)
 
-    def make_room(self, path: str) -> Path:
-        """The file to write a picture to: its folder is created, an old file is deleted."""
+    def prepare_file(self, path: str) -> Path:
+        """Return the file to write a picture to; create its folder and delete an old file."""
         file = self._data_dir / path
         make_folder(file.parent)
         file.unlink(missing_ok=True)
         return file
 
     def add_screenshot(self, path: str, width: int, height: int, size: int) -> dict[str, object]:
-        """Record a picture that Webots wrote; returns the result of its command."""
+        """Record a picture that Webots wrote; return the result of its command."""
         clock = self._clock
         row = (clock.sim_time_s, time.time(), "screenshot", None, path, width, height, size)
         self._recorder.record("image", clock.run, row)
         return {"path": path, "width": width, "height": height, "size_bytes": size}
 
     def _name_of(self, device: str) -> str:
-        """The beginning of a camera's file names."""
+        """Return the beginning of a camera's file names."""
         registration = self._recorder.registration
         robot = registration.robot_name if registration else "robot"
         return f"{_file_name(robot)}.{_file_name(device)}"
 
     def _kept_of(self, name: str) -> deque[str]:
-        """The existing frames of a device, oldest first; the folder is listed only once."""
+        """Return the existing frames of a device, oldest first; the folder is listed only once."""
         if name not in self._kept:
             self._kept[name] = self._left_before(name)
         return self._kept[name]
 
     def _left_before(self, name: str) -> deque[str]:
-        """The frames of the robot's earlier sessions; listing costs 1 us per file of any camera."""
+        """Return the frames of earlier sessions; listing takes 1 us per file of any camera."""
         folder = self._data_dir / CAMERA_FOLDER
         files = sorted(file.name for file in folder.glob(f"{name}.[0-9]*.png"))
         return deque(f"{CAMERA_FOLDER}/{file}" for file in files)
 
     def _write(self, path: str, data: bytes) -> int:
         """Write a file under another name and rename it: a reader never sees half a picture."""
-        with whole_file(self.make_room(path)) as aside:
+        with whole_file(self.prepare_file(path)) as aside:
             aside.write_bytes(data)
         return len(data)
 
@@ -128,7 +128,7 @@ class PictureFiles:
 
 
 def image_of(camera: Any) -> tuple[bytes, int, int]:
-    """A camera's newest image (4 bytes a pixel: blue, green, red, alpha), width and height.
+    """Return a camera's newest image (4 bytes a pixel: blue, green, red, alpha), width and height.
 
     Raises:
         CommandRefusedError: The camera is disabled or has no image yet.
@@ -148,7 +148,7 @@ def image_of(camera: Any) -> tuple[bytes, int, int]:
 
 
 def encode_png(bgra: bytes, width: int, height: int) -> bytes:
-    """A PNG of a Webots camera image (4 bytes a pixel: blue, green, red, alpha; rows from the top).
+    """Encode a Webots image (blue, green, red, alpha; rows from the top) as PNG.
 
     Format: W3C Portable Network Graphics, section 11 (IHDR, IDAT, IEND), 8-bit RGB, filter 0.
 
@@ -172,7 +172,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def complete_png_size(file: Path) -> tuple[int, int, int] | None:
-    """(width, height, size in bytes) of a PNG that is written completely, else None."""
+    """Return width, height and size in bytes of a PNG; None if it is not written completely."""
     try:
         data = file.read_bytes()
     except OSError:
@@ -184,7 +184,7 @@ def complete_png_size(file: Path) -> tuple[int, int, int] | None:
 
 
 def _file_name(text: str) -> str:
-    """A part of a file name that is valid on every system and differs for different texts."""
+    """Return a text as part of a file name: valid on every system, and unique for each text."""
     most_bytes = 80
     name = "".join(c if c.isalnum() or c in "-_" else "_" for c in text)
     if name == text and 0 < len(name.encode()) <= most_bytes:

@@ -10,7 +10,7 @@ from typing import Final
 
 
 def colour(red: int, green: int, blue: int) -> int:
-    """A pixel in the order of a Webots image: the bytes blue, green, red, alpha."""
+    """Return a pixel in the order of a Webots image: the bytes blue, green, red, alpha."""
     return int.from_bytes(bytes((blue, green, red, 255)), sys.byteorder)
 
 

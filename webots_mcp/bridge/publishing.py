@@ -24,19 +24,19 @@ from webots_mcp.bridge.simulation import Clock
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.signals.register import SignalNames, StateChanges
 
-_BYTES_OF_A_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
+_BYTES_PER_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
 
 
 class Publisher:
     """Handles each call of `publish` and `auto_publish`.
 
     Args:
-        begin_run: Called where simulation time has gone back since the last call.
+        begin_run: Called if simulation time has gone back since the last call.
 
     Attributes:
-        recorded: Recorded calls.
-        total_s: The time that they took.
-        longest_s: The longest of them.
+        recorded: Number of recorded calls.
+        total_s: The time that they took together, in seconds.
+        longest_s: The time that the longest of them took.
         devices: Reads the devices for `auto_publish`.
     """
 
@@ -78,10 +78,10 @@ class Publisher:
         if self._clock.update():
             self._begin_run()
         wanted, hit, full_rate, breakpoints = force, None, self._full_rate, self._breakpoints
-        # Tested here, since even an empty call would slow down every `publish`.
+        # Checked before the call, since even a call that does nothing slows down every `publish`.
         if breakpoints.armed or breakpoints.run is not self._clock.run:
             hit = breakpoints.evaluate(state)
-            wanted |= breakpoints.reaches  # the past, asked of rows, is the same
+            wanted |= breakpoints.reaches  # `check` evaluates the recorded rows, and needs this one
         if self._watch.asks_states:
             wanted = self._watch.evaluate(state) or wanted
         if self._throttle.admits(wanted or hit or self._heartbeat.loop):
@@ -98,22 +98,22 @@ class Publisher:
     def publish_devices(
         self, extra: Mapping[Any, Any], include_time: bool, force: bool = False
     ) -> dict[Any, Any] | None:
-        """Record the devices' values; they are read if this call is due.
+        """Record the devices' values; they are read only if this call is due.
 
-        Where breakpoints are armed or a run has a goal, they are read in every call; for the ring
-        buffer as often as the limit on the time for reading allows.
+        While breakpoints are armed or a run has a goal, every call reads them. For the ring buffer
+        they are read as often as the limit on reading time allows.
 
         Returns:
-            The state; None where the devices were not read.
+            The state; None if the devices were not read.
         """
         state = None
         if self._clock.update():
             self._begin_run()
         full_rate, throttle = self._full_rate, self._throttle
         due = full_rate.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
-        if due or self._breakpoints.ask_states() or self._watch.asks_states:
+        if due or self._breakpoints.must_evaluate() or self._watch.asks_states:
             state = self._read(extra, include_time)
-            # What the devices say is made anew each time: nothing else can change it.
+            # The devices' values are new objects in each call: no other code can change them.
             self.publish(state, force, own_bytes=0 if extra else self._own_bytes)
             return state
         if throttle.admits(force or self._heartbeat.loop is not None):
@@ -128,7 +128,7 @@ class Publisher:
         return state
 
     def unread(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
-        """A state without the devices."""
+        """Return the state without the devices: the time and `extra`."""
         return ({"time": self._clock.sim_time_s} if include_time else {}) | _finite(extra)
 
     def _take_camera_frames(self, *, at_once: bool) -> None:
@@ -149,7 +149,7 @@ class Publisher:
         self._journal.state(encoded)
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             self._record_changes(state)
-        self._own_bytes = _BYTES_OF_A_CHARACTER * len(encoded.text)
+        self._own_bytes = _BYTES_PER_CHARACTER * len(encoded.text)
         self._names.register(state, encoded.text, self._recorder.enter_signals)
         self._heartbeat.beat_if_due()
         self._count(time.perf_counter() - started_s)
@@ -170,7 +170,7 @@ class Publisher:
 
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
-    """A mapping as a dict of `len` items: the iterator of a user's own mapping may be endless."""
+    """Return a mapping as a dict of `len` items, since a user's own mapping may be endless."""
     if extra.__class__ is dict:
         return cast("dict[Any, Any]", extra)
     if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]

@@ -29,7 +29,7 @@ class RingRow(NamedTuple):
     size_bytes: int
 
     def encode(self) -> tuple[int, float, float, str, str | None]:
-        """The row as it would have been recorded."""
+        """Return the row as it would have been recorded."""
         if isinstance(self.data, str):
             return (*self[:3], self.data, self.replaced)
         data = self.data.state() if isinstance(self.data, StateCopy) else self.data
@@ -81,7 +81,7 @@ class Ring:
         return rows
 
     def begin(self, starts_s: float) -> None:
-        """Empty the ring; rows are complete from that simulation time on."""
+        """Empty the ring: from that simulation time on no row is missing."""
         self._rows.clear()
         self.size_bytes, self.starts_s = 0, starts_s
 

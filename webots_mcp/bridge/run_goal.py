@@ -44,7 +44,7 @@ class Goal(NamedTuple):
 
 
 def read_goal(params: dict[str, Any]) -> Goal:
-    """The goal that the parameters of a command describe.
+    """Return the goal that the parameters of a command describe.
 
     Raises:
         InvalidInputError: One of them is invalid, or both `until` and `for_s` are missing.
@@ -215,10 +215,10 @@ class Watch:
             self._finish(watched)
 
     def over(self) -> bool:
-        """In `get_command()`: whether the goal is reached.
+        """Return in `get_command()` whether the goal is reached.
 
-        The time is judged here only where this step's state is published already: else its
-        condition, which may hold at the same step, would not be evaluated.
+        The time limit is judged only once this step's state is published: its condition, which may
+        hold at the same step, must be evaluated first.
         """
         watched = self._watched
         if watched is None or not self._begun(watched):
@@ -249,7 +249,7 @@ class Watch:
         return True
 
     def describe(self) -> dict[str, object]:
-        """The result of the `run` command: how it ended, where, and how fast it ran.
+        """Return the result of the `run` command: how it ended, where, and how fast it ran.
 
         Raises:
             CommandRefusedError: The condition could not be evaluated on the published state.
@@ -276,7 +276,7 @@ class Watch:
     # -- inside --------------------------------------------------------------------------------
 
     def _begun(self, watched: _Watched) -> bool:
-        """Whether the run in which it is watched has begun: the awaited reset has happened."""
+        """Return whether the run to watch has begun, so that an awaited reset has happened."""
         if watched.run is None and self._clock.run is not watched.former:
             watched.run = self._clock.run
             if watched.reached is None:  # else it was ended before the reset came

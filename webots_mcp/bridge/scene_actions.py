@@ -39,7 +39,7 @@ class SceneActions:
         }
 
     def begin_run(self) -> None:
-        """After a reset, undo the changes that Webots has not undone."""
+        """Undo after a reset the changes that Webots has not undone."""
         if self._changes is not None:
             self._changes.begin_run()
 

@@ -40,11 +40,10 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
 _LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
 _LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
-_STAY: Final = ("WorldInfo", "Viewpoint")
+_REQUIRED: Final = ("WorldInfo", "Viewpoint")  # nodes without which Webots has no world
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
 _WORD: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
-_ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
-_SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
+_SEE_CONSOLE: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
 
 
 class SceneChanges:
@@ -62,7 +61,7 @@ class SceneChanges:
         self._edits = edits
 
     def begin_run(self) -> None:
-        """After a reset, undo the changes that Webots has not undone."""
+        """Undo after a reset the changes that Webots has not undone."""
         self._edits.begin_run()
 
     def set_field(self, command: ClaimedCommand) -> Progress:
@@ -91,7 +90,8 @@ class SceneChanges:
         ):
             raise CommandRefusedError(
                 f"{target.path} is {now!r:.200} after it was set: a controller set it again, or "
-                f"Webots refused the value; {_SAYS}. Fields inside a PROTO cannot be set"
+                f"Webots refused the value; {_SEE_CONSOLE}. "
+                "Fields inside a PROTO cannot be set"
             )
         elif not is_same(target.type_name, now, value):
             facts["now"] = _shown(now)  # the simulation has changed it since
@@ -110,8 +110,8 @@ class SceneChanges:
             node = _newest(robot, target, before)
         if node is None:
             raise CommandRefusedError(
-                f"Webots added nothing to {target.path}; {_SAYS}. A PROTO has to be declared in "
-                "the world file first: IMPORTABLE EXTERNPROTO"
+                f"Webots added nothing to {target.path}; {_SEE_CONSOLE}. A PROTO has "
+                "to be declared in the world file first: IMPORTABLE EXTERNPROTO"
             )
         path = _path_of(robot, node)
         self._edits.added.add(int(node.getId()))
@@ -146,10 +146,10 @@ class SceneChanges:
         if robot.getFromId(node_id) is not None:
             yield from self._until_stepped()
         if robot.getFromId(node_id) is not None:
-            raise CommandRefusedError(f"Webots did not remove {target.path}; {_SAYS}")
+            raise CommandRefusedError(f"Webots did not remove {target.path}; {_SEE_CONSOLE}")
         reset = "puts it back"
         if is_added:
-            reset = _ADDED_BEFORE
+            reset = "does not bring it back: it was added in this run"
         elif not is_known:
             reset = self._edits.remember_removed(removal, is_proto=is_proto)
         self._journal.event("remove_node", facts | _asked_by(command), target.path)
@@ -294,7 +294,7 @@ def _require_removable(robot: Any, target: PathTarget) -> None:
     node = target.node
     if target.is_hidden:
         raise InvalidInputError(f"{target.path} is inside a PROTO, where nothing can be removed")
-    if node.getTypeName() in _STAY or node.getId() == robot.getRoot().getId():
+    if node.getTypeName() in _REQUIRED or node.getId() == robot.getRoot().getId():
         raise InvalidInputError(f"{target.path} ({label(node)}) cannot be removed from a world")
     each = robot.getSelf()
     while each is not None:

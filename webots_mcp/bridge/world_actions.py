@@ -114,10 +114,13 @@ class WorldActions:
         return (yield from _until_ended("worldLoad"))
 
     def _world_of_project(self, world: object) -> Path:
-        """A world of the current one's project.
+        """Return the file of a world, which must be in the project of the current one.
 
-        This is checked here, so that every client is bound by it: loading a world starts its
-        controllers, and so runs their code.
+        Loading a world runs the code of its controllers. The bridge checks this, not the server,
+        so that every client is bound by it.
+
+        Raises:
+            InvalidInputError: If it is no world, or a world of another project.
         """
         try:
             file = full_path(world) if isinstance(world, str) else Path()
@@ -149,7 +152,7 @@ class WorldActions:
 
 
 def _until_ended(asked: str) -> Progress:
-    """Done when the controller ends, which Webots does before anything else."""
+    """Wait until Webots ends the controller, which it does first of all."""
     deadline_s = time.monotonic() + _RELOAD_TIMEOUT_S
     try:
         while time.monotonic() < deadline_s:

@@ -24,9 +24,9 @@ END_SESSION: Final = (
     "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, end_reason = :reason "
     "WHERE id = :id AND ended_wall_time_s IS NULL"
 )
-# For sessions of dead processes: the rows are counted, since the process cannot report them, and
-# the last row may be younger than the last heartbeat. Counting takes long, so it comes first, when
-# no robot waits for it; its result stays true, since no other process writes to these runs.
+# A dead process cannot report its rows, so they are counted; the last row may be younger than the
+# last heartbeat. Counting takes long, so it comes first, while no robot waits for the lock. The
+# count stays right, since no other process writes to these runs.
 _LAST_ROW: Final = (
     "coalesce((SELECT {0} FROM state WHERE run_id = run.id ORDER BY sim_time_s DESC LIMIT 1), {1})"
 )
@@ -70,10 +70,15 @@ class OpenSession(NamedTuple):
 def free_name(
     connection: sqlite3.Connection, name: str, makes_way: Callable[[OpenSession], bool]
 ) -> str:
-    """The name for a robot's new session: where a living one has it, `#2` and so on is appended.
+    """Return the name for a robot's new session; `#2` and so on if a living session has the name.
 
-    A living one may make way, as an observer's does, of `customData`, for a bridge. Sessions of
-    that name which are over are ended as superseded; the caller opens the transaction.
+    Dead sessions of that name are ended as `superseded`. The caller opens the transaction.
+
+    Args:
+        connection: A connection in a transaction.
+        name: The robot's own name.
+        makes_way: Returns whether a living session gives up its name, as an observer's recording
+            of `customData` does for a bridge.
     """
     wanted, number = name, 1
     while True:
@@ -90,14 +95,15 @@ def free_name(
 def reap(connection: sqlite3.Connection, now_s: float) -> None:
     """Settle everything that no live process will finish.
 
-    Pending commands past their time become `expired`. Open sessions whose process on this host is
-    gone are ended (`reload` if they asked for one, else `crashed`). Commands claimed by an ended
-    session become `lost`, and are never run again by themselves; only one that asked Webots for a
-    reload gets a minute for the next session to confirm it, where Webots starts one. Where a file
-    of the session waits next to the database, the command's result may be in it: the process that
-    takes the file in settles the rest.
+    - Pending commands past their time become `expired`.
+    - Open sessions whose process on this host has ended are ended: as `reload` if they requested
+      one, else as `crashed`.
+    - Commands claimed by an ended session become `lost` and never run again by themselves. A
+      reload gets a minute in which the next session may confirm it, unless the controller is
+      extern. If a file of the session waits next to the database, the command's result may be in
+      it: the process that ingests the file settles the command.
 
-    The caller opens the transaction, or accepts that each statement is one of its own.
+    The caller opens the transaction, or accepts that each statement is a transaction of its own.
     """
     connection.execute(EXPIRE, {"now": now_s})
     for session_id, reason in find_dead_sessions(connection):
@@ -117,20 +123,24 @@ def reap(connection: sqlite3.Connection, now_s: float) -> None:
 
 
 def _may_wait(connection: sqlite3.Connection, session_uuid: str | None) -> bool:
-    """Whether entries of that session may still wait next to the database."""
+    """Return whether rows of that session may still wait in a file next to the database."""
     query = "SELECT file FROM pragma_database_list WHERE name = 'main'"
     ((file,),) = connection.execute(query).fetchall()
     return bool(file and session_uuid) and waiting_path(Path(file), f"{session_uuid}").exists()
 
 
 def reap_if_dead(connection: sqlite3.Connection) -> None:
-    """Settle where a session looks open and is not: views and SQL can't judge processes."""
+    """Settle dead sessions, if there are any: views and SQL cannot check processes."""
     if find_dead_sessions(connection):
         reap(connection, time.time())
 
 
 def find_dead_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:
-    """Sessions that look open although their process on this host is gone, and how they ended."""
+    """Find sessions that look open although their process on this host has ended.
+
+    Returns:
+        The id of each, and how it ended: `reload` or `crashed`.
+    """
     sessions = connection.execute(_OPEN_SESSIONS, (host_name(),)).fetchall()
     return [
         (session_id, "reload" if reloading else "crashed")
@@ -149,7 +159,7 @@ def end_session(connection: sqlite3.Connection, session_id: int, reason: str) ->
 def end_runs(
     connection: sqlite3.Connection, session_id: int, reason: str, going_on: str = "none"
 ) -> None:
-    """End the open runs of a session, as of their last sign of life, but for that UUID."""
+    """End the open runs of a session as of their last sign of life, except the run of a UUID."""
     values = (session_id, going_on)
     for run_id, last_s, last_sim_s, rows in connection.execute(_FOUND, values).fetchall():
         times = {"last_s": last_s, "last_sim_s": last_sim_s}

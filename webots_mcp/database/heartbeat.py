@@ -1,4 +1,4 @@
-"""The heartbeat of a session: what it says of the loop and the recording, and how it is written.
+"""The heartbeat of a session: what it reports of the loop and the recording, and how it is written.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -32,7 +32,7 @@ _BEAT_RUN: Final = (
 
 
 class LoopTimes(NamedTuple):
-    """What the rounds of a run took of wall time, from one end of a step to the next."""
+    """The wall time of a run in the controller's own code and in its steps, and their number."""
 
     own_s: float
     step_wait_s: float
@@ -40,7 +40,7 @@ class LoopTimes(NamedTuple):
 
 
 class LoopStatus(NamedTuple):
-    """What a heartbeat says of the loop."""
+    """What a heartbeat reports of the loop."""
 
     sim_time_s: float
     last_poll_wall_time_s: float | None
@@ -51,7 +51,7 @@ class LoopStatus(NamedTuple):
 
 
 class RecordingStatus(NamedTuple):
-    """What a heartbeat says of the recording."""
+    """What a heartbeat reports of the recording."""
 
     rows_waiting: int
     rows_dropped: int
@@ -66,14 +66,14 @@ def write_heartbeat(
     run_id: int | None,
     rows: int,
 ) -> None:
-    """Write a session and its run as they are now, inside a transaction of the caller.
+    """Write the status of a session and its run, inside a transaction of the caller.
 
     Args:
-        connection: To the database.
-        loop: What the loop does.
-        recording: What became of its rows.
+        connection: A connection in a transaction.
+        loop: The status of the loop.
+        recording: The status of the recording.
         session_id: The session.
-        run_id: Its run.
+        run_id: Its current run; None before its row is written.
         rows: How many states of that run are in the database.
     """
     now = time.time()

@@ -43,9 +43,9 @@ class JobLease(NamedTuple):
     """The right to do a job.
 
     Attributes:
-        name: Of the job.
-        holder: Of the process that does it, as no other has it.
-        lasts_s: Of wall time, each time that it is taken or renewed.
+        name: The name of the job.
+        holder: A text that identifies the process that does it.
+        lasts_s: Wall time for which the lease holds each time it is taken or renewed, in seconds.
     """
 
     name: str
@@ -53,24 +53,24 @@ class JobLease(NamedTuple):
     lasts_s: float = LEASE_S
 
     def latest_s(self, now_s: float) -> float:
-        """The latest wall time up to which a held lease may last."""
+        """Return the latest wall time up to which a held lease may last."""
         return now_s + _TIMES * self.lasts_s
 
 
 def lease_of(name: str) -> JobLease:
-    """A lease that this process may take, by the name of the job."""
+    """Return a lease for a job that this process can take."""
     return JobLease(name, f"{host_name()} {os.getpid()} {os.urandom(4).hex()}")
 
 
 def holder_of(connection: sqlite3.Connection, name: str) -> str | None:
-    """Who renewed the lease of that job lately; None where no process did."""
+    """Return the process that holds the lease of a job; None if no process renewed it lately."""
     now_s = time.time()
     row = connection.execute(_HOLDER, (name, now_s, now_s + _TIMES * LEASE_S)).fetchone()
     return row and str(row[0])
 
 
 def held_jobs(connection: sqlite3.Connection, prefix: str) -> list[str]:
-    """The jobs that a process does, of those whose names begin so."""
+    """Return the names of the jobs with this prefix whose lease some process holds."""
     now_s = time.time()
     asked = {"prefix": prefix, "now": now_s, "latest": now_s + _TIMES * LEASE_S}
     return [str(name) for (name,) in connection.execute(_HELD, asked)]
@@ -83,13 +83,13 @@ def take(
     forced: bool = False,
     outranked: str | None = None,
 ) -> bool:
-    """Take a lease, or renew it; False where another process has it.
+    """Take a lease, or renew it; False if another process has it.
 
     Args:
-        connection: In the role "writer".
+        connection: A connection in the role "writer".
         lease: The lease, and its holder.
         forced: Take it from its holder, whose process is known to have ended.
-        outranked: Live holders from which it may be taken, as a pattern of SQL's LIKE.
+        outranked: Live holders from which it may be taken, as a LIKE pattern.
     """
     now_s = time.time()
     times = {"now": now_s, "until": now_s + lease.lasts_s, "latest": lease.latest_s(now_s)}
@@ -98,16 +98,16 @@ def take(
 
 
 def give_back(connection: sqlite3.Connection, lease: JobLease) -> None:
-    """Let others take it at once."""
+    """Release a lease, so that others can take it at once."""
     connection.execute(_GIVE_BACK, (lease.name, lease.holder))
 
 
 @contextmanager
 def still_held(connection: sqlite3.Connection, lease: JobLease) -> Generator[None]:
-    """A transaction for what only the holder may write; it renews the lease.
+    """Open a transaction for what only the holder may write; it renews the lease.
 
     Raises:
-        LeaseLostError: Another process has taken it; nothing is written.
+        LeaseLostError: If another process has taken the lease; nothing is written.
     """
     with transaction(connection):
         values = (time.time() + lease.lasts_s, lease.name, lease.holder)

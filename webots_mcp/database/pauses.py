@@ -72,12 +72,12 @@ _OF_RUN: Final = (
 
 
 class Cause(NamedTuple):
-    """For what a pause began, or ended; of most fields nothing is known.
+    """Why a pause began or ended; fields that do not apply are None.
 
     Attributes:
-        command_id: Of the command that did it.
-        breakpoint_id: Of the breakpoint that was hit; None also where it is not stored.
-        condition: Of that breakpoint.
+        command_id: The command that did it.
+        breakpoint_id: The breakpoint that was hit; None also if it is not stored.
+        condition: The condition of that breakpoint.
         by: Who else did it, in words.
     """
 
@@ -103,13 +103,13 @@ class Cause(NamedTuple):
 def change_since(
     connection: sqlite3.Connection, session_id: int, sim_time_s: float, wall_time_s: float
 ) -> str | None:
-    """`PAUSE` or `RESUME`, whichever happened last since a heartbeat; None for neither.
+    """Return `PAUSE` or `RESUME`, whichever happened last since a heartbeat; None for neither.
 
     Args:
-        connection: To the recording.
+        connection: A connection to the recording.
         session_id: The session.
         sim_time_s: The simulation time of its heartbeat.
-        wall_time_s: When that was.
+        wall_time_s: The wall time of its heartbeat.
     """
     values = {"session_id": session_id, "sim_time_s": sim_time_s, "wall_time_s": wall_time_s}
     row = connection.execute(_CHANGE_SINCE, values).fetchone()
@@ -117,7 +117,7 @@ def change_since(
 
 
 def breakpoint_at(connection: sqlite3.Connection, session_id: int) -> str | None:
-    """Which breakpoint began the newest pause of a session, and when; None where a command did."""
+    """Describe the breakpoint that began the newest pause of a session; None if a command did."""
     found = connection.execute(_CONDITION, (session_id,)).fetchone()
     if found is None or found[0] is None:
         return None
@@ -125,7 +125,7 @@ def breakpoint_at(connection: sqlite3.Connection, session_id: int) -> str | None
 
 
 def paused_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> float:
-    """For how much of the wall time of a run, up to its end, its bridge kept it paused."""
+    """Return for how many seconds of wall time its bridge kept a run paused, up to its end."""
     total_s, since_s = 0.0, math.inf
     for kind, wall_s in (*connection.execute(_OF_RUN, (run_id,)), (RESUME, end_wall_s)):
         if kind == PAUSE:

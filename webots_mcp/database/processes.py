@@ -25,7 +25,7 @@ _CONNECTION_STATES: Final = {"01": False, "08": True}  # tcp(7): open; closed by
 def is_living(
     host: str, pid: int, process: str | None, last_seen_wall_time_s: float, now_s: float
 ) -> bool:
-    """Whether the process of a session that has not ended still runs.
+    """Return whether the process of a session that has not ended still runs.
 
     On this host the process shows it, as `process_alive` says; on another only a recent heartbeat
     does.
@@ -36,17 +36,17 @@ def is_living(
 
 
 def process_alive(pid: int, process: str | None, last_seen_wall_time_s: float) -> bool:
-    """Whether a process of this host still runs.
+    """Return whether a process of this host still runs.
 
     Args:
         pid: Its id, which another process may have by now.
-        process: Its `process_identity`, which no other has, whatever clocks are set to.
-        last_seen_wall_time_s: Its newest sign of life, Unix time: what there is to go by where the
-            identity is not known. Where the system does not show either when a process started
-            (macOS), any process of that pid counts.
+        process: Its `process_identity`, which no other process has.
+        last_seen_wall_time_s: Its newest sign of life in Unix time, which decides if the identity
+            is unknown. If the system does not show when a process started (macOS), any process of
+            that pid counts.
     """
     if not (_is_pid(pid) and isinstance(last_seen_wall_time_s, (int, float))):  # pyright: ignore[reportUnnecessaryIsInstance]
-        return False  # no bridge has written this: a recording may come from anywhere
+        return False  # no bridge has written this: a file may have any origin
     now = process_identity(pid) if process is not None else None
     if now is not None:
         return now == process
@@ -64,10 +64,10 @@ def _is_pid(pid: object) -> bool:
 
 
 def process_identity(pid: int) -> str | None:
-    """Which process of this host that pid names now, whatever the wall clock is set to.
+    """Return a text that identifies the process which now has that pid, whatever the clock shows.
 
-    A pid comes back; its boot and its start within that boot do not. On Windows the creation
-    time, which setting the clock does not change afterwards. None where no such process runs, or
+    A pid is used again, but never with the same start in the same boot. On Windows the text is the
+    creation time, which does not change when the clock is set. None if no such process runs, or
     the system does not show it (macOS).
     """
     if sys.platform == "win32":
@@ -84,7 +84,7 @@ def process_identity(pid: int) -> str | None:
 
 
 def _posix_start(pid: int) -> float | None:
-    """Unix time of the process' start; 0 where it is not shown, None where there is no process."""
+    """Return the Unix time of a process' start; 0 if it is not shown, None without a process."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -95,7 +95,7 @@ def _posix_start(pid: int) -> float | None:
 
 
 def _linux_start(pid: int) -> float | None:
-    """A process that ended but was not yet waited for ("Z") still has a pid."""
+    """Return a process' start; None for one that has ended and keeps its pid until waited for."""
     try:
         fields = _linux_stat(pid)
         if fields[0] == b"Z":
@@ -107,13 +107,13 @@ def _linux_start(pid: int) -> float | None:
 
 
 def _linux_stat(pid: int) -> list[bytes]:
-    """From its state on, which proc_pid_stat(5) has third; the start in clock ticks is 22nd."""
+    """Read the fields of proc_pid_stat(5) from the third on, the state; the 22nd is the start."""
     with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123  (no pathlib in the loop)
         return file.read().rpartition(b") ")[2].split()
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a signal or a debugger has stopped a process; only Linux shows that."""
+    """Return whether a signal or a debugger has stopped a process; only Linux shows that."""
     try:
         return _linux_stat(pid)[0] in (b"T", b"t")
     except (OSError, IndexError):
@@ -121,14 +121,14 @@ def is_stopped(pid: int) -> bool:
 
 
 def has_lost_simulator(pid: int, instance: str) -> bool:
-    """Whether Webots has closed its connection to a controller, which waits for it regardless.
+    """Return whether Webots has closed its connection to a controller that still waits for it.
 
-    Over TCP, Webots' library then waits for an answer without end; over a local socket it ends the
-    process. Only Linux shows it, to the user whose process it is.
+    Over TCP, Webots' library then waits forever for an answer; over a local socket it ends the
+    process. Only Linux shows this, and only to the user who owns the process.
 
     Args:
         pid: The controller's process.
-        instance: Its simulator, as `contract.instance_of` names it: `host:port`.
+        instance: Its simulator as `host:port`, see `contract.instance_of`.
     """
     port = instance.rpartition(":")[2]
     if not (_is_pid(pid) and port.isascii() and port.isdecimal()):
@@ -143,7 +143,7 @@ def has_lost_simulator(pid: int, instance: str) -> bool:
 
 
 def _open_files(pid: int) -> Generator[str]:
-    """What the descriptors of a process lead to; one may be closed meanwhile."""
+    """Yield the targets of a process' file descriptors; one may be closed meanwhile."""
     folder = f"/proc/{pid}/fd"
     for name in os.listdir(folder):  # noqa: PTH208
         with suppress(FileNotFoundError):
@@ -151,7 +151,7 @@ def _open_files(pid: int) -> Generator[str]:
 
 
 def _connections_to(pid: int, port: int) -> Generator[tuple[str, bool]]:
-    """Sockets in the network of a process that lead to a port: inode, and whether it is closed."""
+    """Yield the sockets of a process' network that lead to a port: inode, and whether closed."""
     for table in ("tcp", "tcp6"):
         with suppress(FileNotFoundError), open(f"/proc/{pid}/net/{table}") as file:  # noqa: PTH123
             for line in file.readlines()[1:]:
@@ -164,13 +164,13 @@ def _connections_to(pid: int, port: int) -> Generator[tuple[str, bool]]:
 
 
 def signal_process(pid: int, process: str | None, number: int) -> None:
-    """Send a signal that would end whoever does not expect it.
+    """Send a signal that would end a process without a handler for it. Linux only.
 
-    It is sent to that very process (`process_identity`) only, not to another of its pid, and where
-    a handler is installed: another program, begun by `exec`, has none. Linux only.
+    It is sent only if the process is still the one of that identity (`process_identity`), and has
+    a handler installed: another program, started by `exec`, has none.
 
     Raises:
-        OSError: No such process runs, or the system does not tell.
+        OSError: If no such process runs, or the system does not show it.
     """
     if sys.platform != "linux":
         return
@@ -187,16 +187,18 @@ def signal_process(pid: int, process: str | None, number: int) -> None:
 
 
 def _windows_start(pid: int) -> float | None:
-    """As `_posix_start`."""
+    """Return the Unix time of a process' start; 0 if it is not shown, None without a process."""
     created = _windows_creation(pid)
     epoch_s = 11_644_473_600  # from 1601 to 1970
     return created / 1e7 - epoch_s if created else created
 
 
 def _windows_creation(pid: int) -> int | None:
-    """In 100 ns since 1601; 0 where it is not shown, None where there is no process.
+    """Return a process' creation time in units of 100 ns since 1601.
 
-    os.kill(pid, 0) would end the process on Windows, asking does not.
+    Returns:
+        0 if the system does not show it, None if there is no process. `os.kill(pid, 0)` would end
+        the process on Windows; this does not.
     """
     import ctypes
 

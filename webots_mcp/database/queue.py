@@ -1,10 +1,10 @@
-"""The command queue: the rows of `command`, and every statement that changes one.
+"""The command queue as a client uses it: adds commands, cancels them, and reads their outcome.
 
-A client adds a command as `pending`. The controller that it is for makes it `claimed`, in one
-statement and before anything runs, and then `done` or `failed`. A command that is not claimed in
-time is `expired`, one that its client cancels before that is `cancelled`, and one whose claimer's
-process ended without an answer is `lost`. So a command runs at most once, and its outcome is final:
-each statement names the status that it expects, which holds for any number of processes.
+A client adds a command as `pending`. The robot's controller makes it `claimed`, in one statement
+and before anything runs, and then `done` or `failed`. A command that is not claimed in time becomes
+`expired`, one that its client cancels before that `cancelled`, and one whose controller ended
+without an answer `lost`. So a command runs at most once, and its outcome is final: each statement
+names the status that it expects (`queue_statements`), whatever other processes do.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -68,7 +68,7 @@ class QueuedCommand(NamedTuple):
         return self.status in FINAL_STATUSES
 
     def decoded_result(self) -> Any:
-        """What the controller answered; None where it did not, or where it is no JSON."""
+        """Return the controller's answer; None if there is none, or it is not JSON."""
         try:
             return json.loads(self.result) if self.result is not None else None
         except ValueError:
@@ -110,24 +110,24 @@ class CommandQueue:
         idempotency_key: str | None = None,
         request_id: int | None = None,
     ) -> QueuedCommand:
-        """Ask for an action; sending it again with the same key makes no second command.
+        """Queue a command; sending it again with the same key makes no second command.
 
         The insert is repeated while the database is busy. That is safe: every repetition carries
         the same unique key, so that an insert whose answer was lost is found instead of doubled.
 
         Args:
-            robot_id: Whose controller is to run it.
+            robot_id: The robot whose controller is to run it.
             action: A built-in or registered action.
             params: Its parameters, plain JSON.
-            time_to_live_s: Unclaimed after this time, it expires and never runs.
-            requested_by: Who asks, for the record.
-            idempotency_key: A key of the caller's; one is made up if it is None.
-            request_id: The row of the request that it is sent for.
+            time_to_live_s: Time after which an unclaimed command expires and never runs.
+            requested_by: The caller, for the record.
+            idempotency_key: A key of the caller's; None for a new one.
+            request_id: The row of the request for which it is sent.
 
         Raises:
-            InvalidInputError: The parameters are not plain JSON or too long, or the key already
-                belongs to another request.
-            sqlite3.OperationalError: The database stayed locked.
+            InvalidInputError: If the parameters are not plain JSON or too long, or the key already
+                belongs to another command.
+            sqlite3.OperationalError: If the database stayed locked.
         """
         key = idempotency_key or new_uuid()
         now_s = self._clock()
@@ -151,7 +151,7 @@ class CommandQueue:
         return command
 
     def leave(self, command_id: int, why: str) -> bool:
-        """The caller has stopped waiting: cancel it, or note that where it is already running.
+        """Cancel a command whose caller has stopped waiting, or note that if it is already running.
 
         Returns:
             Whether it is running.
@@ -168,16 +168,16 @@ class CommandQueue:
 
 
 def find_command(connection: sqlite3.Connection, idempotency_key: str) -> QueuedCommand | None:
-    """The command that was sent with that key; None where none was."""
+    """Return the command that was sent with that key; None where none was."""
     row = connection.execute(_BY_KEY, (idempotency_key,)).fetchone()
     return QueuedCommand(*row) if row else None
 
 
 def fetch_command(connection: sqlite3.Connection, command_id: int) -> QueuedCommand:
-    """The command of that id.
+    """Return the command of that id.
 
     Raises:
-        InvalidInputError: There is none.
+        InvalidInputError: If there is none.
     """
     row = connection.execute(_BY_ID, (command_id,)).fetchone()
     if row is None:
@@ -193,7 +193,7 @@ def list_commands(
     status: str | None = None,
     before_id: int | None = None,
 ) -> list[QueuedCommand]:
-    """The robot's newest commands, newest first; with a limit of -1 all of them.
+    """Return the robot's newest commands, newest first; with a limit of -1 all of them.
 
     `before_id` pages towards older ones.
     """
@@ -202,7 +202,7 @@ def list_commands(
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:
-    """Whether `dead_sessions.reap` could have anything to say about commands."""
+    """Return whether `dead_sessions.reap` could have anything to say about commands."""
     return bool(connection.execute(_UNFINISHED).fetchone()[0])
 
 

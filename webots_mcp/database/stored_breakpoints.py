@@ -14,9 +14,9 @@ from webots_mcp.database.connection import transaction
 from webots_mcp.errors import InvalidInputError
 
 VIOLATION: Final = "violation"  # the kind of the event: what was expected did not hold
-OF_CONTROLLER: Final = "controller"  # `created_by` of those that the controller's own code has set
-# Those end with their session.
-OF_PROJECT: Final = "project"  # of those of its file
+# `created_by`: those of the controller's own code end with their session.
+OF_CONTROLLER: Final = "controller"
+OF_PROJECT: Final = "project"  # those of the project's file
 _MEANT: Final = "(b.robot_id = r.id OR b.robot_name IN ('*', r.name))"
 _OF_ROBOT: Final = (
     f"FROM robot r JOIN breakpoint b ON {_MEANT} LEFT JOIN session s ON s.id = b.session_id "
@@ -83,7 +83,7 @@ class StoredBreakpoint(NamedTuple):
 
 
 def list_breakpoints(connection: sqlite3.Connection, robot_id: int) -> list[StoredBreakpoint]:
-    """Those of a robot, the oldest first."""
+    """List the breakpoints of a robot, the oldest first."""
     return [StoredBreakpoint(*row) for row in connection.execute(_LISTED, (robot_id,)).fetchall()]
 
 
@@ -95,10 +95,10 @@ def set_breakpoint(
     after_hits: int,
     created_by: str,
 ) -> int:
-    """Store one; the one that is there already is the answer to its like. Returns its id.
+    """Store a breakpoint, unless an identical one is stored; return its id.
 
     Raises:
-        InvalidInputError: The robot has as many as there may be.
+        InvalidInputError: If the robot has the maximum number of breakpoints.
     """
     with transaction(connection):
         asked = (condition, action, after_hits)
@@ -113,10 +113,10 @@ def set_breakpoint(
 
 
 def remove_breakpoint(connection: sqlite3.Connection, robot_id: int, breakpoint_id: int) -> None:
-    """Delete one; the events of its hits stay.
+    """Delete a breakpoint; the events of its hits stay.
 
     Raises:
-        InvalidInputError: The robot has none of that id.
+        InvalidInputError: If the robot has none with that id.
     """
     with transaction(connection):
         removed = connection.execute(_REMOVE, (breakpoint_id, robot_id)).fetchall()

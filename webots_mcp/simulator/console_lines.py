@@ -44,7 +44,7 @@ class ConsoleLines:
         self._left_out = 0
 
     def take(self, message: Message) -> Iterator[Said]:
-        """The lines of a message; none of one that is about something else."""
+        """Return the lines of a message; none of one that is about something else."""
         lines = list(console_lines(message.text))
         if lines and self._is_first:
             self._is_first = False
@@ -75,7 +75,7 @@ class ConsoleLines:
         yield from self._note_left_out()
 
     def take_line(self, line: WebotsLine) -> Iterator[Said]:
-        """A line that has just been printed, unless it is one of too many."""
+        """Return a line that has just been printed, unless it is one of too many."""
         second = int(time.monotonic())
         if second != self._second:
             yield from self._note_left_out()

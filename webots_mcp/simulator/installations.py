@@ -97,7 +97,7 @@ def _default_homes(platform: str) -> list[Path]:
 
 
 def _at(home: Path, found_by: str, platform: str) -> Iterator[Installation]:
-    """The installation in a folder; nothing where no program is there."""
+    """Return the installation in a folder; nothing where no program is there."""
     program = _program(home, "webots", platform)
     if program is not None:
         libraries = _LIBRARIES.get(platform, ("lib",))

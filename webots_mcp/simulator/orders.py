@@ -242,7 +242,7 @@ def begin_console(stream: Stream) -> None:
 
 
 def console_lines(text: str) -> Iterator[WebotsLine]:
-    """The lines of a message; each names its stream, those that go on with it do not.
+    """Return the lines of a message; each names its stream, those that go on with it do not.
 
     Empty ones are left out: where a line of a controller ends, there is one.
     """

@@ -101,7 +101,7 @@ def controllers_of(project: Path, platform: str = sys.platform) -> list[ProjectC
 
 
 def _started(folder: Path, platform: str) -> Iterator[ProjectController]:
-    """The file of a controller's folder that Webots starts: the first that is there."""
+    """Return the file of a controller's folder that Webots starts: the first that is there."""
     name = folder.name
     program = f"{name}.exe" if platform == "win32" else name
     kinds = {

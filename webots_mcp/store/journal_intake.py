@@ -47,8 +47,8 @@ from webots_mcp.database.connection import identify_files, in_transaction
 from webots_mcp.database.waiting_file import (
     FORMAT,
     STATEMENTS,
+    Ingested,
     Kind,
-    Taken,
     WaitingEntry,
     journal_parts,
 )
@@ -337,7 +337,7 @@ class _Reading:
             if entries := self._entries(lines, session_id):
                 finish = partial(self._finish, session_id, robot_id, session_state, lines)
                 begin = partial(self._begin, session_state)
-                taken = waiting_file.take_in(self.connection, session_id, entries, finish, begin)
+                taken = waiting_file.ingest(self.connection, session_id, entries, finish, begin)
                 done = _until(lines, taken.number)[-1].end
                 place = _JournalPosition(self.identity, done, taken.number, True, self.faults)
             else:
@@ -424,7 +424,7 @@ class _Reading:
         robot_id: int,
         session_state: _JournalState,
         lines: Sequence[_Line],
-        taken: Taken,
+        taken: Ingested,
     ) -> None:
         """Write what follows: names, changes, times, ends of runs, what was dropped."""
         written = {entry.number for entry in taken.written}

@@ -24,11 +24,8 @@ from webots_mcp.signals.naming import harmless_first
 Progress = Generator[None, None, object]
 """A running built-in action: it yields until its outcome is known, and returns the result."""
 
-_MOST_NAMED: Final = 10
-
 _INTERRUPTED: Final = "the controller was interrupted before the command began; it was not run"
 _MOST_NAME_CHARACTERS: Final = 100
-_MOST_DOC_CHARACTERS: Final = 4000
 
 
 def whole_number(params: dict[str, Any], name: str, least: int, most: int, *, default: int) -> int:
@@ -192,7 +189,7 @@ def _name_replaced(replaced: Mapping[str, str]) -> str | None:
     """Name the values of a result that JSON cannot hold, by path and kind."""
     if not replaced:
         return None
-    first = list(replaced.items())[:_MOST_NAMED]
+    first = list(replaced.items())[:10]
     named = [f"{path or 'all of it'} ({kind})" for path, kind in first]
     more = f" and {len(replaced) - len(first)} more" if len(replaced) > len(first) else ""
     return f"values of the result that JSON cannot hold were replaced: {', '.join(named)}{more}"
@@ -246,7 +243,7 @@ class Handlers:
             why = "this function is called instead of the callbacks of on_reload()"
             self._journal.log("info", "bridge", f"the controller has registered {action!r}: {why}")
         self._handlers[action] = handler
-        self._recorder.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
+        self._recorder.actions[action] = storable(cut(doc, 4_000))
         self._recorder.update_actions()
 
     def knows(self, action: str) -> bool:

@@ -11,8 +11,7 @@ from webots_mcp.errors import DatabaseError, WebotsMCPError, warn
 if TYPE_CHECKING:
     from types import TracebackType
 
-_LONGEST_WARNING = 2000
-_LONGEST_TEXT: Final = 2000  # of what an error says
+_LONGEST_TEXT: Final = 2000  # characters of an error
 
 
 class ErrorReport:
@@ -33,7 +32,7 @@ class ErrorReport:
 
     def warn(self, kind: str, text: str) -> None:
         """Keep an error as the newest one; print the first of its kind; raise in strict mode."""
-        text = text[:_LONGEST_WARNING].encode("utf-8", "replace").decode()
+        text = text[:_LONGEST_TEXT].encode("utf-8", "replace").decode()
         self.last_error = text
         if kind not in self._warned:
             self._warned.add(kind)

@@ -116,7 +116,7 @@ class Heartbeat:
     def change_loop(self, loop: str | None, mode_before: str | None = None) -> None:
         """Write how a command controls the loop from now on.
 
-        It is written at once: whoever reads the command's answer must not see the old status.
+        It is written at once: a reader of the command's answer must not see the old status.
 
         Args:
             loop: The new value of `loop`.

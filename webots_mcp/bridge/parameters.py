@@ -22,7 +22,6 @@ MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database
 
 V = TypeVar("V", float, int, bool, str)
 SETTERS: Final = ("command", "trial")  # the kinds that a command may name
-_MOST_NAMED: Final = 5
 
 
 class Parameter(Generic[V]):
@@ -335,7 +334,7 @@ class StartValues:
             if name not in declared and not isinstance(value, dict)
         ]
         if unknown:
-            named = ", ".join(f"{name!r:.80}" for name in unknown[:_MOST_NAMED])
+            named = ", ".join(f"{name!r:.80}" for name in unknown[:5])
             self._warn("unknown", f"the controller declares no parameter {named}")
 
     def _read(self) -> dict[str, Any]:

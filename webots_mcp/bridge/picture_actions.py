@@ -8,15 +8,12 @@ from __future__ import annotations
 import time
 from collections.abc import Generator
 from pathlib import Path
-from typing import Final
 
 from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.picture_files import PictureFiles, complete_png_size
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import SCREENSHOT_FOLDER
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-
-_SCREENSHOT_TIMEOUT_S: Final = 10.0
 
 
 class PictureActions:
@@ -64,11 +61,12 @@ class PictureActions:
 
 
 def _wait_for_picture(file: Path) -> Generator[None, None, tuple[int, int, int]]:
-    deadline_s = time.monotonic() + _SCREENSHOT_TIMEOUT_S
+    timeout_s = 10.0  # Webots writes the file at its next rendering, or never
+    deadline_s = time.monotonic() + timeout_s
     while (size := complete_png_size(file)) is None:
         if time.monotonic() > deadline_s:
             raise CommandRefusedError(
-                f"Webots wrote no complete picture to {file} within {_SCREENSHOT_TIMEOUT_S:.0f} s; "
+                f"Webots wrote no complete picture to {file} within {timeout_s:.0f} s; "
                 "its console has the reason"
             )
         yield

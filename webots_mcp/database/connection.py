@@ -462,7 +462,7 @@ class ReadingConnection(sqlite3.Connection):
         return super().execute(*statement)
 
     def is_late(self) -> Callable[[], bool]:
-        """Return a function that tells whether the newest statement has exceeded its time."""
+        """Return a function that returns whether the newest statement exceeds its time."""
         until_s = self._until_s
         return lambda: time.monotonic() > until_s[0]
 

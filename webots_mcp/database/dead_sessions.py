@@ -1,4 +1,4 @@
-"""Tells a dead controller from a slow one, and settles what a dead one left behind.
+"""Distinguishes a dead controller from a slow one, and settles what a dead one left behind.
 
 A session is dead once its process no longer runs (`processes`); silence alone does not count. Its
 runs are ended as of their last sign of life, and its commands become `lost`. The text of a robot's

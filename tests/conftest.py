@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 import shutil
 import signal
@@ -72,9 +73,9 @@ _LONGEST = (
     "tests/plugins/pool/parquet/test_reading.py",
 )
 
-# Tests wait for simulations, servers and locks in half of their time: more of them run side by
-# side than there are cores. A process takes 0.7 GB at its end.
-_PROCESSES_PER_CORE = 2
+# Tests spend a third of their time waiting for simulations, servers and locks: three processes
+# keep two cores busy. Each of them collects all tests, and takes 0.7 GB at its end.
+_PROCESSES_PER_CORE = 1.5
 _MOST_PROCESSES = 6
 
 # The same examples each time, so that a red run was made red by the change that it tests;
@@ -102,7 +103,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Return how many processes `-n auto` starts."""
-    return min(_PROCESSES_PER_CORE * (os.cpu_count() or 1), _MOST_PROCESSES)
+    return min(math.ceil(_PROCESSES_PER_CORE * (os.cpu_count() or 1)), _MOST_PROCESSES)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final, cast
 
 from webots_mcp.analysis.arrays import Array, median, np, runs_of
@@ -263,6 +263,9 @@ def _ratios(
 
     Returns:
         When each cell begins, how long cells are, and the ratios.
+
+    Raises:
+        NotSearchableError: The position is too noisy to tell how far it went.
     """
     rows, x, y = places_in(run.frame, position)
     clock = run.frame.times[rows]
@@ -270,28 +273,38 @@ def _ratios(
     mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
     least = max(4 * run.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
     ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
-    drives = np.sign(mean) * ahead
-    per_row_s = max(run.noise.interval_s, 1e-6)
-    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum())
-    speed_m_s = way_m / (max(1, int(np.count_nonzero(ahead))) * per_row_s)
-    noises = {each: 1.5 * run.noise.position_m * (per_row_s / each) ** 0.5 for each in _CELLS_S}
-    fit = (
-        each for each, noise_m in noises.items()
-        if each >= 3 * per_row_s and noise_m / each <= _NOISE_SHARE * speed_m_s
-    )  # fmt: skip
-    lasts_s = next(fit, _CELLS_S[-1])
-    cells = (clock // lasts_s).astype(np.intp)
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
-    if len(starts) < 2:
-        return np.zeros(0), lasts_s, np.zeros(0)
     course = np.zeros(len(rows))
     if (heading := run.motion.heading) is not None:
         turn = heading.turn or math.tau
         course = unwrap(run.frame.numbers(heading.name)[rows], turn) * math.tau / turn
-    counts = np.diff(starts, append=len(rows))
-    t, x, y, turned, course, driven = (
-        np.add.reduceat(each, starts) / counts for each in (clock, x, y, mean, course, drives)
+    per_row_s = max(run.noise.interval_s, 1e-6)
+    columns = (clock, x, y, mean, course, np.sign(mean) * ahead)
+    for lasts_s in [each for each in _CELLS_S if each >= 3 * per_row_s] or _CELLS_S[-1:]:
+        starts_s, ratios, went_m_s = _ratios_in(columns, lasts_s)
+        noise_m_s = 1.5 * run.noise.position_m * (per_row_s / lasts_s) ** 0.5 / lasts_s
+        if not len(went_m_s) or noise_m_s <= _NOISE_SHARE * median(went_m_s):
+            return starts_s, lasts_s, ratios
+    raise NotSearchableError(
+        f"position noise of {run.noise.position_m:.2g} m at a row each {per_row_s:.3g} s hides how "
+        "far it went"
     )
+
+
+def _ratios_in(columns: Sequence[Array], lasts_s: float) -> tuple[Array, Array, Array]:
+    """The same in cells of one length, and how fast it went in those that count.
+
+    Args:
+        columns: Times, x, y, the mean speed of the wheels, the course, and 1 or -1 where these
+            drive it ahead or back; in rows with a position.
+        lasts_s: How long cells are.
+    """
+    clock = columns[0]
+    cells = (clock // lasts_s).astype(np.intp)
+    starts = np.flatnonzero(np.diff(cells, prepend=-1))
+    if len(starts) < 2:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    counts = np.diff(starts, append=len(clock))
+    t, x, y, turned, course, driven = (np.add.reduceat(each, starts) / counts for each in columns)
     whole = (np.abs(driven) == 1) & (counts >= 2)
     both = whole[1:] & whole[:-1] & (driven[1:] == driven[:-1]) & (np.diff(cells[starts]) == 1)
     both &= np.abs(np.diff(course)) <= _TURNS_RAD
@@ -299,7 +312,7 @@ def _ratios(
     went_m = np.hypot(np.diff(x), np.diff(y))
     ratios = np.full(len(both), math.nan)
     ratios[both] = went_m[both] / rates[both]
-    return clock[starts[:-1]], lasts_s, ratios
+    return clock[starts[:-1]], ratios, went_m[both] / np.diff(t)[both]
 
 
 # -- two estimates of one thing --------------------------------------------------------------------

@@ -324,8 +324,7 @@ def _(t: Array, random: Random) -> Columns:
 
 
 @_problem(
-    "gaps of two lengths lie between rows", counts("gap", 74), lasts_s=100, interval_s=0.017,
-    known_gap="gaps of a regular pattern are taken for a second recording rate",
+    "gaps of two lengths lie between rows", counts("gap", 74), lasts_s=101, interval_s=0.017,
     source="the fr2_desk recording of TUM",
 )  # fmt: skip
 def _(t: Array, random: Random) -> Columns:

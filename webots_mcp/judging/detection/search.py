@@ -24,8 +24,8 @@ from webots_mcp.judging.detection.kinds import (
     NotAskedError,
     NotSearchableError,
 )
-from webots_mcp.signals.meaning import Meaning, Quantity
-from webots_mcp.signals.naming import FARTHEST_M, listed, metres_in, unit_in
+from webots_mcp.signals.meaning import INPUTS, Meaning, Quantity, words_in
+from webots_mcp.signals.naming import FARTHEST_M, listed, unit_in
 from webots_mcp.signals.register import first_in, pair_in
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.meanings import meanings_of
@@ -144,7 +144,7 @@ def find_motion(
     signals = {
         role: own[name]
         for name, role in roles.items()
-        if name in own and _may_have(role, meanings[name])
+        if name in own and _may_have(role, name, meanings[name])
     }
 
     def first(role: str, name: str | None = None) -> RegisteredSignal | None:
@@ -166,7 +166,7 @@ def find_motion(
         ever = {
             role: known[name]
             for name, role in stored_roles(known).items()
-            if _may_have(role, all_meanings[name])
+            if _may_have(role, name, all_meanings[name])
         }
         position = _pair(signals, place) or _pair(ever, pair_in(ever))
     commanded = first("commanded_speed", options.commanded)
@@ -194,9 +194,15 @@ def find_motion(
 _OF_ROLES: Final = {"x": "x", "y": "y", "z": "height", "yaw": "heading", "mode": "mode"}
 
 
-def _may_have(role: str, meaning: Meaning) -> bool:
-    """Whether a signal may have a role by its name: nothing stronger says something else."""
+def _may_have(role: str, name: str, meaning: Meaning) -> bool:
+    """Whether a signal may have a role by its name: nothing stronger says something else.
+
+    What a person moves by hand, and where the robot shall go, is not where it is.
+    """
     quantity = _OF_ROLES.get(role.rstrip("0123456789"))
+    by_hand = not INPUTS.isdisjoint(words_in(name))
+    if quantity not in (None, "mode") and meaning.source == "named" and (meaning.sets or by_hand):
+        return False
     is_said = meaning.source in ("declared", "device") and meaning.quantity is not None
     return quantity is None or not is_said or meaning.quantity == quantity
 
@@ -208,8 +214,8 @@ def _pair(
 
 
 def in_metres(signal: RegisteredSignal, lengths: Array) -> Array:
-    """Lengths that a signal holds, in metres; they are metres where its name has no unit."""
-    factor = metres_in(signal.name)
+    """Lengths that a signal holds, in metres; they are metres where it has no unit."""
+    factor = signal.metres
     return lengths if factor == 1 else lengths * factor
 
 
@@ -237,7 +243,7 @@ def doubt_of_unit(
 ) -> str | None:
     """That a position without a unit in its names is hardly in metres; None where it may be."""
     name = position[0].name
-    if speed_m_s <= IMPLAUSIBLE_M_S or unit_in(name):
+    if speed_m_s <= IMPLAUSIBLE_M_S or unit_in(name) or position[0].stated_unit:
         return None
     return (
         f"{name} is taken as metres, since its name has no unit, but robots are not so fast: if it "
@@ -262,7 +268,7 @@ class RunNoise:
         self.rows = len(run)
         intervals = np.concatenate([np.zeros(0), *(np.diff(part.times) for part in self._parts)])
         self.interval_s = median(intervals) if len(intervals) else 0.0
-        noises = [self.of(each.name) * metres_in(each.name) for each in motion.position or ()]
+        noises = [self.of(each.name) * each.metres for each in motion.position or ()]
         self.position_m = math.hypot(*noises) / math.sqrt(2)
 
     def of(self, name: str) -> float:

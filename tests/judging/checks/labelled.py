@@ -173,7 +173,8 @@ def falls(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     lies = np.array(run.columns["gps"])
     lies[last:] = lies[last]
     lies[last:, :2] += rng.normal(0, run.noise_m, (len(lies) - last, 2))
-    return replace(run, columns={**run.columns, "imu_roll_rad": roll.tolist(), "gps": lies.tolist()})
+    fallen = {"imu_roll_rad": roll.tolist(), "gps": lies.tolist()}
+    return replace(run, columns={**run.columns, **fallen})
 
 
 def grips_on_one_side(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:

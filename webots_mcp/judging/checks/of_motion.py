@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final, cast
 
-from webots_mcp.analysis.arrays import Array, median, np, runs_of
+from webots_mcp.analysis.arrays import Array, Indexes, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times, total_s
 from webots_mcp.judging.detection.fall import FALL
@@ -47,6 +47,15 @@ _SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no
 _WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
 _FAILS: Final = (0.15, 0.3)
 _OTHER_LENGTH: Final = 1.15  # times as long: worth a word
+_HEADING_WARNS_RAD: Final = 0.35  # two headings so far apart in the middle of a second, for 3 s
+_HEADING_FAILS_RAD: Final = 1.0
+_HEADING_CELL_S: Final = 1.0
+# Words of who measures a heading, and of what it is: a name of others is not of the robot's own.
+_MEASURES: Final = frozenset((
+    "ahrs", "compass", "ekf", "estimate", "estimated", "filtered", "fused", "gps", "gyro", "imu",
+    "mag", "magnetometer", "odom", "odometry", "pose", "position", "true",
+))  # fmt: skip
+_HEADINGS: Final = frozenset(("attitude", "deg", "degree", "euler", "heading", "rad", "rpy", "yaw"))
 
 
 def moves_when_commanded(run: RunUnderCheck) -> Finding:
@@ -263,6 +272,9 @@ def _ratios(
 
     Returns:
         When each cell begins, how long cells are, and the ratios.
+
+    Raises:
+        NotSearchableError: The position is too noisy to tell how far it went.
     """
     rows, x, y = places_in(run.frame, position)
     clock = run.frame.times[rows]
@@ -270,28 +282,38 @@ def _ratios(
     mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
     least = max(4 * run.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
     ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
-    drives = np.sign(mean) * ahead
-    per_row_s = max(run.noise.interval_s, 1e-6)
-    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum())
-    speed_m_s = way_m / (max(1, int(np.count_nonzero(ahead))) * per_row_s)
-    noises = {each: 1.5 * run.noise.position_m * (per_row_s / each) ** 0.5 for each in _CELLS_S}
-    fit = (
-        each for each, noise_m in noises.items()
-        if each >= 3 * per_row_s and noise_m / each <= _NOISE_SHARE * speed_m_s
-    )  # fmt: skip
-    lasts_s = next(fit, _CELLS_S[-1])
-    cells = (clock // lasts_s).astype(np.intp)
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
-    if len(starts) < 2:
-        return np.zeros(0), lasts_s, np.zeros(0)
     course = np.zeros(len(rows))
     if (heading := run.motion.heading) is not None:
         turn = heading.turn or math.tau
         course = unwrap(run.frame.numbers(heading.name)[rows], turn) * math.tau / turn
-    counts = np.diff(starts, append=len(rows))
-    t, x, y, turned, course, driven = (
-        np.add.reduceat(each, starts) / counts for each in (clock, x, y, mean, course, drives)
+    per_row_s = max(run.noise.interval_s, 1e-6)
+    columns = (clock, x, y, mean, course, np.sign(mean) * ahead)
+    for lasts_s in [each for each in _CELLS_S if each >= 3 * per_row_s] or _CELLS_S[-1:]:
+        starts_s, ratios, went_m_s = _ratios_in(columns, lasts_s)
+        noise_m_s = 1.5 * run.noise.position_m * (per_row_s / lasts_s) ** 0.5 / lasts_s
+        if not len(went_m_s) or noise_m_s <= _NOISE_SHARE * median(went_m_s):
+            return starts_s, lasts_s, ratios
+    raise NotSearchableError(
+        f"position noise of {run.noise.position_m:.2g} m at a row each {per_row_s:.3g} s hides how "
+        "far it went"
     )
+
+
+def _ratios_in(columns: Sequence[Array], lasts_s: float) -> tuple[Array, Array, Array]:
+    """The same in cells of one length, and how fast it went in those that count.
+
+    Args:
+        columns: Times, x, y, the mean speed of the wheels, the course, and 1 or -1 where these
+            drive it ahead or back; in rows with a position.
+        lasts_s: How long cells are.
+    """
+    clock = columns[0]
+    cells = (clock // lasts_s).astype(np.intp)
+    starts = np.flatnonzero(np.diff(cells, prepend=-1))
+    if len(starts) < 2:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    counts = np.diff(starts, append=len(clock))
+    t, x, y, turned, course, driven = (np.add.reduceat(each, starts) / counts for each in columns)
     whole = (np.abs(driven) == 1) & (counts >= 2)
     both = whole[1:] & whole[:-1] & (driven[1:] == driven[:-1]) & (np.diff(cells[starts]) == 1)
     both &= np.abs(np.diff(course)) <= _TURNS_RAD
@@ -299,7 +321,7 @@ def _ratios(
     went_m = np.hypot(np.diff(x), np.diff(y))
     ratios = np.full(len(both), math.nan)
     ratios[both] = went_m[both] / rates[both]
-    return clock[starts[:-1]], lasts_s, ratios
+    return clock[starts[:-1]], ratios, went_m[both] / np.diff(t)[both]
 
 
 # -- two estimates of one thing --------------------------------------------------------------------
@@ -308,17 +330,21 @@ def _ratios(
 def estimates_agree(run: RunUnderCheck) -> Finding:
     """Warns where two positions came apart by 5 % of the way, and fails from 15 % on.
 
-    Each may have a frame of its own: they are laid over each other where the run begins; two that
-    are far apart there already are not taken for estimates of one thing.
+    So for two headings by 0.35 and 1 rad for 3 s. Each may have a frame of its own: they are laid
+    over each other where the run begins; two positions that are far apart there already are not
+    taken for estimates of one thing.
     """
     known = run.search.known
     by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}
     pairs = [(by_role.get(f"x{place}"), by_role.get(f"y{place}")) for place in PLACES]
     positions = [(x, y) for x, y in pairs if x and y]
     made = [_drift(run, positions[0], other) for other in positions[1:]]
-    if not (findings := [each for each in made if each is not None]):
+    findings = [each for each in made if each is not None]
+    headings = [name for name in known if name in run.frame and _is_own_heading(run, name)]
+    findings += [_turned_apart(run, headings[0], other) for other in headings[1:]]
+    if not findings:
         raise NotSearchableError(
-            "no second position of the robot that goes along with the first"
+            "no second heading, and no second position of the robot that goes along with the first"
             f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
         )
     return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
@@ -357,6 +383,46 @@ def _drift(
     since_s = float(run.frame.times[there][int(np.argmax(off > warns_m))])
     outcome = "fail" if worst_m > fails_m else "warn"
     return Finding(outcome, evidence, since_s, 1, run.shows(one[0].name, other[0].name))
+
+
+def _is_own_heading(run: RunUnderCheck, name: str) -> bool:
+    """Whether a heading is measured, and its name says of nothing but by whom."""
+    meaning, words = run.meanings[name], frozenset(words_in(name))
+    if not run.search.known[name].is_number or meaning.quantity not in ("heading", None):
+        return False
+    is_heading = meaning.quantity == "heading" or not words.isdisjoint(("heading", "yaw"))
+    return is_heading and meaning.role in ("measured", None) and words <= _MEASURES | _HEADINGS
+
+
+def _turned_apart(run: RunUnderCheck, one: str, other: str) -> Finding:
+    """How far two headings came apart; they may differ in sense and where they begin to count."""
+    courses: list[Array] = []
+    for name in (one, other):
+        in_degrees = not frozenset(words_in(name)).isdisjoint(("deg", "degree"))
+        turn = run.search.known[name].turn or (360 if in_degrees else math.tau)
+        courses.append(np.asarray(run.frame.numbers(name) * math.tau / turn))
+    there = np.isfinite(courses[0]) & np.isfinite(courses[1])
+    clock = run.frame.times[there]
+    if len(clock) < 2:
+        return Finding("not applicable", f"{one} and {other} are never known at once")
+    a, b = (each[there] for each in courses)
+    cells = np.flatnonzero(np.diff(clock // _HEADING_CELL_S, prepend=-1))
+    off = min((_cells_apart(a - sense * b, cells) for sense in (1, -1)), key=lambda e: median(e))
+    apart = runs_of(off > _HEADING_WARNS_RAD, clock[cells])
+    long = apart.only(apart.durations_s + _HEADING_CELL_S >= APART_S)
+    evidence = f"{one} and {other}: {off.max():.3g} rad apart at most"
+    if not len(long):
+        return Finding("pass", evidence)
+    worst = max(float(np.median(off[each.start : each.stop])) for each in long.spans())
+    outcome = "fail" if worst > _HEADING_FAILS_RAD else "warn"
+    evidence = f"{one} and {other}: {worst:.3g} rad apart, {times(len(long))} for 3 s or more"
+    return Finding(outcome, evidence, float(long.starts_s[0]), len(long), run.shows(one, other))
+
+
+def _cells_apart(difference: Array, cells: Indexes) -> Array:
+    """The mean angle of a difference in each cell, from that of the first cell on."""
+    turned = np.add.reduceat(np.exp(1j * difference), cells)
+    return np.abs(np.angle(turned * np.conj(turned[0])))
 
 
 def _laid_over(a: Any, b: Any, first: int) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any, Final, Literal, cast
 
-from webots_mcp.analysis.arrays import np, runs_of
+from webots_mcp.analysis.arrays import Array, Runs, median, np, runs_of
 from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times
 from webots_mcp.judging.detection.degradation import DEGRADATION
 from webots_mcp.judging.detection.jump import JUMP
@@ -28,6 +28,9 @@ _LEAST_S: Final = 1.0  # as of what is missing
 _AT_LIMIT: Final = 0.05  # of the rows
 _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
+_CUT_OFF: Final = 5  # times at one extreme to the last digit: of values that never repeat none is
+_BRIEFLY: Final = 3  # rows: what is cut off comes back soon, what rests at a stop does not
+_UNIQUE: Final = 0.95  # of all values but the extreme: so many differ from all others
 
 
 def sensors_speak(run: RunUnderCheck) -> Finding:
@@ -188,6 +191,7 @@ _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
 def sensors_within_limits(run: RunUnderCheck) -> Finding:
     """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
 
+    Also where one whose values never repeat came back to the very same extreme again and again.
     Not a range, which ends where nothing is in sight.
     """
     found = list(_saturated(run))
@@ -226,6 +230,14 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
             long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
             if len(long) >= _OFTEN and at.mean() >= _AT_LIMIT:
                 yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
+            elif limit != 0 and len(rests) >= _CUT_OFF and _is_cut_off(values[~at], rests):
+                yield name, limit, float(at.mean()), float(rests.starts_s[0]), len(rests)
+
+
+def _is_cut_off(others: Array, hits: Runs) -> bool:
+    """Return whether brief hits of one extreme are no chance: all other values are unique."""
+    brief = median((hits.stops - hits.starts).astype(np.float64)) <= _BRIEFLY
+    return bool(brief and len(np.unique(others)) >= _UNIQUE * len(others))
 
 
 def sensors_drop_nothing(run: RunUnderCheck) -> Finding:

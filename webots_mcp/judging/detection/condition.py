@@ -16,7 +16,7 @@ from itertools import starmap
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, RowSpan, Runs, median, np, runs_of
-from webots_mcp.database.pauses import EXPECTED, OF_PROJECT, VIOLATION
+from webots_mcp.database.stored_breakpoints import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.errors import (
     ConditionFailedError,
     InvalidConditionError,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Final
 
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection import (
     condition,
@@ -286,7 +286,7 @@ def _is_left(place: Place, borders: dict[str, Place | None]) -> bool:
 
 def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:
     """Those in which nothing goes on any more: they have ended, or their process is gone."""
-    gone = dict(dead_sessions(connection))
+    gone = dict(find_dead_sessions(connection))
     sessions = [connection.execute(_IS_OPEN, (run_id,)).fetchone() for run_id in set(run_ids)]
     return {run_id for run_id, session_id, is_open in sessions if not is_open or session_id in gone}
 

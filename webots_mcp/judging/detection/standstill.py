@@ -155,6 +155,9 @@ class Standings:
         # A speed whose name leaves open whether it is commanded or measured says so where it is 0.
         self.stops = (np.abs(self.speeds) < least) & (motion.commanded is not None)
         self.stops &= ~self.told_to_turn
+        # To turn in place is no answer to a command to drive ahead, and not to turn.
+        self.only_ahead: Flags = self.told & (np.abs(self.turn_speeds) < least_turn)
+        self.only_ahead &= motion.commanded is not None
         wheels = motion.wheel_commands or motion.wheels
         self.wheels = [each for each in wheels if each.name in frame]
         # Wheels whose name leaves it open and that have no noise at all were set, not measured.
@@ -280,7 +283,7 @@ class Standings:
         """
         events = list[Judged]()
         hindered = np.zeros(len(self.times), np.bool_)  # it moved in its place for long enough
-        for start, stop in self.spans(self.turns | self.sways, 0.0):
+        for start, stop in self.spans((self.turns | self.sways) & ~self.only_ahead, 0.0):
             hindered[start:stop] = True
         drives = self.told | (self.wheel_drives != 0) | self.in_moving_mode
         if self.motion.heading is not None:  # else it is not known whether it turned

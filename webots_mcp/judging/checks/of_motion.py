@@ -56,8 +56,7 @@ def moves_when_commanded(run: RunUnderCheck) -> Examined:
     Warns where only a mode that is the same in the whole run says so, or motors that lift it.
     """
     stood = run.events("standstill")
-    stuck = [each for each in run.events("stuck") if each.duration_s >= APART_S]
-    if stuck:
+    if stuck := run.events("stuck"):
         evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
         first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"
         first += f", but {against}" if (against := stuck[0].details.get("evidence_against")) else ""

@@ -278,7 +278,7 @@ def understands_signals(run: RunUnderCheck) -> Examined:
         zones = run.frame.zone_map(name)
         if not signal.is_number or not zones.value_count.any():
             continue
-        if run.meanings[name].quantity is not None:
+        if run.meanings[name].quantity is not None and run.meanings[name].is_firm:
             understood += 1
         elif signal.reduction is None:
             changes[name] += int(zones.change_count.sum())

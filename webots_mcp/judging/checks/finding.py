@@ -14,7 +14,7 @@ from webots_mcp.judging.detection.events import Found
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import Motion, RunNoise, Search
 from webots_mcp.signals.conditions.compiler import Expectation
-from webots_mcp.signals.meaning import Meaning
+from webots_mcp.signals.meaning import SOURCES, Meaning
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.runs import RunInfo
 
@@ -150,6 +150,12 @@ class RunUnderCheck:
         end_s = end_s if lasts_s is None else start_s + lasts_s
         covered.intervals.append(JudgedInterval(self.info.run_id, start_s, end_s))
         return covered
+
+    def firmest(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return those signals whose meaning is known from the strongest source of all of them."""
+        there = [name for name in dict.fromkeys(names) if name in self.meanings]
+        places = {name: SOURCES.index(self.meanings[name].source) for name in there}
+        return tuple(name for name in there if places[name] == min(places.values()))
 
     def more(self, *kinds: str) -> str:
         """The call that shows events of these kinds."""

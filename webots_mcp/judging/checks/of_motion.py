@@ -14,7 +14,12 @@ from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
-from webots_mcp.judging.detection.standstill import COMMAND_NOISE, ON_THE_SPOT, TURNED_RAD
+from webots_mcp.judging.detection.standstill import (
+    COMMAND_NOISE,
+    ON_THE_SPOT,
+    SPEED_UNITS,
+    TURNED_RAD,
+)
 from webots_mcp.judging.detection.targets import OFF_S, OFF_SHARE, OFF_TARGET, pursuits_in
 from webots_mcp.signals.meaning import words_in
 from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, unit_in, words_of
@@ -65,8 +70,7 @@ def moves_when_commanded(run: RunUnderCheck) -> Examined:
     Warns where only a mode that is the same in the whole run says so, or motors that lift it.
     """
     stood = run.events("standstill")
-    stuck = [each for each in run.events("stuck") if each.duration_s >= APART_S]
-    if stuck:
+    if stuck := run.events("stuck"):
         evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
         first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"
         first += f", but {against}" if (against := stuck[0].details.get("evidence_against")) else ""
@@ -174,7 +178,9 @@ def follows_targets(run: RunUnderCheck) -> Examined:
         f"{names}: {details['off_percent']:g} % off {details['target']} for "
         f"{longest.duration_s:.3g} s without coming nearer"
     )
-    return Fault("fail", evidence, found[0].start_s, len(found), run.more(OFF_TARGET.name))
+    firm = run.firmest(each.name or "" for each in found)
+    more = run.more(OFF_TARGET.name)
+    return Fault("fail", evidence, found[0].start_s, len(found), more, signals=firm)
 
 
 # -- attitude --------------------------------------------------------------------------------------
@@ -352,14 +358,21 @@ def estimates_agree(run: RunUnderCheck) -> Examined:
     by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}
     pairs = [(by_role.get(f"x{place}"), by_role.get(f"y{place}")) for place in PLACES]
     positions = [(x, y) for x, y in pairs if x and y]
-    made = [_drift(run, positions[0], other) for other in positions[1:]]
-    examined = [each for each in made if each is not None]
+    if not positions and run.motion.position is not None:
+        positions = [run.motion.position]
+    made: list[Examined | None] = []
+    if positions:
+        declared = _same_positions(run, positions[0])
+        others = [each for each in positions[1:] if each not in declared]
+        made = [_drift(run, positions[0], each) for each in others]
+        made += [_drift(run, positions[0], each, is_declared=True) for each in declared]
     headings = [name for name in known if name in run.frame and _is_own_heading(run, name)]
-    examined += [_turned_apart(run, headings[0], other) for other in headings[1:]]
-    if not examined:
+    made += [_turned_apart(run, headings[0], other) for other in headings[1:]]
+    made += [_values_apart(run, *each) for each in _same_values(run)]
+    if not (examined := [each for each in made if each is not None]):
         raise NotSearchableError(
             "no second heading, and no second position of the robot that goes along with the first"
-            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
+            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say, or declare same_as"
         )
     faults = [each for each in examined if isinstance(each, Fault)]
     return min(faults, key=lambda each: each.severity, default=examined[0])
@@ -369,6 +382,8 @@ def _drift(
     run: RunUnderCheck,
     one: tuple[RegisteredSignal, RegisteredSignal],
     other: tuple[RegisteredSignal, RegisteredSignal],
+    *,
+    is_declared: bool = False,
 ) -> Examined | None:
     """None where they are no two of one thing, or it went too little to tell."""
     both = [in_metres(each, run.frame.numbers(each.name)) for each in (*one, *other)]
@@ -384,7 +399,8 @@ def _drift(
     first = max(5, int(np.count_nonzero(way_m < _FITTED * way_m[-1])) * thin)
     a, b = a - a[:first].mean(), b - b[:first].mean()
     off = min((_laid_over(a, each, first) for each in (b, b.conj())), key=lambda each: each.max())
-    if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1) and not _are_own(one, other):
+    is_apart = off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1)
+    if is_apart and not is_declared and not _are_own(one, other):
         return None
     names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
     warns_m, fails_m = (max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS))
@@ -446,6 +462,74 @@ def _cells_apart(difference: Array, cells: Indexes) -> Array:
     """The mean angle of a difference in each cell, from that of the first cell on."""
     turned = np.add.reduceat(np.exp(1j * difference), cells)
     return np.abs(np.angle(turned * np.conj(turned[0])))
+
+
+def _same_positions(
+    run: RunUnderCheck, one: tuple[RegisteredSignal, RegisteredSignal]
+) -> list[tuple[RegisteredSignal, RegisteredSignal]]:
+    """Positions of which it was declared that they measure the same as the first."""
+    known, same = run.search.known, _declared_same(run)
+    both = [[b if a == each.name else a for a, b in same if each.name in (a, b)] for each in one]
+    return [(known[x], known[y]) for x, y in zip(*both, strict=False)]
+
+
+def _declared_same(run: RunUnderCheck) -> list[tuple[str, str]]:
+    """Pairs of signals that were published and declared to measure the same thing."""
+    return [
+        (name, each.same_as)
+        for name, each in run.meanings.items()
+        if each.same_as is not None and name in run.frame and each.same_as in run.frame
+        if not each.sets and not run.meanings[each.same_as].sets
+    ]
+
+
+def _same_values(run: RunUnderCheck) -> list[tuple[RegisteredSignal, RegisteredSignal]]:
+    """The declared pairs that are no coordinates of a position, which may have its own frame."""
+    return [
+        (run.search.known[one], run.search.known[other])
+        for one, other in _declared_same(run)
+        if not {run.meanings[one].quantity, run.meanings[other].quantity} & {"x", "y"}
+    ]
+
+
+def _values_apart(
+    run: RunUnderCheck, one: RegisteredSignal, other: RegisteredSignal
+) -> Examined | None:
+    """Whether two measurements of one value are apart for 3 s, by medians of a second each."""
+    a, b = (_in_one_unit(each, run.frame.numbers(each.name)) for each in (one, other))
+    there = np.flatnonzero(np.isfinite(a) & np.isfinite(b))
+    reach = float(np.ptp(np.concatenate((a[there], b[there])))) if len(there) else 0.0
+    if len(there) < _LEAST_CELLS or not reach:
+        return None
+    off = np.abs(a[there] - b[there])
+    if one.turn:
+        off = np.abs(np.remainder(a[there] - b[there] + math.pi, math.tau) - math.pi)
+    clock = run.frame.times[there]
+    starts = np.flatnonzero(np.diff(np.floor(clock), prepend=-1))
+    middles = np.array([float(np.median(part)) for part in np.split(off, starts[1:].tolist())])
+    noises = [_in_one_unit(each, np.array([run.noise.of(each.name)]))[0] for each in (one, other)]
+    noise = _NOISE * float(max(noises))
+    names = f"{one.name} and {other.name}"
+    for severity, (share, _) in (("fail", _FAILS), ("warn", _WARNS)):
+        apart = runs_of(middles > max(share * reach, noise), clock[starts])
+        long = apart.only(apart.durations_s >= APART_S)
+        if len(long):
+            span = next(iter(long.spans()))
+            far = float(np.median(middles[span.start : span.stop]))
+            evidence = f"{names}: {far:.3g} apart, {100 * far / reach:.3g} % of their range"
+            more = run.shows(one.name, other.name)
+            firm = run.firmest([one.name])
+            return Fault(severity, evidence, span.start_s, len(long), more, signals=firm)
+    judged, limit = "2 measurements", f"limit {100 * _WARNS[0]:g} % of their range"
+    return run.covered(f"{names}: {float(middles.max()):.3g} apart", judged=judged, limit=limit)
+
+
+def _in_one_unit(signal: RegisteredSignal, values: Array) -> Array:
+    """Values in metres, radians, m/s or rad/s, where they have such a unit."""
+    if signal.turn:
+        return values * (math.tau / signal.turn)
+    unit = signal.unit or ""
+    return values * SPEED_UNITS.get(unit, METRES.get(unit, 1.0))
 
 
 def _laid_over(a: Any, b: Any, first: int) -> Array:

@@ -53,17 +53,20 @@ def sensors_speak(run: RunUnderCheck) -> Examined:
         if many := [name for name, share in shares.items() if share >= least]:
             most, up_to = 100 * max(shares.values()), "up to " * (len(many) > 1)
             evidence = f"{listed(many, MOST_NAMED)}: NaN in {up_to}{most:.3g} % of the rows"
-            return Fault("warn", evidence, None, len(many), run.shows(many[0]))
+            firm = run.firmest(many)
+            return Fault("warn", evidence, None, len(many), run.shows(many[0]), signals=firm)
         says = "none that had a value was without one for a second"
         return run.covered(says, of="missing", limit=f"limit {100 * _MANY:g} % of the rows")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]
+    firm = run.firmest([*never, *(each.name or "" for each in silent)])
     silent = by_array(silent)
     longest_s = max((each.duration_s for each in silent), default=0.0)
     evidence = f"{_names(silent)}: {times(len(silent))}, up to {longest_s:.4g} s without a value"
     evidence = f"{listed(never, MOST_NAMED)}: NaN in every row" if never else evidence
     since_s = silent[0].start_s if silent and not never else run.search.began_s
     outcome = "fail" if nan or never else "warn"
-    return Fault(outcome, evidence, since_s, len(silent) + len(never), run.more("missing"))
+    often, more = len(silent) + len(never), run.more("missing")
+    return Fault(outcome, evidence, since_s, often, more, signals=firm)
 
 
 def _missing_items(run: RunUnderCheck) -> Fault | None:
@@ -118,7 +121,9 @@ def sensors_live(run: RunUnderCheck) -> Examined:
     longest_s = max(each.duration_s for each in frozen)
     evidence = f"{_names(frozen)}: {times(len(frozen))}, up to {longest_s:.3g} s the same{says}"
     outcome = "fail" if "fail" in outcomes else "warn"
-    return Fault(outcome, evidence, first.start_s, len(frozen), run.more(FLAT.name))
+    firm = run.firmest(each.name or "" for each, said in judged if said == outcome)
+    more = run.more(FLAT.name)
+    return Fault(outcome, evidence, first.start_s, len(frozen), more, signals=firm)
 
 
 def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
@@ -206,7 +211,7 @@ def sensors_within_limits(run: RunUnderCheck) -> Examined:
     others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
     evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
     evidence += f"; also {others}" if others else ""
-    return Fault("warn", evidence, since_s, count, run.shows(name))
+    return Fault("warn", evidence, since_s, count, run.shows(name), signals=(name,))
 
 
 def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
@@ -262,7 +267,8 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Examined:
     evidence = f"{_names(gone)}: away and back {times(len(gone))}"
     evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
-    return Fault(outcome, evidence, gone[0].start_s, len(gone), run.more(JUMP.name))
+    more = run.more(JUMP.name)
+    return Fault(outcome, evidence, gone[0].start_s, len(gone), more, signals=(name or "",))
 
 
 def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
@@ -289,7 +295,8 @@ def sensors_keep_noise(run: RunUnderCheck) -> Examined:
     others = listed([e.name or "" for e in found if e is not worst], MOST_NAMED)
     evidence += f"; also {others}" if others else ""
     more = run.more(DEGRADATION.name)
-    return Fault("warn", evidence, worst.start_s, len(found), more)
+    firm = run.firmest(each.name or "" for each in found)
+    return Fault("warn", evidence, worst.start_s, len(found), more, signals=firm)
 
 
 def by_array(events: Iterable[Event]) -> list[Event]:

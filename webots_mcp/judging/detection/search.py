@@ -29,6 +29,7 @@ from webots_mcp.signals.naming import FARTHEST_M, listed, unit_in
 from webots_mcp.signals.register import first_in, pair_in
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.meanings import meanings_of
+from webots_mcp.store.reading.behaviour import with_behaviour
 from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
@@ -515,8 +516,8 @@ class Search:
 
     @cached_property
     def meanings(self) -> dict[str, Meaning]:
-        """What each signal of the robot means."""
-        return meanings_of(self.known)
+        """What each signal of the robot means, also by its values in this run."""
+        return with_behaviour(meanings_of(self.known), self.known, self.whole)
 
     @cached_property
     def signals(self) -> list[RegisteredSignal]:

@@ -470,8 +470,8 @@ def _was_set(frame: Frame, name: str, noise: RunNoise) -> bool:
         return False
     values = frame.numbers(name)
     turns = np.abs(values[1:]) > 0
-    repeated = np.count_nonzero(np.diff(values)[turns] == 0)
-    return bool(turns.any()) and repeated >= MOSTLY * np.count_nonzero(turns)
+    repeated = int(np.count_nonzero(np.diff(values)[turns] == 0))
+    return repeated > 0 and repeated >= MOSTLY * int(np.count_nonzero(turns))
 
 
 @dataclass(frozen=True)

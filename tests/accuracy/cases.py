@@ -20,11 +20,12 @@ _INTRODUCTION: Final = """\
 would give: {healthy} kinds of healthy robots, about which any alarm is false, and {problems}
 problems, each of which has to be noticed, or be said not to have been searched."""
 _LABELLED: Final = """\
-The rules were made with those in view. For a fairer score, {count} further public situations of other
-kinds were labelled, and the labels committed, before the first question: 2 points for the right
-answer, 1 for one that helps, 0 for none, -1 for a false one (an alarm about a healthy robot, or a
-pass of the check that should have noticed). The first answers earned {first} of {most} points; some of
-their misses were then mended as classes."""
+The rules were made with those in view. For a fairer score, {count} further public situations of
+other kinds were labelled, and the labels committed, before the first question: 2 points for the
+right answer, 1 for one that helps, 0 for none, -1 for a false one (an alarm about a healthy robot,
+or a pass of the check that should have noticed). The first answers earned {first} of {most} points;
+some of their misses were then mended as classes. The right answers are in
+`tests/cases/public_labels.toml`."""
 _ALSO_DRAWN: Final = """\
 The healthy kinds were drawn again with a row each {rates}, with other noise: {runs} runs, of which
 {alarmed} raise an alarm{names}."""

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
+import numpy as np
+
 from tests.accuracy.page import table
 from tests.benchmarks.core import Bench
 from tests.cases import healthy_robots, problems
+from tests.cases.columns import TURN, Array, Random
 from tests.cases.public import FIRST_POINTS, PUBLIC, RIGHT, labels, score
 from tests.cases.rates import FAULTS, INTERVALS_S, NOISES, answer
-from tests.cases.situations import HEALTHY, PROBLEMS, Situation, failures, quiet, recorded
+from tests.cases.situations import HEALTHY, PROBLEMS, Columns, Situation, failures, quiet, recorded
 
 _MODULES = (healthy_robots, problems)  # which fill the registries
 _OTHER_INTERVALS_S: Final = (0.016, 0.064, 0.16)
@@ -29,6 +33,11 @@ some of their misses were then mended as classes. The right answers are in
 _ALSO_DRAWN: Final = """\
 The healthy kinds were drawn again with a row each {rates}, with other noise: {runs} runs, of which
 {alarmed} raise an alarm{names}."""
+_OSCILLATIONS: Final = 30
+_GROWTH: Final = """\
+Of {count} oscillations whose amplitude grows or decays 4 to 20 times in a minute, {found} are found
+and {told} are told with their amplitudes at start and end; of {count} that keep theirs, {false} are
+told to grow."""
 _RATES: Final = """\
 One situation must not be judged differently because it was recorded faster or with more noise.
 Below, noise is a share of a signal's range (standard deviation). *Found* is an event with a start
@@ -60,9 +69,35 @@ def cases(bench: Bench) -> Iterator[str]:
     yield table(("situation", "first", "now"), rows)
     bench.say("cases: other rates")
     yield _other_rates()
+    yield _growth()
     bench.say("cases: rates and noises")
     yield _RATES
     yield table(("fault", "a row each", *(f"{100 * each:g} %" for each in NOISES)), _rates())
+
+
+def _growth() -> str:
+    """Draw oscillations that grow, decay or keep their amplitude, and count what is told of it."""
+    random = np.random.default_rng(10_000)
+    told, found = {True: 0, False: 0}, {True: 0, False: 0}
+    for number in range(2 * _OSCILLATIONS):
+        changes = number % 2 == 0
+        period_s, factor = float(random.uniform(1.5, 4)), float(random.uniform(4, 20))
+        over_s = 60 / math.log(factor) * float(random.choice((-1, 1)))
+
+        def draw(t: Array, noise: Random) -> Columns:
+            size = np.exp((t - 30) / over_s) if changes else np.ones(len(t))  # noqa: B023
+            swing = size * np.sin(TURN * t / period_s)  # noqa: B023
+            return {"roll": 0.1 * (swing + noise.normal(0, 0.02, len(t)))}
+
+        interval_s = float(random.choice(_OTHER_INTERVALS_S))
+        drawn = Situation(f"oscillation {number}", draw, (), 60.0, interval_s)
+        with recorded(drawn) as asked:
+            events = asked.events("oscillation", signals=("roll",)).events
+        found[changes] += bool(events)
+        told[changes] += any("amplitude_at_end" in each.details for each in events)
+    return _GROWTH.format(
+        count=_OSCILLATIONS, told=told[True], false=told[False], found=found[True]
+    )
 
 
 def _linked(name: str) -> str:

@@ -191,7 +191,7 @@ _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
 def sensors_within_limits(run: RunUnderCheck) -> Finding:
     """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
 
-    Also where a noisy one, whose values never repeat, came back to the very same extreme again and again.
+    Also where a noisy one, whose values never repeat, came back to one extreme again and again.
     Not a range, which ends where nothing is in sight.
     """
     found = list(_saturated(run))

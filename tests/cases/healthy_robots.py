@@ -176,7 +176,7 @@ def _(t: Array, random: Random) -> Columns:
 def _(t: Array, random: Random) -> Columns:
     pull = np.select([t < 10, t < 50, t < 60, t < 70, t < 80], [3.0, 0.0, -3.0, 0.0, 3.0], 0.0)
     speed = np.interp(t, [0, 10, 50, 60, 70, 80, 120], [0, 30, 30, 0, 0, 30, 30])
-    way = np.cumsum(speed) * 0.032
+    way = np.cumsum(speed) * t[0]
     return {
         "gps": np.column_stack([way, 20 * np.sin(way / 300)]) + random.normal(0, 0.02, (len(t), 2)),
         "speed_m_s": speed + noise(random, t, 0.02),

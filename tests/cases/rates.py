@@ -60,7 +60,7 @@ def _dropout(t: Array, noisy: Noisy) -> Columns:
 
 def _oscillation(t: Array, noisy: Noisy) -> Columns:
     swings = (t >= 20) & (t < 40)
-    return {"roll": noisy(0.2 * swings * np.sin(TURN * t / 2), 0.4)}
+    return {"roll": noisy(np.where(swings, 0.2 * np.sin(TURN * t / 2), 0.0), 0.4)}
 
 
 def _slip(t: Array, noisy: Noisy) -> Columns:

@@ -60,7 +60,8 @@ class Situation:
     def columns(self) -> tuple[Array, Columns]:
         """Return the times of its rows, and its columns; each call returns the same."""
         count = int(self.lasts_s / self.interval_s)
-        times: Array = np.round(np.arange(1.0, count + 1) * self.interval_s, 6)
+        steps = [round(step * self.interval_s, 6) for step in range(1, count + 1)]
+        times = np.array(steps, dtype=np.float64)
         random = np.random.default_rng(zlib.crc32(self.name.encode()))
         return times, self.draw(times, random)
 

@@ -173,8 +173,8 @@ def falls(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     lies = np.array(run.columns["gps"])
     lies[last:] = lies[last]
     lies[last:, :2] += rng.normal(0, run.noise_m, (len(lies) - last, 2))
-    fallen = {"imu_roll_rad": roll.tolist(), "gps": lies.tolist()}
-    return replace(run, columns={**run.columns, **fallen})
+    columns = {"imu_roll_rad": roll.tolist(), "gps": lies.tolist()}
+    return replace(run, columns={**run.columns, **columns})
 
 
 def grips_on_one_side(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
@@ -187,7 +187,7 @@ def grips_on_one_side(rng: np.random.Generator, run: LabelledRun) -> LabelledRun
     way = (left + right) / 2 * 0.064
     noise = rng.normal(0, float(rng.choice([0.0, 0.002])), (2, len(times)))
     x, y = np.cumsum(way * np.cos(yaw)) + noise[0], np.cumsum(way * np.sin(yaw)) + noise[1]
-    columns = {
+    columns: dict[str, Any] = {
         "gps": np.column_stack([x, y]).tolist(),
         "heading": np.angle(np.exp(1j * yaw)).tolist(),
         "wheels": [{"left": speed_m_s / WHEEL_RADIUS_M, "right": speed_m_s / WHEEL_RADIUS_M}]
@@ -232,7 +232,7 @@ def turns_instead(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     drives = (times < 15) | (times >= 50)
     way = np.cumsum(0.25 * drives) * 0.064
     yaw = np.cumsum(float(rng.uniform(0.5, 2.0)) * on) * 0.064
-    columns = {
+    columns: dict[str, Any] = {
         "pose": [
             {"x": a, "y": 0.0, "yaw": b}
             for a, b in zip(way.tolist(), np.angle(np.exp(1j * yaw)).tolist(), strict=True)

@@ -510,7 +510,8 @@ def _values_apart(
     noises = [_in_one_unit(each, np.array([run.noise.of(each.name)]))[0] for each in (one, other)]
     noise = _NOISE * float(max(noises))
     names = f"{one.name} and {other.name}"
-    for severity, (share, _) in (("fail", _FAILS), ("warn", _WARNS)):
+    for limits in (_FAILS, _WARNS):
+        severity, share = ("fail" if limits is _FAILS else "warn"), limits[0]
         apart = runs_of(middles > max(share * reach, noise), clock[starts])
         long = apart.only(apart.durations_s >= APART_S)
         if len(long):

@@ -199,7 +199,7 @@ _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
 def sensors_within_limits(run: RunUnderCheck) -> Examined:
     """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
 
-    Also where one whose values never repeat came back to the very same extreme again and again.
+    Also where a noisy one, whose values never repeat, came back to one extreme again and again.
     Not a range, which ends where nothing is in sight.
     """
     found = list(_saturated(run))
@@ -245,9 +245,13 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
 
 
 def _is_cut_off(others: Array, hits: Runs) -> bool:
-    """Return whether brief hits of one extreme are no chance: all other values are unique."""
+    """Return whether brief hits of one extreme are no chance: all other values are unique.
+
+    Those of a smooth course are as well, which may have one crest again and again.
+    """
     brief = median((hits.stops - hits.starts).astype(np.float64)) <= _BRIEFLY
-    return bool(brief and len(np.unique(others)) >= _UNIQUE * len(others))
+    unique = len(np.unique(others)) >= _UNIQUE * len(others)
+    return bool(brief and unique and is_noisy(others))
 
 
 def sensors_drop_nothing(run: RunUnderCheck) -> Examined:

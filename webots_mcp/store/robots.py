@@ -76,62 +76,22 @@ _CONSOLE_TROUBLE: Final = (
     "instance = (SELECT instance FROM trouble ORDER BY id DESC LIMIT 1) GROUP BY source) "
     "ORDER BY source = 'console' DESC, id"
 )
-_ALL: Final = (
-    "SELECT id, name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s "
-    "FROM robot ORDER BY id"
-)
-_KIND: Final = "SELECT kind FROM robot WHERE id = ?"
-_NAME: Final = "SELECT name FROM robot WHERE id = ?"
 _SHOWN_NAMES: Final = 20
-_BESIDE: Final = (
-    "SELECT r.id, b.name FROM session s JOIN robot b ON b.id = s.robot_id "
-    "JOIN run r ON r.session_id = s.id JOIN session me ON me.id = :session "
-    f"WHERE b.kind = '{OBSERVER}' AND s.instance = me.instance "
-    "AND r.started_wall_time_s <= :last AND r.last_wall_time_s >= :first "
-    "ORDER BY r.id DESC LIMIT 1"
-)
-_SEEN: Final = (
-    "SELECT data FROM event WHERE run_id IN (SELECT id FROM run WHERE session_id = "
-    f"(SELECT session_id FROM run WHERE id = ?)) AND kind = '{WORLD_EVENT}' AND run_id <= ? "
-    "ORDER BY id DESC LIMIT 1"
-)
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
 STARTING: Final = "starting"
-_CLAIMED: Final = (
-    "SELECT id, action, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
-    "WHERE robot_id = ? AND session_id = ? "
-    "AND status = 'claimed' ORDER BY id DESC"
-)
 _STILL_MOVING_S: Final = 1.0
 _WRITING_S: Final = 0.1  # after a signal
 _SLOWEST_STILL_MOVING_S: Final = 15.0
 _UNPUBLISHED_S: Final = 5.0  # of wall time without a row
 _UNPUBLISHED_INTERVALS: Final = 10.0  # of the usual time between two rows
-_UNPUBLISHED: Final = (
-    "its loop runs, but for {:.1f} s of simulation time it recorded no state: is bridge.publish() "
-    "still called in the loop?"
-)
 _ENDED: Final = {
     "finished": "its controller finished",
     "reload": "the world was reloaded and no new controller session has appeared yet",
     "crashed": "its controller process is gone without having finished (killed or crashed)",
     "superseded": "a newer session took its place",
 }
-_ENDED_BY: Final = (
-    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
-    "AND level = 'error' AND source = 'controller' AND message GLOB ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_HUNG: Final = (
-    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
-    f"AND logger = '{LOGGER}' AND wall_time_s > ? ORDER BY id DESC LIMIT 1"
-)
 _MOST_ERROR_CHARACTERS: Final = 300
-_READ_NO_MORE: Final = (
-    "it was recorded by the observer from its customData: the observer ended, or the robot is gone"
-)
-_RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
 # From inside these look alike; `diagnosis.webots_checks` looks at it from outside.
 SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
@@ -155,40 +115,15 @@ CONNECTION_LOST: Final = (
     "its answer in step()"
 )
 _STOPPED_PROCESS: Final = "its controller (process {}) is stopped, by a signal or a debugger"
-_AWAITS_PERSON: Final = "its loop waits for a person, in a debugger or for a key or click, in {}"
 _HELD_UP_BY: Final = "its loop waits in step(), as the whole world does, for {}: {}"
-_STARTED: Final = "its controller has just started; simulation time has not moved yet"
-_NOT_STARTED: Final = (
-    "its controller has started, but simulation time has not moved since: the simulation may be "
-    "paused in Webots, or the controller has not reached its loop"
-)
-_SEEN_MODE: Final = (
-    "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN "
-    f"(SELECT id FROM run WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1"
-)
-_STANDING: Final = (
-    "its loop is alive but simulation time stands still: paused by the controller's own code, or "
-    "it calls step(0) only"
-)
 _BEGINNING_S: Final = 10.0  # in which a first step may take long: Webots loads, or compiles shaders
 _SURE_OF_HANG: Final = 2.0  # limits of the bridge, or of the silences from which it came back
 _MOST_SILENCES: Final = 20
-_SILENCES: Final = (
-    "SELECT l.wall_time_s, (SELECT s.wall_time_s FROM state s WHERE s.run_id = l.run_id "
-    "AND s.sim_time_s >= l.sim_time_s AND s.wall_time_s > l.wall_time_s "
-    "ORDER BY s.sim_time_s, s.id LIMIT 1) FROM log l "
-    "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
-    f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}"
-)
 _SLOW_STEPS: Final = 3.0  # usual steps that one may last before the world counts as standing
-_USUAL_STEP: Final = (
-    "SELECT sum(step_wait_wall_s) / nullif(sum(steps), 0) FROM run WHERE session_id = ?"
-)
 PRESS_PLAY: Final = (
     "press play in Webots if it is paused there: only a person can resume it while the controller "
     "is inside step(); else check what its loop is waiting for"
 )
-_RESUME_BY: Final = "webots_simulation_control('resume') resumes it"
 _FREE_IT: Final = "mend that line, or end the controller and start it again"
 
 # Controller processes: who they are, and whether they still live.
@@ -339,7 +274,13 @@ class WorldSeen:
 
 def list_robots(connection: sqlite3.Connection, now_s: float) -> list[RobotRecord]:
     """Every robot ever seen, in the order in which they first appeared."""
-    return [_robot(connection, row, now_s) for row in connection.execute(_ALL).fetchall()]
+    return [
+        _robot(connection, row, now_s)
+        for row in connection.execute(
+            "SELECT id, name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s "
+            "FROM robot ORDER BY id"
+        ).fetchall()
+    ]
 
 
 def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
@@ -348,7 +289,7 @@ def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
     Raises:
         NothingRecordedError: Its row is not there, or cannot be read.
     """
-    row = connection.execute(_NAME, (robot_id,)).fetchone()
+    row = connection.execute("SELECT name FROM robot WHERE id = ?", (robot_id,)).fetchone()
     if row is None:
         raise NothingRecordedError(f"robot {robot_id} has no row that can be read")
     return row[0]
@@ -458,11 +399,23 @@ def world_seen(connection: sqlite3.Connection, run: RunRecord) -> WorldSeen | No
         "first": run.started_wall_time_s,
         "last": run.last_wall_time_s,
     }
-    row = connection.execute(_BESIDE, values).fetchone()
+    row = connection.execute(
+        "SELECT r.id, b.name FROM session s JOIN robot b ON b.id = s.robot_id "
+        "JOIN run r ON r.session_id = s.id JOIN session me ON me.id = :session "
+        f"WHERE b.kind = '{OBSERVER}' AND s.instance = me.instance "
+        "AND r.started_wall_time_s <= :last AND r.last_wall_time_s >= :first "
+        "ORDER BY r.id DESC LIMIT 1",
+        values,
+    ).fetchone()
     if row is None:
         return None
     run_id, observer = row
-    found = connection.execute(_SEEN, (run_id, run_id)).fetchone()
+    found = connection.execute(
+        "SELECT data FROM event WHERE run_id IN (SELECT id FROM run WHERE session_id = "
+        f"(SELECT session_id FROM run WHERE id = ?)) AND kind = '{WORLD_EVENT}' AND run_id <= ? "
+        "ORDER BY id DESC LIMIT 1",
+        (run_id, run_id),
+    ).fetchone()
     if found is None:
         return None
     return WorldSeen(observer, json.loads(found[0]), _places(connection, run_id, run))
@@ -531,7 +484,9 @@ def judge(
             return Status(RUNNING, why)
         return _stopped(session, moved_s, now_s, why)
     if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= still_moving_s:
-        return Status(STARTING, _STARTED)
+        return Status(
+            STARTING, "its controller has just started; simulation time has not moved yet"
+        )
     if moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s:
         return Status(RUNNING, _why_unpublished(connection, session, run))
     return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
@@ -588,7 +543,7 @@ def find_block(
         return BlockedLoop(CONNECTION_LOST.format(session.pid), fix)
     seen = _seen_by_observer(connection, session, now_s)
     if seen and seen.startswith(SEEN_PAUSED):
-        return BlockedLoop(seen, _RESUME_BY)
+        return BlockedLoop(seen, "webots_simulation_control('resume') resumes it")
     if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= _BEGINNING_S:
         return None
     return _block_in_code(connection, session, moved_s, now_s)
@@ -613,7 +568,10 @@ def _block_in_code(
             return None
         return BlockedLoop(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
     if not stacks.is_hang:
-        return BlockedLoop(_AWAITS_PERSON.format(stacks.place), "let it go on")
+        return BlockedLoop(
+            f"its loop waits for a person, in a debugger or for a key or click, in {stacks.place}",
+            "let it go on",
+        )
     if _is_unseen(session, moved_s) or handler_at_work(connection, session, now_s):
         return None
     hang = _hang(connection, session, now_s)
@@ -622,7 +580,10 @@ def _block_in_code(
 
 def _usual_step_s(connection: sqlite3.Connection, session: SessionRecord) -> float:
     """How long the loop has waited in a step on average, in wall seconds; 0 before it is known."""
-    (usual_s,) = connection.execute(_USUAL_STEP, (session.id,)).fetchone()
+    (usual_s,) = connection.execute(
+        "SELECT sum(step_wait_wall_s) / nullif(sum(steps), 0) FROM run WHERE session_id = ?",
+        (session.id,),
+    ).fetchone()
     return usual_s or 0.0
 
 
@@ -631,7 +592,14 @@ def _is_sure(connection: sqlite3.Connection, session: SessionRecord, now_s: floa
     stacks = find_stacks(connection, session, now_s)
     if stacks is None:
         return False
-    silences = connection.execute(_SILENCES, (session.id,)).fetchall()
+    silences = connection.execute(
+        "SELECT l.wall_time_s, (SELECT s.wall_time_s FROM state s WHERE s.run_id = l.run_id "
+        "AND s.sim_time_s >= l.sim_time_s AND s.wall_time_s > l.wall_time_s "
+        "ORDER BY s.sim_time_s, s.id LIMIT 1) FROM log l "
+        "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
+        f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}",
+        (session.id,),
+    ).fetchall()
     lasted_s = [
         end_s - noted_s + stacks.limit_s for noted_s, end_s in silences if end_s is not None
     ]
@@ -675,7 +643,10 @@ def _why_unpublished(
         or unpublished_s <= 0
     ):
         return None
-    return _unseen(session) or _UNPUBLISHED.format(unpublished_s)
+    return _unseen(session) or (
+        f"its loop runs, but for {unpublished_s:.1f} s of simulation time it recorded no "
+        "state: is bridge.publish() still called in the loop?"
+    )
 
 
 def _unseen(session: SessionRecord) -> str | None:
@@ -684,18 +655,28 @@ def _unseen(session: SessionRecord) -> str | None:
 
 
 def _why_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
-    (kind,) = connection.execute(_KIND, (session.robot_id,)).fetchone() or (None,)
+    (kind,) = connection.execute(
+        "SELECT kind FROM robot WHERE id = ?", (session.robot_id,)
+    ).fetchone() or (None,)
     if kind == CUSTOM_DATA:
-        return _READ_NO_MORE
+        return (
+            "it was recorded by the observer from its customData: the observer ended, or the "
+            "robot is gone"
+        )
     if session.end_reason == "reload" and session.extern:
-        return _RELOADED_EXTERN
+        return f"the world was reloaded, which ended its controller; {EXTERN}"
     if session.end_reason == "finished" and (unseen := _unseen(session)):
         return unseen
     if session.end_reason == "crashed" and (error := ended_by(connection, session.id)):
         return f"its controller ended by {error}"
     why = _ENDED.get(session.end_reason or "crashed")
     if session.end_reason in (None, "crashed"):
-        hung = connection.execute(_HUNG, (session.id, session.last_seen_wall_time_s)).fetchone()
+        hung = connection.execute(
+            "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run "
+            f"WHERE session_id = ?) AND logger = '{LOGGER}' AND wall_time_s > ? ORDER BY id DESC "
+            "LIMIT 1",
+            (session.id, session.last_seen_wall_time_s),
+        ).fetchone()
         said = hung[0] if hung else _left_stacks(connection, session)
         why = f"{why}; it was {said.partition(chr(10))[0]}" if said else why
     return why
@@ -711,7 +692,12 @@ def _left_stacks(connection: sqlite3.Connection, session: SessionRecord) -> str 
 
 def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:
     """The exception that ended a controller, as its bridge logged it; None where it had no time."""
-    found = connection.execute(_ENDED_BY, (session_id, f"{ENDED_BY} *")).fetchone()
+    found = connection.execute(
+        "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
+        "AND level = 'error' AND source = 'controller' AND message GLOB ? "
+        "ORDER BY sim_time_s DESC, id DESC LIMIT 1",
+        (session_id, f"{ENDED_BY} *"),
+    ).fetchone()
     return found[0].removeprefix(f"{ENDED_BY} ")[:_MOST_ERROR_CHARACTERS] if found else None
 
 
@@ -737,11 +723,17 @@ def _why_standing(
         at = f"; {stacks.limit_s:g} s after it began it was in {stacks.place}" if stacks else ""
         return f"{UNMOVED}{at}"
     if moved_s is None:
-        return _NOT_STARTED
+        return (
+            "its controller has started, but simulation time has not moved since: the "
+            "simulation may be paused in Webots, or the controller has not reached its loop"
+        )
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
     beaten_since_s = session.last_seen_wall_time_s - moved_s
     if session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S:
-        return _STANDING
+        return (
+            "its loop is alive but simulation time stands still: paused by the controller's "
+            "own code, or it calls step(0) only"
+        )
     left = left_holding(connection, session, now_s)
     if left is None:
         return WAITING_IN_STEP if stacks and stacks.is_in_step else SILENT
@@ -807,7 +799,11 @@ def _seen_by_observer(
 ) -> str | None:
     """What a live observer of the simulation knows of it; None where there is none."""
     for each in (session, *companions(connection, session, now_s)):
-        found = connection.execute(_SEEN_MODE, (each.id,)).fetchone()
+        found = connection.execute(
+            "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN (SELECT id FROM run "
+            f"WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1",
+            (each.id,),
+        ).fetchone()
         if found is not None and each.heartbeat_is_fresh(now_s):
             text = SEEN_PAUSED_BY if found[0] == "pause" else SEEN_RUNNING_BY
             return text.format(robot_name(connection, each.robot_id))
@@ -818,7 +814,12 @@ def handler_at_work(
     connection: sqlite3.Connection, session: SessionRecord, now_s: float
 ) -> str | None:
     """The custom action that the loop is inside of; it beats and steps only by itself there."""
-    claimed = connection.execute(_CLAIMED, (session.robot_id, session.id)).fetchall()
+    claimed = connection.execute(
+        "SELECT id, action, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
+        "WHERE robot_id = ? AND session_id = ? "
+        "AND status = 'claimed' ORDER BY id DESC",
+        (session.robot_id, session.id),
+    ).fetchall()
     for command_id, action, since_s in claimed:
         built_in = BUILT_IN_ACTIONS.get(action)
         if built_in is None or built_in.runs_user_code:

@@ -82,7 +82,6 @@ _OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
 """Marks of ended runs by database, run and start. The result of a check of them is final."""
 _CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp lights")
 """Checks runs in the background, so that no request waits for a check."""
-_OUTCOME_MARKS: Final = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}
 _NO_OUTCOME: Final = "⚪"
 """Mark of runs that were not checked yet, or cannot be checked."""
 
@@ -250,7 +249,7 @@ def _check(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
     try:
         with recording.reader() as connection:
             outcome = check_run(connection, key[1], deadline_s=_LIMITS.check_s).outcome
-        _OUTCOMES[key] = _OUTCOME_MARKS.get(outcome, _NO_OUTCOME)
+        _OUTCOMES[key] = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}.get(outcome, _NO_OUTCOME)
     except (WebotsMCPError, sqlite3.Error):
         del _OUTCOMES[key]
     except Exception:  # noqa: BLE001 - No request waits for it and could report it.

@@ -38,10 +38,7 @@ if TYPE_CHECKING:
 
 
 _SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
-_MEND_LINE: Final = f"mend that line; else {_SEE_PAGE}"
-_PRESS_PLAY: Final = "press play in Webots"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
-_OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,7 @@ def _judged(view: RobotView) -> Diagnosis:
             return wrong(seen, "see 'webots-mcp logs --level error', mend the controller and start "
                          "it again")  # fmt: skip
         return ok(seen)
-    hangs = _MEND_LINE if "silent for " in (status.why or "") else None
+    hangs = f"mend that line; else {_SEE_PAGE}" if "silent for " in (status.why or "") else None
     if status.is_moving:
         return Diagnosis("warning" if status.why else "ok", seen, hangs)
     if status.text == PAUSED:
@@ -127,7 +124,7 @@ def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
     webots = _webots_of(subject, session)
     reload, play = (
         _also_by_websocket(fix, order, webots)
-        for fix, order in ((_RELOAD, "reload"), (_PRESS_PLAY, "resume"))
+        for fix, order in ((_RELOAD, "reload"), ("press play in Webots", "resume"))
     )
     others = None if session.host != host_name() else _controllers_beside(view, session, webots)
     busy = None if others is None else _computing({session.pid, *others.pids})
@@ -168,7 +165,9 @@ def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
 def _also_by_websocket(fix: str, order: str, webots: Instance | None) -> str:
     """Return what a person can do, and what a client can if Webots was started with --stream."""
     is_open = webots is not None and webots.streams and webots.is_listening
-    return _OBEYS.format(fix, order) if is_open else fix
+    if not is_open:
+        return fix
+    return f"{fix}; or webots_simulation_control('{order}'): this Webots obeys it by its WebSocket"
 
 
 def _webots_of(subject: Examined, session: SessionRecord) -> Instance | None:

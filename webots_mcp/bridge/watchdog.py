@@ -5,7 +5,7 @@ it writes the stacks of all threads: with the interpreter's lock, so that no thr
 meanwhile. The timer of `faulthandler` does without that lock, and ended one process in 15 to 100
 whose code was running then (Python 3.10 to 3.13, measured); it is not used. Where C code keeps the
 lock, no thread of Python runs. The file's time stops then, and who asks for the status sends a
-signal on which `faulthandler` writes the stacks (`store.robots`); those stand still as well.
+signal on which `faulthandler` writes the stacks (`store.loop_evidence`); those stand still as well.
 """
 
 from __future__ import annotations

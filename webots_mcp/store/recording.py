@@ -56,19 +56,14 @@ from webots_mcp.store.journal_intake import (
     journals_behind,
     kept_journals,
 )
+from webots_mcp.store.loop_evidence import ask_stuck
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
-from webots_mcp.store.robots import (
-    RobotRecord,
-    SessionRecord,
-    Status,
-    ask_stuck,
-    console_trouble,
-    judge,
-    stopped_for,
-)
+from webots_mcp.store.robot_status import Status, decide_status, stopped_for
+from webots_mcp.store.robots import RobotRecord, console_trouble
 from webots_mcp.store.run_rows import RunRecord, StateRecord, current_run, newest_state
+from webots_mcp.store.sessions import SessionRecord
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "
@@ -398,7 +393,7 @@ def view_of(
     current = current_run(connection, robot.id)
     run = run or current
     if run is None or run == current:
-        status = judge(connection, robot.session, run, now_s)
+        status = decide_status(connection, robot.session, run, now_s)
     else:
         status = _of_earlier_run(run, now_s)
     state = newest_state(connection, run.id) if run else None

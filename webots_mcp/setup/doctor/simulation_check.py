@@ -31,7 +31,8 @@ from webots_mcp.setup.doctor import (
 from webots_mcp.simulator.instances import shown_of
 from webots_mcp.simulator.orders import address_of
 from webots_mcp.store.recording import RobotView
-from webots_mcp.store.robots import SILENT, WAITING_IN_STEP, SessionRecord, companions
+from webots_mcp.store.robot_status import SILENT, WAITING_IN_STEP
+from webots_mcp.store.sessions import SessionRecord, companions
 
 if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance

@@ -26,7 +26,7 @@ from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.page_data import draw, page_request, picture, problem, robot_status
-from webots_mcp.plugins.page.steering import steer, tune
+from webots_mcp.plugins.page.page_orders import steer, tune
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.store.recording import RecordingAccess
 

@@ -26,7 +26,7 @@ from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.steering.dispatch import withdraw_if_blocked
 from webots_mcp.store.recording import RecordingAccess as Store
-from webots_mcp.store.robots import WAITING_IN_STEP, BlockedLoop, find_block
+from webots_mcp.store.robot_status import WAITING_IN_STEP, BlockedLoop, find_block
 
 __all__ = ["data_dir", "filed", "start"]
 pytestmark = pytest.mark.anyio

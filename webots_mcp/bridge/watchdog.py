@@ -6,7 +6,7 @@ no other thread runs meanwhile. The timer of `faulthandler` is not used: it work
 and ended one process in 15 to 100 whose code was running then (measured, Python 3.10 to 3.13).
 
 While C code holds the lock, no Python thread runs, and the file's time stops. Then a process that
-reads the status sends a signal, on which `faulthandler` writes the stacks (`store.robots`).
+reads the status sends a signal, on which `faulthandler` writes the stacks (`store.loop_evidence`).
 """
 
 from __future__ import annotations

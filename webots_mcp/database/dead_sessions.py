@@ -2,7 +2,7 @@
 
 A session is dead once its process no longer runs (`processes`); silence alone does not count. Its
 runs are ended as of their last sign of life, and its commands become `lost`. The text of a robot's
-status is made from this by `store.robots.judge`.
+status is made from this by `store.robot_status.decide_status`.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """

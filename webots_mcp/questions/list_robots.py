@@ -32,6 +32,7 @@ from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
 from webots_mcp.questions.declaring import READS, question
+from webots_mcp.store.loop_evidence import rows_waiting
 from webots_mcp.store.recording import (
     GETTING_STARTED,
     RecordingAccess,
@@ -44,14 +45,10 @@ from webots_mcp.store.retention import described, unheeded
 from webots_mcp.store.retention_plan import file_sizes
 from webots_mcp.store.robots import (
     RobotRecord,
-    SessionRecord,
     WorldSeen,
-    companions,
     console_trouble,
-    fetch_session,
     list_robots,
     nothing_recorded,
-    rows_waiting,
     world_seen,
 )
 from webots_mcp.store.run_rows import (
@@ -60,6 +57,7 @@ from webots_mcp.store.run_rows import (
     pace_of,
     real_time_factor,
 )
+from webots_mcp.store.sessions import SessionRecord, companions, fetch_session
 
 _TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
 _PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")

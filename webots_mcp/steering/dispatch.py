@@ -25,7 +25,8 @@ from webots_mcp.steering.run_command import ACTION, describe_progress
 from webots_mcp.steering.target import find_target, require_parameters
 from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import BlockedLoop, find_block, robot_name
+from webots_mcp.store.robot_status import BlockedLoop, find_block
+from webots_mcp.store.robots import robot_name
 
 # Receives how much is done, how much there is to do (None if unknown), and a text.
 ProgressReport = Callable[[float, float | None, str], Awaitable[None]]

@@ -43,7 +43,8 @@ from webots_mcp.store.parameters import (
 )
 from webots_mcp.store.recording import Job, RecordingAccess, RobotView
 from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import find_block, robot_name
+from webots_mcp.store.robot_status import find_block
+from webots_mcp.store.robots import robot_name
 
 OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
 _ASKER: Final = "trials"

@@ -31,10 +31,6 @@ from webots_mcp.store.chunks import ABSENT, Absent, Replaced, parse, shown
 if TYPE_CHECKING:
     from webots_mcp.store.chunks import StateColumns
 
-_OF_ROBOT: Final = (
-    "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
-    "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
-)
 
 _TURNING: Final = ("heading", "roll", "pitch")  # in radians where no unit is known
 _NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
@@ -107,7 +103,11 @@ class RegisteredSignal:
 
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, RegisteredSignal]:
     """The signals of a robot in the register, by name."""
-    rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
+    rows = connection.execute(
+        "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
+        "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id",
+        (robot_id,),
+    ).fetchall()
     signals = (_registered(RegisteredSignal(*row)) for row in rows)
     return {signal.name: signal for signal in signals}
 

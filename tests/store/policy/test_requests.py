@@ -21,7 +21,7 @@ from tests.server.test_parameters import TunableDriver
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import NotAllowedError
-from webots_mcp.plugins.page.steering import steer
+from webots_mcp.plugins.page.page_orders import steer
 from webots_mcp.server.mcp_server import INSTRUCTIONS, create_server
 from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.store.merging import merge, settled

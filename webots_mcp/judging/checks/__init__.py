@@ -41,9 +41,9 @@ from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot
 from webots_mcp.store.recording import waiting_rows_note
-from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import run_info
+from webots_mcp.store.sessions import fetch_session
 
 CHECK_DEADLINE_S: Final = 8.0
 _OF_EVENTS: Final = 0.7  # of the time

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, Final, cast
+from typing import Any, Final, Literal, cast
 
 from webots_mcp.analysis.arrays import Array, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
@@ -438,7 +438,9 @@ def _values_apart(
     noises = [_in_one_unit(each, np.array([run.noise.of(each.name)]))[0] for each in (one, other)]
     noise = _NOISE * float(max(noises))
     names = f"{one.name} and {other.name}"
-    for severity, (share, _) in (("fail", _FAILS), ("warn", _WARNS)):
+    levels: tuple[tuple[Literal["warn", "fail"], float], ...]
+    levels = ("fail", _FAILS[0]), ("warn", _WARNS[0])
+    for severity, share in levels:
         apart = runs_of(middles > max(share * reach, noise), clock[starts])
         long = apart.only(apart.durations_s >= APART_S)
         if len(long):

@@ -55,7 +55,7 @@ def _told(connection: sqlite3.Connection, kind: str) -> Told:
         connection, find_range(connection, Scope(run_id=1)), EventOptions(kinds=(kind,))
     )
     verdicts = found.verdicts
-    word = "not searched" if kind in verdicts.reasons else "not found"
+    word = "not found" if kind in verdicts.not_found else "not searched"
     word = "found" if kind in verdicts.found else word
     checks = {each.name: each.outcome for each in check_run(connection, 1).findings}
     spans_s = [(each.start_s, each.end_s) for each in found.events]

@@ -616,6 +616,12 @@ class Search:
             JudgedInterval(self.segment.run_id, *span) for span in self._asked_of(spans_s or ())
         ]
 
+    def judged_nothing(self, kind: str, reason: str, cause: Cause | None = None) -> None:
+        """Note why nothing of this run could be judged for a kind."""
+        coverage, run_id = self.coverage.of(kind), self.segment.run_id
+        coverage.intervals = [each for each in coverage.intervals if each.run_id != run_id]
+        coverage.note_missing(reason, cause)
+
     def _asked_of(self, spans_s: Sequence[tuple[float, float]]) -> Iterator[tuple[float, float]]:
         """What of these spans was asked about."""
         asked = self.asked or self.segment
@@ -779,11 +785,11 @@ def _found_of(kind: EventKind, search: Search) -> list[Event]:
     except NotAskedError:
         return []
     except NotSearchableError as error:
-        search.not_searched(kind.name, str(error), cause=error.cause)
+        search.judged_nothing(kind.name, str(error), error.cause)
         return []
     if not found and kind.lasts and search.length_s < (least_s := kind.least_s(search.options)):
         run = f"run {search.segment.run_id} lasted only {search.length_s:.3g} s"
-        search.not_searched(kind.name, f"{run}; this kind needs at least {least_s:g} s")
+        search.judged_nothing(kind.name, f"{run}; this kind needs at least {least_s:g} s")
         return []
     search.note_interval(kind)
     if not kind.stored:

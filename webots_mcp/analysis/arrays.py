@@ -37,6 +37,8 @@ _ORDER: Final = 4
 _GAIN: Final = 0.6745 * 70**0.5
 LEAST_ROWS: Final = 3 * _ORDER
 GAP_INTERVALS: Final = 3.0  # a longer pause between two rows is a gap; in median intervals
+EVEN_STEPS: Final = 1e-3  # of the mean step: steps that differ by less are even
+LEAST_WEIGHT: Final = 1e-9  # of rows of the same moment, so that no sum of weights is 0
 ANOTHER_RATE: Final = 5  # this many long intervals in a row are a slower rate, not gaps
 
 
@@ -137,6 +139,47 @@ def constant_runs(numbers: Array, times: Array) -> Runs:
     stops = np.append(edges[1:], len(numbers))
     long = stops - edges >= 2
     return _runs(edges[long], stops[long], times)
+
+
+# -- how much of the time a row stands for ---------------------------------------------------------
+
+
+def time_weights(times: Array) -> Array | None:
+    """Return how much of the time each row stands for, in units of the mean share.
+
+    A row stands for half of the step before it and half of the step after it, which is the
+    trapezoidal rule; the first and the last stand for half a usual step beyond the ends. So rows
+    that follow each other evenly count alike, rows that were recorded at a higher rate count for
+    less each, and a gap belongs to the rows around it.
+
+    Args:
+        times: They do not fall.
+
+    Returns:
+        None where the rows count alike: their steps are even, or no time passes.
+    """
+    if len(times) < 3:
+        return None
+    steps = np.diff(times)
+    if steps.max() - steps.min() <= EVEN_STEPS * steps.mean():
+        return None
+    usual_s = median(steps)
+    weights = np.empty(len(times))
+    weights[1:-1] = (steps[1:] + steps[:-1]) / 2
+    weights[0] = (steps[0] + min(steps[0], usual_s)) / 2
+    weights[-1] = (steps[-1] + min(steps[-1], usual_s)) / 2
+    total_s = float(weights.sum())
+    if total_s <= 0:
+        return None
+    return np.maximum(weights * (len(times) / total_s), LEAST_WEIGHT)
+
+
+def weighted_mean(values: Array, weights: Array | None) -> float:
+    """Return the mean of at least one value; None as weights lets all count alike."""
+    if weights is None:
+        return float(values.mean())
+    mean = inner(values, weights) / float(weights.sum())
+    return min(max(mean, float(values.min())), float(values.max()))  # sums round
 
 
 # -- how regularly rows were recorded, and where some are missing ----------------------------------

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from webots_mcp.analysis.arrays import Array, Indexes, inner, np
+from webots_mcp.analysis.arrays import Array, Indexes, inner, np, weighted_mean
 
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction
@@ -33,6 +33,8 @@ MOST_CHANCE_OF_BEST: Final = 0.01  # that a set is called better than the next o
 
 class Summary(NamedTuple):
     """Counts of the values, and figures of the numbers, which are None where there are none.
+
+    Sums are weighted by time, in such a way that the weights of all numbers add up to their count.
 
     Attributes:
         rows: State rows that were looked at.
@@ -103,7 +105,12 @@ class Summary(NamedTuple):
 
 
 def summarise_numbers(
-    times: Array, numbers: Array, *, rows: int | None = None, turn: float | None = None
+    times: Array,
+    numbers: Array,
+    *,
+    rows: int | None = None,
+    turn: float | None = None,
+    weights: Array | None = None,
 ) -> Summary:
     """Summarise usable numbers, as `usable_part` gives them, in order.
 
@@ -116,12 +123,16 @@ def summarise_numbers(
         numbers: In order.
         rows: Of which so many held one; None for as many.
         turn: A whole turn of what is an angle, in its unit.
+        weights: How much each number counts; None where all count alike.
     """
     present = len(numbers)
     if not present:
         return Summary(rows or 0)
-    total = float(numbers.sum())
-    deviations = numbers - total / present
+    weights = _per_number(weights)
+    mean = float(numbers.sum()) / present if weights is None else weighted_mean(numbers, weights)
+    total = mean * present
+    deviations = numbers - mean
+    squares = deviations if weights is None else deviations * weights
     angles = numbers * (math.tau / turn) if turn else None
     ends = {"first": 0, "last": -1, "min": numbers.argmin(), "max": numbers.argmax()}
     figures = {name: float(numbers[at]) for name, at in ends.items()}
@@ -131,11 +142,20 @@ def summarise_numbers(
         present,
         int(np.count_nonzero(np.diff(numbers))),
         sum=total,
-        squares=inner(deviations, deviations),
-        sines=None if angles is None else float(np.sin(angles).sum()),
-        cosines=None if angles is None else float(np.cos(angles).sum()),
+        squares=inner(squares, deviations),
+        sines=None if angles is None else _weighted_sum(np.sin(angles), weights),
+        cosines=None if angles is None else _weighted_sum(np.cos(angles), weights),
         **figures,
     )
+
+
+def _per_number(weights: Array | None) -> Array | None:
+    """Weights that add up to the count of the numbers."""
+    return None if weights is None else weights * (len(weights) / float(weights.sum()))
+
+
+def _weighted_sum(values: Array, weights: Array | None) -> float:
+    return float(values.sum()) if weights is None else inner(values, weights)
 
 
 def with_extremes(whole: Summary, recorded: Summary) -> Summary:
@@ -199,14 +219,17 @@ class LevelStep:
     after: float
 
 
-def fit_line(times: Array, values: Array, mean: float) -> FittedLine | None:
+def fit_line(
+    times: Array, values: Array, mean: float, weights: Array | None = None
+) -> FittedLine | None:
     """Least squares: slope = S_tv / S_tt, r2 = S_tv**2 / (S_tt * S_vv), sums about the means.
 
-    N. R. Draper, H. Smith, Applied Regression Analysis (3rd ed. 1998), sections 1.2 and 1.3. None
-    where time stood still; r2 is 0 for a constant.
+    N. R. Draper, H. Smith, Applied Regression Analysis (3rd ed. 1998), sections 1.2, 1.3 and, for
+    weights, 9.2. None where time stood still; r2 is 0 for a constant.
     """
-    dt, dv = times - times.mean(), values - mean
-    stt, stv, svv = inner(dt, dt), inner(dt, dv), inner(dv, dv)
+    dt, dv = times - weighted_mean(times, weights), values - mean
+    wt, wv = (dt, dv) if weights is None else (dt * weights, dv * weights)
+    stt, stv, svv = inner(wt, dt), inner(wt, dv), inner(wv, dv)
     if stt == 0:
         return None
     return FittedLine(stv / stt, min(1.0, stv / stt * (stv / svv)) if svv > 0 else 0.0)
@@ -293,7 +316,9 @@ def _step_row(values: Array) -> int:
     return row
 
 
-def time_effect(times: Array, values: Array, mean: float, squares: float) -> float:
+def time_effect(
+    times: Array, values: Array, mean: float, squares: float, weights: Array | None = None
+) -> float:
     """The share of the variance that lies between eight equal stretches of time, 0 to 1.
 
     The correlation ratio eta squared (R. A. Fisher, Statistical Methods for Research Workers,
@@ -304,8 +329,17 @@ def time_effect(times: Array, values: Array, mean: float, squares: float) -> flo
     if squares == 0 or width_s == 0:
         return 0.0
     borders: Array = times[0] + width_s * np.arange(TIME_BINS)
-    parts = np.split(values, np.searchsorted(times, borders[1:]))
-    between = sum(len(part) * (float(part.mean()) - mean) ** 2 for part in parts if len(part))
+    cuts = np.searchsorted(times, borders[1:])
+    parts = np.split(values, cuts)
+    if weights is None:
+        between = sum(len(part) * (float(part.mean()) - mean) ** 2 for part in parts if len(part))
+        return min(1.0, between / squares)
+    weights = weights * (len(weights) / float(weights.sum()))
+    between = sum(
+        float(of.sum()) * (weighted_mean(part, of) - mean) ** 2
+        for part, of in zip(parts, np.split(weights, cuts), strict=True)
+        if len(part)
+    )
     return min(1.0, between / squares)
 
 

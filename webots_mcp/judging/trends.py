@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-from webots_mcp.analysis.arrays import Array, Indexes, np
+from webots_mcp.analysis.arrays import Array, Indexes, np, weighted_mean
 from webots_mcp.analysis.summary import (
     FLAT_BAND,
     LARGEST,
@@ -44,6 +44,7 @@ from webots_mcp.store.reading.frame_summary import (
     change_points,
     reads_values,
     summary_of,
+    weighted_sums,
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import (
@@ -53,7 +54,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     shown_time,
 )
-from webots_mcp.store.series import STATES_SHARE, signals_left
+from webots_mcp.store.series import STATES_SHARE, WEIGHTED, signals_left
 from webots_mcp.store.signals import RegisteredSignal
 
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
@@ -160,6 +161,7 @@ class Course:
         inner_variance: That of the values within what the means are of. Where more of it lies there
             than between them, the course of the means is not that of the values.
         resolution_s: The usual length of what the means are of; None where the numbers are values.
+        weights: How much of the time each number stands for; None where all count alike.
     """
 
     times: Array
@@ -171,9 +173,16 @@ class Course:
     rest_s: float | None = None
     inner_variance: float = 0.0
     resolution_s: float | None = None
+    weights: Array | None = None
 
 
-def course_of_values(times: Array, recorded: Array, turn: float | None, summary: Summary) -> Course:
+def course_of_values(
+    times: Array,
+    recorded: Array,
+    turn: float | None,
+    summary: Summary,
+    weights: Array | None = None,
+) -> Course:
     """The course of a signal of which every value is looked at.
 
     Args:
@@ -181,27 +190,37 @@ def course_of_values(times: Array, recorded: Array, turn: float | None, summary:
         recorded: The usable values.
         turn: A whole turn of an angle, in its unit; None of what is none.
         summary: What the values come to.
+        weights: How much of the time each value stands for; None where all count alike.
     """
     leaps = turn is not None and leaps_in(recorded, turn)
     numbers = recorded if turn is None or leaps else unwrap(recorded, turn)
-    counted = None if turn is None or leaps else summarise_numbers(times, numbers)
+    counted = None if turn is None or leaps else summarise_numbers(times, numbers, weights=weights)
     monotonic, rest_s = _monotonic(numbers), flat_since(times, numbers)
-    return Course(times, numbers, counted or summary, counted, leaps, monotonic, rest_s)
+    return Course(
+        times, numbers, counted or summary, counted, leaps, monotonic, rest_s, weights=weights
+    )
 
 
 def in_means(course: Course, rows: int) -> Course:
     """A course in the means of so many values each, for what takes long to find in all of them."""
     starts = np.arange(0, len(course.times), rows)
     counts = np.diff(starts, append=len(course.times))
-    means = np.add.reduceat(course.numbers, starts) / counts
+    of_rows = course.weights
+    weights = counts if of_rows is None else np.add.reduceat(of_rows, starts)
+
+    def means_of(values: Array) -> Array:
+        sums = np.add.reduceat(values if of_rows is None else values * of_rows, starts)
+        return np.asarray(sums / weights, np.float64)
+
+    means, times = means_of(course.numbers), means_of(course.times)
     off = course.numbers - np.repeat(means, counts)
-    times = np.add.reduceat(course.times, starts) / counts
     return replace(
         course,
         times=times,
         numbers=means,
-        inner=summarise_numbers(times, means),
-        inner_variance=float(np.mean(off * off)),
+        inner=summarise_numbers(times, means, weights=weights),
+        inner_variance=weighted_mean(off * off, of_rows),
+        weights=weights,
         resolution_s=_digits(np.median(np.diff(times))) if len(times) > 1 else None,
     )
 
@@ -209,10 +228,11 @@ def in_means(course: Course, rows: int) -> Course:
 def course_of_means(frame: Frame, name: str, zones: ZoneMap) -> Course:
     """The course of a signal with numbers, of many rows, from what its chunks come to."""
     held = np.flatnonzero(~np.isnan(zones.sum))
-    counts, means = zones.value_count[held], zones.sum[held] / zones.value_count[held]
+    weights, sums, squares = (each[held] for each in weighted_sums(frame, name, zones))
+    counts, means = zones.value_count[held], sums / weights
     variances = np.where(
         zones.min[held] < zones.max[held],
-        zones.squared_deviations[held] / np.maximum(1, counts - 1),
+        squares / weights * (counts / np.maximum(1, counts - 1)),
         0.0,
     )
     starts = zones.start_s[held]
@@ -221,11 +241,12 @@ def course_of_means(frame: Frame, name: str, zones: ZoneMap) -> Course:
     return Course(
         times,
         means,
-        summarise_numbers(times, means),
+        summarise_numbers(times, means, weights=weights),
         monotonic=_monotonic_chunks(zones, held),
         rest_s=_rest_of_chunks(frame, name, zones, held),
-        inner_variance=math.fsum(variances.tolist()) / len(held),
+        inner_variance=weighted_mean(variances, weights),
         resolution_s=_digits(np.median(lengths)),
+        weights=weights,
     )
 
 
@@ -274,7 +295,11 @@ def judge(
     turn = signal.turn if summary.sines is not None else None
     slow = _slow_share(inner, course.inner_variance)
     fast = slow < SLOW_SHARE or course.leaps
-    line = None if course.leaps else _of_all(fit_line(times, numbers, inner.mean or 0.0), slow)
+    line = (
+        None
+        if course.leaps
+        else _of_all(fit_line(times, numbers, inner.mean or 0.0, course.weights), slow)
+    )
     monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
     swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
     mean = summary.mean if turn is None else summary.centre(turn)
@@ -304,7 +329,7 @@ def judge(
         step=None if spikes is None or turn is not None else find_step(times, numbers),
         missing=summary.rows - summary.present - (too_large or 0),
         too_large=too_large,
-        change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0)
+        change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0, course.weights)
         * slow
         * _relative_range(summary),
         says="",
@@ -583,6 +608,7 @@ def trends(
     ]
     notes = [_unseen_swings(run) for run in runs if run.resolution_s is not None]
     notes += [f"run {run.run_id}: {each}" for run in runs for each in run.unread]
+    notes += [WEIGHTED] if any(run.numbers for run in runs) else []
     return Trends(time_range.robot, tuple(runs), (*time_range.notes, *notes))
 
 
@@ -657,7 +683,8 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
     too_large: int | None = None
     if reads_values(frame, signal):
         times, numbers = frame.usable(name)
-        course = course_of_values(times, numbers, signal.turn, summary)
+        weights = frame.usable_weights(name)
+        course = course_of_values(times, numbers, signal.turn, summary, weights)
         if is_long:
             course = in_means(course, chunk_making.GROUP_ROWS)
         else:

@@ -35,6 +35,7 @@ from webots_mcp.store.signals import RegisteredSignal, cleaned
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
 MOST_NAMED: Final = 5  # signals that there was no time for
+WEIGHTED: Final = "means and deviations are weighted by time"
 STATES_SHARE: Final = 0.5  # of the time, where numbers are asked for as well
 
 _NEWEST_WALL: Final = (
@@ -176,7 +177,13 @@ def query_history(
         for segment in time_range.segments
     ]  # fmt: skip
     unread = [f"run {run.run_id}: {each}" for run in runs for each in run.unread]
-    return History(time_range.robot, tuple(runs), (*time_range.notes, *unread))
+    return History(time_range.robot, tuple(runs), (*time_range.notes, *unread, *_weighted(runs)))
+
+
+def _weighted(runs: Sequence[RunHistory]) -> Iterator[str]:
+    """That means are weighted by time, where some are shown."""
+    if any(run.numbers and run.step_s is not None for run in runs):
+        yield WEIGHTED
 
 
 def _share(max_points: int, segment: Segment, total_s: float) -> int:

@@ -11,17 +11,13 @@ from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import (
     EVEN_STEPS,
-    GAP_INTERVALS,
     Array,
     Flags,
     Indexes,
     Rhythm,
-    gaps_in,
     inner,
-    interruptions,
     np,
     rhythm_of,
-    usual_interval_s,
     weighted_mean,
 )
 from webots_mcp.analysis.summary import (
@@ -38,7 +34,6 @@ from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts,
 from webots_mcp.store.signals import RegisteredSignal
 
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
-_SAMPLE_ROWS: Final = 2000
 _ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
 _NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
 _DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before a border is behind
@@ -183,18 +178,8 @@ def frame_around(connection: sqlite3.Connection, segment: Segment, deadline: Dea
 
 
 def rhythm_in(frame: Frame) -> Rhythm:
-    """The rhythm of the rows of a frame; of many, only chunks that have a gap are opened.
-
-    The median is then that of the first 2,000 rows.
-    """
-    if len(frame) <= FULL_ROWS:
-        return rhythm_of(frame.times)
-    interval_s = usual_interval_s(frame.rows(0, _SAMPLE_ROWS).times)
-    if interval_s is None:
-        return rhythm_of(frame.times)
-    around = frame.around_steps(GAP_INTERVALS * interval_s)
-    gaps = [gap for times in around for gap in gaps_in(times, interval_s)]
-    return Rhythm(interval_s, interruptions(gaps))
+    """Return the rhythm of the rows of a frame."""
+    return rhythm_of(frame.times)
 
 
 @dataclass(frozen=True)

@@ -301,7 +301,9 @@ def _usual_of(intervals: Array, at: Indexes, steps: Indexes) -> Array:
     """What the intervals so many places away let expect; 0 where there are too few of them."""
     places = at[:, None] + steps
     there = (places >= 0) & (places < len(intervals))
-    around = np.where(there, intervals[np.clip(places, 0, len(intervals) - 1)], np.inf)
+    around = np.where(
+        there, intervals[np.minimum(np.maximum(places, 0), len(intervals) - 1)], np.inf
+    )
     around.sort(axis=1)
     count = there.sum(axis=1)
     around[count == 0] = 1.0  # the answer is 0 then
@@ -322,7 +324,7 @@ def _slowest_rate(intervals: Array, at: Indexes) -> Array:
     width = _GAPS.another_rate
     places = at[:, None, None] + np.arange(-width + 1, 1)[:, None] + np.arange(width)
     there = (places >= 0) & (places < len(intervals))
-    rows = np.where(there, intervals[np.clip(places, 0, len(intervals) - 1)], 0.0)
+    rows = np.where(there, intervals[np.minimum(np.maximum(places, 0), len(intervals) - 1)], 0.0)
     return np.asarray(rows.min(axis=2).max(axis=1), np.float64)
 
 

@@ -12,6 +12,9 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 from webots_mcp.analysis.arrays import Array, Indexes, inner, np, weighted_mean
 
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+_GOES_ON: Final = 3.0  # times the steps around it: a step over the end of a scale is no longer
+_MOSTLY_GOES_ON: Final = 0.9  # of such steps
+_SLACK: Final = 1e-6  # of a turn
 NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction
 _LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
 TIME_BINS: Final = 8
@@ -69,6 +72,8 @@ class Summary(NamedTuple):
     def centre(self, turn: float | None) -> float | None:
         """The mean; of an angle the circular one, in its unit: below 0 only where its values are.
 
+        Where the values count turns, it is that direction next to their arithmetic mean.
+
         It is the direction of the resultant vector (K. V. Mardia, P. E. Jupp, Directional
         Statistics, 2000, section 2.2.1); None where the vectors cancel out.
 
@@ -80,6 +85,9 @@ class Summary(NamedTuple):
         if math.hypot(self.sines, self.cosines) < NO_LENGTH * self.present:
             return None
         centre = math.atan2(self.sines, self.cosines) * turn / math.tau
+        low, high = self.min or 0.0, self.max or 0.0
+        if high - low > turn or not -turn / 2 - _SLACK * turn <= low <= high <= turn * (1 + _SLACK):
+            return near_turns(centre, turn, self.mean or 0.0)  # turns are counted
         return centre + turn if centre < 0 <= (self.min or 0.0) else centre
 
     @property
@@ -354,6 +362,42 @@ def leaps_in(angles: Array, turn: float) -> bool:
     steps = np.diff(angles)
     steps -= turn * np.rint(steps / turn)
     return bool(np.any(np.abs(steps) > turn / 4))
+
+
+def may_wrap(low: float, high: float) -> float | None:
+    """Return the turn of which values of this range may be angles: 2 pi, or 360; else None."""
+    for turn in (math.tau, 360.0):
+        slack = 1e-6 * turn
+        for begin in (0.0, -turn / 2):
+            if begin - slack <= low and high <= begin + turn + slack and high - low > turn / 2:
+                return turn
+    return None
+
+
+def wraps(numbers: Array, turn: float) -> bool:
+    """Return whether numbers within one turn behave as an angle that passes the end of its scale.
+
+    Each step is less than a quarter turn, the short way round; some are a jump from one end of the
+    scale to the other, and those go on, the short way round, as the steps next to them do. What
+    switches between two values near the ends stands still next to its jumps, and is no angle.
+    """
+    steps = np.diff(numbers)
+    turns = np.rint(steps / turn)
+    short = steps - turn * turns
+    jumps = np.flatnonzero(turns)
+    if not len(jumps) or np.abs(short).max() > turn / 4:
+        return False
+    around = jumps[:, None] + np.array([-2, -1, 1, 2])
+    around = np.minimum(np.maximum(around, 0), len(short) - 1)
+    near = np.abs(short[around])
+    near[around == jumps[:, None]] = 0.0  # at the ends
+    goes_on = np.abs(short[jumps]) <= _GOES_ON * near.max(axis=1)
+    return bool(np.count_nonzero(goes_on) >= _MOSTLY_GOES_ON * len(jumps))
+
+
+def near_turns(angle: float, turn: float, at: float) -> float:
+    """Return the same direction, as many whole turns away as brings it next to another angle."""
+    return angle + turn * round((at - angle) / turn)
 
 
 def unwrap(angles: Array, turn: float = math.tau) -> Array:

@@ -41,6 +41,7 @@ from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.frame import Frame, ZoneMap, read_frame, read_kept
 from webots_mcp.store.reading.frame_summary import (
     ChangePoints,
+    as_angle,
     change_points,
     reads_values,
     summary_of,
@@ -54,7 +55,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     shown_time,
 )
-from webots_mcp.store.series import STATES_SHARE, WEIGHTED, signals_left
+from webots_mcp.store.series import STATES_SHARE, TURNS_COUNTED, WEIGHTED, signals_left
 from webots_mcp.store.signals import RegisteredSignal
 
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
@@ -93,6 +94,8 @@ class Trend:
         turned: How far an angle turned, positive as it grows, turns counted; else None.
         leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
             the nearest of several things does: its turns cannot be counted.
+        is_angle_by_values: Only its values show that it is an angle: they jump by a full turn.
+        is_turned: Its figures count turns and differ from the recorded values by whole turns.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
         fast: It varies so fast that the means of chunks do not show its course.
         swings: Where it moved to and fro, as `find_events` reports it, but of any period.
@@ -116,6 +119,8 @@ class Trend:
     deviation: float | None
     turned: float | None
     leaps: bool
+    is_angle_by_values: bool
+    is_turned: bool
     slope_per_s: float | None
     r2: float | None
     shape: Shape
@@ -302,11 +307,14 @@ def judge(
     )
     monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
     swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
-    mean = summary.mean if turn is None else summary.centre(turn)
     counted = None if fast else course.counted
+    recorded = summary
     deviation = summary.deviation_in(turn) if counted is None else counted.deviation_in(None)
     if counted is not None:
-        summary = with_extremes_of(summary, counted)
+        summary = with_extremes_of(summary, counted)._replace(
+            first=counted.first, last=counted.last, sum=counted.sum, squares=counted.squares
+        )
+    mean = summary.mean if turn is None else summary.centre(turn)
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
@@ -317,6 +325,8 @@ def judge(
         deviation=deviation,
         turned=None if counted is None else (counted.last or 0.0) - (counted.first or 0.0),
         leaps=course.leaps,
+        is_angle_by_values=signal.wraps_at is not None,
+        is_turned=counted is not None and _counts_turns(recorded, course),
         slope_per_s=line.slope_per_s if line else None,
         r2=line.r2 if line else None,
         shape=shape,
@@ -335,6 +345,12 @@ def judge(
         says="",
     )
     return replace(trend, says="; ".join(_remarks(trend)))
+
+
+def _counts_turns(recorded: Summary, course: Course) -> bool:
+    """Whether an angle went over the end of its scale, so that counting its turns shifts values."""
+    counted = course.counted
+    return counted is not None and (counted.min, counted.max) != (recorded.min, recorded.max)
 
 
 def _slow_share(means: Summary, inner_variance: float) -> float:
@@ -423,6 +439,8 @@ def _remarks(trend: Trend) -> Iterator[str]:
         yield "changes by more than a quarter turn between rows: turns are not counted"
     elif trend.fast:
         yield f"varies within {trend.resolution_s:g} s: ask for a shorter range"
+    if trend.is_angle_by_values:
+        yield "taken for an angle, as it jumps by a full turn"
     yield from _beyond_ends(trend)
     if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
         yield f"also {_swinging(trend, unit)}"
@@ -609,6 +627,8 @@ def trends(
     notes = [_unseen_swings(run) for run in runs if run.resolution_s is not None]
     notes += [f"run {run.run_id}: {each}" for run in runs for each in run.unread]
     notes += [WEIGHTED] if any(run.numbers for run in runs) else []
+    if any(trend.is_turned for run in runs for trend in run.numbers):
+        notes.append(TURNS_COUNTED)
     return Trends(time_range.robot, tuple(runs), (*time_range.notes, *notes))
 
 
@@ -679,6 +699,9 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
     summary = summary_of(frame, signal)
     if summary.sum is None:
         return None
+    angle = as_angle(frame, signal, summary)
+    if angle is not signal:
+        signal, summary = angle, summary_of(frame, angle)
     spikes: list[Spike] | None = None
     too_large: int | None = None
     if reads_values(frame, signal):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +36,10 @@ _OF_ROBOT: Final = (
     "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
 )
 
+_DIRECTIONS: Final = ("heading", "roll", "pitch")
+_ANGLES: Final = (*_DIRECTIONS, "joint position")
+_DEGREES: Final = ("deg", "degree", "degrees", "°")
+_RADIANS: Final = ("rad", "radian", "radians")
 _NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
 _TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as it is
     "null": _NO_VALUES,
@@ -53,6 +58,7 @@ class RegisteredSignal:
         reduction: None, or how the long array at `path` becomes one number.
         role: What it tells of the robot's motion, as `signal_register` decides; None of most.
         is_choice: Its whole numbers, of which there are few, name what a robot does.
+        wraps_at: A whole turn, where its values show that it is an angle: see `as_angle`.
         stated: What was declared of its meaning, or is known from its device, the strongest first;
             filled in by `meanings.with_stated`.
     """
@@ -67,11 +73,34 @@ class RegisteredSignal:
     role: str | None = None
     is_choice: bool = False
     stated: tuple[StatedMeaning, ...] = ()
+    wraps_at: float | None = None
 
     @property
     def turn(self) -> float | None:
-        """A whole turn of an angle, in its unit; None of what is no angle."""
-        return turn_of(self.name, self.kind)
+        """A whole turn of an angle, in its unit; None of what is no angle.
+
+        What was declared or is known from the device counts most, then the name, then how its
+        values behave.
+        """
+        if self.wraps_at is not None:
+            return self.wraps_at
+        named = turn_of(self.name, self.kind)
+        if not self.stated or self.kind not in ("num", "angle"):
+            return named
+        quantity = next((e.said.quantity for e in self.stated if e.said.quantity), None)
+        unit = next((e.said.unit for e in self.stated if e.said.unit), self.unit)
+        if (quantity is None and named is None) or quantity not in (None, *_DIRECTIONS):
+            return None
+        if unit in _DEGREES:
+            return 360.0
+        return math.tau if quantity is not None or unit in _RADIANS else named
+
+    @property
+    def may_be_angle(self) -> bool:
+        """Whether nothing but its values can tell that it is an angle."""
+        said = any(each.said.quantity not in (None, *_ANGLES) for each in self.stated)
+        is_plain = self.kind == "num" and not (self.is_index or self.is_choice or said)
+        return is_plain and self.wraps_at is None and self.turn is None
 
     @property
     def is_index(self) -> bool:

@@ -24,15 +24,21 @@ from webots_mcp.analysis.summary import (
     LARGEST,
     NO_LENGTH,
     Summary,
+    leaps_in,
+    may_wrap,
     summarise_numbers,
+    unwrap,
     with_extremes,
+    wraps,
 )
+from webots_mcp.signals.meaning import ANGLES, meaning_by_name
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, ZoneMap, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts, just_after
 from webots_mcp.store.signals import RegisteredSignal
 
+_MAY_TURN: Final = frozenset((None, *ANGLES))  # quantities of what may be an angle by its values
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
 _ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
 _NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
@@ -54,6 +60,43 @@ def reads_values(frame: Frame, signal: RegisteredSignal) -> bool:
     largest_step = max(zones.largest_step[held].max(), between.max(initial=0.0))
     span = zones.max[held].max() - zones.min[held].min()
     return bool(span > signal.turn / 2 or largest_step > signal.turn / 4)
+
+
+def as_angle(frame: Frame, signal: RegisteredSignal, found: Summary) -> RegisteredSignal:
+    """Return a signal as an angle, where its values show that it is one; else as it is.
+
+    Args:
+        frame: The rows.
+        signal: A numeric one.
+        found: What its values come to.
+    """
+    if not signal.may_be_angle or found.min is None or found.max is None:
+        return signal
+    turn = may_wrap(found.min, found.max)
+    if turn is None or meaning_by_name(signal.name, signal.kind).quantity not in _MAY_TURN:
+        return signal
+    return replace(signal, wraps_at=turn) if wraps(frame.usable(signal.name)[1], turn) else signal
+
+
+def unwrapped(frame: Frame, signal: RegisteredSignal) -> Array | None:
+    """Return an angle in each row with its turns counted, NaN where it has no value.
+
+    None of what is no angle, of one that never goes over the end of its scale, and of one that
+    leaps so far from row to row that its turns cannot be counted.
+    """
+    if signal.turn is None or not reads_values(frame, signal):
+        return None
+    numbers = frame.numbers(signal.name)
+    rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
+    angles = numbers[rows]
+    if not len(rows) or leaps_in(angles, signal.turn):
+        return None
+    turned = unwrap(angles, signal.turn)
+    if turned is angles:
+        return None
+    found: Array = np.full(len(numbers), np.nan)
+    found[rows] = turned
+    return found
 
 
 def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None) -> Summary:
@@ -265,13 +308,27 @@ def cells_of(
         buckets: From `buckets_of` of the same frame.
         kept: Rows that only kept stretches have: they count for extremes.
     """
-    cells = _cells(_parts(frame, signal, buckets), signal.turn, buckets.edges)
+    turned = unwrapped(frame, signal)
+    cells = _cells(_parts(frame, signal, buckets, turned), signal.turn, buckets.edges)
+    if turned is not None and signal.turn is not None:
+        middle = (cells.min + cells.max) / 2
+        turns = np.nan_to_num(np.rint((middle - cells.mean) / signal.turn))
+        cells = cells._replace(mean=cells.mean + turns * signal.turn)
     if kept is not None and len(buckets.starts_s):
         times, numbers = kept.usable(signal.name)
+        if turned is not None and signal.turn is not None:
+            numbers = beside(frame, turned, signal.turn, times, numbers)
         places = np.searchsorted(buckets.starts_s, times + 1e-9, "right") - 1
         np.fmin.at(cells.min, np.maximum(places, 0), numbers)
         np.fmax.at(cells.max, np.maximum(places, 0), numbers)
     return cells
+
+
+def beside(frame: Frame, turned: Array, turn: float, times: Array, angles: Array) -> Array:
+    """Return angles of other rows in as many turns as those of the frame's rows around them."""
+    there = ~np.isnan(turned)
+    near = np.interp(times, frame.times[there], turned[there])
+    return np.asarray(angles + turn * np.rint((near - angles) / turn), np.float64)
 
 
 class _Parts(NamedTuple):
@@ -290,11 +347,13 @@ class _Parts(NamedTuple):
     last: Array
 
 
-def _parts(frame: Frame, signal: RegisteredSignal, buckets: Buckets) -> _Parts:
+def _parts(
+    frame: Frame, signal: RegisteredSignal, buckets: Buckets, turned: Array | None
+) -> _Parts:
     """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
     name = signal.name
     if len(frame) <= FULL_ROWS or signal.turn is not None:
-        return _of_rows(frame, 0, frame.numbers(name))
+        return _of_rows(frame, 0, frame.numbers(name) if turned is None else turned)
     zones = frame.zone_map(name)
     edges = buckets.edges[buckets.edges < len(frame)]
     borders = np.searchsorted(zones.first_row, edges, "right") - 1

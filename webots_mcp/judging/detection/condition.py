@@ -60,7 +60,7 @@ from webots_mcp.signals.naming import (
     find_position,
     metres_in,
 )
-from webots_mcp.store.reading.catalogue import resolve_signals, say_unknown
+from webots_mcp.store.reading.catalogue import item_signal, resolve_signals, say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import recorded_share
 from webots_mcp.store.reading.segment import Segment, full_rate_parts, just_after
@@ -202,7 +202,8 @@ def values_at(
 
 
 def _require_known(condition: Condition, search: Search) -> None:
-    unknown = [name for name in condition.signals if name not in search.known]
+    known = search.known
+    unknown = [e for e in condition.signals if e not in known and item_signal(known, e) is None]
     said = [say_unknown(search.known, name) for name in unknown]
     if said := [*said, *condition.describe_lost(search.known)]:
         raise UnknownSignalError("; ".join(said))
@@ -481,8 +482,8 @@ def aggregated(
 ) -> float | None:
     """What the values of a run come to; None where no row has a value.
 
-    A mean is weighted by time, as all means are; a condition counts from each row in which it holds
-    up to the next one. So a segment with more rows than others does not count more.
+    Rows count for as long as they last, up to the next one, in means and times, so that a stretch
+    with more rows than others does not count more. Where no time has passed, rows count alike.
 
     Raises:
         ConditionFailedError: The values are not of the kinds that it can be asked of.
@@ -500,8 +501,10 @@ def aggregated(
         return float(found[0 if aggregate.function == "first" else -1])
     if aggregate.function != "mean":
         return float(found.min() if aggregate.function == "min" else found.max())
-    weights = frame.weights
-    return weighted_mean(found, None if weights is None else weights[there])
+    known_s = lasts_s[there[:-1]]
+    if known_s.sum() > 0:
+        return float((numbers[:-1][there[:-1]] * known_s).sum() / known_s.sum())
+    return float(found.mean())
 
 
 # -- of the rows before ------------------------------------------------------------------------

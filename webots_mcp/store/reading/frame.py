@@ -141,7 +141,8 @@ class Frame:
     def __contains__(self, name: str) -> bool:
         """Whether a row may have a value of that signal."""
         source = self._source
-        return name in source.ids or name in source.columns.values or name in source.derived
+        is_held = name in source.ids or name in source.columns.values or name in source.derived
+        return is_held or source.is_item(name)
 
     @property
     def new_rows(self) -> StateColumns:

@@ -649,7 +649,7 @@ def _run_trends(
 ) -> RunTrends:
     """The trends of signals in one run."""
     numbers = [signal for signal in signals if signal.is_number and not signal.is_choice]
-    states = [signal for signal in signals if signal not in numbers]
+    states = [signal for signal in signals if not signal.is_number or signal.is_choice]
     for_states = deadline.part(STATES_SHARE) if numbers else deadline
     frame = read_frame(connection, segment, deadline)
     changes = change_points(connection, segment, states, for_states, frame=frame)

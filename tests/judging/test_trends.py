@@ -86,7 +86,7 @@ def test_a_swing_faster_than_the_chunks_gets_no_period_of_an_alias(
     empty: sqlite3.Connection, looked_at: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record(empty, rows=4000, interval_s=0.1, sine=math.sin)
-    (note,) = trends(empty, find_range(empty, Scope(run_id=1))).notes
+    note, _ = trends(empty, find_range(empty, Scope(run_id=1))).notes
     assert "oscillations with a period under 80 s were not searched for" in note
     trend = one(empty, "sine")
     assert (trend.shape, trend.swings, trend.flat_since_s) == ("varying", (), None)

@@ -88,7 +88,7 @@ def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:
         "rover, run 1, 0 to 119.9 s", "pose.0", "heading [rad]", "mode:", "cruise", "back_up",
         "avoid", "nothing recorded", "stuck", "oscillation", "log", "error", "command", "set_speed",
     }  # fmt: skip
-    steps = "simulation time [s]; line: mean, band: minimum to maximum of every 0.6 s"
+    steps = "simulation time [s]; line: mean by time, band: minimum to maximum of every 0.6 s"
     assert " ".join(steps.split()) in {" ".join(word.split()) for word in words(picture)}
     assert picture.caption == "rover, run 1, 0 to 119.9 s: pose.0, heading over mode"
 

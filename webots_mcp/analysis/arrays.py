@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
@@ -37,7 +36,33 @@ _ORDER: Final = 4
 _GAIN: Final = 0.6745 * 70**0.5
 LEAST_ROWS: Final = 3 * _ORDER
 GAP_INTERVALS: Final = 3.0  # a longer pause between two rows is a gap; in median intervals
-ANOTHER_RATE: Final = 5  # this many long intervals in a row are a slower rate, not gaps
+EVEN_STEPS: Final = 1e-3  # of the mean step: steps that differ by less are even
+LEAST_WEIGHT: Final = 1e-9  # of rows of the same moment, so that no sum of weights is 0
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """What counts as a gap in a recording.
+
+    Attributes:
+        around: Intervals on each side with which one is compared.
+        fewest_around: Of fewer on a side nothing is known.
+        least_intervals: A gap is longer than so many usual intervals: two rows are missing.
+        jitter_power: How far beyond its upper quartile a usual interval may be, as a power of the
+            ratio of the quartiles. For a logarithmic normal jitter that is 5.4 deviations.
+        another_rate: So many long intervals in a row are a slower rate.
+        at_once: Intervals that are judged at once, which limits the memory.
+    """
+
+    around: int = 20
+    fewest_around: int = 5
+    least_intervals: float = 2.5
+    jitter_power: float = 3.5
+    another_rate: int = 5
+    at_once: int = 50_000
+
+
+_GAPS: Final = GapSettings()
 
 
 def inner(one: Array, other: Array) -> float:
@@ -139,6 +164,47 @@ def constant_runs(numbers: Array, times: Array) -> Runs:
     return _runs(edges[long], stops[long], times)
 
 
+# -- how much of the time a row stands for ---------------------------------------------------------
+
+
+def time_weights(times: Array) -> Array | None:
+    """Return how much of the time each row stands for, in units of the mean share.
+
+    A row stands for half of the step before it and half of the step after it, which is the
+    trapezoidal rule; the first and the last stand for half a usual step beyond the ends. So rows
+    that follow each other evenly count alike, rows that were recorded at a higher rate count for
+    less each, and a gap belongs to the rows around it.
+
+    Args:
+        times: They do not fall.
+
+    Returns:
+        None where the rows count alike: their steps are even, or no time passes.
+    """
+    if len(times) < 3:
+        return None
+    steps = np.diff(times)
+    if steps.max() - steps.min() <= EVEN_STEPS * steps.mean():
+        return None
+    usual_s = median(steps)
+    weights = np.empty(len(times))
+    weights[1:-1] = (steps[1:] + steps[:-1]) / 2
+    weights[0] = (steps[0] + min(steps[0], usual_s)) / 2
+    weights[-1] = (steps[-1] + min(steps[-1], usual_s)) / 2
+    total_s = float(weights.sum())
+    if total_s <= 0:
+        return None
+    return np.maximum(weights * (len(times) / total_s), LEAST_WEIGHT)
+
+
+def weighted_mean(values: Array, weights: Array | None) -> float:
+    """Return the mean of at least one value; None as weights lets all count alike."""
+    if weights is None:
+        return float(values.mean())
+    mean = inner(values, weights) / float(weights.sum())
+    return min(max(mean, float(values.min())), float(values.max()))  # sums round
+
+
 # -- how regularly rows were recorded, and where some are missing ----------------------------------
 
 
@@ -164,25 +230,102 @@ class Rhythm:
 
 
 def rhythm_of(times: Sequence[float] | Array) -> Rhythm:
-    """The rhythm of the given times; a gap is an interval of more than three median ones."""
-    interval_s = usual_interval_s(times)
-    return Rhythm(interval_s, interruptions(gaps_in(times, interval_s)) if interval_s else ())
+    """Return the rhythm of some times, and where it is interrupted; see `find_gaps`."""
+    return Rhythm(usual_interval_s(times), find_gaps(times))
 
 
-def interruptions(gaps: Sequence[Gap]) -> tuple[Gap, ...]:
-    """The gaps without those that are the intervals of another, slower rate.
+def find_gaps(times: Sequence[float] | Array) -> tuple[Gap, ...]:
+    """Return the intervals that are longer than those around them let expect.
 
-    Where five or more follow one another directly, only what is longer than three of them is one.
+    An interval is a gap if it is longer than 2.5 usual ones before it and after it, so that two
+    rows are missing, and beyond what the jitter of those explains: their upper quartile times the
+    3.5th power of its ratio to the lower one. Of intervals with logarithmic normal, normal or
+    exponential jitter at most one in 50,000 is taken for a gap. Where five or more long intervals
+    follow each other, rows come at another rate; only what is longer than those is a gap.
+
+    Args:
+        times: They do not fall. Those that stand still, while a simulation is paused, do not count.
     """
-    cuts = [at for at in range(1, len(gaps)) if gaps[at].start_s != gaps[at - 1].end_s]
-    edges = pairwise([0, *cuts, len(gaps)]) if gaps else ()
-    return tuple(gap for start, end in edges for gap in _longest(gaps[start:end]))
+    moments: Array = np.asarray(times, np.float64)
+    intervals = np.diff(moments)
+    rows = np.flatnonzero(intervals > 0)
+    intervals = intervals[rows]
+    at = _suspects(intervals)
+    at = at[intervals[at] > _longest_usual(intervals, at) * (1 + 1e-6)]
+    rows = rows[at]
+    return tuple(
+        Gap(*pair) for pair in zip(moments[rows].tolist(), moments[rows + 1].tolist(), strict=True)
+    )
 
 
-def _longest(chain: Sequence[Gap]) -> Iterator[Gap]:
-    lengths_s = sorted(gap.end_s - gap.start_s for gap in chain)
-    usual_s = lengths_s[len(chain) // 2] if len(chain) >= ANOTHER_RATE else 0.0
-    return (gap for gap in chain if gap.end_s - gap.start_s > GAP_INTERVALS * usual_s * (1 + 1e-6))
+def longest_usual_s(times: Array) -> float | None:
+    """Return how long no row may follow the last one before that is a gap; None if not known."""
+    intervals = np.diff(times)
+    intervals = intervals[intervals > 0]
+    if len(intervals) < _GAPS.fewest_around:
+        return None
+    at: Indexes = np.array([len(intervals)])
+    return float(_longest_usual(np.append(intervals, np.inf), at)[0])
+
+
+def _suspects(intervals: Array) -> Indexes:
+    """The intervals that are far longer than one near them, which all gaps are."""
+    if len(intervals) < 3:
+        return np.zeros(0, np.intp)
+    near = _GAPS.around // 2 + 1
+    least = np.pad(intervals, near, constant_values=np.inf)
+    window = 1
+    while window < near:  # the minimum of each `near` intervals, from those of half as many
+        step = min(window, near - window)
+        least = np.minimum(least[:-step], least[step:])
+        window += step
+    before, after = least[: len(intervals)], least[near + 1 :][: len(intervals)]
+    return np.flatnonzero(intervals > _GAPS.least_intervals * np.minimum(before, after))
+
+
+def _longest_usual(intervals: Array, at: Indexes) -> Array:
+    """How long some intervals may be for those around them."""
+    found: list[Array] = []
+    for first in range(0, len(at), _GAPS.at_once):
+        part = at[first : first + _GAPS.at_once]
+        steps = np.arange(1, _GAPS.around + 1)
+        sides = (_usual_of(intervals, part, steps), _usual_of(intervals, part, -steps))
+        usual = np.maximum(*sides)
+        unknown = usual == 0
+        usual[unknown] = _GAPS.least_intervals * median(intervals) if unknown.any() else 0.0
+        found.append(np.maximum(usual, _GAPS.least_intervals * _slowest_rate(intervals, part)))
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def _usual_of(intervals: Array, at: Indexes, steps: Indexes) -> Array:
+    """What the intervals so many places away let expect; 0 where there are too few of them."""
+    places = at[:, None] + steps
+    there = (places >= 0) & (places < len(intervals))
+    around = np.where(
+        there, intervals[np.minimum(np.maximum(places, 0), len(intervals) - 1)], np.inf
+    )
+    around.sort(axis=1)
+    count = there.sum(axis=1)
+    around[count == 0] = 1.0  # the answer is 0 then
+    each = np.arange(len(at))
+    last = np.maximum(count - 1, 0)
+    low, middle, high = (
+        around[each, np.ceil(share * last).astype(np.intp)] for share in (0.25, 0.5, 0.75)
+    )
+    usual = np.maximum(_GAPS.least_intervals * middle, high * (high / low) ** _GAPS.jitter_power)
+    return np.where(count >= _GAPS.fewest_around, usual, 0.0)
+
+
+def _slowest_rate(intervals: Array, at: Indexes) -> Array:
+    """The shortest of five intervals in a row, of which one is that in question: of all such fives.
+
+    An interval that is as long as four others around it is one of a slower rate.
+    """
+    width = _GAPS.another_rate
+    places = at[:, None, None] + np.arange(-width + 1, 1)[:, None] + np.arange(width)
+    there = (places >= 0) & (places < len(intervals))
+    rows = np.where(there, intervals[np.minimum(np.maximum(places, 0), len(intervals) - 1)], 0.0)
+    return np.asarray(rows.min(axis=2).max(axis=1), np.float64)
 
 
 def usual_interval_s(times: Sequence[float] | Array) -> float | None:
@@ -190,15 +333,6 @@ def usual_interval_s(times: Sequence[float] | Array) -> float | None:
     intervals: Array = np.diff(np.asarray(times, np.float64))
     moving = intervals[intervals > 0]
     return median(moving) if len(moving) else None
-
-
-def gaps_in(times: Sequence[float] | Array, interval_s: float) -> tuple[Gap, ...]:
-    """The gaps between rows that usually come at such intervals."""
-    moments: Array = np.asarray(times, np.float64)
-    rows = gap_borders(moments, interval_s)
-    return tuple(
-        Gap(*pair) for pair in zip(moments[rows - 1].tolist(), moments[rows].tolist(), strict=True)
-    )
 
 
 def gap_borders(times: Array, interval_s: float) -> Indexes:

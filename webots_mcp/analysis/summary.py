@@ -9,9 +9,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from webots_mcp.analysis.arrays import Array, Indexes, inner, np
+from webots_mcp.analysis.arrays import Array, Indexes, inner, np, weighted_mean
 
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+_GOES_ON: Final = 3.0  # times the steps around it: a step over the end of a scale is no longer
+_MOSTLY_GOES_ON: Final = 0.9  # of such steps
+_SLACK: Final = 1e-6  # of a turn
 NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction
 _LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
 TIME_BINS: Final = 8
@@ -33,6 +36,8 @@ MOST_CHANCE_OF_BEST: Final = 0.01  # that a set is called better than the next o
 
 class Summary(NamedTuple):
     """Counts of the values, and figures of the numbers, which are None where there are none.
+
+    Sums are weighted by time, in such a way that the weights of all numbers add up to their count.
 
     Attributes:
         rows: State rows that were looked at.
@@ -67,6 +72,8 @@ class Summary(NamedTuple):
     def centre(self, turn: float | None) -> float | None:
         """The mean; of an angle the circular one, in its unit: below 0 only where its values are.
 
+        Where the values count turns, it is that direction next to their arithmetic mean.
+
         It is the direction of the resultant vector (K. V. Mardia, P. E. Jupp, Directional
         Statistics, 2000, section 2.2.1); None where the vectors cancel out.
 
@@ -78,6 +85,9 @@ class Summary(NamedTuple):
         if math.hypot(self.sines, self.cosines) < NO_LENGTH * self.present:
             return None
         centre = math.atan2(self.sines, self.cosines) * turn / math.tau
+        low, high = self.min or 0.0, self.max or 0.0
+        if high - low > turn or not -turn / 2 - _SLACK * turn <= low <= high <= turn * (1 + _SLACK):
+            return near_turns(centre, turn, self.mean or 0.0)  # turns are counted
         return centre + turn if centre < 0 <= (self.min or 0.0) else centre
 
     @property
@@ -103,7 +113,12 @@ class Summary(NamedTuple):
 
 
 def summarise_numbers(
-    times: Array, numbers: Array, *, rows: int | None = None, turn: float | None = None
+    times: Array,
+    numbers: Array,
+    *,
+    rows: int | None = None,
+    turn: float | None = None,
+    weights: Array | None = None,
 ) -> Summary:
     """Summarise usable numbers, as `usable_part` gives them, in order.
 
@@ -116,12 +131,16 @@ def summarise_numbers(
         numbers: In order.
         rows: Of which so many held one; None for as many.
         turn: A whole turn of what is an angle, in its unit.
+        weights: How much each number counts; None where all count alike.
     """
     present = len(numbers)
     if not present:
         return Summary(rows or 0)
-    total = float(numbers.sum())
-    deviations = numbers - total / present
+    weights = _per_number(weights)
+    mean = float(numbers.sum()) / present if weights is None else weighted_mean(numbers, weights)
+    total = mean * present
+    deviations = numbers - mean
+    squares = deviations if weights is None else deviations * weights
     angles = numbers * (math.tau / turn) if turn else None
     ends = {"first": 0, "last": -1, "min": numbers.argmin(), "max": numbers.argmax()}
     figures = {name: float(numbers[at]) for name, at in ends.items()}
@@ -131,11 +150,20 @@ def summarise_numbers(
         present,
         int(np.count_nonzero(np.diff(numbers))),
         sum=total,
-        squares=inner(deviations, deviations),
-        sines=None if angles is None else float(np.sin(angles).sum()),
-        cosines=None if angles is None else float(np.cos(angles).sum()),
+        squares=inner(squares, deviations),
+        sines=None if angles is None else _weighted_sum(np.sin(angles), weights),
+        cosines=None if angles is None else _weighted_sum(np.cos(angles), weights),
         **figures,
     )
+
+
+def _per_number(weights: Array | None) -> Array | None:
+    """Weights that add up to the count of the numbers."""
+    return None if weights is None else weights * (len(weights) / float(weights.sum()))
+
+
+def _weighted_sum(values: Array, weights: Array | None) -> float:
+    return float(values.sum()) if weights is None else inner(values, weights)
 
 
 def with_extremes(whole: Summary, recorded: Summary) -> Summary:
@@ -199,14 +227,17 @@ class LevelStep:
     after: float
 
 
-def fit_line(times: Array, values: Array, mean: float) -> FittedLine | None:
+def fit_line(
+    times: Array, values: Array, mean: float, weights: Array | None = None
+) -> FittedLine | None:
     """Least squares: slope = S_tv / S_tt, r2 = S_tv**2 / (S_tt * S_vv), sums about the means.
 
-    N. R. Draper, H. Smith, Applied Regression Analysis (3rd ed. 1998), sections 1.2 and 1.3. None
-    where time stood still; r2 is 0 for a constant.
+    N. R. Draper, H. Smith, Applied Regression Analysis (3rd ed. 1998), sections 1.2, 1.3 and, for
+    weights, 9.2. None where time stood still; r2 is 0 for a constant.
     """
-    dt, dv = times - times.mean(), values - mean
-    stt, stv, svv = inner(dt, dt), inner(dt, dv), inner(dv, dv)
+    dt, dv = times - weighted_mean(times, weights), values - mean
+    wt, wv = (dt, dv) if weights is None else (dt * weights, dv * weights)
+    stt, stv, svv = inner(wt, dt), inner(wt, dv), inner(wv, dv)
     if stt == 0:
         return None
     return FittedLine(stv / stt, min(1.0, stv / stt * (stv / svv)) if svv > 0 else 0.0)
@@ -293,7 +324,9 @@ def _step_row(values: Array) -> int:
     return row
 
 
-def time_effect(times: Array, values: Array, mean: float, squares: float) -> float:
+def time_effect(
+    times: Array, values: Array, mean: float, squares: float, weights: Array | None = None
+) -> float:
     """The share of the variance that lies between eight equal stretches of time, 0 to 1.
 
     The correlation ratio eta squared (R. A. Fisher, Statistical Methods for Research Workers,
@@ -304,8 +337,17 @@ def time_effect(times: Array, values: Array, mean: float, squares: float) -> flo
     if squares == 0 or width_s == 0:
         return 0.0
     borders: Array = times[0] + width_s * np.arange(TIME_BINS)
-    parts = np.split(values, np.searchsorted(times, borders[1:]))
-    between = sum(len(part) * (float(part.mean()) - mean) ** 2 for part in parts if len(part))
+    cuts = np.searchsorted(times, borders[1:])
+    parts = np.split(values, cuts)
+    if weights is None:
+        between = sum(len(part) * (float(part.mean()) - mean) ** 2 for part in parts if len(part))
+        return min(1.0, between / squares)
+    weights = weights * (len(weights) / float(weights.sum()))
+    between = sum(
+        float(of.sum()) * (weighted_mean(part, of) - mean) ** 2
+        for part, of in zip(parts, np.split(weights, cuts), strict=True)
+        if len(part)
+    )
     return min(1.0, between / squares)
 
 
@@ -320,6 +362,42 @@ def leaps_in(angles: Array, turn: float) -> bool:
     steps = np.diff(angles)
     steps -= turn * np.rint(steps / turn)
     return bool(np.any(np.abs(steps) > turn / 4))
+
+
+def may_wrap(low: float, high: float) -> float | None:
+    """Return the turn of which values of this range may be angles: 2 pi, or 360; else None."""
+    for turn in (math.tau, 360.0):
+        slack = 1e-6 * turn
+        for begin in (0.0, -turn / 2):
+            if begin - slack <= low and high <= begin + turn + slack and high - low > turn / 2:
+                return turn
+    return None
+
+
+def wraps(numbers: Array, turn: float) -> bool:
+    """Return whether numbers within one turn behave as an angle that passes the end of its scale.
+
+    Each step is less than a quarter turn, the short way round; some are a jump from one end of the
+    scale to the other, and those go on, the short way round, as the steps next to them do. What
+    switches between two values near the ends stands still next to its jumps, and is no angle.
+    """
+    steps = np.diff(numbers)
+    turns = np.rint(steps / turn)
+    short = steps - turn * turns
+    jumps = np.flatnonzero(turns)
+    if not len(jumps) or np.abs(short).max() > turn / 4:
+        return False
+    around = jumps[:, None] + np.array([-2, -1, 1, 2])
+    around = np.minimum(np.maximum(around, 0), len(short) - 1)
+    near = np.abs(short[around])
+    near[around == jumps[:, None]] = 0.0  # at the ends
+    goes_on = np.abs(short[jumps]) <= _GOES_ON * near.max(axis=1)
+    return bool(np.count_nonzero(goes_on) >= _MOSTLY_GOES_ON * len(jumps))
+
+
+def near_turns(angle: float, turn: float, at: float) -> float:
+    """Return the same direction, as many whole turns away as brings it next to another angle."""
+    return angle + turn * round((at - angle) / turn)
 
 
 def unwrap(angles: Array, turn: float = math.tau) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-from webots_mcp.analysis.arrays import Array, Indexes, np
+from webots_mcp.analysis.arrays import Array, Indexes, np, weighted_mean
 from webots_mcp.analysis.summary import (
     FLAT_BAND,
     LARGEST,
@@ -41,9 +41,11 @@ from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.frame import Frame, ZoneMap, read_frame, read_kept
 from webots_mcp.store.reading.frame_summary import (
     ChangePoints,
+    as_angle,
     change_points,
     reads_values,
     summary_of,
+    weighted_sums,
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import (
@@ -53,7 +55,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     shown_time,
 )
-from webots_mcp.store.series import STATES_SHARE, signals_left
+from webots_mcp.store.series import STATES_SHARE, TURNS_COUNTED, WEIGHTED, signals_left
 from webots_mcp.store.signals import RegisteredSignal
 
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
@@ -92,6 +94,8 @@ class Trend:
         turned: How far an angle turned, positive as it grows, turns counted; else None.
         leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
             the nearest of several things does: its turns cannot be counted.
+        is_angle_by_values: Only its values show that it is an angle: they jump by a full turn.
+        is_turned: Its figures count turns and differ from the recorded values by whole turns.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
         fast: It varies so fast that the means of chunks do not show its course.
         swings: Where it moved to and fro, as `find_events` reports it, but of any period.
@@ -115,6 +119,8 @@ class Trend:
     deviation: float | None
     turned: float | None
     leaps: bool
+    is_angle_by_values: bool
+    is_turned: bool
     slope_per_s: float | None
     r2: float | None
     shape: Shape
@@ -160,6 +166,7 @@ class Course:
         inner_variance: That of the values within what the means are of. Where more of it lies there
             than between them, the course of the means is not that of the values.
         resolution_s: The usual length of what the means are of; None where the numbers are values.
+        weights: How much of the time each number stands for; None where all count alike.
     """
 
     times: Array
@@ -171,9 +178,16 @@ class Course:
     rest_s: float | None = None
     inner_variance: float = 0.0
     resolution_s: float | None = None
+    weights: Array | None = None
 
 
-def course_of_values(times: Array, recorded: Array, turn: float | None, summary: Summary) -> Course:
+def course_of_values(
+    times: Array,
+    recorded: Array,
+    turn: float | None,
+    summary: Summary,
+    weights: Array | None = None,
+) -> Course:
     """The course of a signal of which every value is looked at.
 
     Args:
@@ -181,27 +195,37 @@ def course_of_values(times: Array, recorded: Array, turn: float | None, summary:
         recorded: The usable values.
         turn: A whole turn of an angle, in its unit; None of what is none.
         summary: What the values come to.
+        weights: How much of the time each value stands for; None where all count alike.
     """
     leaps = turn is not None and leaps_in(recorded, turn)
     numbers = recorded if turn is None or leaps else unwrap(recorded, turn)
-    counted = None if turn is None or leaps else summarise_numbers(times, numbers)
+    counted = None if turn is None or leaps else summarise_numbers(times, numbers, weights=weights)
     monotonic, rest_s = _monotonic(numbers), flat_since(times, numbers)
-    return Course(times, numbers, counted or summary, counted, leaps, monotonic, rest_s)
+    return Course(
+        times, numbers, counted or summary, counted, leaps, monotonic, rest_s, weights=weights
+    )
 
 
 def in_means(course: Course, rows: int) -> Course:
     """A course in the means of so many values each, for what takes long to find in all of them."""
     starts = np.arange(0, len(course.times), rows)
     counts = np.diff(starts, append=len(course.times))
-    means = np.add.reduceat(course.numbers, starts) / counts
+    of_rows = course.weights
+    weights = counts if of_rows is None else np.add.reduceat(of_rows, starts)
+
+    def means_of(values: Array) -> Array:
+        sums = np.add.reduceat(values if of_rows is None else values * of_rows, starts)
+        return np.asarray(sums / weights, np.float64)
+
+    means, times = means_of(course.numbers), means_of(course.times)
     off = course.numbers - np.repeat(means, counts)
-    times = np.add.reduceat(course.times, starts) / counts
     return replace(
         course,
         times=times,
         numbers=means,
-        inner=summarise_numbers(times, means),
-        inner_variance=float(np.mean(off * off)),
+        inner=summarise_numbers(times, means, weights=weights),
+        inner_variance=weighted_mean(off * off, of_rows),
+        weights=weights,
         resolution_s=_digits(np.median(np.diff(times))) if len(times) > 1 else None,
     )
 
@@ -209,10 +233,11 @@ def in_means(course: Course, rows: int) -> Course:
 def course_of_means(frame: Frame, name: str, zones: ZoneMap) -> Course:
     """The course of a signal with numbers, of many rows, from what its chunks come to."""
     held = np.flatnonzero(~np.isnan(zones.sum))
-    counts, means = zones.value_count[held], zones.sum[held] / zones.value_count[held]
+    weights, sums, squares = (each[held] for each in weighted_sums(frame, name, zones))
+    counts, means = zones.value_count[held], sums / weights
     variances = np.where(
         zones.min[held] < zones.max[held],
-        zones.squared_deviations[held] / np.maximum(1, counts - 1),
+        squares / weights * (counts / np.maximum(1, counts - 1)),
         0.0,
     )
     starts = zones.start_s[held]
@@ -221,11 +246,12 @@ def course_of_means(frame: Frame, name: str, zones: ZoneMap) -> Course:
     return Course(
         times,
         means,
-        summarise_numbers(times, means),
+        summarise_numbers(times, means, weights=weights),
         monotonic=_monotonic_chunks(zones, held),
         rest_s=_rest_of_chunks(frame, name, zones, held),
-        inner_variance=math.fsum(variances.tolist()) / len(held),
+        inner_variance=weighted_mean(variances, weights),
         resolution_s=_digits(np.median(lengths)),
+        weights=weights,
     )
 
 
@@ -274,14 +300,21 @@ def judge(
     turn = signal.turn if summary.sines is not None else None
     slow = _slow_share(inner, course.inner_variance)
     fast = slow < SLOW_SHARE or course.leaps
-    line = None if course.leaps else _of_all(fit_line(times, numbers, inner.mean or 0.0), slow)
+    line = (
+        None
+        if course.leaps
+        else _of_all(fit_line(times, numbers, inner.mean or 0.0, course.weights), slow)
+    )
     monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
     swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
-    mean = summary.mean if turn is None else summary.centre(turn)
     counted = None if fast else course.counted
+    recorded = summary
     deviation = summary.deviation_in(turn) if counted is None else counted.deviation_in(None)
     if counted is not None:
-        summary = with_extremes_of(summary, counted)
+        summary = with_extremes_of(summary, counted)._replace(
+            first=counted.first, last=counted.last, sum=counted.sum, squares=counted.squares
+        )
+    mean = summary.mean if turn is None else summary.centre(turn)
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
@@ -292,6 +325,8 @@ def judge(
         deviation=deviation,
         turned=None if counted is None else (counted.last or 0.0) - (counted.first or 0.0),
         leaps=course.leaps,
+        is_angle_by_values=signal.wraps_at is not None,
+        is_turned=counted is not None and _counts_turns(recorded, course),
         slope_per_s=line.slope_per_s if line else None,
         r2=line.r2 if line else None,
         shape=shape,
@@ -304,12 +339,18 @@ def judge(
         step=None if spikes is None or turn is not None else find_step(times, numbers),
         missing=summary.rows - summary.present - (too_large or 0),
         too_large=too_large,
-        change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0)
+        change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0, course.weights)
         * slow
         * _relative_range(summary),
         says="",
     )
     return replace(trend, says="; ".join(_remarks(trend)))
+
+
+def _counts_turns(recorded: Summary, course: Course) -> bool:
+    """Whether an angle went over the end of its scale, so that counting its turns shifts values."""
+    counted = course.counted
+    return counted is not None and (counted.min, counted.max) != (recorded.min, recorded.max)
 
 
 def _slow_share(means: Summary, inner_variance: float) -> float:
@@ -398,6 +439,8 @@ def _remarks(trend: Trend) -> Iterator[str]:
         yield "changes by more than a quarter turn between rows: turns are not counted"
     elif trend.fast:
         yield f"varies within {trend.resolution_s:g} s: ask for a shorter range"
+    if trend.is_angle_by_values:
+        yield "taken for an angle, as it jumps by a full turn"
     yield from _beyond_ends(trend)
     if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
         yield f"also {_swinging(trend, unit)}"
@@ -583,6 +626,9 @@ def trends(
     ]
     notes = [_unseen_swings(run) for run in runs if run.resolution_s is not None]
     notes += [f"run {run.run_id}: {each}" for run in runs for each in run.unread]
+    notes += [WEIGHTED] if any(run.numbers for run in runs) else []
+    if any(trend.is_turned for run in runs for trend in run.numbers):
+        notes.append(TURNS_COUNTED)
     return Trends(time_range.robot, tuple(runs), (*time_range.notes, *notes))
 
 
@@ -603,7 +649,7 @@ def _run_trends(
 ) -> RunTrends:
     """The trends of signals in one run."""
     numbers = [signal for signal in signals if signal.is_number and not signal.is_choice]
-    states = [signal for signal in signals if signal not in numbers]
+    states = [signal for signal in signals if not signal.is_number or signal.is_choice]
     for_states = deadline.part(STATES_SHARE) if numbers else deadline
     frame = read_frame(connection, segment, deadline)
     changes = change_points(connection, segment, states, for_states, frame=frame)
@@ -653,11 +699,15 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
     summary = summary_of(frame, signal)
     if summary.sum is None:
         return None
+    angle = as_angle(frame, signal, summary)
+    if angle is not signal:
+        signal, summary = angle, summary_of(frame, angle)
     spikes: list[Spike] | None = None
     too_large: int | None = None
     if reads_values(frame, signal):
         times, numbers = frame.usable(name)
-        course = course_of_values(times, numbers, signal.turn, summary)
+        weights = frame.usable_weights(name)
+        course = course_of_values(times, numbers, signal.turn, summary, weights)
         if is_long:
             course = in_means(course, chunk_making.GROUP_ROWS)
         else:

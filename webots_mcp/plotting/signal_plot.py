@@ -230,7 +230,7 @@ def _x_label(parts: Sequence[PlottedRun]) -> str:
     steps = {part.run.step_s for part in parts if part.run.numbers}
     if len(steps) != 1 or None in steps:
         return clock
-    return f"{clock}; line: mean, band: minimum to maximum of every {steps.pop():g} s"
+    return f"{clock}; line: mean by time, band: minimum to maximum of every {steps.pop():g} s"
 
 
 def _caption(plot: SignalAxes) -> str:

@@ -97,8 +97,25 @@ NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x
 _OBEYED: Final = re.compile(
     r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f]|\r(?!\n)"
 )
+_BRACKETS: Final = re.compile(r"\[(\d+)\]")
+_LONGEST_PLACE: Final = 7  # digits of the place of an item
 _NO_WORD: Final = re.compile(r"\W+")
 _LONGEST_COMPARED: Final = 100  # characters of a name
+
+
+def array_item(name: str) -> tuple[str, int] | None:
+    """Return the array and the place that a name of an item means; None of other names.
+
+    `scan.12` is item 12 of `scan`, and so is `scan[12]`: see `with_dots`.
+    """
+    array, _, last = name.rpartition(".")
+    is_place = last.isascii() and last.isdigit() and len(last) <= _LONGEST_PLACE
+    return (array, int(last)) if array and is_place else None
+
+
+def with_dots(name: str) -> str:
+    """Return a name as signals are called: `pose[0]` as `pose.0`."""
+    return _BRACKETS.sub(r".\1", name)
 
 
 def flatten(state: dict[str, Any]) -> dict[str, Value]:

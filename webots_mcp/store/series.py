@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, Gap, np
-from webots_mcp.analysis.summary import LARGEST, Summary
+from webots_mcp.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.naming import Value, flatten, listed
 from webots_mcp.store.chunks import parse
@@ -22,11 +22,14 @@ from webots_mcp.store.reading.frame_summary import (
     Buckets,
     ChangePoints,
     Point,
+    as_angle,
+    beside,
     buckets_of,
     cells_of,
     change_points,
     rhythm_in,
     summary_of,
+    unwrapped,
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
@@ -35,6 +38,10 @@ from webots_mcp.store.signals import RegisteredSignal, cleaned
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
 MOST_NAMED: Final = 5  # signals that there was no time for
+TURNS_COUNTED: Final = (
+    "angles: extremes, last values and slopes count turns (unwrapped); means are circular"
+)
+WEIGHTED: Final = "means and deviations are weighted by time"
 STATES_SHARE: Final = 0.5  # of the time, where numbers are asked for as well
 
 _NEWEST_WALL: Final = (
@@ -52,6 +59,8 @@ class NumberColumns:
 
     Attributes:
         turn: A whole turn in its unit, of an angle; else None.
+        is_turned: Its values are those of an angle whose turns are counted, which differ from the
+            recorded ones by whole turns.
         mean: Of an angle the circular mean.
         whole: The same for the whole range, with the times of its extremes.
         too_large: How many values are beyond 1e100, where there is no other.
@@ -62,6 +71,7 @@ class NumberColumns:
     kind: str
     unit: str | None
     turn: float | None
+    is_turned: bool
     min: list[float | None]
     max: list[float | None]
     mean: list[float | None]
@@ -176,7 +186,15 @@ def query_history(
         for segment in time_range.segments
     ]  # fmt: skip
     unread = [f"run {run.run_id}: {each}" for run in runs for each in run.unread]
-    return History(time_range.robot, tuple(runs), (*time_range.notes, *unread))
+    return History(time_range.robot, tuple(runs), (*time_range.notes, *unread, *_weighted(runs)))
+
+
+def _weighted(runs: Sequence[RunHistory]) -> Iterator[str]:
+    """That means are weighted by time, where some are shown."""
+    if any(run.numbers and run.step_s is not None for run in runs):
+        yield WEIGHTED
+    if any(columns.is_turned for run in runs for columns in run.numbers):
+        yield TURNS_COUNTED
 
 
 def _share(max_points: int, segment: Segment, total_s: float) -> int:
@@ -242,8 +260,14 @@ def signals_left(names: Sequence[str]) -> Iterator[str]:
 def _columns(
     frame: Frame, signal: RegisteredSignal, buckets: Buckets, kept: Frame | None
 ) -> NumberColumns:
-    cells = cells_of(frame, signal, buckets, kept)
     whole, too_large = summary_of(frame, signal, kept), 0
+    angle = as_angle(frame, signal, whole)
+    if angle is not signal:
+        signal, whole = angle, summary_of(frame, angle, kept)
+    cells = cells_of(frame, signal, buckets, kept)
+    turned = unwrapped(frame, signal)
+    if turned is not None and signal.turn is not None:
+        whole = _turned_summary(frame, signal, turned, whole, kept)
     if not whole.present:
         too_large = int(np.count_nonzero(np.abs(frame.numbers(signal.name)) > LARGEST))
     return NumberColumns(
@@ -251,6 +275,7 @@ def _columns(
         kind=signal.kind,
         unit=signal.unit,
         turn=signal.turn,
+        is_turned=turned is not None,
         min=_figures(cells.min),
         max=_figures(cells.max),
         mean=_figures(cells.mean),
@@ -260,6 +285,21 @@ def _columns(
         too_large=too_large,
         replaced=dict(frame.replaced(signal.name)),
     )
+
+
+def _turned_summary(
+    frame: Frame, signal: RegisteredSignal, turned: Array, whole: Summary, kept: Frame | None
+) -> Summary:
+    """The figures of an angle whose turns are counted; its mean is that of the directions."""
+    assert signal.turn is not None
+    there = ~np.isnan(turned)
+    weights = frame.usable_weights(signal.name)
+    found = summarise_numbers(frame.times[there], turned[there], rows=whole.rows, weights=weights)
+    if kept is not None and signal.name in kept:
+        times, angles = kept.usable(signal.name)
+        angles = beside(frame, turned, signal.turn, times, angles)
+        found = with_extremes(found, summarise_numbers(times, angles))
+    return found._replace(sines=whole.sines, cosines=whole.cosines)
 
 
 def _figures(column: Array) -> list[float | None]:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 
 _TURNING: Final = ("heading", "roll", "pitch")  # in radians where no unit is known
+_ANGLES: Final = (*_TURNING, "joint position")
 _NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
 _TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as it is
     "null": _NO_VALUES,
@@ -51,6 +52,7 @@ class RegisteredSignal:
         reduction: None, or how the long array at `path` becomes one number.
         role: What it tells of the robot's motion, as `signal_register` decides; None of most.
         is_choice: Its whole numbers, of which there are few, name what a robot does.
+        wraps_at: A whole turn, where its values show that it is an angle: see `as_angle`.
         stated: What was declared of its meaning, or is known from its device, the strongest first;
             filled in by `meanings.with_stated`.
     """
@@ -65,10 +67,17 @@ class RegisteredSignal:
     role: str | None = None
     is_choice: bool = False
     stated: tuple[StatedMeaning, ...] = ()
+    wraps_at: float | None = None
 
     @property
     def turn(self) -> float | None:
-        """A whole turn of an angle, in its unit; None of what is no angle."""
+        """A whole turn of an angle, in its unit; None of what is no angle.
+
+        What was declared or is known from the device counts most, then the name, then how its
+        values behave.
+        """
+        if self.wraps_at is not None:
+            return self.wraps_at
         if not self.stated or not self.is_number:
             return turn_of(self.name, self.kind)
         quantity = next(filter(None, (each.said.quantity for each in self.stated)), None)
@@ -89,6 +98,13 @@ class RegisteredSignal:
     def metres(self) -> float:
         """What one of its unit is in metres: 1 of a length without a unit."""
         return METRES.get(self.stated_unit or "") or metres_in(self.name)
+
+    @property
+    def may_be_angle(self) -> bool:
+        """Whether nothing but its values can tell that it is an angle."""
+        said = any(each.said.quantity not in (None, *_ANGLES) for each in self.stated)
+        is_plain = self.kind == "num" and not (self.is_index or self.is_choice or said)
+        return is_plain and self.wraps_at is None and self.turn is None
 
     @property
     def is_index(self) -> bool:

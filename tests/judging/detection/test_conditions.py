@@ -132,9 +132,9 @@ def test_the_answer_says_whether_the_rows_are_all_that_was_published(
     counting.publish(0.0, {"n": 1})
     counting.connection.execute("UPDATE session SET throttle_interval = ?", (interval,))
 
-    (note,) = ask(counting.connection, "n > 0").notes
+    notes = ask(counting.connection, "n > 0").notes
 
-    assert said in note
+    assert any(said in note for note in notes)
 
 
 def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connection) -> None:

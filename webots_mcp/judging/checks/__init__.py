@@ -9,9 +9,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, Final
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
 
-from webots_mcp.analysis.arrays import np
+from webots_mcp.analysis.arrays import Array, np
+from webots_mcp.analysis.levels import level_changes
 from webots_mcp.errors import ConditionFailedError, UnknownSignalError
 from webots_mcp.judging.checks import of_motion, of_sensors
 from webots_mcp.judging.checks.finding import (
@@ -52,7 +54,10 @@ _OF_EVENTS: Final = 0.7  # of the time
 # -- of a run as a whole: its pace, its log, its end, and whether it reached its goal --------------
 
 SLOW: Final = 0.9  # of real time
-_CELL_S: Final = 5.0  # of simulation time, over which the pace is measured
+_CELL_S: Final = 1.0  # of simulation time, over which the pace is measured, or longer
+_MOST_CELLS: Final = 500
+_MOST_PARTS: Final = 3  # slow ones that are named
+_FALSE_ALARMS: Final = 1e-3  # that a run of one pace is divided
 _LONGEST_MESSAGE: Final = 120
 _MUCH: Final = 0.05  # of the run, or of its rows
 _HABIT: Final = 3  # so many times: its code does it
@@ -80,29 +85,76 @@ _TWO: Final = "two positions of the robot, such as gps and odometry"
 
 
 def keeps_pace(run: RunUnderCheck) -> Examined:
-    """Warns where it was slower than 0.9 of real time; waits of over a second do not count."""
+    """Warns where a part of it was slower than 0.9 of real time; waits do not count.
+
+    Parts are divided where the pace changes for good, by a rank test with a false-alarm rate of
+    1 in 1,000 for a run. A wait is over a second long and over 20 times as long as its step.
+    """
     frame = run.frame
     steps, waits = np.diff(frame.times), np.diff(frame.wall_times)
     moved = (steps > 0) & (waits >= 0)
     usual_s = float(np.median(waits[moved])) if moved.any() else 0.0  # of who is slow all the time
     goes_on = moved & (waits <= np.maximum(max(1.0, 3 * usual_s), 20 * steps))
-    sim_s, wall_s = float(steps[goes_on].sum()), float(waits[goes_on].sum())
-    if wall_s < 1.0:
+    if float(waits[goes_on].sum()) < 1.0:
         raise NotSearchableError("it lasted less than a second of wall time")
-    factor = sim_s / wall_s
     longest = float(waits[moved].max())
     waited = f"; longest wait between two rows {longest:.3g} s" if longest > 1.0 else ""
-    evidence = f"{factor:.3g} times real time{waited}"
-    if factor >= SLOW:
+    parts = _paces(frame.times[1:][goes_on], steps[goes_on], waits[goes_on])
+    slow = [part for part in parts if part.factor < SLOW]
+    said = [f"{part.factor:.3g} times real time" for part in slow or [_in_all(parts)]]
+    if len(parts) > 1 and slow:
+        others = [part for part in parts if part.factor >= SLOW]
+        said = [f"{e.factor:.3g} times real time {_span(e, parts)}" for e in slow[:_MOST_PARTS]]
+        said += [f"else {_in_all(others).factor:.3g}"] if others else []
+    evidence = ", ".join(said) + waited
+    if not slow:
         judged = counted(len(frame), "row")
         return run.covered(evidence, judged=judged, limit=f"limit {SLOW:g} times real time")
-    cells = (frame.times[1:] // _CELL_S).astype(np.intp) if len(frame) else np.zeros(0, np.intp)
-    cells -= cells.min()
-    paces = [np.bincount(cells, each * goes_on) for each in (steps, waits)]
-    slow = np.flatnonzero(paces[0] < SLOW * paces[1])
-    since_s = max(float(frame.times[0]), float(frame.times[1] // _CELL_S + slow[0]) * _CELL_S)
+    since_s = slow[0].start_s if slow[0] is not parts[0] else float(frame.times[0])
     more = f"webots_list_runs(cursor={run.info.run_id + 1})"
     return Fault("warn", evidence, since_s, None, more)
+
+
+class PacePart(NamedTuple):
+    """A part of a run of one pace: simulated and wall seconds without waits."""
+
+    start_s: float
+    end_s: float
+    sim_s: float
+    wall_s: float
+
+    @property
+    def factor(self) -> float:
+        """The real-time factor."""
+        return self.sim_s / max(self.wall_s, 1e-9)
+
+
+def _paces(times: Array, steps: Array, waits: Array) -> list[PacePart]:
+    """The parts of a run between changes of its pace."""
+    cell_s = max(_CELL_S, float(times[-1] - times[0]) / _MOST_CELLS)
+    cells = ((times - times[0]) // cell_s).astype(np.intp)
+    firsts = np.flatnonzero(np.diff(cells, prepend=-1))
+    sim_s, wall_s = np.add.reduceat(steps, firsts), np.add.reduceat(waits, firsts)
+    edges = [0, *level_changes(sim_s / np.maximum(wall_s, 1e-9), _FALSE_ALARMS), len(firsts)]
+    ends_s = np.append(times[firsts[1:]] - steps[firsts[1:]], times[-1])
+    begins_s = times[firsts] - steps[firsts]
+    return [
+        PacePart(
+            float(begins_s[a]), float(ends_s[b - 1]), float(sim_s[a:b].sum()),
+            float(wall_s[a:b].sum()),
+        )
+        for a, b in pairwise(edges)
+    ]  # fmt: skip
+
+
+def _in_all(parts: Sequence[PacePart]) -> PacePart:
+    sim_s, wall_s = sum(each.sim_s for each in parts), sum(each.wall_s for each in parts)
+    return PacePart(parts[0].start_s, parts[-1].end_s, sim_s, wall_s)
+
+
+def _span(part: PacePart, parts: Sequence[PacePart]) -> str:
+    until = "on" if part is parts[-1] else f"to {part.end_s:.4g} s"
+    return f"from {part.start_s:.4g} s {until}"
 
 
 def misses_no_steps(run: RunUnderCheck) -> Examined:
@@ -119,7 +171,8 @@ def misses_no_steps(run: RunUnderCheck) -> Examined:
     longest_s = max(each.duration_s for each in gaps)
     evidence = f"no rows {times(len(gaps))}, up to {longest_s:.3g} s, {gone_s:.3g} s in total"
     is_habit = len(gaps) > _MUCH * len(run.frame) and len(gaps) >= _HABIT
-    severity = "fail" if gone_s > _MUCH * length_s and not is_habit else "warn"
+    between_s = total_s(each for each in gaps if "until" not in each.details)  # then it may be done
+    severity = "fail" if between_s > _MUCH * length_s and not is_habit else "warn"
     return Fault(severity, evidence, gaps[0].start_s, len(gaps), run.more("gap"))
 
 

@@ -15,7 +15,18 @@ from functools import partial, reduce
 from itertools import starmap
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, RowSpan, Runs, median, np, runs_of
+from webots_mcp.analysis.arrays import (
+    Array,
+    Flags,
+    Indexes,
+    RowSpan,
+    Runs,
+    median,
+    np,
+    runs_of,
+    weighted_mean,
+)
+from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.database.stored_breakpoints import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.errors import (
     ConditionFailedError,
@@ -41,14 +52,23 @@ from webots_mcp.signals.conditions.compiler import (
 from webots_mcp.signals.conditions.scoring import Aggregate
 from webots_mcp.signals.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
 from webots_mcp.signals.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
-from webots_mcp.signals.naming import FARTHEST_M, NO_POSITION, Value, find_position, metres_in
-from webots_mcp.store.reading.catalogue import say_unknown
+from webots_mcp.signals.naming import (
+    FARTHEST_M,
+    NO_POSITION,
+    Value,
+    counted,
+    find_position,
+    metres_in,
+)
+from webots_mcp.store.reading.catalogue import item_signal, resolve_signals, say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import recorded_share
 from webots_mcp.store.reading.segment import Segment, full_rate_parts, just_after
+from webots_mcp.store.series import WEIGHTED
 from webots_mcp.store.signals import RegisteredSignal
 
 _MOST_VALUES: Final = 8
+_MOST_IN_ALL: Final = 4  # numbers whose figures over all times are given
 _ROWS_BEFORE: Final = 20  # a range: what was there last, for `changed` and `rate`
 _FOLDING: Final = {"min": "minimum", "max": "maximum"}
 _MIRRORED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
@@ -86,25 +106,61 @@ def condition_events(search: Search) -> Iterator[Event]:
         _require_values(condition, frame, position)
     rows = search.coverage.rows = search.coverage.rows + int(np.count_nonzero(read))
     search.coverage.note_nearest("condition", rows, f"true in none of {rows} rows")
+    also = _also_asked(search, condition)
+    if len(runs):
+        in_all = _figures_in_all(frame, [*condition.signals, *also], runs)
+        search.coverage.notes.append(WEIGHTED)
+        search.coverage.note_of_run(search.segment.run_id, in_all)
     for run, values in zip(runs.spans(), values_at(condition, frame, position, runs), strict=True):
-        details = dict(list(values.items())[:_MOST_VALUES]) | _extremes_in(frame, values, run)
+        details = dict(list(values.items())[:_MOST_VALUES])
+        details |= _extremes_in(frame, [*values, *also], run)
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)
 
 
-def _extremes_in(frame: Frame, values: dict[str, Value], run: RowSpan) -> dict[str, Any]:
-    """The mean, minimum and maximum of each number of a condition while it held."""
+def _also_asked(search: Search, condition: Condition) -> list[str]:
+    """The numbers that were named next to a condition: what they were while it held is wanted."""
+    if tuple(search.options.signals) == ("*",):
+        return []
+    named = resolve_signals(search.known, search.options.signals)
+    return [e.name for e in named if e.is_number and e.name not in condition.signals]
+
+
+def _extremes_in(frame: Frame, names: Sequence[str], run: RowSpan) -> dict[str, Any]:
+    """The mean, minimum and maximum of each number while a condition held once."""
     found: dict[str, Any] = {}
     part = frame.rows(run.start, run.stop)
-    for name in values:
+    for name in names:
         if len(found) >= _MOST_VALUES or name not in frame:
             continue
         numbers = part.usable(name)[1]
         if len(numbers) > 1 and numbers.min() < numbers.max():
-            figures = {"mean": numbers.mean(), "min": numbers.min(), "max": numbers.max()}
-            found[f"{name} meanwhile"] = {
-                each: float(f"{figure:.6g}") for each, figure in figures.items()
-            }
+            found[f"{name} meanwhile"] = _figures_of(numbers, part.usable_weights(name))
     return found
+
+
+def _figures_in_all(frame: Frame, names: Sequence[str], runs: Runs) -> str:
+    """What numbers came to in all the rows in which a condition held, in words."""
+    held: Flags = np.zeros(len(frame), np.bool_)
+    for start, stop in zip(runs.starts.tolist(), runs.stops.tolist(), strict=True):
+        held[start:stop] = True
+    lasted_s = float((np.append(np.diff(frame.times), 0.0))[held].sum())
+    said = [f"true in {counted(int(np.count_nonzero(held)), 'row')}, {lasted_s:.4g} s"]
+    for name in names:
+        if len(said) > _MOST_IN_ALL or name not in frame:
+            continue
+        numbers = frame.numbers(name)
+        rows = held & (np.abs(numbers) <= LARGEST)
+        if rows.any():
+            weights = None if frame.weights is None else frame.weights[rows]
+            of = _figures_of(numbers[rows], weights)
+            said.append(f"{name} mean {of['mean']:g}, min {of['min']:g}, max {of['max']:g}")
+    return "; ".join(said)
+
+
+def _figures_of(numbers: Array, weights: Array | None) -> dict[str, float]:
+    mean = weighted_mean(numbers, weights)
+    figures = {"mean": mean, "min": numbers.min(), "max": numbers.max()}
+    return {each: float(f"{figure:.6g}") for each, figure in figures.items()}
 
 
 def _read(search: Search, segment: Segment, condition: Condition) -> Frame:
@@ -146,7 +202,8 @@ def values_at(
 
 
 def _require_known(condition: Condition, search: Search) -> None:
-    unknown = [name for name in condition.signals if name not in search.known]
+    known = search.known
+    unknown = [e for e in condition.signals if e not in known and item_signal(known, e) is None]
     said = [say_unknown(search.known, name) for name in unknown]
     if said := [*said, *condition.describe_lost(search.known)]:
         raise UnknownSignalError("; ".join(said))

@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
-from webots_mcp.analysis.arrays import np
+from webots_mcp.analysis.arrays import longest_usual_s, np, usual_interval_s
 from webots_mcp.database.stored_breakpoints import VIOLATION
 from webots_mcp.judging.detection.kinds import (
     LEVELS,
@@ -63,6 +63,9 @@ _REFUSED: Final = (
     "SELECT sim_time_s, wall_time_s, tool, client || ' (' || transport || ')', rule FROM request "
     f"{_IN_SEGMENT} AND rule IS NOT NULL "
 )
+END_OF_RUN: Final = "the end of the run"
+_LAST_ROWS: Final = 21  # of a run: they tell what is usual at its end
+_ENDED: Final = "SELECT last_sim_time_s FROM run WHERE id = ? AND end_reason IS NOT NULL"
 _RUN_WALLS: Final = (
     "SELECT started_wall_time_s, coalesce((SELECT min(n.started_wall_time_s) FROM run n "
     "WHERE n.robot_id = r.robot_id AND n.id > r.id), 9e99) FROM run r WHERE id = ?"
@@ -105,6 +108,26 @@ def gap_events(search: Search) -> Iterator[Event]:
         if gap.end_s > segment.start_s and gap.start_s < segment.end_s:
             place = (segment.run_id, gap.start_s, gap.end_s, search.wall_time_at(gap.start_s))
             yield Event("gap", *place, None, {"usual_interval_s": rhythm.interval_s})
+    yield from _gap_at_end(search, rhythm.interval_s)
+
+
+def _gap_at_end(search: Search, interval_s: float | None) -> Iterator[Event]:
+    """Yield the gap between the last row of a run that ended and its end, if there is one.
+
+    The next row would have come after the end, at the earliest a usual interval later.
+    """
+    run_id = search.segment.run_id
+    ended = search.connection.execute(_ENDED, (run_id,)).fetchone()
+    rows = search.whole.rows(len(search.whole) - _LAST_ROWS, len(search.whole))
+    if ended is None or interval_s is None or len(rows) < 2 or search.whole.cut_at_s is not None:
+        return
+    last_s, end_s = float(rows.times[-1]), float(ended[0])
+    most_s, usual_s = longest_usual_s(rows.times), usual_interval_s(rows.times)
+    is_asked = search.segment.start_s < end_s and search.segment.end_s > last_s
+    if most_s and usual_s and is_asked and end_s - last_s + usual_s > most_s:
+        place = (run_id, last_s, end_s, search.wall_time_at(last_s))
+        details = {"usual_interval_s": interval_s, "until": END_OF_RUN}
+        yield Event("gap", *place, None, details)
 
 
 def change_events(search: Search) -> Iterator[Event]:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import fnmatch
 import math
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.analysis.arrays import Indexes, np
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.signals.meaning import Meaning
-from webots_mcp.signals.naming import REDUCTIONS, Value, nearest_first
-from webots_mcp.signals.register import MAX_SIGNALS, Kind
+from webots_mcp.signals.naming import REDUCTIONS, Value, array_item, nearest_first, with_dots
+from webots_mcp.signals.register import MAX_SIGNALS, Kind, unit_of
 from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
 from webots_mcp.store.meanings import meanings_of, with_stated
 from webots_mcp.store.reading.behaviour import with_behaviour
@@ -214,9 +214,27 @@ def one_signal(known: dict[str, RegisteredSignal], name: str) -> RegisteredSigna
     return signal
 
 
+def item_signal(known: Mapping[str, RegisteredSignal], name: str) -> RegisteredSignal | None:
+    """Return a single item of a long array, which is not registered: `scan.117`; else None.
+
+    Its values are read from the state rows, as long as those are kept.
+    """
+    if name in known or (item := array_item(name)) is None:
+        return None
+    array, place = item
+    count = known.get(f"{array}.{REDUCTIONS[0]}")
+    if count is None or count.reduction != REDUCTIONS[0]:
+        return None
+    unit = unit_of(array, "num")
+    return RegisteredSignal(None, count.robot_id, name, "num", unit, f"{count.path}[{place}]", None)
+
+
 def _meant(known: dict[str, RegisteredSignal], name: str) -> Iterable[RegisteredSignal]:
+    name = name if name in known else with_dots(name)
     if "*" not in name and name in known:
         return (known[name],)
+    if (item := item_signal(known, name)) is not None:
+        return (item,)
     pattern = name if "*" in name else f"{name}.*"
     escaped = pattern.replace("[", "[[]").replace("?", "[?]")
     return (known[each] for each in known if fnmatch.fnmatchcase(each, escaped))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, time_weights
 from webots_mcp.analysis.summary import usable_part
 from webots_mcp.signals.naming import Value
 from webots_mcp.store import chunk_making
@@ -141,7 +141,8 @@ class Frame:
     def __contains__(self, name: str) -> bool:
         """Whether a row may have a value of that signal."""
         source = self._source
-        return name in source.ids or name in source.columns.values or name in source.derived
+        is_held = name in source.ids or name in source.columns.values or name in source.derived
+        return is_held or source.is_item(name)
 
     @property
     def new_rows(self) -> StateColumns:
@@ -199,6 +200,20 @@ class Frame:
     def times(self) -> Array:
         """Simulation time of each row, in s."""
         return self._decoded(SIM_TIMES).numbers
+
+    @cached_property
+    def weights(self) -> Array | None:
+        """How much of the time each row stands for, the mean being 1; None where all count alike.
+
+        See `time_weights`.
+        """
+        return time_weights(self.times)
+
+    def usable_weights(self, name: str) -> Array | None:
+        """Return the weights of the rows that `usable` gives."""
+        if self.weights is None:
+            return None
+        return usable_part(self.weights, self.numbers(name))[0]
 
     @cached_property
     def wall_times(self) -> Array:

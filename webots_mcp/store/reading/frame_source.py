@@ -13,8 +13,10 @@ from functools import cached_property
 from typing import Any, Final, TypeVar, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.signals.naming import REDUCTIONS, array_item
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunks import (
+    ABSENT,
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
@@ -33,6 +35,15 @@ from webots_mcp.store.reading.observed_pose import Derived
 from webots_mcp.store.reading.unread import Unread
 
 MOST_CACHED_BYTES: Final = 80_000_000  # of arrays that one frame keeps
+_PATH: Final = (
+    "SELECT path FROM signal WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND name = ?"
+)
+_OF_ITEMS: Final = (
+    "SELECT id, json_extract(data, ?), json_array_length(data, ?) FROM {} "
+    "WHERE run_id = ? AND id BETWEEN ? AND ? AND json_valid(data)"
+)
+_ITEMS: Final = _OF_ITEMS.format("state")
+_KEPT_ITEMS: Final = _OF_ITEMS.format("kept_state")
 _MOST_GROUP_ROWS: Final = 2**20  # far more than any maker puts into a group
 _NAMES: Final[dict[Column, str]] = {
     SIM_TIMES: "simulation times",
@@ -137,12 +148,54 @@ class FrameSource:
             for place, times in self._of_parts(SIM_TIMES, places):
                 yield place, self.derived[column](times.numbers)
             return
+        if isinstance(column, str) and self.is_item(column):
+            for place in places:
+                yield place, self._item(column, place)
+            return
         groups = len(self._group_ids)
         yield from self._of_groups(column, [place for place in places if place < groups])
         rows = _of_rows(self.columns, column) or ()
         for place in (each for each in places if each >= groups and len(rows)):
             first = (place - groups) * chunk_making.GROUP_ROWS
             yield place, decoded_of(rows[first : first + chunk_making.GROUP_ROWS])
+
+    def is_item(self, column: Column) -> bool:
+        """Return whether a name means one item of a long array, of which no chunk has values."""
+        if not isinstance(column, str) or column in self.ids or column in self.columns.values:
+            return False
+        item = array_item(column)
+        count = f"{item[0]}.{REDUCTIONS[0]}" if item else ""
+        return bool(count) and (count in self.ids or count in self.columns.values)
+
+    def _item(self, column: str, place: int) -> Decoded:
+        """Return one item of an array in the rows of a part, from the states that are kept."""
+        return self.cached(("item", column, place), lambda: self._read_item(column, place))
+
+    def _read_item(self, column: str, place: int) -> Decoded:
+        array, at = cast("tuple[str, int]", array_item(column))
+        ((_, ids),) = self._of_parts(STATE_IDS, [place])
+        wanted = ids.numbers.astype(np.intp).tolist()
+        span = (float(self.starts_s[place]), float(self.ends_s[place]))
+        paths = self.connection.execute(_PATH, (self.run_id, f"{array}.{REDUCTIONS[0]}")).fetchone()
+        path = f"{paths[0] if paths else _path_of(array)}[{at}]"
+        found: dict[int, tuple[Any, Any]] = {}
+        for query, sign in ((_ITEMS, 1), (_KEPT_ITEMS, -1)):
+            some = [sign * row_id for row_id in wanted if sign * row_id > 0]
+            if some:
+                asked = (path, path[: path.rindex("[")], self.run_id, min(some), max(some))
+                rows = self.connection.execute(query, asked)
+                found |= {sign * row_id: (value, count) for row_id, value, count in rows}
+        values = [found[row_id][0] if row_id in found else ABSENT for row_id in wanted]
+        if gone := sum(row_id not in found for row_id in wanted):
+            why = f"{gone} rows were deleted by retention, and single items of {array} with them"
+            self.unread[Unread(*span, f"{column}: {why}")] = column
+        longest = max((count for _, count in found.values() if count is not None), default=None)
+        if found and (longest is None or longest <= at):
+            why = (
+                f"there {array} is no array" if longest is None else f"{array} has {longest} items"
+            )
+            self.unread[Unread(*span, f"{column}: {why}")] = column
+        return decoded_of(values)
 
     def _of_groups(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
         """Yield the values that the chunks of some groups hold."""
@@ -201,7 +254,7 @@ class FrameSource:
 
     def _statistics(self, column: Column) -> Array:
         table = no_statistics(len(self.starts_s))
-        if column in self.derived:
+        if column in self.derived or self.is_item(column):
             for place, part in self._of_parts(column, range(len(table))):
                 table[place] = statistics_of(part)
             return table
@@ -291,6 +344,11 @@ def _bytes_of(made: object) -> int:
         return int(made.nbytes)
     parts = cast("Sequence[object]", made) if isinstance(made, tuple) else vars(made).values()
     return sum(int(getattr(part, "nbytes", 0)) for part in parts)
+
+
+def _path_of(name: str) -> str:
+    """Return the JSON path of a dotted name that is not registered yet."""
+    return "$" + "".join(f'."{part}"' for part in name.split("."))
 
 
 def no_statistics(parts: int) -> Array:

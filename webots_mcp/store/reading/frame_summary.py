@@ -10,32 +10,36 @@ from itertools import count, pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import (
-    GAP_INTERVALS,
+    EVEN_STEPS,
     Array,
     Flags,
     Indexes,
     Rhythm,
-    gaps_in,
-    interruptions,
+    inner,
     np,
     rhythm_of,
-    usual_interval_s,
+    weighted_mean,
 )
 from webots_mcp.analysis.summary import (
     LARGEST,
     NO_LENGTH,
     Summary,
+    leaps_in,
+    may_wrap,
     summarise_numbers,
+    unwrap,
     with_extremes,
+    wraps,
 )
+from webots_mcp.signals.meaning import ANGLES, meaning_by_name
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, ZoneMap, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts, just_after
 from webots_mcp.store.signals import RegisteredSignal
 
+_MAY_TURN: Final = frozenset((None, *ANGLES))  # quantities of what may be an angle by its values
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
-_SAMPLE_ROWS: Final = 2000
 _ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
 _NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
 _DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before a border is behind
@@ -58,6 +62,43 @@ def reads_values(frame: Frame, signal: RegisteredSignal) -> bool:
     return bool(span > signal.turn / 2 or largest_step > signal.turn / 4)
 
 
+def as_angle(frame: Frame, signal: RegisteredSignal, found: Summary) -> RegisteredSignal:
+    """Return a signal as an angle, where its values show that it is one; else as it is.
+
+    Args:
+        frame: The rows.
+        signal: A numeric one.
+        found: What its values come to.
+    """
+    if not signal.may_be_angle or found.min is None or found.max is None:
+        return signal
+    turn = may_wrap(found.min, found.max)
+    if turn is None or meaning_by_name(signal.name, signal.kind).quantity not in _MAY_TURN:
+        return signal
+    return replace(signal, wraps_at=turn) if wraps(frame.usable(signal.name)[1], turn) else signal
+
+
+def unwrapped(frame: Frame, signal: RegisteredSignal) -> Array | None:
+    """Return an angle in each row with its turns counted, NaN where it has no value.
+
+    None of what is no angle, of one that never goes over the end of its scale, and of one that
+    leaps so far from row to row that its turns cannot be counted.
+    """
+    if signal.turn is None or not reads_values(frame, signal):
+        return None
+    numbers = frame.numbers(signal.name)
+    rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
+    angles = numbers[rows]
+    if not len(rows) or leaps_in(angles, signal.turn):
+        return None
+    turned = unwrap(angles, signal.turn)
+    if turned is angles:
+        return None
+    found: Array = np.full(len(numbers), np.nan)
+    found[rows] = turned
+    return found
+
+
 def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None) -> Summary:
     """Counts, extremes, mean and deviation of all rows; those of an angle are circular as well.
 
@@ -71,13 +112,16 @@ def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None
     if reads_values(frame, signal):
         numbers = frame.usable(signal.name)
         rows = int(np.count_nonzero(frame.was_read(signal.name)))
-        return summarise_numbers(*numbers, rows=rows, turn=signal.turn)
+        weights = frame.usable_weights(signal.name)
+        return summarise_numbers(*numbers, rows=rows, turn=signal.turn, weights=weights)
     found = _summary_of_zone_map(frame, signal.name)
     if signal.turn is None or not found.present:
         return found
-    angles = frame.numbers(signal.name) * (math.tau / signal.turn)
-    angles = angles[np.abs(angles) <= LARGEST]
-    return found._replace(sines=float(np.sin(angles).sum()), cosines=float(np.cos(angles).sum()))
+    numbers = frame.usable(signal.name)
+    circular = summarise_numbers(
+        *numbers, turn=signal.turn, weights=frame.usable_weights(signal.name)
+    )
+    return found._replace(sines=circular.sines, cosines=circular.cosines)
 
 
 def _summary_of_zone_map(frame: Frame, name: str) -> Summary:
@@ -91,10 +135,12 @@ def _summary_of_zone_map(frame: Frame, name: str) -> Summary:
     held = np.flatnonzero(~np.isnan(zones.sum))
     if not len(held):
         return Summary(len(frame))
-    counts, sums = zones.value_count[held], zones.sum[held]
-    present, total = int(counts.sum()), math.fsum(sums.tolist())
+    present = int(zones.value_count[held].sum())
+    counts, sums, own_squares = (each[held] for each in weighted_sums(frame, name, zones))
+    scale = present / math.fsum(counts.tolist())
+    total = math.fsum(sums.tolist()) * scale
     shifts = sums / counts - total / present
-    squares = zones.squared_deviations[held] + counts * shifts * shifts
+    squares = (own_squares + counts * shifts * shifts) * scale
     stepped = zones.last[held][:-1] != zones.first[held][1:]
     low, high = int(np.nanargmin(zones.min)), int(np.nanargmax(zones.max))
     return Summary(
@@ -112,6 +158,49 @@ def _summary_of_zone_map(frame: Frame, name: str) -> Summary:
         sum=total,
         squares=math.fsum(squares.tolist()),
     )
+
+
+def weighted_sums(frame: Frame, name: str, zones: ZoneMap) -> tuple[Array, Array, Array]:
+    """Weights, weighted sums and weighted squares of the deviations from the mean, by chunk.
+
+    Chunks whose rows follow each other evenly come to what their statistics say, times the weight
+    of a row. Others are opened.
+    """
+    weight, is_even = weights_of_chunks(frame, zones)
+    found = (
+        zones.value_count * weight,
+        zones.sum * weight,
+        zones.squared_deviations * weight,
+    )
+    if frame.weights is None or is_even.all():
+        return found
+    for start, numbers in frame.opened(name, ~is_even & (zones.value_count > 0)):
+        stop_row = start + len(numbers)
+        inside = (zones.first_row >= start) & (zones.first_row < stop_row)
+        edges: list[int] = [*(zones.first_row[inside] - start).tolist(), len(numbers)]
+        for first, stop in pairwise(edges):
+            part = numbers[first:stop]
+            usable = np.abs(part) <= LARGEST
+            values, weights = part[usable], frame.weights[start + first : start + stop][usable]
+            at = int(np.searchsorted(zones.first_row, start + first, "right")) - 1
+            if len(values):
+                own, mean = float(weights.sum()), weighted_mean(values, weights)
+                off = values - mean
+                found[0][at], found[1][at] = own, mean * own
+                found[2][at] = inner(off * weights, off)
+    return found
+
+
+def weights_of_chunks(frame: Frame, zones: ZoneMap) -> tuple[Array, Flags]:
+    """Return the mean weight of a row in each chunk, and in which chunks all rows count alike."""
+    chunks = len(zones)
+    if frame.weights is None or not chunks:
+        return np.ones(chunks), np.ones(chunks, np.bool_)
+    starts = zones.first_row
+    weight = np.add.reduceat(frame.weights, starts) / zones.row_count
+    low = np.minimum.reduceat(frame.weights, starts)
+    high = np.maximum.reduceat(frame.weights, starts)
+    return weight, high - low <= EVEN_STEPS * weight
 
 
 def _time_of(
@@ -132,18 +221,8 @@ def frame_around(connection: sqlite3.Connection, segment: Segment, deadline: Dea
 
 
 def rhythm_in(frame: Frame) -> Rhythm:
-    """The rhythm of the rows of a frame; of many, only chunks that have a gap are opened.
-
-    The median is then that of the first 2,000 rows.
-    """
-    if len(frame) <= FULL_ROWS:
-        return rhythm_of(frame.times)
-    interval_s = usual_interval_s(frame.rows(0, _SAMPLE_ROWS).times)
-    if interval_s is None:
-        return rhythm_of(frame.times)
-    around = frame.around_steps(GAP_INTERVALS * interval_s)
-    gaps = [gap for times in around for gap in gaps_in(times, interval_s)]
-    return Rhythm(interval_s, interruptions(gaps))
+    """Return the rhythm of the rows of a frame."""
+    return rhythm_of(frame.times)
 
 
 @dataclass(frozen=True)
@@ -229,46 +308,70 @@ def cells_of(
         buckets: From `buckets_of` of the same frame.
         kept: Rows that only kept stretches have: they count for extremes.
     """
-    cells = _cells(_parts(frame, signal, buckets), signal.turn, buckets.edges)
+    turned = unwrapped(frame, signal)
+    cells = _cells(_parts(frame, signal, buckets, turned), signal.turn, buckets.edges)
+    if turned is not None and signal.turn is not None:
+        middle = (cells.min + cells.max) / 2
+        turns = np.nan_to_num(np.rint((middle - cells.mean) / signal.turn))
+        cells = cells._replace(mean=cells.mean + turns * signal.turn)
     if kept is not None and len(buckets.starts_s):
         times, numbers = kept.usable(signal.name)
+        if turned is not None and signal.turn is not None:
+            numbers = beside(frame, turned, signal.turn, times, numbers)
         places = np.searchsorted(buckets.starts_s, times + 1e-9, "right") - 1
         np.fmin.at(cells.min, np.maximum(places, 0), numbers)
         np.fmax.at(cells.max, np.maximum(places, 0), numbers)
     return cells
 
 
+def beside(frame: Frame, turned: Array, turn: float, times: Array, angles: Array) -> Array:
+    """Return angles of other rows in as many turns as those of the frame's rows around them."""
+    there = ~np.isnan(turned)
+    near = np.interp(times, frame.times[there], turned[there])
+    return np.asarray(angles + turn * np.rint((near - angles) / turn), np.float64)
+
+
 class _Parts(NamedTuple):
-    """Rows, and chunks that lie within one bucket, in order: what each comes to."""
+    """Rows, and chunks that lie within one bucket, in order: what each comes to.
+
+    Attributes:
+        weights: How much of the time each stands for; `sum` is weighted by it.
+    """
 
     first_row: Indexes
     counts: Indexes
+    weights: Array
     min: Array
     max: Array
     sum: Array
     last: Array
 
 
-def _parts(frame: Frame, signal: RegisteredSignal, buckets: Buckets) -> _Parts:
+def _parts(
+    frame: Frame, signal: RegisteredSignal, buckets: Buckets, turned: Array | None
+) -> _Parts:
     """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
     name = signal.name
     if len(frame) <= FULL_ROWS or signal.turn is not None:
-        return _of_rows(0, frame.numbers(name))
+        return _of_rows(frame, 0, frame.numbers(name) if turned is None else turned)
     zones = frame.zone_map(name)
     edges = buckets.edges[buckets.edges < len(frame)]
     borders = np.searchsorted(zones.first_row, edges, "right") - 1
     cut: Flags = np.zeros(len(zones), np.bool_)
     cut[borders[zones.first_row[borders] != edges]] = True
+    weight, is_even = weights_of_chunks(frame, zones)
+    cut |= ~is_even
     whole = ~cut & (zones.value_count > 0) & ~np.isnan(zones.sum)
     chunks = _Parts(
         zones.first_row[whole],
         zones.value_count[whole],
+        (zones.value_count * weight)[whole],
         zones.min[whole],
         zones.max[whole],
-        zones.sum[whole],
+        (zones.sum * weight)[whole],
         zones.last[whole],
     )
-    opened = [_of_rows(*each) for each in frame.opened(name, cut)]
+    opened = [_of_rows(frame, *each) for each in frame.opened(name, cut)]
     return _in_order([chunks, *opened])
 
 
@@ -278,11 +381,13 @@ def _in_order(some: Sequence[_Parts]) -> _Parts:
     return _Parts(*(column[order] for column in joined))
 
 
-def _of_rows(start: int, numbers: Array) -> _Parts:
+def _of_rows(frame: Frame, start: int, numbers: Array) -> _Parts:
     """Each row that has a usable number."""
     rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
     held = numbers if len(rows) == len(numbers) else numbers[rows]
-    return _Parts(rows + start, np.ones(len(rows), np.intp), held, held, held, held)
+    ones = np.ones(len(rows))
+    weights = ones if frame.weights is None else frame.weights[rows + start]
+    return _Parts(rows + start, ones.astype(np.intp), weights, held, held, held * weights, held)
 
 
 def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> BucketFigures:
@@ -303,28 +408,32 @@ def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> BucketFigures:
     low = np.minimum.reduceat(parts.min, starts)
     high = np.maximum.reduceat(parts.max, starts)
     if turn is None:
-        mean = np.add.reduceat(parts.sum, starts) / counts
+        mean = _weighted_means(parts, starts)
         mean = np.minimum(np.maximum(mean, low), high)  # sums round
     else:
-        mean = _circular_means(parts.sum, starts, counts, turn, low)
+        mean = _circular_means(parts, starts, turn, low)
     count_of: Indexes = np.zeros(cells, np.intp)
     count_of[filled] = counts
     last = parts.last[np.append(starts[1:], len(places)) - 1]
     return BucketFigures(count_of, spread(low), spread(high), spread(mean), spread(last))
 
 
-def _circular_means(
-    values: Array, starts: Indexes, counts: Indexes, turn: float, low: Array
-) -> Array:
+def _weighted_means(parts: _Parts, starts: Indexes) -> Array:
+    weights = np.add.reduceat(parts.weights, starts)
+    return np.asarray(np.add.reduceat(parts.sum, starts) / weights, np.float64)
+
+
+def _circular_means(parts: _Parts, starts: Indexes, turn: float, low: Array) -> Array:
     """The direction of the resultant vector; NaN where the vectors cancel out.
 
     K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.2.1.
     """
-    angles = values * (math.tau / turn)
-    sines = np.add.reduceat(np.sin(angles), starts)
-    cosines = np.add.reduceat(np.cos(angles), starts)
+    weights = np.add.reduceat(parts.weights, starts)
+    angles = parts.last * (math.tau / turn)
+    sines = np.add.reduceat(np.sin(angles) * parts.weights, starts)
+    cosines = np.add.reduceat(np.cos(angles) * parts.weights, starts)
     means = np.arctan2(sines, cosines) * (turn / math.tau)
-    means[np.hypot(sines, cosines) < NO_LENGTH * counts] = np.nan
+    means[np.hypot(sines, cosines) < NO_LENGTH * weights] = np.nan
     return np.where((means < 0) & (low >= 0), means + turn, means)
 
 

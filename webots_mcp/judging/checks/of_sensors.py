@@ -17,6 +17,7 @@ from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT
 from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed
 from webots_mcp.store.chunks import parse
+from webots_mcp.store.reading.frame import ZoneMap
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 MOST_NAMED: Final = 3
@@ -213,7 +214,7 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
         ):
             continue
         zones = run.frame.zone_map(name)
-        if zones.change_count.sum() < _MANY_VALUES:
+        if zones.change_count.sum() < _MANY_VALUES or not _may_be_cut_off(zones):
             continue
         clock, values = run.frame.usable(name)
         if len(np.unique(values)) < _MANY_VALUES:
@@ -226,6 +227,14 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
             long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
             if len(long) >= _OFTEN and at.mean() >= _AT_LIMIT:
                 yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
+
+
+def _may_be_cut_off(zones: ZoneMap) -> bool:
+    """Return whether the chunks that reach an extreme value have enough rows for a warning."""
+    least_rows = _AT_LIMIT * zones.value_count.sum()
+    at_low = zones.value_count[zones.min == np.nanmin(zones.min)].sum()
+    at_high = zones.value_count[zones.max == np.nanmax(zones.max)].sum()
+    return bool(max(at_low, at_high) >= least_rows)
 
 
 def sensors_drop_nothing(run: RunUnderCheck) -> Finding:

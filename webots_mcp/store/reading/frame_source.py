@@ -32,7 +32,7 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.reading.observed_pose import Derived
 from webots_mcp.store.reading.unread import Unread
 
-MOST_CACHED_BYTES: Final = 80_000_000  # of arrays that one frame keeps
+MOST_CACHED_BYTES: Final = 320_000_000  # of arrays that one frame keeps
 _MOST_GROUP_ROWS: Final = 2**20  # far more than any maker puts into a group
 _NAMES: Final[dict[Column, str]] = {
     SIM_TIMES: "simulation times",

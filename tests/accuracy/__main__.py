@@ -13,12 +13,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from tests.accuracy import comparing, costs, events
+from tests.accuracy import cases, comparing, costs, events
 from tests.accuracy.page import FIGURES, PAGE, README, Part, headline, sections
 from tests.benchmarks import recorders
 from tests.benchmarks.core import Bench
 
 PARTS: Final = (
+    Part("cases", "Situations that people met", cases.cases),
     Part("events", "Events", events.events),
     Part("checks", "Checks", events.checks),
     Part("comparisons", "Comparisons of runs", comparing.comparisons),
@@ -38,10 +39,11 @@ two; `python -m tests.accuracy loop` only that part, `--effort 0.1` a tenth); no
 written by hand. Durations are of one busy machine: compare ratios. Shares have the interval in
 parentheses that holds the true one nineteen times of twenty.
 
-The recordings are drawn, since only so is it known what happened in them. The robots, their
-noise and their faults are the authors' idea of real ones; the rules were made with other draws
-of the same kinds. No recording of a real robot was labelled yet. `python -m tests.judging.detection
---wrong` and `python -m tests.judging.checks` show the single cases."""
+The first part is about robots and faults that other people reported. In the others the recordings
+are drawn, since only then is it known exactly what happened in them: their robots, noise and faults
+are the authors' idea of real ones, and the rules were made with other draws of the same kinds.
+`python -m tests.cases`, `python -m tests.judging.detection --wrong` and `python -m
+tests.judging.checks` show the single cases."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

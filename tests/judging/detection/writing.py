@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Any, Final
 
 from tests.judging.detection.labelled import LabelledRun
 from tests.recordings.rover import WALL_PER_SIM, Recorder
+from webots_mcp.bridge.encoding import encode
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
@@ -79,12 +78,6 @@ def _rows(run: LabelledRun, run_id: int, wall_start_s: float) -> Iterator[tuple[
     names = list(run.columns)
     for time_s, *values in zip(run.times.tolist(), *run.columns.values(), strict=True):
         state = dict(zip(names, values, strict=True))
-        replaced = {name: "nan" for name, value in state.items() if _is_nan(value)}
-        state.update(dict.fromkeys(replaced))
-        text = json.dumps(state, allow_nan=False, separators=(",", ":"))
+        encoded = encode(state)
         wall_s = wall_start_s + time_s * WALL_PER_SIM
-        yield run_id, time_s, wall_s, text, json.dumps(replaced) if replaced else None
-
-
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and math.isnan(value)
+        yield run_id, time_s, wall_s, encoded.text, encoded.replaced_text

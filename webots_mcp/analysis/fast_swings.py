@@ -9,15 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, noise_of, np, runs_of
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
 from webots_mcp.analysis.swings import EvenRows, Swing
 
 LONGEST_FAST_ROWS: Final = 7.0  # of a period; longer ones are found by their bends
 FALSE_ALARMS: Final = 1e-6  # of a window without an oscillation
 _WINDOW: Final = 64  # rows
 _HOP: Final = 32
+_FIRST_ORDINATE: Final = math.ceil(_WINDOW / LONGEST_FAST_ROWS)
+_AT_ONCE: Final = 256  # windows, which stay in the cache of a processor
 _LOCAL: Final = 14  # rows over which an amplitude is local
 _LEAST_WINDOWS: Final = 3  # that follow each other: filtered noise seldom makes two
 LEAST_FAST_ROWS: Final = _WINDOW + (_LEAST_WINDOWS - 1) * _HOP  # of a fast one that is found
@@ -44,27 +47,14 @@ def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> I
 
 def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
     starts = np.arange(0, len(values) - _WINDOW + 1, _HOP)
-    windows: Array = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
-    base = np.vander(np.linspace(-1, 1, _WINDOW), _DEGREE + 1)
-    orthogonal = np.linalg.qr(base)[0]
-    rest: Array = windows - (windows @ orthogonal) @ np.transpose(orthogonal)
-    power = np.abs(np.fft.rfft(rest, axis=1)) ** 2
-    power[:, -1] /= 2  # the last ordinate has one degree of freedom, the others two
-    first = math.ceil(_WINDOW / LONGEST_FAST_ROWS)
-    band = power[:, first:]
-    count = band.shape[1]
-    total = band.sum(axis=1)
-    peak = band.argmax(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.nan_to_num(band.max(axis=1) / total)
-    chance = count * (1 - share) ** (count - 1)
-    # What remains of a step or a bend is spread over the band; rounding is no oscillation.
-    swings = (chance < FALSE_ALARMS) & (total > 1e-12 * np.maximum(power.sum(axis=1), 1e-300))
-    amplitude = np.sqrt(2 * total * share) / (_WINDOW / math.sqrt(2))
+    parts = [
+        _peaks_of(values, part) for part in np.split(starts, range(_AT_ONCE, len(starts), _AT_ONCE))
+    ]
+    swings, peak, share, amplitude = map(np.concatenate, zip(*parts, strict=True))
     for run in runs_of(swings, times[starts]).spans():
         if run.stop - run.start < _LEAST_WINDOWS or np.ptp(peak[run.start : run.stop]) > 2:
             continue
-        ordinate = first + int(np.bincount(peak[run.start : run.stop]).argmax())
+        ordinate = _FIRST_ORDINATE + int(np.bincount(peak[run.start : run.stop]).argmax())
         begin, end = int(starts[run.start]), int(starts[run.stop - 1]) + _WINDOW - 1
         begin, end = _ends_of(values[begin : end + 1], ordinate, begin)
         interval_s = float(times[end] - times[begin]) / (end - begin)
@@ -76,6 +66,37 @@ def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
             yield Swing(
                 float(times[begin]), float(times[end]), half_swings, period_s, size, explained
             )
+
+
+def _peaks_of(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Array]:
+    """Of the windows that begin in these rows: whether they oscillate, and their largest ordinate.
+
+    Returns:
+        For each window whether Fisher's test finds an oscillation, which ordinate of the band is
+        the largest one, its share of the band, and its amplitude.
+    """
+    windows: Array = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
+    orthogonal = _slow_motion()
+    rest: Array = windows - (windows @ orthogonal) @ np.transpose(orthogonal)
+    found = np.fft.rfft(rest, axis=1)
+    power: Array = found.real**2 + found.imag**2
+    power[:, -1] /= 2  # the last ordinate has one degree of freedom, the others two
+    band = power[:, _FIRST_ORDINATE:]
+    count = band.shape[1]
+    total = band.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.nan_to_num(band.max(axis=1) / total)
+    chance = count * (1 - share) ** (count - 1)
+    # What remains of a step or a bend is spread over the band; rounding is no oscillation.
+    swings = (chance < FALSE_ALARMS) & (total > 1e-12 * np.maximum(power.sum(axis=1), 1e-300))
+    amplitude = np.sqrt(2 * total * share) / (_WINDOW / math.sqrt(2))
+    return swings, band.argmax(axis=1), share, amplitude
+
+
+@lru_cache(1)
+def _slow_motion() -> Array:
+    """Polynomials over a window as orthogonal columns."""
+    return np.linalg.qr(np.vander(np.linspace(-1, 1, _WINDOW), _DEGREE + 1))[0]
 
 
 def _ends_of(values: Array, ordinate: int, first: int) -> tuple[int, int]:
@@ -99,7 +120,7 @@ class SwingCourse(NamedTuple):
     end_amplitude: float
 
 
-def course_of(swing: Swing, times: Array, values: Array) -> SwingCourse:
+def course_of(swing: Swing, times: Array, values: Array, noise: float) -> SwingCourse:
     """Follow an oscillation to where its amplitude is lost in the noise, on both sides.
 
     A growing oscillation stands out late, though its first periods have the same period and phase.
@@ -108,8 +129,9 @@ def course_of(swing: Swing, times: Array, values: Array) -> SwingCourse:
         swing: As it was found.
         times: Of the rows around it, without recording gaps.
         values: Of the same rows.
+        noise: Standard deviation of the noise in them.
     """
-    period_s, noise = swing.period_s, noise_of(values)
+    period_s = swing.period_s
     amplitudes: list[float] = []
     first_s, last_s = swing.start_s, swing.end_s
     for step_s in (-period_s, period_s):

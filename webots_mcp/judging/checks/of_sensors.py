@@ -18,6 +18,7 @@ from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT
 from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed
 from webots_mcp.store.chunks import parse
+from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 MOST_NAMED: Final = 3
@@ -227,7 +228,7 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
         ):
             continue
         zones = run.frame.zone_map(name)
-        if zones.change_count.sum() < _MANY_VALUES:
+        if zones.change_count.sum() < _MANY_VALUES or not _is_often_at_an_end(run.frame, name):
             continue
         clock, values = run.frame.usable(name)
         if len(np.unique(values)) < _MANY_VALUES:
@@ -242,6 +243,17 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
                 yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
             elif limit != 0 and len(rests) >= _CUT_OFF and _is_cut_off(values[~at], rests):
                 yield name, limit, float(at.mean()), float(rests.starts_s[0]), len(rests)
+
+
+def _is_often_at_an_end(frame: Frame, name: str) -> bool:
+    """Return whether enough rows have an extreme value; only chunks that reach one are opened."""
+    zones = frame.zone_map(name)
+    least_rows = min(_AT_LIMIT * zones.value_count.sum(), _CUT_OFF)
+    for ends, limit in ((zones.min, np.nanmin(zones.min)), (zones.max, np.nanmax(zones.max))):
+        opened = (numbers for _, numbers in frame.opened(name, ends == limit))
+        if sum(np.count_nonzero(numbers == limit) for numbers in opened) >= least_rows:
+            return True
+    return False
 
 
 def _is_cut_off(others: Array, hits: Runs) -> bool:

@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.analysis.arrays import Array, noise_of, np
+from webots_mcp.analysis.arrays import Array, Indexes, noise_of, np
 from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, places_in
 from webots_mcp.signals.meaning import Quantity
+from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal
 
 _ROUNDING: Final = 1e-9  # of the largest value: less noise is that of floating-point numbers
@@ -56,11 +57,15 @@ def degradation_events(search: Search) -> Iterator[Event]:
 
 def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, float] | None:
     """When the noise grew, and how large it was before and after; None where it did not."""
-    times, values = search.frame.usable(signal.name)
-    blocks = min(_BLOCKS, len(values) // _LEAST_ROWS)
+    zones = search.frame.zone_map(signal.name)
+    rows = int(zones.value_count.sum())
+    blocks = min(_BLOCKS, rows // _LEAST_ROWS)
     if blocks < 2 * _LEAST_SIDE:
         return None
-    edges = np.linspace(0, len(values), blocks + 1).astype(np.intp)
+    edges = np.linspace(0, rows, blocks + 1).astype(np.intp)
+    if not _may_have_grown(search.frame, signal.name, edges):
+        return None
+    times, values = search.frame.usable(signal.name)
     noises = np.array([noise_of(values[a:b]) for a, b in pairwise(edges.tolist())])
     if noises.min() <= _ROUNDING * float(np.abs(values).max()):
         return None
@@ -77,6 +82,30 @@ def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, 
         float(np.median(noises[:middle])),
         float(np.median(noises[middle:])),
     )
+
+
+def _may_have_grown(frame: Frame, name: str, edges: Indexes) -> bool:
+    """Return whether the last blocks are noisier than the first ones, pair by pair from outside.
+
+    The noise of most sensors stays, so that two or four blocks of them suffice to say no.
+
+    Args:
+        frame: The rows.
+        name: The signal.
+        edges: Of the blocks, counted in rows that have a usable value.
+    """
+    if edges[-1] < len(frame):  # where a block lies is known once all values are
+        return True
+    before, after = 0.0, math.inf
+    for at in range(_LEAST_SIDE):
+        first, last = (
+            noise_of(frame.rows(*span).numbers(name))
+            for span in (edges[at : at + 2].tolist(), edges[len(edges) - 2 - at :][:2].tolist())
+        )
+        before, after = max(before, first), min(after, last)
+        if before >= after:
+            return False
+    return True
 
 
 def _moves_alike(search: Search, times: Array, row: int) -> bool:

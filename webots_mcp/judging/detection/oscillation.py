@@ -5,9 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Final
 
-from webots_mcp.analysis.arrays import Array, gap_borders, np, usual_interval_s
+from webots_mcp.analysis.arrays import (
+    Array,
+    Indexes,
+    gap_borders,
+    noise_of,
+    np,
+    usual_interval_s,
+)
 from webots_mcp.analysis.fast_swings import (
     LEAST_FAST_ROWS,
     LONGEST_FAST_ROWS,
@@ -116,7 +124,8 @@ def _found(
             rows = rows if len(times) == len(part) else EvenRows.of(times)
             if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
                 numbers = unwrap(numbers, signal.turn)
-            found = [_course(swing, times, numbers) for swing in swings_in(rows, numbers, *asked)]
+            courses = _Courses(times, numbers)
+            found = [courses.of(swing) for swing in swings_in(rows, numbers, *asked)]
             fast = (
                 SwingCourse(swing, swing.amplitude, swing.amplitude)
                 for swing in find_fast_swings(rows, numbers, least)
@@ -125,16 +134,30 @@ def _found(
             yield from ((signal.name, each) for each in (*found, *fast))
 
 
-def _course(swing: Swing, times: Array, values: Array) -> SwingCourse:
-    """The whole of an oscillation, in the rows around it without a gap."""
-    gaps = gap_borders(times, usual_interval_s(times) or 0.0)
-    edges = np.concatenate(([0], gaps, [len(times)]))
-    row = int(np.searchsorted(times, swing.start_s))
-    at = int(np.searchsorted(edges, row, "right")) - 1
-    part = slice(int(edges[at]), int(edges[at + 1]))
-    if swing.end_s > times[part][-1]:  # it goes on after a gap
-        return SwingCourse(swing, swing.amplitude, swing.amplitude)
-    return course_of(swing, times[part], values[part])
+class _Courses:
+    """The rows of a signal in which oscillations are followed to their ends."""
+
+    def __init__(self, times: Array, values: Array) -> None:
+        self._times, self._values = times, values
+        self._noises: dict[int, float] = {}
+
+    @cached_property
+    def _edges(self) -> Indexes:
+        """Where stretches without a gap begin, and the number of rows."""
+        gaps = gap_borders(self._times, usual_interval_s(self._times) or 0.0)
+        return np.concatenate(([0], gaps, [len(self._times)]))
+
+    def of(self, swing: Swing) -> SwingCourse:
+        """The whole of an oscillation, in the rows around it without a gap."""
+        row = int(np.searchsorted(self._times, swing.start_s))
+        at = int(np.searchsorted(self._edges, row, "right")) - 1
+        part = slice(int(self._edges[at]), int(self._edges[at + 1]))
+        times, values = self._times[part], self._values[part]
+        if swing.end_s > times[-1]:  # it goes on after a gap
+            return SwingCourse(swing, swing.amplitude, swing.amplitude)
+        if at not in self._noises:
+            self._noises[at] = noise_of(values)
+        return course_of(swing, times, values, self._noises[at])
 
 
 def _overlap(one: Swing, other: Swing) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Final
@@ -40,6 +40,7 @@ MOST_OPENED: Final = 8  # chunks with most changes in which that is looked for
 HABITUAL_ROWS: Final = 10  # with the same value at other times: it comes back to it
 TARGET_WENT: Final = 0.1  # of the whole range of a target: so far it goes on, to show something
 LONGEST_READ_S: Final = 120.0  # of a rest: longer ones show it in their first part
+FEW_VALUES: Final = 32  # whose rows are counted one by one; for more, sorting is faster
 MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
 _INDEX: Final = re.compile(r"\.\d+$")  # items that go missing at once are reported as the array
 
@@ -120,6 +121,7 @@ class _Resting:
     search: Search
     signal: RegisteredSignal
     least_s: float
+    _counts: dict[float, int] = field(default_factory=dict[float, int])
 
     @cached_property
     def rests(self) -> list[RowSpan]:
@@ -192,12 +194,17 @@ class _Resting:
 
     def _rows_elsewhere(self, rest: RowSpan) -> int:
         """How many other rows of the run have the same value."""
-        first = int(np.searchsorted(self._sorted, rest.value))
-        return (
-            int(np.searchsorted(self._sorted, rest.value, "right"))
-            - first
-            - (rest.stop - rest.start)
-        )
+        if rest.value not in self._counts:
+            self._counts[rest.value] = self._rows_with(rest.value)
+        return self._counts[rest.value] - (rest.stop - rest.start)
+
+    def _rows_with(self, value: float) -> int:
+        """How many rows of the run have a value; once many are asked for, of the sorted ones."""
+        if len(self._counts) < FEW_VALUES:
+            return int(np.count_nonzero(self.search.whole.numbers(self.signal.name) == value))
+        ends = (np.searchsorted(self._sorted, value, side) for side in ("left", "right"))
+        first, stop = map(int, ends)
+        return stop - first
 
     @cached_property
     def _sorted(self) -> Array:

@@ -535,10 +535,11 @@ def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:
 def _coded(values: Decoded, *, numbers: bool) -> Coded:
     labels: list[Value] = [None]
     codes = np.zeros(len(values.numbers), np.intp)
-    if numbers:
+    is_number = None if values.codes is None else values.codes == IS_NUMBER
+    if numbers and (is_number is None or is_number.any()):
         held = ~np.isnan(values.numbers)
-        if values.codes is not None:
-            held &= values.codes == IS_NUMBER
+        if is_number is not None:
+            held &= is_number
         found = values.numbers[held]
         changes = np.append(True, found[1:] != found[:-1])[: len(found)]  # most stay as they are
         unique, places = np.unique(found[changes], return_inverse=True)

@@ -34,7 +34,7 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.reading.observed_pose import Derived
 from webots_mcp.store.reading.unread import Unread
 
-MOST_CACHED_BYTES: Final = 80_000_000  # of arrays that one frame keeps
+MOST_CACHED_BYTES: Final = 160_000_000  # of arrays that one frame keeps
 _PATH: Final = (
     "SELECT path FROM signal WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND name = ?"
 )

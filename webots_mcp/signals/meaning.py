@@ -80,6 +80,7 @@ _FREE_MOTORS: Final = frozenset((  # motors that move no robot over the ground b
     "thruster", "vacuum", "drum", "blade", "turbine",
 ))  # fmt: skip
 _TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
+_HEIGHTS: Final = frozenset(("height", "altitude"))
 _GYROS: Final = frozenset(("gyro", "imu", "gyroscope"))
 _WORD_QUANTITIES: Final[dict[str, Quantity]] = {
     "distance": "distance", "force": "force", "torque": "torque", "voltage": "voltage",
@@ -150,6 +151,7 @@ def understood_words() -> dict[str, list[str]]:
         "joint position or joint speed": _JOINTS,
         "motor speed, not of a wheel": _FREE_MOTORS,
         "angular velocity": said.get("angular velocity", set()) | _GYROS,
+        "height, with a unit of length": _HEIGHTS,
         "count": _COUNTS,
     }
     return {meaning: sorted(words) for meaning, words in groups.items()}
@@ -521,7 +523,7 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
             return "roll"
         return "pitch" if "pitch" in said else None
     if unit in ("m", "cm", "mm", "km") and not said & _JOINTS:
-        return "distance"
+        return "height" if said & _HEIGHTS else "distance"
     for word in words:
         if word in _WORD_QUANTITIES:
             return _WORD_QUANTITIES[word]

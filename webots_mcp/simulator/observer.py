@@ -19,6 +19,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any, Final
 
@@ -26,6 +27,7 @@ from webots_mcp.bridge.custom_data import CustomDataReader, ObserverParts
 from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.signals.meaning import DeclaredMeaning
 from webots_mcp.simulator.observed_world import DIGITS, ObservedBody, ObservedWorld
 
 PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
@@ -105,6 +107,10 @@ class ObserverBridge(MCPBridge):
     def record_event(self, kind: str, data: dict[str, object]) -> None:
         """Record what changes seldom: what there is, and the mode."""
         self._session.journal.event(kind, data)
+
+    def record_meanings(self, known: Sequence[tuple[DeclaredMeaning, str]]) -> None:
+        """Record what signals mean, and what says it."""
+        self._session.meanings.record_devices(known)
 
     def count_steps_by_time(self) -> None:
         """Count steps by time, since the world advances between two rounds of this loop."""
@@ -241,6 +247,7 @@ class Observer:
         self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
         self.bridge.count_steps_by_time()
         self.world = ObservedWorld(robot, self._period_ms, self._warn)
+        self.bridge.record_meanings(self.world.describe_signals())
         self.custom_data = self.bridge.read_custom_data()
         self._pace = StepPace(robot, self._period_ms, world_waits=self.bridge.world_waits)
         self._due_s = -math.inf

@@ -172,7 +172,8 @@ def stays_upright(run: RunUnderCheck) -> Finding:
     first = falls[0]
     got_up = first.details.get("got_up")
     after = f"and got up {first.duration_s:.3g} s later" if got_up else "and stayed down"
-    evidence = f"fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
+    who = f"{first.name} " if first.name else ""
+    evidence = f"{who}fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
     return Finding("fail", evidence, first.start_s, len(falls), run.more(FALL.name))
 
 

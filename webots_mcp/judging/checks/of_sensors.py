@@ -15,7 +15,7 @@ from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT
-from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed
+from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, find_targets, listed
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
@@ -26,6 +26,7 @@ _ROWS: Final = "SELECT data, replaced FROM state WHERE id IN ({marks})"
 _MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first steps alone
 _LEAST_S: Final = 1.0  # as of what is missing
 _AT_LIMIT: Final = 0.05  # of the rows
+_OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
 _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
 
@@ -166,11 +167,15 @@ class _NamesIn:
 
     @cached_property
     def sensors(self) -> dict[str, RegisteredSignal]:
-        """The numbers that a sensor gave, as far as it is known what they mean."""
+        """The numbers that a sensor gave, as far as it is known what they mean.
+
+        What an observer saw of a body is exact, and no sensor that may fail.
+        """
         return {
             each.name: each
             for each in self._run.search.numbers
             if not each.is_index and self._run.meanings[each.name].is_sensed
+            if not each.name.startswith(_OBSERVED)
         }
 
 

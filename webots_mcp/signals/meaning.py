@@ -20,7 +20,8 @@ Quantity = Literal[
     "x", "y", "height", "heading", "roll", "pitch", "speed", "turn rate", "wheel speed",
     "motor speed", "joint position", "joint speed", "distance", "force", "torque", "current",
     "voltage", "temperature", "pressure", "light", "acceleration", "angular velocity",
-    "magnetic field", "percentage", "time", "count", "flag", "mode", "text",
+    "magnetic field", "percentage", "energy", "power", "angle", "colour", "time", "count", "flag",
+    "mode", "text",
 ]  # fmt: skip
 Role = Literal["measured", "commanded", "target", "limit"]
 Source = Literal["declared", "device", "named", "behaviour", "unknown"]
@@ -219,15 +220,17 @@ _OF_POSES: Final[dict[str, Quantity]] = {"x": "x", "y": "y", "z": "height", "yaw
 # A quantity that may be nothing at any time: an actuator is off, a foot is in the air, it is dark.
 CAN_BE_OFF: Final = frozenset[Quantity | None]((
     "speed", "turn rate", "wheel speed", "motor speed", "joint speed", "force", "torque", "current",
-    "pressure", "light", "acceleration", "angular velocity",
+    "pressure", "light", "acceleration", "angular velocity", "power",
 ))  # fmt: skip
 # A quantity that cannot step away and back between two rows: its mass or capacity forbids it.
 INERT: Final = frozenset[Quantity | None]((
     "x", "y", "height", "heading", "roll", "pitch", "joint position", "voltage", "temperature",
-    "percentage",
+    "percentage", "energy",
 ))  # fmt: skip
-ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint position"))
-_NO_SENSOR: Final = frozenset[Quantity | None]((None, "count", "flag", "mode", "text", "time"))
+ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint position", "angle"))
+_NO_SENSOR: Final = frozenset[Quantity | None]((
+    None, "colour", "count", "flag", "mode", "text", "time",
+))  # fmt: skip
 
 UNKNOWN: Final = Meaning(why="its name does not say what it is")
 

@@ -13,16 +13,15 @@ from webots_mcp.judging.detection.fall import FALL
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
-from webots_mcp.judging.detection.standstill import COMMAND_NOISE, ON_THE_SPOT, TURNED_RAD
+from webots_mcp.judging.detection.slip import SLIP, flies
+from webots_mcp.judging.detection.standstill import COMMAND_NOISE, TURNED_RAD
 from webots_mcp.judging.detection.targets import OFF_TARGET, pursuits_in
-from webots_mcp.signals.meaning import words_in
-from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, unit_in, words_of
+from webots_mcp.signals.naming import BRANCHES, counted, listed, words_of
 from webots_mcp.signals.register import PLACES
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.segment import just_after
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
-_OFF_THE_FLOOR_M: Final = 0.3
 APART_S: Final = 3.0  # command and measurement for so long
 NO_COMMAND: Final = (
     "nothing says when it should move: publish commanded_m_s, the speeds of its wheels, or mode"
@@ -31,16 +30,6 @@ _OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is no
 _NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
 _NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
 _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
-_ALIKE: Final = 0.05  # of the faster side: wheels that differ by less drive straight on
-_TURNED_ALONE_RAD: Final = 0.3  # in 3 s, while both sides turn alike
-_SLIPS: Final = 0.5  # of the usual way per turn of the wheels
-_CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
-_NOISE_SHARE: Final = 0.1  # of the speed that it may take
-_CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
-_TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
-_LEAST_CELLS: Final = 10
-_SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
-_BY_WHEELS: Final = ("odom", "odometry")
 _FITTED: Final = 0.2  # of the way: so much of it lays one estimate over the other
 _LEAST_WAY_M: Final = 1.0
 _SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
@@ -115,24 +104,12 @@ def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
 def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
     """Whether more says that it should have moved than a constant mode, or motors that lift it."""
     said = stuck.details["evidence_for"].split("; ")
-    if _flies(run):
+    if flies(run.search):
         said = [each for each in said if not each.startswith("wheels at ")]
     by_mode = [each for each in said if each.startswith(("in mode ", "mode "))]
     mode = run.motion.mode
     may_change = mode is not None and len(set(run.frame.coded(mode.name).labels)) > 2
     return len(said) > len(by_mode) or (bool(said) and may_change)
-
-
-def _flies(run: RunUnderCheck) -> bool:
-    """Whether its motors are those of propellers: none is called a wheel, and it is off the floor.
-
-    The motors of what flies turn all the time.
-    """
-    motors, height = run.motion.wheels or run.motion.wheel_commands, run.motion.height
-    if height is None or any("wheel" in each.name.lower() for each in motors):
-        return False
-    heights = in_metres(height, run.frame.usable(height.name)[1])
-    return len(heights) > 0 and median(heights) > _OFF_THE_FLOOR_M
 
 
 # -- command and measurement -----------------------------------------------------------------------
@@ -181,126 +158,17 @@ def stays_upright(run: RunUnderCheck) -> Finding:
 
 
 def wheels_grip(run: RunUnderCheck) -> Finding:
-    """Fails where the wheels drove ahead for 3 s and it went less than half as far as usual."""
-    motion, position = run.motion, run.motion.position
-    wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
-    if position is None or not wheels:
-        raise NotSearchableError("publish the position and the speeds of its wheels")
-    if _flies(run):
-        raise NotSearchableError("its motors lift it")
-    if position[0].name.partition(".")[0] in _BY_WHEELS:
-        raise NotSearchableError(f"{position[0].name} is counted by the wheels themselves")
-    starts_s, lasts_s, ratios = _ratios(run, position, wheels)
-    known = np.isfinite(ratios)
-    if np.count_nonzero(known) < _LEAST_CELLS:
-        raise NotSearchableError("its wheels drove it ahead too seldom")
-    usual = median(ratios[ratios >= np.nanquantile(ratios, 0.5)])
-    rolled = ratios[ratios >= _SLIPS * usual]
-    usual = median(rolled)
-    if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
-        raise NotSearchableError("its speed and that of its wheels have no fixed ratio")
-    slips = runs_of(ratios < _SLIPS * usual, starts_s)
-    found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).spans())
-    if turned := _turns_though_straight(run, wheels):
-        return turned
-    unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
-    rolls = f"rolls {usual:.3g} m/s{unit}"
-    if not found:
-        return Finding("pass", f"{rolls}, over {np.count_nonzero(known) * lasts_s:.3g} s")
-    longest_s = max(each.duration_s for each in found) + 2 * lasts_s
-    least = min(float(np.nanmin(ratios[each.start : each.stop])) for each in found)
-    evidence = f"slipped {times(len(found))}, up to {longest_s:.3g} s; {rolls}, then {least:.3g}"
-    return Finding("fail", evidence, found[0].start_s, len(found), run.shows(wheels[0].name))
+    """Fails where the wheels drove ahead for 3 s and it went less than half as far as usual.
 
-
-def _turns_though_straight(run: RunUnderCheck, wheels: list[RegisteredSignal]) -> Finding | None:
-    """A robot that turned for long while the wheels of both sides turned alike: one side slips.
-
-    A robot that steers turns so by nature, and where none of its wheels has a side nothing is said.
+    Also where it turned while the wheels of both sides turned alike: one side slipped.
     """
-    heading = run.motion.heading
-    sides = {
-        side: [w for w in wheels if (run.meanings[w.name].side or "").endswith(side)]
-        for side in ("left", "right")
-    }
-    steers = any("steering" in words_in(name) for name in run.search.known)
-    if heading is None or steers or not all(sides.values()):
-        return None
-    frame, turn = run.frame, heading.turn or math.tau
-    course = unwrap(frame.numbers(heading.name), turn) * math.tau / turn
-    left, right = (
-        np.mean([frame.numbers(each.name) for each in wheels], axis=0) for wheels in sides.values()
-    )
-    fastest = np.maximum(np.abs(left), np.abs(right))
-    alike = (np.abs(left - right) <= _ALIKE * fastest) & (fastest > 0) & np.isfinite(course)
-    noise = run.noise.of(heading.name) * math.tau / turn
-    for rest in runs_of(alike, frame.times).spans():
-        if rest.end_s - rest.start_s < APART_S:
-            continue
-        part = course[rest.start : rest.stop]
-        clock = frame.times[rest.start : rest.stop]
-        cells = np.searchsorted(clock, np.arange(clock[0], clock[-1], APART_S))
-        turned = np.diff(part[cells])
-        far = np.flatnonzero(np.abs(turned) > max(_TURNED_ALONE_RAD, _NOISE * noise))
-        if not len(far):
-            continue
-        side = "left" if turned[far[0]] > 0 else "right"
-        total = float(np.abs(turned[far]).sum())
-        evidence = (
-            f"the {side} side slipped: it turned by {total:.3g} rad while the wheels of both "
-            "sides turned alike"
-        )
-        since_s = float(clock[cells[far[0]]])
-        return Finding("fail", evidence, since_s, 1, run.shows(heading.name, wheels[0].name))
-    return None
-
-
-def _ratios(
-    run: RunUnderCheck,
-    position: tuple[RegisteredSignal, RegisteredSignal],
-    wheels: list[RegisteredSignal],
-) -> tuple[Array, float, Array]:
-    """From cell to cell how far it went per turn of its wheels; NaN where these do not drive it.
-
-    Returns:
-        When each cell begins, how long cells are, and the ratios.
-    """
-    rows, x, y = places_in(run.frame, position)
-    clock = run.frame.times[rows]
-    speeds = np.nan_to_num([run.frame.numbers(each.name)[rows] for each in wheels])
-    mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
-    least = max(4 * run.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
-    ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
-    drives = np.sign(mean) * ahead
-    per_row_s = max(run.noise.interval_s, 1e-6)
-    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum())
-    speed_m_s = way_m / (max(1, int(np.count_nonzero(ahead))) * per_row_s)
-    noises = {each: 1.5 * run.noise.position_m * (per_row_s / each) ** 0.5 for each in _CELLS_S}
-    fit = (
-        each for each, noise_m in noises.items()
-        if each >= 3 * per_row_s and noise_m / each <= _NOISE_SHARE * speed_m_s
-    )  # fmt: skip
-    lasts_s = next(fit, _CELLS_S[-1])
-    cells = (clock // lasts_s).astype(np.intp)
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
-    if len(starts) < 2:
-        return np.zeros(0), lasts_s, np.zeros(0)
-    course = np.zeros(len(rows))
-    if (heading := run.motion.heading) is not None:
-        turn = heading.turn or math.tau
-        course = unwrap(run.frame.numbers(heading.name)[rows], turn) * math.tau / turn
-    counts = np.diff(starts, append=len(rows))
-    t, x, y, turned, course, driven = (
-        np.add.reduceat(each, starts) / counts for each in (clock, x, y, mean, course, drives)
-    )
-    whole = (np.abs(driven) == 1) & (counts >= 2)
-    both = whole[1:] & whole[:-1] & (driven[1:] == driven[:-1]) & (np.diff(cells[starts]) == 1)
-    both &= np.abs(np.diff(course)) <= _TURNS_RAD
-    rates = np.abs(turned[1:] + turned[:-1]) / 2 * np.diff(t)
-    went_m = np.hypot(np.diff(x), np.diff(y))
-    ratios = np.full(len(both), math.nan)
-    ratios[both] = went_m[both] / rates[both]
-    return clock[starts[:-1]], lasts_s, ratios
+    slips = run.events(SLIP.name)
+    if not slips:
+        return Finding("pass", run.found.verdicts.not_found.get(SLIP.name) or "no wheel slipped")
+    first = slips[0]
+    longest_s = max(each.duration_s for each in slips)
+    evidence = f"slipped {times(len(slips))}, up to {longest_s:.3g} s; {first.details['says']}"
+    return Finding("fail", evidence, first.start_s, len(slips), run.more(SLIP.name))
 
 
 # -- two estimates of one thing --------------------------------------------------------------------

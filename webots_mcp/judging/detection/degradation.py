@@ -105,4 +105,5 @@ DEGRADATION: Final = EventKind(
     of_numbers=True,
     lasts=True,
     ends_within_s=lambda event: math.inf,
+    drawn=3,
 )

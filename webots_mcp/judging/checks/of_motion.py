@@ -12,6 +12,7 @@ from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times, tot
 from webots_mcp.judging.detection.fall import FALL
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
+from webots_mcp.judging.detection.oscillation import OSCILLATION
 from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
 from webots_mcp.judging.detection.slip import SLIP, flies
 from webots_mcp.judging.detection.standstill import COMMAND_NOISE, TURNED_RAD
@@ -136,6 +137,28 @@ def follows_targets(run: RunUnderCheck) -> Finding:
         f"{longest.duration_s:.3g} s without coming nearer"
     )
     return Finding("fail", evidence, found[0].start_s, len(found), run.more(OFF_TARGET.name))
+
+
+def stays_stable(run: RunUnderCheck) -> Finding:
+    """Warns where an oscillation of heading, wheels, speed and the like became twice as large."""
+    growing = [
+        each
+        for each in run.events(OSCILLATION.name)
+        if each.details.get("amplitude_at_end", 0.0) > each.details.get("amplitude_at_start", 0.0)
+    ]
+    if not growing:
+        return Finding("pass", "no oscillation grew")
+    worst = max(
+        growing,
+        key=lambda e: e.details["amplitude_at_end"] / (e.details["amplitude_at_start"] or 1),
+    )
+    start, end = (worst.details[f"amplitude_at_{at}"] for at in ("start", "end"))
+    names = listed(list(dict.fromkeys(each.name or "" for each in growing)), 3)
+    evidence = (
+        f"{names}: the amplitude grew from {start:.3g} to {end:.3g} in {worst.duration_s:.3g} s, "
+        f"with a period of {worst.details['period_s']:.3g} s"
+    )
+    return Finding("warn", evidence, worst.start_s, len(growing), run.more(OSCILLATION.name))
 
 
 # -- attitude --------------------------------------------------------------------------------------

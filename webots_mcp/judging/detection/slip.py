@@ -212,7 +212,7 @@ def _ratios(
 
 SLIP: Final = EventKind(
     "slip",
-    "its wheels turned, it went less far or turned by itself",
+    "wheels turn, it goes less far",
     slip_events,
     lasts=True,
     least_s=lambda options: SLIP_S,

@@ -21,10 +21,7 @@ UPRIGHT_RAD: Final = math.radians(30)  # below it a robot stands ...
 FALLEN_RAD: Final = math.radians(60)  # ... beyond this it has tipped over ...
 DOWN_RAD: Final = math.radians(45)  # ... and beyond this it lies
 SETTLED_S: Final = 1.0  # for so long each of them has to last
-NO_ATTITUDE: Final = (
-    "publish roll and pitch (of an InertialUnit), in rad or deg; MCPBridge.attach and an observer "
-    "record them"
-)
+NO_ATTITUDE: Final = "publish roll and pitch (of an InertialUnit), in rad or deg"
 _OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
 
 

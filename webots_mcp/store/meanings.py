@@ -104,8 +104,14 @@ def with_stated(
         if name in plain:
             places = sorted([*plain[name], *places])  # the strongest first
         stated = tuple(stored[at].stated for at in places)
-        found[name] = replace(signal, stated=stated) if stated else signal
+        found[name] = _stated(signal, stated) if stated else signal
     return found
+
+
+def _stated(signal: RegisteredSignal, stated: tuple[StatedMeaning, ...]) -> RegisteredSignal:
+    """The signal with what was stated of it: its unit is the one that was stated."""
+    found = replace(signal, stated=stated)
+    return replace(found, unit=found.stated_unit or signal.unit)
 
 
 def stored_meanings(connection: sqlite3.Connection, robot_id: int) -> list[StoredMeaning]:

@@ -12,7 +12,7 @@ from tests.judging.asking import ask as ask_events
 from tests.simulator.observer.conftest import Watching
 from webots_mcp.database.connection import connect
 from webots_mcp.judging.checks import check_run
-from webots_mcp.simulator.observed_world import BodyPose, pose_of
+from webots_mcp.simulator.observed_bodies import BodyPose, pose_of
 from webots_mcp.store.meanings import meanings_of
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.segment import Subject

@@ -1,7 +1,8 @@
 """`fall`: a robot that stood upright tipped over and stayed down.
 
 The tilt is the angle between the robot's up axis now and while it stood at first, from its roll and
-pitch, so that a sensor that is mounted upside down does not matter.
+pitch, so that a sensor that is mounted upside down does not matter. What flies or climbs at such a
+tilt has not fallen: its position goes on changing.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
 from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
-from webots_mcp.judging.detection.search import EventKind, Search
-from webots_mcp.signals.naming import SOLIDS, WORLD
+from webots_mcp.judging.detection.search import EventKind, Search, in_metres
+from webots_mcp.signals.naming import SOLIDS, WORLD, words_of
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal
 
@@ -21,6 +22,9 @@ UPRIGHT_RAD: Final = math.radians(30)  # below it a robot stands ...
 FALLEN_RAD: Final = math.radians(60)  # ... beyond this it has tipped over ...
 DOWN_RAD: Final = math.radians(45)  # ... and beyond this it lies
 SETTLED_S: Final = 1.0  # for so long each of them has to last
+MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
+_BY_WHEELS: Final = frozenset(("odom", "odometry"))
+_NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
 NO_ATTITUDE: Final = "publish roll and pitch (of an InertialUnit), in rad or deg"
 _OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
 
@@ -54,6 +58,11 @@ def fall_events(search: Search) -> Iterator[Event]:
         if len(times) < 2:
             continue
         are_known = True
+        search.judged(
+            "fall",
+            filter(None, (attitude.roll, attitude.pitch)),
+            [(float(times[0]), float(times[-1]))],
+        )
         yield from _falls_of(search, attitude.body, times, tilt)
         largest_deg = math.degrees(float(tilt.max()))
         of_body = "" if attitude.body is None else f" of {attitude.body}"
@@ -69,6 +78,8 @@ def _falls_of(search: Search, body: str | None, times: Array, tilt: Array) -> It
         lies = tilt[run.start : run.stop]
         lasts_s = run.end_s - run.start_s
         if run.start_s < fell_s or lasts_s < SETTLED_S or lies.max() < FALLEN_RAD:
+            continue
+        if body is None and _moves_on(search, run.start_s, run.end_s):
             continue
         before = np.flatnonzero(tilt[: run.start] > UPRIGHT_RAD)
         left = run.start
@@ -88,6 +99,35 @@ def _falls_of(search: Search, body: str | None, times: Array, tilt: Array) -> It
             tilt_deg=round(math.degrees(float(np.median(lies))), 1),
             got_up=bool(len(up)),
         )
+
+
+def _moves_on(search: Search, start_s: float, end_s: float) -> bool:
+    """Return whether its place changed in most seconds of an interval.
+
+    Means of seconds are compared, so that neither noise nor the rate of rows decides. Nothing is
+    known to move where no place is known, or only what wheels count that may turn in the air.
+    """
+    motion = search.motion
+    places = [
+        each
+        for each in (*(motion.position or ()), motion.height)
+        if each is not None and _BY_WHEELS.isdisjoint(words_of(each.name.partition(".")[0]))
+    ]
+    part = search.frame.between(start_s, end_s)
+    seconds = np.floor((part.times - start_s) / SETTLED_S).astype(np.intp)
+    starts = np.flatnonzero(np.diff(seconds, prepend=-1))
+    if len(starts) < 2:
+        return False
+    counts = np.diff(starts, append=len(seconds))
+    moved_m2 = np.zeros(len(starts) - 1)
+    least_m = MOVES_M_S * SETTLED_S
+    for each in places:
+        values = in_metres(each, part.numbers(each.name))
+        means = np.add.reduceat(values, starts) / counts
+        moved_m2 += np.diff(means) ** 2
+        noise = in_metres(each, np.array([search.noise.of(each.name)]))[0]
+        least_m = max(least_m, float(_NOISE * noise / np.sqrt(np.median(counts))))
+    return bool(np.count_nonzero(moved_m2 > least_m**2) > len(moved_m2) / 2)
 
 
 def tilt_of(

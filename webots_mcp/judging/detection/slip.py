@@ -8,7 +8,7 @@ alike slips on the side that goes ahead less.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, median, np, runs_of
@@ -23,7 +23,7 @@ from webots_mcp.store.signals import RegisteredSignal
 SLIP_S: Final = 3.0  # for so long
 _ALIKE: Final = 0.05  # of the faster side: wheels that differ by less drive straight on
 _TURNED_ALONE_RAD: Final = 0.3  # in 3 s, while both sides turn alike
-_SLIPS: Final = 0.5  # of the usual way per turn of the wheels
+SLIPS: Final = 0.5  # of the usual way per turn of the wheels
 _CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
 _NOISE_SHARE: Final = 0.1  # of the speed that it may take
 _CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
@@ -67,12 +67,13 @@ def slip_events(search: Search) -> Iterator[Event]:
     if _Slip not in search.shared:
         search.shared[_Slip] = _slips_of(search, search.motion.position, wheels)
     slips, rolls, kept = search.shared[_Slip]
+    search.judged("slip", [*search.motion.position, *wheels], [search.whole.bounds_s])
     segment = search.segment
     for slip in slips:
         if slip.start_s < segment.end_s and slip.end_s >= segment.start_s:
             side = {"side": slip.side} if slip.side else {}
             yield search.event("slip", slip.start_s, slip.end_s, None, says=slip.says, **side)
-    search.note_nearest("slip", _SLIPS / max(kept, _SLIPS), rolls)
+    search.note_nearest("slip", SLIPS / max(kept, SLIPS), rolls)
 
 
 def flies(search: Search) -> bool:
@@ -104,13 +105,13 @@ def _slips_of(
     if np.count_nonzero(known) < _LEAST_CELLS:
         raise NotSearchableError("its wheels drove it ahead too seldom")
     usual = median(ratios[ratios >= np.nanquantile(ratios, 0.5)])
-    rolled = ratios[ratios >= _SLIPS * usual]
+    rolled = ratios[ratios >= SLIPS * usual]
     usual = median(rolled)
     if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
         raise NotSearchableError("its speed and that of its wheels have no fixed ratio")
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
     rolls = f"rolls {usual:.3g} m/s{unit}"
-    runs = runs_of(ratios < _SLIPS * usual, starts_s)
+    runs = runs_of(ratios < SLIPS * usual, starts_s)
     slips = list(_turns_though_straight(search, wheels))
     for run in runs.only(runs.durations_s + 2 * lasts_s >= SLIP_S).spans():
         least = float(np.nanmin(ratios[run.start : run.stop]))
@@ -171,6 +172,9 @@ def _ratios(
 
     Returns:
         When each cell begins, how long cells are, and the ratios.
+
+    Raises:
+        NotSearchableError: The position is too noisy to tell how far it went.
     """
     rows, x, y = places_in(search.whole, position)
     clock = search.whole.times[rows]
@@ -178,28 +182,38 @@ def _ratios(
     mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
     least = max(4 * search.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
     ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
-    drives = np.sign(mean) * ahead
-    per_row_s = max(search.noise.interval_s, 1e-6)
-    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum())
-    speed_m_s = way_m / (max(1, int(np.count_nonzero(ahead))) * per_row_s)
-    noises = {each: 1.5 * search.noise.position_m * (per_row_s / each) ** 0.5 for each in _CELLS_S}
-    fit = (
-        each for each, noise_m in noises.items()
-        if each >= 3 * per_row_s and noise_m / each <= _NOISE_SHARE * speed_m_s
-    )  # fmt: skip
-    lasts_s = next(fit, _CELLS_S[-1])
-    cells = (clock // lasts_s).astype(np.intp)
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
-    if len(starts) < 2:
-        return np.zeros(0), lasts_s, np.zeros(0)
     course = np.zeros(len(rows))
     if (heading := search.motion.heading) is not None:
         turn = heading.turn or math.tau
         course = unwrap(search.whole.numbers(heading.name)[rows], turn) * math.tau / turn
-    counts = np.diff(starts, append=len(rows))
-    t, x, y, turned, course, driven = (
-        np.add.reduceat(each, starts) / counts for each in (clock, x, y, mean, course, drives)
+    per_row_s = max(search.noise.interval_s, 1e-6)
+    columns = (clock, x, y, mean, course, np.sign(mean) * ahead)
+    for lasts_s in [each for each in _CELLS_S if each >= 3 * per_row_s] or _CELLS_S[-1:]:
+        starts_s, ratios, went_m_s = _ratios_in(columns, lasts_s)
+        noise_m_s = 1.5 * search.noise.position_m * (per_row_s / lasts_s) ** 0.5 / lasts_s
+        if not len(went_m_s) or noise_m_s <= _NOISE_SHARE * median(went_m_s):
+            return starts_s, lasts_s, ratios
+    raise NotSearchableError(
+        f"position noise of {search.noise.position_m:.2g} m at a row each {per_row_s:.3g} s hides "
+        "how far it went"
     )
+
+
+def _ratios_in(columns: Sequence[Array], lasts_s: float) -> tuple[Array, Array, Array]:
+    """The same in cells of one length, and how fast it went in those that count.
+
+    Args:
+        columns: Times, x, y, the mean speed of the wheels, the course, and 1 or -1 where these
+            drive it ahead or back; in rows with a position.
+        lasts_s: How long cells are.
+    """
+    clock = columns[0]
+    cells = (clock // lasts_s).astype(np.intp)
+    starts = np.flatnonzero(np.diff(cells, prepend=-1))
+    if len(starts) < 2:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    counts = np.diff(starts, append=len(clock))
+    t, x, y, turned, course, driven = (np.add.reduceat(each, starts) / counts for each in columns)
     whole = (np.abs(driven) == 1) & (counts >= 2)
     both = whole[1:] & whole[:-1] & (driven[1:] == driven[:-1]) & (np.diff(cells[starts]) == 1)
     both &= np.abs(np.diff(course)) <= _TURNS_RAD
@@ -207,7 +221,7 @@ def _ratios(
     went_m = np.hypot(np.diff(x), np.diff(y))
     ratios = np.full(len(both), math.nan)
     ratios[both] = went_m[both] / rates[both]
-    return clock[starts[:-1]], lasts_s, ratios
+    return clock[starts[:-1]], ratios, went_m[both] / np.diff(t)[both]
 
 
 SLIP: Final = EventKind(

@@ -363,10 +363,10 @@ class _Recording:
         state = dict({} if is_stale else self._values)
         pose = self._body.pose_now() or {}
         own = pose.keys() & state.keys()
-        beside = pose.keys() if own & _PLACE else own
-        state |= {name: value for name, value in pose.items() if name not in beside}
-        if beside:
-            state[SEEN] = {name: value for name, value in pose.items() if name in beside}
+        moved = pose.keys() if own & _PLACE else own
+        state |= {name: value for name, value in pose.items() if name not in moved}
+        if moved:
+            state[SEEN] = {name: value for name, value in pose.items() if name in moved}
         if self._sequence.last is not None:
             state.setdefault(MISSED, self._sequence.missed)
         encoded = encode(state)

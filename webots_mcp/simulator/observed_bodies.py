@@ -84,7 +84,7 @@ class BodyPose(NamedTuple):
 
 
 def pose_of(matrix: Sequence[float], sim_time_s: float, up_axis: int) -> BodyPose:
-    """Return the pose that a matrix of Webots tells.
+    """Return the pose given by a matrix of Webots.
 
     Roll and pitch are those of the world's up direction in the body's own frame, so that they do
     not depend on where the body heads. Where the world's y axis is up (NUE), its z axis points to

@@ -15,6 +15,7 @@ from webots_mcp import MemoryDatabase, testing
 from webots_mcp.cli import described
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS
+from webots_mcp.judging.detection.events import KINDS
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.signals.meaning import QUANTITIES, ROLES, SIDES, short_forms, understood_words
 from webots_mcp.testing import pytest_plugin
@@ -78,6 +79,20 @@ def checks(_page: str = "") -> str:
     """Each check with what it needs."""
     rows = [[each.name, each.means, each.needs or "nothing"] for each in CHECKS]
     return "## The checks\n\n" + _table(["check", "when it warns and fails", "needs"], rows)
+
+
+def events(_page: str = "") -> str:
+    """Each kind of event: what it is, whether it lasts, and the checks that judge it."""
+    rows = [
+        [
+            f"`{kind.name}`",
+            kind.means or kind.name,
+            "yes" if kind.lasts else "no",
+            ", ".join(check.name for check in CHECKS if kind.name in check.kinds),
+        ]
+        for kind in KINDS
+    ]
+    return "## All kinds\n\n" + _table(["kind", "what it is", "has a duration", "checks"], rows)
 
 
 def meanings(_page: str = "") -> str:
@@ -201,6 +216,7 @@ def _table(columns: list[str], rows: list[list[str]]) -> str:
 ADDED: Final[dict[str, Callable[[str], str]]] = {
     "docs/index": navigation,
     "docs/check": checks,
+    "docs/events": events,
     "docs/meanings": meanings,
     "docs/tools": tools,
     "docs/command-line": commands,

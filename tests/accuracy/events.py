@@ -84,7 +84,12 @@ def events(bench: Bench) -> Iterator[str]:
     yield f"Measured by their checks: {', '.join(f'`{kind}`' for kind in CHECKED)}."
 
 
-CHECKED: Final = ("off_target", "fall", "degradation")  # kinds that labelled runs of checks show
+CHECKED: Final = (
+    "off_target",
+    "fall",
+    "slip",
+    "degradation",
+)  # kinds that labelled runs of checks show
 _EVENTS: Final = """\
 For each row interval and each level of noise recordings of {recordings} kinds are drawn, {cases}
 of each: drives, stops, docking, creeping, robots that are held, sensors that fail, values that

@@ -164,10 +164,83 @@ def test_a_distance_sensor_has_the_range_of_its_lookup_table(
     assert (said.quantity, said.unit, said.low, said.high) == ("distance", unit, low, high)
 
 
-def test_latitude_and_longitude_are_no_position_in_metres() -> None:
-    assert said_of(gps=device("GPS", getCoordinateSystem=1)) == {}
+def test_latitude_and_longitude_are_no_position_in_metres_but_the_altitude_is_a_height() -> None:
+    globe = said_of(gps=device("GPS", getCoordinateSystem=1))
+    assert [(each.quantity, each.unit) for each in globe.values()] == [
+        ("angle", "deg"), ("angle", "deg"), ("height", "m")
+    ]  # fmt: skip
     local = said_of(gps=device("GPS", getCoordinateSystem=0))
     assert [each.quantity for each in local.values()] == ["x", "y", "height"]
+
+
+def world_of(system: str) -> Any:
+    """The root of a world with that coordinate system."""
+    value = SimpleNamespace(value=system, getCount=lambda: -1)
+    info = scene_node("WorldInfo", 7, coordinateSystem=value)
+
+    def get_node(_: int) -> Any:
+        return info
+
+    top = SimpleNamespace(getTypeName=lambda: "MFNode", getCount=lambda: 1, getMFNode=get_node)
+    return scene_node("Group", 0, children=top)
+
+
+def scene_node(type_name: str, number: int, **fields: Any) -> Any:
+    """A node that a walk through the scene may meet."""
+    return SimpleNamespace(
+        getId=lambda: number,
+        getTypeName=lambda: type_name,
+        getBaseTypeName=lambda: type_name,
+        getDef=str,
+        isProto=lambda: False,
+        getField=fields.get,
+    )
+
+
+@pytest.mark.parametrize(
+    ("system", "is_supervisor", "quantities"),
+    [
+        ("NUE", True, ["x", "height", "y"]),
+        ("ENU", True, ["x", "y", "height"]),
+        ("NUE", False, ["x", "y", "height"]),  # it cannot look into the scene
+    ],
+)
+def test_a_gps_knows_its_height_where_the_y_axis_points_up(
+    system: str, is_supervisor: bool, quantities: list[str]
+) -> None:
+    gps = device("GPS", getCoordinateSystem=0)
+    robot = SimpleNamespace(devices={"gps": gps}, getRoot=lambda: world_of(system))
+    found = describe_devices(robot, is_supervisor=is_supervisor)
+    assert [said.quantity for said, _ in found] == quantities
+
+
+def test_what_a_camera_and_a_radar_see_and_grippers_and_the_battery_are_known() -> None:
+    robot = SimpleNamespace(
+        devices={"cam": device("Camera"), "radar": device("Radar"), "hand": device("Connector")},
+        batterySensorGetValue=lambda: 10.0,
+    )
+    said = {each.name: each for each, _ in describe_devices(robot, is_supervisor=False)}
+    assert {name: each.quantity for name, each in said.items()} == {
+        "sensors.cam.count": "count", "sensors.cam.min_m": "distance",
+        "sensors.cam.nearest.*.id": "count", "sensors.cam.nearest.*.colors.*": "colour",
+        "sensors.radar.count": "count", "sensors.radar.min_m": "distance",
+        "sensors.radar.nearest.*.speed_m_s": "speed",
+        "sensors.radar.nearest.*.azimuth_rad": "angle",
+        "sensors.radar.nearest.*.receiver_power": "power", "actuators.hand.locked": "flag",
+        "actuators.hand.on": "flag", "actuators.hand.presence": "flag", "battery_j": "energy",
+    }  # fmt: skip
+    assert said["battery_j"].unit == "J"
+    plain = device("Camera", hasRecognition=False)
+    assert said_of(cam=plain) == {}
+
+
+def test_the_sensor_of_a_linear_motor_is_in_metres_whatever_it_says_itself() -> None:
+    sensor = device("PositionSensor", getName="height", getType=0)
+    motor = device("Motor", getType=1, getPositionSensor=sensor)
+    type(motor).LINEAR = 1  # type: ignore[attr-defined]
+    found = said_of(height=sensor, lift=motor)
+    assert found["sensors.height"].unit == "m"
+    assert found["motors.lift.target_position_m"].target_of == "sensors.height"
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import described, names
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.database.connection import OLDEST_SQLITE, SCHEMA_FILE
+from webots_mcp.judging.checks import CHECKS
 from webots_mcp.judging.detection.events import kind_names
 from webots_mcp.questions.arguments import MAX_WAIT_S
 from webots_mcp.server.mcp_server import create_server
@@ -114,6 +115,16 @@ def test_the_pages_name_only_kinds_of_events_that_there_are() -> None:
     named = [kind for kinds in found for kind in kinds]
     assert named
     assert set(named) <= set(kind_names())
+
+
+def test_the_page_of_events_has_each_kind_and_what_a_check_makes_of_it() -> None:
+    text = page("events.md")
+    headings = " ".join(re.findall(r"(?m)^## (.+)$", text)).replace(",", " ").split()
+    facts = text[text.index("## What was recorded") :]
+    told = {*headings, *re.findall(r"`(\w+)`", facts)}
+    assert set(kind_names()) <= told
+    judged = [check for check in CHECKS if check.kinds and set(check.kinds) & set(headings)]
+    assert [each.name for each in judged if f'"{each.name}"' not in text] == []
 
 
 def test_the_first_page_leads_to_each_other_once() -> None:

@@ -90,7 +90,10 @@ def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:
     }  # fmt: skip
     steps = "simulation time [s]; line: mean by time, band: minimum to maximum of every 0.6 s"
     assert " ".join(steps.split()) in {" ".join(word.split()) for word in words(picture)}
-    assert picture.caption == "rover, run 1, 0 to 119.9 s: pose.0, heading over mode"
+    assert picture.caption == (
+        "rover, run 1, 0 to 119.9 s: pose.0, heading over mode; "
+        "events: stuck, jump, oscillation, log, command"
+    )
 
 
 def test_what_could_not_be_drawn_is_said(rover: sqlite3.Connection) -> None:

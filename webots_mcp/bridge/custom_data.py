@@ -34,6 +34,7 @@ from webots_mcp.signals.register import SignalNames, StateChanges
 
 TEXT: Final = "custom_data"  # the signal of a text that is no JSON object
 MISSED: Final = "seq_missed"  # how many messages of this run were overwritten before a reading
+_PLACE: Final = frozenset(("x_m", "y_m", "z_m", "heading_rad"))  # they stay together
 SEEN: Final = "seen"  # the branch of the pose where a robot publishes one of its keys itself
 LONGEST_TEXT: Final = 65_536  # characters that are taken for JSON, and sent with each step
 
@@ -361,7 +362,11 @@ class _Recording:
         is_stale = self._clock.sim_time_s < self._stale_until_s
         state = dict({} if is_stale else self._values)
         pose = self._body.pose_now() or {}
-        state |= {SEEN: pose} if pose.keys() & state.keys() else pose
+        own = pose.keys() & state.keys()
+        moved = pose.keys() if own & _PLACE else own
+        state |= {name: value for name, value in pose.items() if name not in moved}
+        if moved:
+            state[SEEN] = {name: value for name, value in pose.items() if name in moved}
         if self._sequence.last is not None:
             state.setdefault(MISSED, self._sequence.missed)
         encoded = encode(state)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.bridge.devices import SECTORS
+from webots_mcp.bridge.scene_nodes import world_up_axis
 from webots_mcp.signals.meaning import LONGEST_NAME, DeclaredMeaning, Quantity
 
 _MOST_MOTORS: Final = 64  # that are looked up in the scene: each takes about ten requests
@@ -40,6 +41,7 @@ def describe_devices(robot: Any, *, is_supervisor: bool) -> list[Described]:
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
     motors = {name: each for name, each in devices.items() if type(each).__name__ == "Motor"}
     moved_by_motor = _moved_by(robot, motors) if is_supervisor and motors else {}
+    up_axis = _up_axis(robot, devices) if is_supervisor else 2
     sensors = {name: _ask(motor, "getPositionSensor") for name, motor in motors.items()}
     found: list[Described] = []
     joints: dict[str, str] = {}
@@ -57,8 +59,12 @@ def describe_devices(robot: Any, *, is_supervisor: bool) -> list[Described]:
             said = _of_position_sensor(name, device, motors.get(joint), moved_by_motor.get(joint))
         else:
             said = describe(name, device) if describe is not None else iter(())
+            if type(device).__name__ == "GPS" and up_axis == 1:
+                said = _in_nue(said)
         why = _why(device, moved_by_motor.get(joints.get(name, name)))
         found += [(each, why) for each in said if _is_storable(each.name)]
+    if hasattr(robot, "batterySensorGetValue"):
+        found.append((_measured("battery_j", "energy", "J"), "battery of the robot"))
     return found
 
 
@@ -145,12 +151,35 @@ def _of_one_number(quantity: Quantity, unit: str | None) -> Any:
 
 
 def _of_gps(name: str, device: Any) -> Iterator[DeclaredMeaning]:
-    """Yield the coordinates, unless they are latitude and longitude, which are not in metres."""
-    if _ask(device, "getCoordinateSystem") in (None, _WGS84):
+    """Where it is and how high; latitude and longitude are no position in metres."""
+    system = _ask(device, "getCoordinateSystem")
+    if system is None:
         return
-    quantities: tuple[Quantity, ...] = ("x", "y", "height")
-    for item, quantity in enumerate(quantities):
-        yield _measured(f"sensors.{name}.{item}", quantity, "m")
+    plane: tuple[Quantity, Quantity] = ("angle", "angle") if system == _WGS84 else ("x", "y")
+    for item, quantity in enumerate(plane):
+        unit = "deg" if quantity == "angle" else "m"
+        yield _measured(f"sensors.{name}.{item}", quantity, unit)
+    yield _measured(f"sensors.{name}.2", "height", "m")
+
+
+def _in_nue(said: Iterator[DeclaredMeaning]) -> Iterator[DeclaredMeaning]:
+    """What a GPS says in a world whose y axis points up."""
+    quantities: dict[Quantity | None, Quantity] = {"y": "height", "height": "y"}
+    is_local = False
+    for each in said:
+        is_local = is_local or each.quantity == "x"  # else latitude, longitude and altitude
+        swapped = quantities.get(each.quantity, each.quantity) if is_local else each.quantity
+        yield each._replace(quantity=swapped)
+
+
+def _up_axis(robot: Any, devices: dict[str, Any]) -> int:
+    """The axis of the world that points up, where a GPS makes that a question."""
+    if not any(type(each).__name__ == "GPS" for each in devices.values()):
+        return 2
+    try:
+        return world_up_axis(robot)
+    except Exception:  # noqa: BLE001  (what is not known changes nothing)
+        return 2
 
 
 def _of_inertial_unit(name: str, _: Any) -> Iterator[DeclaredMeaning]:
@@ -172,6 +201,30 @@ def _of_ranges(name: str, device: Any) -> Iterator[DeclaredMeaning]:
 def _of_objects(name: str, _: Any) -> Iterator[DeclaredMeaning]:
     yield _measured(f"sensors.{name}.count", "count")
     yield _measured(f"sensors.{name}.min_m", "distance", "m")
+
+
+def _of_camera(name: str, camera: Any) -> Iterator[DeclaredMeaning]:
+    """What it recognises. Which object is the nearest one may change from row to row."""
+    if _ask(camera, "hasRecognition") is False:
+        return
+    yield from _of_objects(name, camera)
+    yield _measured(f"sensors.{name}.nearest.*.id", "count")
+    yield _measured(f"sensors.{name}.nearest.*.colors.*", "colour")
+
+
+def _of_radar(name: str, radar: Any) -> Iterator[DeclaredMeaning]:
+    yield from _of_objects(name, radar)
+    each = f"sensors.{name}.nearest.*"
+    yield _measured(f"{each}.speed_m_s", "speed", "m/s")
+    yield _measured(f"{each}.azimuth_rad", "angle", "rad")
+    yield _measured(f"{each}.receiver_power", "power", "dBm")
+
+
+def _of_gripper(name: str, _: Any) -> Iterator[DeclaredMeaning]:
+    """A connector or a vacuum gripper: whether it holds, and whether something is there."""
+    for switch in ("locked", "on"):
+        yield DeclaredMeaning(f"actuators.{name}.{switch}", "flag", "commanded")
+    yield _measured(f"actuators.{name}.presence", "flag")
 
 
 def _of_touch_sensor(name: str, device: Any) -> Iterator[DeclaredMeaning]:
@@ -197,8 +250,9 @@ def _of_led(name: str, _: Any) -> Iterator[DeclaredMeaning]:
 _SENSORS: Final[dict[str, Callable[[str, Any], Iterator[DeclaredMeaning]]]] = {
     "Accelerometer": _of_vector("acceleration", "m/s²"),
     "Altimeter": _of_one_number("height", "m"),
-    "Camera": _of_objects,
+    "Camera": _of_camera,
     "Compass": _of_vector("magnetic field", None),
+    "Connector": _of_gripper,
     "DistanceSensor": _of_distance_sensor,
     "GPS": _of_gps,
     "Gyro": _of_vector("angular velocity", "rad/s"),
@@ -206,10 +260,11 @@ _SENSORS: Final[dict[str, Callable[[str, Any], Iterator[DeclaredMeaning]]]] = {
     "LED": _of_led,
     "Lidar": _of_ranges,
     "LightSensor": _of_one_number("light", None),
-    "Radar": _of_objects,
+    "Radar": _of_radar,
     "RangeFinder": _of_ranges,
     "Receiver": _of_receiver,
     "TouchSensor": _of_touch_sensor,
+    "VacuumGripper": _of_gripper,
 }
 
 
@@ -262,7 +317,9 @@ def _of_motor(
 def _of_position_sensor(
     name: str, sensor: Any, motor: Any, moved_by_motor: _MovedBody | None
 ) -> Iterator[DeclaredMeaning]:
-    unit = "m" if _ask(sensor, "getType") == getattr(sensor, "LINEAR", "none") else "rad"
+    linear = _ask(sensor, "getType") == getattr(sensor, "LINEAR", "none")
+    linear = linear or (motor is not None and _is_linear(motor))
+    unit = "m" if linear else "rad"
     low, high = _Limits() if motor is None else _limits_of(motor)
     side = moved_by_motor.side if moved_by_motor else None
     yield _measured(f"sensors.{name}", "joint position", unit, side=side, low=low, high=high)

@@ -140,6 +140,17 @@ def walk(
             yield found
 
 
+def world_up_axis(robot: Any) -> int:
+    """Return the axis of the world that points up: 1 (y) in a world of type NUE, else 2 (z).
+
+    Args:
+        robot: A Supervisor.
+    """
+    top = walk(robot.getRoot(), deepest=1, everything=True)
+    infos = (scene.node for scene in top if scene.base_type == "WorldInfo")
+    return next((1 for info in infos if read_value(info, "coordinateSystem") == "NUE"), 2)
+
+
 def holds_solids(node: Any) -> bool:
     """Return whether a walk yields a node even without `everything`."""
     return node.getBaseTypeName() in WALKED

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from webots_mcp.analysis.arrays import Gap
-from webots_mcp.plotting.colours import MOST_VALUES, OTHER_VALUES
+from webots_mcp.plotting.colours import LINES, MOST_VALUES, OTHER_VALUES
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.frame_summary import Point, spelled
 from webots_mcp.store.series import ChangeColumns, RunHistory
@@ -34,12 +34,14 @@ class Lane:
     Attributes:
         values: In the order of their colours.
         merged: Values that share the name "others", because there are too many to tell apart.
+        colour: Of events; a kind has the same one in each picture.
     """
 
     name: str
     intervals: Sequence[Interval]
     values: Sequence[str]
     merged: Sequence[str] = ()
+    colour: str = LINES[1]
 
     def moved(self, origin_s: float, name: str) -> Lane:
         """Return the same under that name, on a clock that begins at `origin_s`."""

@@ -16,6 +16,7 @@ from webots_mcp.judging.detection.events import Events, Found, drawn_kinds, find
 from webots_mcp.judging.detection.kinds import Event, EventOptions
 from webots_mcp.judging.detection.search import find_motion
 from webots_mcp.plotting.canvas import short
+from webots_mcp.plotting.colours import EVENT_COLOURS
 from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.reading.catalogue import one_signal, signals_of
@@ -283,7 +284,8 @@ def _not_looked_for(verdicts: Verdicts) -> list[str]:
 def _lane(kind: str, found: Events, part: PlottedRun) -> Lane:
     events = sorted((e for e in found.events if e.kind == kind), key=lambda event: event.start_s)
     intervals = [_interval(event, part).moved(part.origin_s) for event in events]
-    return Lane(kind, intervals, ())
+    place = [each.name for each in drawn_kinds()].index(kind)
+    return Lane(kind, intervals, (), colour=EVENT_COLOURS[place % len(EVENT_COLOURS)])
 
 
 def _interval(event: Event, part: PlottedRun) -> Interval:

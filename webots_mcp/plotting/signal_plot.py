@@ -238,7 +238,8 @@ def _caption(plot: SignalAxes) -> str:
     below = [lane.name for lane in plot.lanes]
     behind = f" over {plot.bands.name}" if plot.bands else ""
     unread = f", from {plot.unread[0].start_s:g} s on not all was read" if plot.unread else ""
-    return f"{plot.title}: {', '.join([*shown, *below])}{behind}{unread}"
+    events = "; events: " + ", ".join(lane.name for lane in plot.events) if plot.events else ""
+    return f"{plot.title}: {', '.join([*shown, *below])}{behind}{events}{unread}"
 
 
 def _notes(parts: Sequence[PlottedRun], curves: Sequence[Curve]) -> list[str]:
@@ -508,7 +509,7 @@ class _SignalPainter:
                 if row < len(plot.lanes):
                     paint_area(canvas, self._styles[each.value], box)
                 else:
-                    paint_area(canvas, Area(LINES[1], dotted=False), box, 0.3)
+                    paint_area(canvas, Area(lane.colour, dotted=False), box, 0.3)
         self._hatch(frame)
         self._close()
         for row, lane in enumerate(plot.rows):
@@ -534,7 +535,7 @@ class _SignalPainter:
         ends = [*(each.start_s for each in lane.intervals[1:]), frame.x[1]]
         for each, end_s in zip(lane.intervals, ends, strict=True):
             x = float(frame.px(each.start_s))
-            paint_mark(self._canvas, "diamond", (x, middle), 4.0, fill=LINES[1])
+            paint_mark(self._canvas, "diamond", (x, middle), 4.0, fill=lane.colour)
             if _has_room(frame, Interval(each.value, each.start_s, end_s)):
                 self._name(short(each.value), x, middle, shift=7.0)
 

@@ -21,7 +21,8 @@ Quantity = Literal[
     "x", "y", "height", "heading", "roll", "pitch", "speed", "turn rate", "wheel speed",
     "motor speed", "joint position", "joint speed", "distance", "force", "torque", "current",
     "voltage", "temperature", "pressure", "light", "acceleration", "angular velocity",
-    "magnetic field", "percentage", "time", "count", "flag", "mode", "text",
+    "magnetic field", "percentage", "energy", "power", "angle", "colour", "time", "count", "flag",
+    "mode", "text",
 ]  # fmt: skip
 Role = Literal["measured", "commanded", "target", "limit"]
 Source = Literal["declared", "device", "named", "behaviour", "unknown"]
@@ -92,6 +93,7 @@ INPUTS: Final = frozenset((  # what a person moves by hand
     "keyboard", "key", "button", "input",
 ))  # fmt: skip
 _TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
+_HEIGHTS: Final = frozenset(("height", "altitude"))
 _GYROS: Final = frozenset(("gyro", "imu", "gyroscope"))
 _WORD_QUANTITIES: Final[dict[str, Quantity]] = {
     "distance": "distance", "force": "force", "torque": "torque", "voltage": "voltage",
@@ -162,6 +164,7 @@ def understood_words() -> dict[str, list[str]]:
         "joint position or joint speed": _JOINTS,
         "motor speed, not of a wheel": _FREE_MOTORS,
         "angular velocity": said.get("angular velocity", set()) | _GYROS,
+        "height, with a unit of length": _HEIGHTS,
         "count": _COUNTS,
         "moved by hand, no position": INPUTS,
     }
@@ -230,15 +233,17 @@ _OF_POSES: Final[dict[str, Quantity]] = {"x": "x", "y": "y", "z": "height", "yaw
 # A quantity that may be nothing at any time: an actuator is off, a foot is in the air, it is dark.
 CAN_BE_OFF: Final = frozenset[Quantity | None]((
     "speed", "turn rate", "wheel speed", "motor speed", "joint speed", "force", "torque", "current",
-    "pressure", "light", "acceleration", "angular velocity",
+    "pressure", "light", "acceleration", "angular velocity", "power",
 ))  # fmt: skip
 # A quantity that cannot step away and back between two rows: its mass or capacity forbids it.
 INERT: Final = frozenset[Quantity | None]((
     "x", "y", "height", "heading", "roll", "pitch", "joint position", "voltage", "temperature",
-    "percentage",
+    "percentage", "energy",
 ))  # fmt: skip
-ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint position"))
-_NO_SENSOR: Final = frozenset[Quantity | None]((None, "count", "flag", "mode", "text", "time"))
+ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint position", "angle"))
+_NO_SENSOR: Final = frozenset[Quantity | None]((
+    None, "colour", "count", "flag", "mode", "text", "time",
+))  # fmt: skip
 
 UNKNOWN: Final = Meaning(why="its name does not say what it is")
 
@@ -579,7 +584,7 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
             return "roll"
         return "pitch" if "pitch" in said else None
     if unit in ("m", "cm", "mm", "km") and not said & _JOINTS:
-        return "distance"
+        return "height" if said & _HEIGHTS else "distance"
     for word in words:
         if word in _WORD_QUANTITIES:
             return _WORD_QUANTITIES[word]

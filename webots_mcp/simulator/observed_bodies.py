@@ -12,11 +12,12 @@ import math
 import re
 import time
 import unicodedata
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from webots_mcp.bridge.scene_nodes import MOST_NODES, SceneNode, read_value, walk
+from webots_mcp.bridge.scene_nodes import MOST_NODES, SceneNode, read_value, walk, world_up_axis
+from webots_mcp.signals.meaning import DeclaredMeaning, Quantity
 from webots_mcp.signals.naming import SEEN_SPEED, SOLIDS, WORLD
 
 DIGITS: Final = 6
@@ -48,30 +49,61 @@ class WalkLimits:
 
 
 _LIMITS: Final = WalkLimits()
+_UNITS: Final[dict[Quantity, str]] = {
+    "x": "m", "y": "m", "height": "m", "heading": "rad", "roll": "rad", "pitch": "rad",
+    "speed": "m/s",
+}  # fmt: skip
 
 
 class BodyPose(NamedTuple):
-    """The pose of a body at a moment."""
+    """Where a body is at a moment, and how it is turned against the world's up direction."""
 
     sim_time_s: float
     x_m: float
     y_m: float
     z_m: float
     heading_rad: float
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    height_m: float = 0.0
 
     def distance_m(self, position: list[float]) -> float:
         """Return how far away another position is."""
         return math.dist((self.x_m, self.y_m, self.z_m), position)
 
     def signals(self) -> dict[str, float]:
-        """Return the pose as it is recorded."""
-        _, x, y, z, heading = (round(value, DIGITS) for value in self)
-        return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading}
+        """Return it as it is recorded."""
+        values = self._asdict()
+        del values["sim_time_s"]
+        return {name: round(value, DIGITS) + 0.0 for name, value in values.items()}  # no -0.0
 
     def is_elsewhere(self, other: BodyPose) -> bool:
         """Return whether a body has moved or turned between the two."""
         turned = abs(math.remainder(self.heading_rad - other.heading_rad, math.tau))
         return self.distance_m([*other[1:4]]) > _LIMITS.moved_m or turned > _LIMITS.turned_rad
+
+
+def pose_of(matrix: Sequence[float], sim_time_s: float, up_axis: int) -> BodyPose:
+    """Return the pose given by a matrix of Webots.
+
+    Roll and pitch are those of the world's up direction in the body's own frame, so that they do
+    not depend on where the body heads. Where the world's y axis is up (NUE), its z axis points to
+    the right of its x axis: angles are those of the same body in a world whose z axis is up.
+
+    Args:
+        matrix: 16 numbers by rows, as `Node.getPose` returns them.
+        sim_time_s: When it was there.
+        up_axis: The axis of the world that points up: 1 or 2.
+    """
+    place = matrix[3], matrix[7], matrix[11]
+    up = matrix[4 * up_axis : 4 * up_axis + 3]
+    if up_axis == 1:
+        heading_rad, up = math.atan2(-matrix[8], matrix[0]), (up[0], -up[2], up[1])
+    else:
+        heading_rad = math.atan2(matrix[4], matrix[0])
+    roll_rad = math.atan2(up[1], up[2])
+    pitch_rad = math.asin(max(-1.0, min(1.0, -up[0])))
+    return BodyPose(sim_time_s, *place, heading_rad, roll_rad, pitch_rad, place[up_axis])
 
 
 @dataclass
@@ -86,6 +118,7 @@ class ObservedBody:
         is_robot: Whether it is a robot.
         place: Where it was seen last.
         has_moved: Whether it was ever seen to move.
+        up_axis: The axis of the world that points up.
         speed_mps: Between the two places that were seen last; None before.
     """
 
@@ -94,6 +127,7 @@ class ObservedBody:
     name: str
     controller: str
     is_robot: bool
+    up_axis: int = 2
     place: BodyPose | None = None
     has_moved: bool = False
     speed_mps: float | None = None
@@ -124,10 +158,8 @@ class ObservedBody:
 
     def _seen(self, sim_time_s: float) -> BodyPose | None:
         node: Any = self.scene.node
-        pose = node.getPose()
-        if not math.isfinite(pose[3]):
-            return None
-        return BodyPose(sim_time_s, pose[3], pose[7], pose[11], math.atan2(pose[4], pose[0]))
+        matrix: Sequence[float] = node.getPose()
+        return pose_of(matrix, sim_time_s, self.up_axis) if math.isfinite(matrix[3]) else None
 
     def _go_on(self, place: BodyPose) -> None:
         before = self.place
@@ -211,6 +243,7 @@ class ObservedBodies:
     def __init__(self, robot: Any, period_ms: int, warn: Any) -> None:
         self._robot = robot
         self._root = robot.getRoot()
+        self._up_axis = world_up_axis(robot)
         self._own_id = int(robot.getSelf().getId())
         self._period_ms = period_ms
         self._warn = warn
@@ -272,6 +305,21 @@ class ObservedBodies:
         }
         return described | ({"more": True} if self._is_cut else {})
 
+    def describe_signals(self) -> list[tuple[DeclaredMeaning, str]]:
+        """Return what the signals of all bodies mean, and the device that says it."""
+        quantities: dict[str, Quantity] = {
+            "x_m": "x", "y_m": "y", "z_m": "height", "heading_rad": "heading",
+            "roll_rad": "roll", "pitch_rad": "pitch", "height_m": "height", SEEN_SPEED: "speed",
+        }  # fmt: skip
+        if self._up_axis == 1:
+            quantities |= {"y_m": "height", "z_m": "y"}
+        said = f"pose of the body by the supervisor {str(self._robot.getName())!r}"
+        return [
+            (DeclaredMeaning(f"{branch}.*.{part}", quantity, "measured", _UNITS[quantity]), said)
+            for branch in (WORLD, SOLIDS)
+            for part, quantity in quantities.items()
+        ]
+
     def find(self, name: object) -> ObservedBody | None:
         """Return the body of that word, DEF name or name."""
         named = [body for body in self.bodies.values() if body.key == name]
@@ -327,7 +375,7 @@ class ObservedBodies:
             key = self._name(scene)
         is_robot = scene.base_type == "Robot"
         controller = str((is_robot and read_value(scene.node, "controller")) or "")
-        self.bodies[key] = ObservedBody(key, scene, scene.name, controller, is_robot)
+        self.bodies[key] = ObservedBody(key, scene, scene.name, controller, is_robot, self._up_axis)
         if self._is_tracking:
             scene.node.enablePoseTracking(self._period_ms)
         self._is_new = True

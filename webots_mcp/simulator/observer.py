@@ -19,6 +19,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any, Final
 
@@ -26,10 +27,15 @@ from webots_mcp.bridge.custom_data import CustomDataReader, ObserverParts
 from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.signals.meaning import DeclaredMeaning
 from webots_mcp.simulator.observed_bodies import DIGITS, ObservedBodies, ObservedBody
 
 PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
 LONGEST_PERIOD_MS: Final = 60_000
+_NOT_JUDGED: Final = (
+    "No event or check judges contacts. Webots reports none for bodies that sleep and for nested "
+    "robots: an empty list does not show that nothing touches."
+)
 _GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to come round
 
 
@@ -105,6 +111,10 @@ class ObserverBridge(MCPBridge):
     def record_event(self, kind: str, data: dict[str, object]) -> None:
         """Record what seldom changes: the bodies of the world, and the simulation mode."""
         self._session.journal.event(kind, data)
+
+    def record_meanings(self, known: Sequence[tuple[DeclaredMeaning, str]]) -> None:
+        """Record what signals mean, and what says it."""
+        self._session.meanings.record_devices(known)
 
     def count_steps_by_time(self) -> None:
         """Count steps by time, since the world advances between two rounds of this loop."""
@@ -241,6 +251,7 @@ class Observer:
         self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
         self.bridge.count_steps_by_time()
         self.world = ObservedBodies(robot, self._period_ms, self._warn)
+        self.bridge.record_meanings(self.world.describe_signals())
         self.custom_data = self.bridge.read_custom_data()
         self._pace = StepPace(robot, self._period_ms, world_waits=self.bridge.world_waits)
         self._due_s = -math.inf
@@ -319,6 +330,7 @@ def _standing(node: Any, robot: Any) -> dict[str, Any]:
         return {
             "contacts": [_contact(contact, robot) for contact in contacts[:30]],
             "contacts_in_all": len(contacts),
+            "contacts_note": _NOT_JUDGED,
             "center_of_mass_m": [round(float(value), DIGITS) for value in node.getCenterOfMass()],
             "is_balanced": bool(node.getStaticBalance()),
         }

@@ -91,28 +91,27 @@ def with_stated(
     stored = stored_meanings(connection, robot_id)
     if not stored:
         return known
-    plain: dict[str, list[StatedMeaning]] = {}
-    for each in stored:
-        if "*" not in each.stated.said.name:
-            plain.setdefault(each.stated.said.name, []).append(each.stated)
-    patterns = [each for each in stored if "*" in each.stated.said.name]
-    if not patterns:
-        return known | {
-            name: _stated(known[name], tuple(stated))
-            for name, stated in plain.items()
-            if name in known
-        }
-    return {name: _stated(signal, _of(name, stored)) for name, signal in known.items()}
+    plain: dict[str, list[int]] = {}
+    patterns: list[tuple[int, str]] = []
+    for at, each in enumerate(stored):
+        if "*" in (name := each.stated.said.name):
+            patterns.append((at, name))
+        else:
+            plain.setdefault(name, []).append(at)
+    found: dict[str, RegisteredSignal] = {}
+    for name, signal in known.items():
+        places = [at for at, pattern in patterns if fits_pattern(pattern, name)]
+        if name in plain:
+            places = sorted([*plain[name], *places])  # the strongest first
+        stated = tuple(stored[at].stated for at in places)
+        found[name] = _stated(signal, stated) if stated else signal
+    return found
 
 
 def _stated(signal: RegisteredSignal, stated: tuple[StatedMeaning, ...]) -> RegisteredSignal:
     """The signal with what was stated of it: its unit is the one that was stated."""
     found = replace(signal, stated=stated)
     return replace(found, unit=found.stated_unit or signal.unit)
-
-
-def _of(name: str, stored: list[StoredMeaning]) -> tuple[StatedMeaning, ...]:
-    return tuple(each.stated for each in stored if fits_pattern(each.stated.said.name, name))
 
 
 def stored_meanings(connection: sqlite3.Connection, robot_id: int) -> list[StoredMeaning]:

@@ -250,6 +250,15 @@ def noisy(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     return replace(run, columns={**run.columns, "depth_m": depth.tolist()})
 
 
+def swings_up(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """From a moment on its steering swings more and more."""
+    since_s = np.maximum(run.times - 0.4 * run.duration_s, 0)
+    swing = np.where(since_s > 0, 0.02 * np.exp(since_s / 12), 0.0)
+    steering = swing * np.sin(float(rng.uniform(2, 4)) * run.times)
+    steering += rng.normal(0, 0.0005, len(run.times))
+    return replace(run, columns={**run.columns, "steering_rad": steering.tolist()})
+
+
 def creeps(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     """It turns slowly while it stands, although no command says so."""
     phases = driving.drive_of(rng, 20.0, 0.25, "cruise")
@@ -264,6 +273,7 @@ def creeps(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
 FAULTS: Final[dict[str, tuple[Fault, str]]] = {
     "held": (held, "moves when commanded"),
     "slips": (slips, "wheels grip"),
+    "swings up": (swings_up, "stays stable"),
     "jammed": (jammed, "follows its targets"),
     "odometry drifts": (drifts, "estimates agree"),
     "leaps": (leaps, "stays in place"),

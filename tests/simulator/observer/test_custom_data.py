@@ -92,6 +92,7 @@ def test_each_text_is_a_state_of_that_robot_with_its_pose(robots: Robots) -> Non
     robots.go_on(5, rover='{"front_m": 0.25, "mode": "turn"}')
     assert robots.newest() == {
         "front_m": 0.25, "mode": "turn", "x_m": 1.0, "y_m": 2.0, "z_m": 0.0, "heading_rad": 0.0,
+        "roll_rad": 0.0, "pitch_rad": 0.0, "height_m": 0.0,
     }  # fmt: skip
     assert robots.newest("e-puck")["custom_data"] == "looking for walls"
     assert robots.sessions() == [
@@ -114,6 +115,9 @@ def test_a_robot_that_publishes_a_pose_itself_keeps_it_and_the_seen_one_stands_b
     robots.go_on(3, rover='{"x_m": 7.0}')
     assert robots.newest()["x_m"] == 7.0
     assert robots.newest()["seen"]["x_m"] == 1.0
+    robots.go_on(3, rover='{"height_m": 0.4}')
+    assert (robots.newest()["x_m"], robots.newest()["height_m"]) == (1.0, 0.4)
+    assert robots.newest()["seen"] == {"height_m": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -215,6 +215,7 @@ def test_contact_points_and_balance_are_told_where_webots_tells_them(
     monkeypatch.setattr(watching.robot, "getFromId", find_floor)
     told = watching.observer.look_at({"params": {"of": "CRATE"}})
     assert told["contacts"] == [[0.1, 0.2, 0.0, "FLOOR"]]
+    assert "No event or check judges contacts" in told["contacts_note"]
     assert (told["center_of_mass_m"], told["is_balanced"]) == ([0.1, 0.2, 0.05], True)
 
 

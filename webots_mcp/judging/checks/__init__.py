@@ -25,7 +25,15 @@ from webots_mcp.judging.checks.finding import (
     total_s,
 )
 from webots_mcp.judging.coverage import WORST_FIRST, Coverage, Fault, Outcome, outcome_of
-from webots_mcp.judging.detection import degradation, fall, jump, sensors, targets
+from webots_mcp.judging.detection import (
+    degradation,
+    fall,
+    jump,
+    oscillation,
+    sensors,
+    slip,
+    targets,
+)
 from webots_mcp.judging.detection.condition import (
     NONE_EXPECTED,
     Adherence,
@@ -360,12 +368,15 @@ def _whole_array(name: str) -> str:
 
 _JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
 _OFF, _FALL = (targets.OFF_TARGET.name,), (fall.FALL.name,)
+_SWINGS: Final = (oscillation.OSCILLATION.name,)
+_SLIP: Final = (slip.SLIP.name,)
 _NOISE: Final = (degradation.DEGRADATION.name,)
 CHECKS: Final[list[Check]] = [
     Check("moves when commanded", of_motion.moves_when_commanded, _MOVES, ("stuck", "standstill")),
     Check("rests when commanded", of_motion.rests_when_commanded, _MOVES, of_values=True),
     Check("follows its targets", of_motion.follows_targets, _AIMS, _OFF),
-    Check("wheels grip", of_motion.wheels_grip, "a position; speeds of wheels", of_values=True),
+    Check("stays stable", of_motion.stays_stable, "numbers", _SWINGS),
+    Check("wheels grip", of_motion.wheels_grip, "a position; speeds of wheels", _SLIP),
     Check("estimates agree", of_motion.estimates_agree, _TWO, of_values=True),
     Check("stays upright", of_motion.stays_upright, "roll and pitch", _FALL),
     Check("stays in place", of_motion.stays_in_place, "the position", _JUMP),

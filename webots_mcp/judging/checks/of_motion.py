@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, Final, cast
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, np, runs_of
@@ -13,22 +13,22 @@ from webots_mcp.judging.coverage import Coverage, Fault
 from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
+from webots_mcp.judging.detection.oscillation import GROWS, OSCILLATION
 from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
+from webots_mcp.judging.detection.slip import SLIP, SLIPS, flies
 from webots_mcp.judging.detection.standstill import (
     COMMAND_NOISE,
-    ON_THE_SPOT,
     SPEED_UNITS,
     TURNED_RAD,
 )
 from webots_mcp.judging.detection.targets import OFF_S, OFF_SHARE, OFF_TARGET, pursuits_in
 from webots_mcp.signals.meaning import words_in
-from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, unit_in, words_of
+from webots_mcp.signals.naming import BRANCHES, counted, listed, words_of
 from webots_mcp.signals.register import PLACES
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.segment import just_after
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
-_OFF_THE_FLOOR_M: Final = 0.3
 APART_S: Final = 3.0  # command and measurement for so long
 NO_COMMAND: Final = (
     "nothing says when it should move: publish commanded_m_s, the speeds of its wheels, or mode"
@@ -37,16 +37,6 @@ _OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is no
 _NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
 _NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
 _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
-_ALIKE: Final = 0.05  # of the faster side: wheels that differ by less drive straight on
-_TURNED_ALONE_RAD: Final = 0.3  # in 3 s, while both sides turn alike
-_SLIPS: Final = 0.5  # of the usual way per turn of the wheels
-_CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
-_NOISE_SHARE: Final = 0.1  # of the speed that it may take
-_CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
-_TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
-_LEAST_CELLS: Final = 10
-_SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
-_BY_WHEELS: Final = ("odom", "odometry")
 _FITTED: Final = 0.2  # of the way: so much of it lays one estimate over the other
 _LEAST_WAY_M: Final = 1.0
 _SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
@@ -134,24 +124,12 @@ def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
 def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
     """Whether more says that it should have moved than a constant mode, or motors that lift it."""
     said = stuck.details["evidence_for"].split("; ")
-    if _flies(run):
+    if flies(run.search):
         said = [each for each in said if not each.startswith("wheels at ")]
     by_mode = [each for each in said if each.startswith(("in mode ", "mode "))]
     mode = run.motion.mode
     may_change = mode is not None and len(set(run.frame.coded(mode.name).labels)) > 2
     return len(said) > len(by_mode) or (bool(said) and may_change)
-
-
-def _flies(run: RunUnderCheck) -> bool:
-    """Whether its motors are those of propellers: none is called a wheel, and it is off the floor.
-
-    The motors of what flies turn all the time.
-    """
-    motors, height = run.motion.wheels or run.motion.wheel_commands, run.motion.height
-    if height is None or any("wheel" in each.name.lower() for each in motors):
-        return False
-    heights = in_metres(height, run.frame.usable(height.name)[1])
-    return len(heights) > 0 and median(heights) > _OFF_THE_FLOOR_M
 
 
 # -- command and measurement -----------------------------------------------------------------------
@@ -183,6 +161,30 @@ def follows_targets(run: RunUnderCheck) -> Examined:
     return Fault("fail", evidence, found[0].start_s, len(found), more, signals=firm)
 
 
+def stays_stable(run: RunUnderCheck) -> Examined:
+    """Warns where an oscillation of heading, wheels, speed and the like became twice as large."""
+    growing = [
+        each
+        for each in run.events(OSCILLATION.name)
+        if each.details.get("amplitude_at_end", 0.0) > each.details.get("amplitude_at_start", 0.0)
+    ]
+    if not growing:
+        return run.covered(
+            "no oscillation grew", of=OSCILLATION.name, limit=f"limit {GROWS:g} times"
+        )
+    worst = max(
+        growing,
+        key=lambda e: e.details["amplitude_at_end"] / (e.details["amplitude_at_start"] or 1),
+    )
+    start, end = (worst.details[f"amplitude_at_{at}"] for at in ("start", "end"))
+    names = listed(list(dict.fromkeys(each.name or "" for each in growing)), 3)
+    evidence = (
+        f"{names}: the amplitude grew from {start:.3g} to {end:.3g} in {worst.duration_s:.3g} s, "
+        f"with a period of {worst.details['period_s']:.3g} s"
+    )
+    return Fault("warn", evidence, worst.start_s, len(growing), run.more(OSCILLATION.name))
+
+
 # -- attitude --------------------------------------------------------------------------------------
 
 
@@ -195,7 +197,8 @@ def stays_upright(run: RunUnderCheck) -> Examined:
     first = falls[0]
     got_up = first.details.get("got_up")
     after = f"and got up {first.duration_s:.3g} s later" if got_up else "and stayed down"
-    evidence = f"fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
+    who = f"{first.name} " if first.name else ""
+    evidence = f"{who}fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
     return Fault("fail", evidence, first.start_s, len(falls), run.more(FALL.name))
 
 
@@ -203,145 +206,18 @@ def stays_upright(run: RunUnderCheck) -> Examined:
 
 
 def wheels_grip(run: RunUnderCheck) -> Examined:
-    """Fails where the wheels drove ahead for 3 s and it went less than half as far as usual."""
-    motion, position = run.motion, run.motion.position
-    wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
-    if position is None or not wheels:
-        raise NotSearchableError("publish the position and the speeds of its wheels")
-    if _flies(run):
-        raise NotSearchableError("its motors lift it")
-    if position[0].name.partition(".")[0] in _BY_WHEELS:
-        raise NotSearchableError(f"{position[0].name} is counted by the wheels themselves")
-    starts_s, lasts_s, ratios = _ratios(run, position, wheels)
-    known = np.isfinite(ratios)
-    if np.count_nonzero(known) < _LEAST_CELLS:
-        raise NotSearchableError("its wheels drove it ahead too seldom")
-    usual = median(ratios[ratios >= np.nanquantile(ratios, 0.5)])
-    rolled = ratios[ratios >= _SLIPS * usual]
-    usual = median(rolled)
-    if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
-        raise NotSearchableError("its speed and that of its wheels have no fixed ratio")
-    slips = runs_of(ratios < _SLIPS * usual, starts_s)
-    found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).spans())
-    if turned := _turns_though_straight(run, wheels):
-        return turned
-    unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
-    rolls = f"rolls {usual:.3g} m/s{unit}"
-    if not found:
-        against = position[0].name.partition(".")[0]
-        return run.covered(
-            rolls,
-            judged=f"{counted(len(wheels), 'wheel')} against {against}",
-            limit=f"slip limit {100 * _SLIPS:g} %",
-            lasts_s=int(np.count_nonzero(known)) * lasts_s,
-        )
-    longest_s = max(each.duration_s for each in found) + 2 * lasts_s
-    least = min(float(np.nanmin(ratios[each.start : each.stop])) for each in found)
-    evidence = f"slipped {times(len(found))}, up to {longest_s:.3g} s; {rolls}, then {least:.3g}"
-    return Fault("fail", evidence, found[0].start_s, len(found), run.shows(wheels[0].name))
+    """Fails where the wheels drove ahead for 3 s and it went less than half as far as usual.
 
-
-def _turns_though_straight(run: RunUnderCheck, wheels: list[RegisteredSignal]) -> Fault | None:
-    """A robot that turned for long while the wheels of both sides turned alike: one side slips.
-
-    A robot that steers turns so by nature, and where none of its wheels has a side nothing is said.
+    Also where it turned while the wheels of both sides turned alike: one side slipped.
     """
-    heading = run.motion.heading
-    sides = {
-        side: [w for w in wheels if (run.meanings[w.name].side or "").endswith(side)]
-        for side in ("left", "right")
-    }
-    steers = any("steering" in words_in(name) for name in run.search.known)
-    if heading is None or steers or not all(sides.values()):
-        return None
-    frame, turn = run.frame, heading.turn or math.tau
-    course = unwrap(frame.numbers(heading.name), turn) * math.tau / turn
-    left, right = (
-        np.mean([frame.numbers(each.name) for each in wheels], axis=0) for wheels in sides.values()
-    )
-    fastest = np.maximum(np.abs(left), np.abs(right))
-    alike = (np.abs(left - right) <= _ALIKE * fastest) & (fastest > 0) & np.isfinite(course)
-    noise = run.noise.of(heading.name) * math.tau / turn
-    for rest in runs_of(alike, frame.times).spans():
-        if rest.end_s - rest.start_s < APART_S:
-            continue
-        part = course[rest.start : rest.stop]
-        clock = frame.times[rest.start : rest.stop]
-        cells = np.searchsorted(clock, np.arange(clock[0], clock[-1], APART_S))
-        turned = np.diff(part[cells])
-        far = np.flatnonzero(np.abs(turned) > max(_TURNED_ALONE_RAD, _NOISE * noise))
-        if not len(far):
-            continue
-        side = "left" if turned[far[0]] > 0 else "right"
-        total = float(np.abs(turned[far]).sum())
-        evidence = (
-            f"the {side} side slipped: it turned by {total:.3g} rad while the wheels of both "
-            "sides turned alike"
-        )
-        since_s = float(clock[cells[far[0]]])
-        return Fault("fail", evidence, since_s, 1, run.shows(heading.name, wheels[0].name))
-    return None
-
-
-def _ratios(
-    run: RunUnderCheck,
-    position: tuple[RegisteredSignal, RegisteredSignal],
-    wheels: list[RegisteredSignal],
-) -> tuple[Array, float, Array]:
-    """From cell to cell how far it went per turn of its wheels; NaN where these do not drive it.
-
-    Returns:
-        When each cell begins, how long cells are, and the ratios.
-
-    Raises:
-        NotSearchableError: The position is too noisy to tell how far it went.
-    """
-    rows, x, y = places_in(run.frame, position)
-    clock = run.frame.times[rows]
-    speeds = np.nan_to_num([run.frame.numbers(each.name)[rows] for each in wheels])
-    mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
-    least = max(4 * run.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
-    ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
-    course = np.zeros(len(rows))
-    if (heading := run.motion.heading) is not None:
-        turn = heading.turn or math.tau
-        course = unwrap(run.frame.numbers(heading.name)[rows], turn) * math.tau / turn
-    per_row_s = max(run.noise.interval_s, 1e-6)
-    columns = (clock, x, y, mean, course, np.sign(mean) * ahead)
-    for lasts_s in [each for each in _CELLS_S if each >= 3 * per_row_s] or _CELLS_S[-1:]:
-        starts_s, ratios, went_m_s = _ratios_in(columns, lasts_s)
-        noise_m_s = 1.5 * run.noise.position_m * (per_row_s / lasts_s) ** 0.5 / lasts_s
-        if not len(went_m_s) or noise_m_s <= _NOISE_SHARE * median(went_m_s):
-            return starts_s, lasts_s, ratios
-    raise NotSearchableError(
-        f"position noise of {run.noise.position_m:.2g} m at a row each {per_row_s:.3g} s hides how "
-        "far it went"
-    )
-
-
-def _ratios_in(columns: Sequence[Array], lasts_s: float) -> tuple[Array, Array, Array]:
-    """The same in cells of one length, and how fast it went in those that count.
-
-    Args:
-        columns: Times, x, y, the mean speed of the wheels, the course, and 1 or -1 where these
-            drive it ahead or back; in rows with a position.
-        lasts_s: How long cells are.
-    """
-    clock = columns[0]
-    cells = (clock // lasts_s).astype(np.intp)
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
-    if len(starts) < 2:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
-    counts = np.diff(starts, append=len(clock))
-    t, x, y, turned, course, driven = (np.add.reduceat(each, starts) / counts for each in columns)
-    whole = (np.abs(driven) == 1) & (counts >= 2)
-    both = whole[1:] & whole[:-1] & (driven[1:] == driven[:-1]) & (np.diff(cells[starts]) == 1)
-    both &= np.abs(np.diff(course)) <= _TURNS_RAD
-    rates = np.abs(turned[1:] + turned[:-1]) / 2 * np.diff(t)
-    went_m = np.hypot(np.diff(x), np.diff(y))
-    ratios = np.full(len(both), math.nan)
-    ratios[both] = went_m[both] / rates[both]
-    return clock[starts[:-1]], ratios, went_m[both] / np.diff(t)[both]
+    slips = run.events(SLIP.name)
+    if not slips:
+        said = run.found.verdicts.not_found.get(SLIP.name) or "no wheel slipped"
+        return run.covered(said, of=SLIP.name, limit=f"slip limit {100 * SLIPS:g} %")
+    first = slips[0]
+    longest_s = max(each.duration_s for each in slips)
+    evidence = f"slipped {times(len(slips))}, up to {longest_s:.3g} s; {first.details['says']}"
+    return Fault("fail", evidence, first.start_s, len(slips), run.more(SLIP.name))
 
 
 # -- two estimates of one thing --------------------------------------------------------------------

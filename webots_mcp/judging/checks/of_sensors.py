@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import Any, Final, Literal, cast
+from typing import Final, Literal
 
 from webots_mcp.analysis.arrays import Array, Runs, median, np, runs_of
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times
@@ -16,18 +15,16 @@ from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT
-from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed
-from webots_mcp.store.chunks import parse
+from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, find_targets, listed
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
-_SAMPLED_ROWS: Final = 50
-_ROWS: Final = "SELECT data, replaced FROM state WHERE id IN ({marks})"
 _MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first steps alone
 _LEAST_S: Final = 1.0  # as of what is missing
 _AT_LIMIT: Final = 0.05  # of the rows
+_OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
 _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
 _CUT_OFF: Final = 5  # times at one extreme to the last digit: of values that never repeat none is
@@ -39,16 +36,19 @@ def sensors_speak(run: RunUnderCheck) -> Examined:
     """Fails where a signal was NaN for a second or more, warns where it was null.
 
     Null may be meant, of what is not seen now; an infinite range is. Warns of one that was NaN in
-    5 % of the rows, never for so long or before its first value.
+    5 % of the rows, never for so long or before its first value, and of 5 % of the items of a long
+    array that stay NaN.
     """
     silent = [e for e in run.events("missing") if e.details.get("value") in (None, _FAULTY)]
+    items = [each for each in silent if "items" in each.details]
+    silent = [each for each in silent if each not in items]
     shares = {
         name: run.frame.replaced(name)[_FAULTY] / max(len(run.frame), 1)
         for name, each in run.search.known.items() if each.is_number
     }  # fmt: skip
     never = [name for name, share in shares.items() if share == 1]
-    if not (silent or never) and (found := _missing_items(run)):
-        return found
+    if items and not (silent or never):
+        return _missing_items(run, items)
     if not (silent or never):
         least = max(_MANY, _LEAST_S / run.search.length_s)
         if many := [name for name, share in shares.items() if share >= least]:
@@ -70,41 +70,15 @@ def sensors_speak(run: RunUnderCheck) -> Examined:
     return Fault(outcome, evidence, since_s, often, more, signals=firm)
 
 
-def _missing_items(run: RunUnderCheck) -> Fault | None:
-    """Of long arrays: items that are NaN in all of a sample of the run's rows."""
-    frame = run.frame
-    arrays = [each for each in run.search.known.values() if each.reduction == "count"]
-    if not arrays or not len(frame):
-        return None
-    rows = np.unique(np.linspace(0, len(frame) - 1, _SAMPLED_ROWS).astype(np.intp))
-    ids = [int(each) for each in frame.ids[rows]]
-    marks = ", ".join("?" * len(ids))
-    stored = run.search.connection.execute(_ROWS.format(marks=marks), ids).fetchall()
-    states = [(parse(data), json.loads(replaced or "{}")) for data, replaced in stored]
-    for array in arrays:
-        name = array.name.rpartition(".")[0]
-        items = [
-            [value is None for value in values]
-            for state, replaced in states
-            if _FAULTY in str(replaced.get(f"{name}.*", "")) and (values := _array_at(state, name))
-        ]
-        if not items or len(items) < len(states) or len({len(each) for each in items}) > 1:
-            continue
-        never = int(np.count_nonzero(np.all(items, axis=0)))
-        total = len(items[0])
-        if never >= _MANY * total:
-            evidence = f"{name}: {never} of {total} items are NaN in every row"
-            since_s = run.search.began_s
-            return Fault("warn", evidence, since_s, never, run.shows(f"{name}.count"))
-    return None
-
-
-def _array_at(state: dict[str, Any], name: str) -> list[Any]:
-    """Return the array of a dotted name in a state; an empty one where there is none."""
-    value: Any = state
-    for key in name.split("."):
-        value = cast("dict[str, Any]", value).get(key) if isinstance(value, dict) else None
-    return cast("list[Any]", value) if isinstance(value, list) else []
+def _missing_items(run: RunUnderCheck, silent: list[Event]) -> Fault:
+    """Of long arrays: items that are NaN up to the end of the run."""
+    worst = max(silent, key=lambda each: each.details["items"] / each.details["of_items"])
+    count, total = worst.details["items"], worst.details["of_items"]
+    since = "in every row" if worst.start_s <= run.search.began_s else "from a moment on"
+    evidence = f"{worst.name}: {count} of {total} items are NaN {since}"
+    others = listed([each.name or "" for each in silent if each is not worst], MOST_NAMED)
+    evidence += f"; also {others}" if others else ""
+    return Fault("warn", evidence, worst.start_s, count, run.shows(f"{worst.name}.count"))
 
 
 def sensors_live(run: RunUnderCheck) -> Examined:
@@ -178,11 +152,15 @@ class _NamesIn:
 
     @cached_property
     def sensors(self) -> dict[str, RegisteredSignal]:
-        """The numbers that a sensor gave, as far as it is known what they mean."""
+        """The numbers that a sensor gave, as far as it is known what they mean.
+
+        What an observer saw of a body is exact, and no sensor that may fail.
+        """
         return {
             each.name: each
             for each in self._run.search.numbers
             if not each.is_index and self._run.meanings[each.name].is_sensed
+            if not each.name.startswith(_OBSERVED)
         }
 
 

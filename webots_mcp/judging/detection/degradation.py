@@ -45,14 +45,18 @@ def degradation_events(search: Search) -> Iterator[Event]:
         if "degradation" not in search.options.kinds:
             raise NotAskedError
         raise NotSearchableError("no sensor is known whose noise does not depend on motion")
+    found_any = False
     for signal in search.in_time("degradation", signals):
         found = _change_of(search, signal)
         if found is None:
             continue
+        found_any = True
         start_s, before, after = found
         end_s = float(search.frame.times[-1])
         details = {"noise_before": float(f"{before:.3g}"), "noise_after": float(f"{after:.3g}")}
         yield search.event("degradation", start_s, end_s, signal.name, **details)
+    if not found_any and search.frame.times[:1].tolist() > [search.began_s]:
+        search.not_searched("degradation", "noise that grew before the range: ask the whole run")
 
 
 def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, float] | None:
@@ -134,4 +138,5 @@ DEGRADATION: Final = EventKind(
     of_numbers=True,
     lasts=True,
     ends_within_s=lambda event: math.inf,
+    drawn=3,
 )

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
 from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, in_metres
-from webots_mcp.signals.meaning import Quantity
-from webots_mcp.signals.naming import words_of
+from webots_mcp.signals.naming import SOLIDS, WORLD, words_of
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal
 
@@ -27,26 +26,60 @@ MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
 _BY_WHEELS: Final = frozenset(("odom", "odometry"))
 _NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
 NO_ATTITUDE: Final = "publish roll and pitch (of an InertialUnit), in rad or deg"
+_OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
+
+
+class Attitude(NamedTuple):
+    """What is known of how a body is tilted.
+
+    Attributes:
+        body: The branch of signals of a robot that an observer sees; None for the robot itself.
+        roll: None where only the pitch is known; it counts as 0 then. `pitch` likewise.
+    """
+
+    body: str | None
+    roll: RegisteredSignal | None
+    pitch: RegisteredSignal | None
 
 
 def fall_events(search: Search) -> Iterator[Event]:
-    """From where the tilt leaves the upright range to where the robot stands again, if ever."""
-    signals = {quantity: _signal(search, quantity) for quantity in ("roll", "pitch")}
-    if not any(signals.values()):
+    """From where the tilt leaves the upright range to where the robot stands again, if ever.
+
+    In the run of an observer, of each robot that it sees.
+    """
+    attitudes = attitudes_in(search)
+    if not attitudes:
         if "fall" not in search.options.kinds:
             raise NotAskedError
         raise NotSearchableError(NO_ATTITUDE)
-    times, tilt = tilt_of(search.frame, signals["roll"], signals["pitch"])
-    if len(times) < 2:
+    are_known = False
+    for attitude in attitudes:
+        times, tilt = tilt_of(search.frame, attitude.roll, attitude.pitch)
+        if len(times) < 2:
+            continue
+        are_known = True
+        search.judged(
+            "fall",
+            filter(None, (attitude.roll, attitude.pitch)),
+            [(float(times[0]), float(times[-1]))],
+        )
+        yield from _falls_of(search, attitude.body, times, tilt)
+        largest_deg = math.degrees(float(tilt.max()))
+        of_body = "" if attitude.body is None else f" of {attitude.body}"
+        what = f"largest tilt{of_body} {largest_deg:.0f}°"
+        search.note_nearest("fall", float(tilt.max()) / FALLEN_RAD, what)
+    if not are_known:
         raise NotSearchableError("roll and pitch have no value in that range")
-    search.judged("fall", filter(None, signals.values()), [(float(times[0]), float(times[-1]))])
+
+
+def _falls_of(search: Search, body: str | None, times: Array, tilt: Array) -> Iterator[Event]:
     fell_s = -math.inf
     for run in runs_of(tilt > DOWN_RAD, times).spans():
         lies = tilt[run.start : run.stop]
         lasts_s = run.end_s - run.start_s
         if run.start_s < fell_s or lasts_s < SETTLED_S or lies.max() < FALLEN_RAD:
             continue
-        if _moves_on(search, run.start_s, run.end_s):
+        if body is None and _moves_on(search, run.start_s, run.end_s):
             continue
         before = np.flatnonzero(tilt[: run.start] > UPRIGHT_RAD)
         left = run.start
@@ -62,15 +95,10 @@ def fall_events(search: Search) -> Iterator[Event]:
             "fall",
             float(times[left]),
             fell_s,
-            None,
+            body,
             tilt_deg=round(math.degrees(float(np.median(lies))), 1),
             got_up=bool(len(up)),
         )
-    search.note_nearest(
-        "fall",
-        float(tilt.max()) / FALLEN_RAD,
-        f"largest tilt {math.degrees(float(tilt.max())):.0f}°",
-    )
 
 
 def _moves_on(search: Search, start_s: float, end_s: float) -> bool:
@@ -129,13 +157,29 @@ def tilt_of(
     return times, np.arccos(np.minimum(np.maximum(first @ up, -1.0), 1.0))
 
 
-def _signal(search: Search, quantity: Quantity) -> RegisteredSignal | None:
-    """The first signal of that quantity that has values and is measured."""
+def attitudes_in(search: Search) -> list[Attitude]:
+    """Return the attitudes in a run: of the robot itself, else of the robots that it observes.
+
+    Roll and pitch of one device belong together, and the first device that has one counts.
+    """
+    by_branch: dict[str, dict[str, RegisteredSignal]] = {}
     for name, meaning in search.meanings.items():
-        is_one = meaning.quantity == quantity and meaning.is_sensed
+        is_one = meaning.quantity in ("roll", "pitch") and meaning.is_sensed
         if is_one and search.whole.zone_map(name).value_count.any():
-            return search.known[name]
-    return None
+            found = by_branch.setdefault(name.rpartition(".")[0], {})
+            found.setdefault(str(meaning.quantity), search.known[name])
+    seen = {branch: each for branch, each in by_branch.items() if branch.startswith(_OBSERVED)}
+    attitudes = [
+        Attitude(branch, each.get("roll"), each.get("pitch"))
+        for branch, each in seen.items()
+        if branch.startswith(f"{WORLD}.")  # what is no robot may lie as it likes
+    ]
+    own = [each for branch, each in by_branch.items() if branch not in seen]
+    if own:  # what stands in two branches (`roll.value`, `pitch.value`) is one attitude as well
+        own.sort(key=len, reverse=True)
+        merged = {quantity: each[quantity] for each in reversed(own) for quantity in each}
+        attitudes.insert(0, Attitude(None, merged.get("roll"), merged.get("pitch")))
+    return attitudes
 
 
 FALL: Final = EventKind(

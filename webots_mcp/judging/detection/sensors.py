@@ -22,6 +22,7 @@ from webots_mcp.analysis.arrays import (
     runs_of,
 )
 from webots_mcp.judging.detection.kinds import Alike, Event
+from webots_mcp.judging.detection.missing_items import missing_item_events
 from webots_mcp.judging.detection.search import MOST_NAMED, EventKind, Search
 from webots_mcp.signals.naming import find_targets, listed
 from webots_mcp.store.reading.catalogue import other_form
@@ -353,6 +354,7 @@ def missing_events(search: Search) -> Iterator[Event]:
         limit = f"for less than missing_s={search.options.missing_s:g} s"
         note = f"without a value {limit}, so not counted as missing: {listed(times, MOST_NAMED)}"
         search.coverage.note_of_run(search.segment.run_id, note)
+    yield from missing_item_events(search, "missing")
 
 
 def _silences(search: Search, signal: RegisteredSignal) -> Runs:

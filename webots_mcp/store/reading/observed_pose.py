@@ -24,8 +24,8 @@ Derived = Mapping[str, Callable[[Array], Decoded]]
 """Signals that no row of a run holds, by name: their values at some simulation times."""
 
 MARGIN_S: Final = 1.0  # of the observer's rows around what is asked for
-_HEADING: Final = "heading_rad"
-_PARTS: Final = ("x_m", "y_m", "z_m", _HEADING)
+_ANGLES: Final = ("heading_rad", "roll_rad", "pitch_rad")
+_PARTS: Final = ("x_m", "y_m", "z_m", *_ANGLES)
 _LONGEST_GAP_S: Final = 1.0  # between two rows of an observer; more of one that looks seldom
 _GAP_INTERVALS: Final = 3.0
 # The observer's run that lasted longest at the same time, in the same simulation.
@@ -144,7 +144,7 @@ def poses_of(key: str, usable: Callable[[str], tuple[Array, Array]]) -> Derived:
 
     def of(part: str) -> Callable[[Array], Decoded]:
         name = f"{WORLD}.{key}.{part}"
-        return lambda times: _decoded(_between(*usable(name), times, turns=part == _HEADING))
+        return lambda times: _decoded(_between(*usable(name), times, turns=part in _ANGLES))
 
     return {_name_of(part): of(part) for part in _PARTS}
 

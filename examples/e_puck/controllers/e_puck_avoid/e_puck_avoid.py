@@ -97,6 +97,9 @@ def main() -> None:
     robot = Robot()
     bridge = MCPBridge(robot)
     e_puck = EPuck(robot, bridge)
+    bridge.describe("proximity.*", quantity="light")  # infrared that comes back, no distance
+    bridge.describe("odom.heading_rad", quantity="heading", unit="rad")
+    bridge.describe("turns", quantity="count")
 
     while robot.step(int(robot.getBasicTimeStep())) != -1:
         if bridge.detect_reload():

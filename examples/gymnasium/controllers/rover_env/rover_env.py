@@ -30,6 +30,8 @@ class RoverEnv:
     def __init__(self) -> None:
         self.robot = robot = Supervisor()
         self.bridge = MCPBridge(robot, throttle_interval=1)
+        self.bridge.describe("action.steer", quantity="turn rate", role="commanded")
+        self.bridge.describe("reward", quantity="count")  # it belongs to no sensor
         self.time_step = int(robot.getBasicTimeStep())
         goal: Any = robot.getFromDef("GOAL")
         self.goal: list[float] = goal.getPosition()[:2]

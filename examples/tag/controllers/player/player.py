@@ -85,6 +85,7 @@ def main() -> None:
     robot = Robot()
     bridge = MCPBridge(robot)
     player = Player(robot, bridge, sys.argv[1])
+    bridge.describe("heading_error_rad", quantity="angle", unit="rad")
 
     while robot.step(int(robot.getBasicTimeStep())) != -1:
         if bridge.detect_reload():

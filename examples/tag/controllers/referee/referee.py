@@ -74,6 +74,7 @@ def main() -> None:
     bridge = MCPBridge(robot)
     referee = Referee(robot)
     bridge.register_command("score", referee.score)
+    bridge.describe("catches", quantity="count")
 
     while robot.step(int(robot.getBasicTimeStep())) != -1:
         if bridge.detect_reload():

@@ -41,6 +41,8 @@ class Collector:
         self.gps, self.imu = robot.getDevice("gps"), robot.getDevice("inertial unit")
         for sensor in (self.gps, self.imu, *self.arm_sensors):
             sensor.enable(time_step)
+        for counter in ("left", "delivered.*"):
+            bridge.describe(counter, quantity="count")
         self.cubes, self.fields = self.find("CUBE_"), self.find("FIELD_")
         self.start()
 

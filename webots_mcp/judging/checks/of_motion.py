@@ -344,7 +344,7 @@ def estimates_agree(run: RunUnderCheck) -> Finding:
     findings += [_turned_apart(run, headings[0], other) for other in headings[1:]]
     if not findings:
         raise NotSearchableError(
-            "no second heading, and no second position of the robot that goes along with the first"
+            "no second position of the robot that goes along with the first"
             f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
         )
     return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))

@@ -27,7 +27,7 @@ from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.extras.plugins import export_formats
-from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
 from webots_mcp.plugins.report.making import make_report

@@ -20,7 +20,7 @@ from webots_mcp.plotting.colours import MERGED, MOST_VALUES, OTHER_VALUES, area_
 from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
 from webots_mcp.plotting.intervals import Interval, at_resolution
 from webots_mcp.plotting.robot_path import PathPoint, RobotPath, headings, thinned
-from webots_mcp.plotting.signals import SignalAxes, compose_signals
+from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.store.chunk_making import chunk_whole_run
 

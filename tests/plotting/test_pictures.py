@@ -31,7 +31,7 @@ from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, image_format_of
 from webots_mcp.plotting.colours import DASHES, LINES
 from webots_mcp.plotting.intervals import Interval
-from webots_mcp.plotting.signals import compose_signals, paint_signals, plot_signals
+from webots_mcp.plotting.signal_plot import compose_signals, paint_signals, plot_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
 from webots_mcp.questions.arguments import RunIds
 from webots_mcp.store.chunk_making import make_chunks

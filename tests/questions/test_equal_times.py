@@ -19,7 +19,7 @@ from webots_mcp.analysis.track import hidden_motion
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.questions import all_questions

@@ -21,6 +21,7 @@ from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.connection import connect
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import MergedQuestion
+from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.anyio
 RICH_TOKENS: Final = 1_500
@@ -72,6 +73,8 @@ def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
             )
         _add_runs(connection)
         connection.execute("COMMIT")
+    while not make_chunks(connection, 100_000).done:
+        pass
     connection.close()
     return file
 

@@ -20,15 +20,18 @@ from webots_mcp.database.queue import CommandQueue
 from webots_mcp.database.waiting_file import waiting_paths
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.recording import view_robot
-from webots_mcp.store.robots import Status, judge, newest_session
+from webots_mcp.store.robot_status import Status, decide_status
 from webots_mcp.store.run_rows import current_run
+from webots_mcp.store.sessions import newest_session
 
 NOW = 4_000_000_000.0  # later than this process, whose sessions these are
 
 
 def status_of(robot: RecordedRobot, after_s: float = 0.0) -> Status:
     session = newest_session(robot.connection, robot.id)
-    return judge(robot.connection, session, current_run(robot.connection, robot.id), NOW + after_s)
+    return decide_status(
+        robot.connection, session, current_run(robot.connection, robot.id), NOW + after_s
+    )
 
 
 def dead_pid() -> int:
@@ -192,7 +195,7 @@ def test_a_controller_that_an_exception_ended_names_it(tmp_path: Path, managed: 
     command = [sys.executable, "-c", program, str(file)]
     subprocess.run(command, stderr=subprocess.DEVNULL, check=False)
     with closing(connect(file, "reader")) as connection:
-        status = judge(connection, newest_session(connection, 1), None, time.time())
+        status = decide_status(connection, newest_session(connection, 1), None, time.time())
     assert "its controller ended by KeyError: 'speed'" in (status.why or "")
 
 
@@ -213,7 +216,9 @@ def test_where_the_database_takes_no_rows_it_says_in_which_file_they_wait_and_si
         with closing(connect(file, "writer")) as connection:
             connection.execute("UPDATE session SET last_seen_monotonic_s = NULL")
             session = newest_session(connection, 1)
-            going, gone = (judge(connection, session, None, began_s + s) for s in (30.5, 60))
+            going, gone = (
+                decide_status(connection, session, None, began_s + s) for s in (30.5, 60)
+            )
     assert going.text == "running"
     assert f"wait in {waiting.name} next to it, for 30 s now" in (going.why or "")
     assert gone.text == "stopped 30 s ago"
@@ -222,7 +227,7 @@ def test_where_the_database_takes_no_rows_it_says_in_which_file_they_wait_and_si
 
 
 def test_without_a_session_a_robot_was_never_seen(recorded: Recorded) -> None:
-    assert judge(recorded.connection, None, None, NOW).text == "never seen"
+    assert decide_status(recorded.connection, None, None, NOW).text == "never seen"
 
 
 def test_an_answer_tells_one_moment_whatever_is_recorded_while_it_is_put_together(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any
 
 from webots_mcp.answers.budget import (
     figure,
@@ -17,8 +17,6 @@ from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.recording import RobotView
-
-_NAMING: Final = ("position", "unit")  # said once where it is the same of all runs
 
 
 def movement(
@@ -53,10 +51,11 @@ def movement(
         ways[segment.run_id] = names | facts
     if len(ways) < 2:
         return next(iter(ways.values()), None)
+    # A value that all runs share is shown once.
     shared = {
         key: value
         for key, value in next(iter(ways.values())).items()
-        if key in _NAMING and all(way.get(key) == value for way in ways.values())
+        if key in ("position", "unit") and all(way.get(key) == value for way in ways.values())
     }
     own = {
         run_id: {key: value for key, value in way.items() if key not in shared}

@@ -16,9 +16,6 @@ from typing import Any, Final, Literal, NamedTuple, cast
 Client = Literal["mcp", "cli"]
 reader: Final[ContextVar[Client]] = ContextVar("reader", default="mcp")
 STATE_BUDGET_TOKENS: Final = 1_500
-# A rule, for the tokenizer of one model tells little about another's: a word of up to 12 letters,
-# three digits, or some signs together are one token, and so is any other character.
-_TOKEN: Final = re.compile(r" ?[A-Za-z]{1,12}|\d{1,3}| ?[!-/:-@\[-`{-~]{1,4}|\s{1,16}|.")
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,9 @@ def compact_json(value: Any) -> str:
 
 def tokens_in(text: str) -> int:
     """About how many tokens a model reads: of JSON in words 4 characters each, in numbers 1.8."""
-    return len(_TOKEN.findall(text))
+    # The tokenizers of models differ, so this is an estimate: a word of up to 12 letters, three
+    # digits, or a few signs together are one token, and so is any other character.
+    return len(re.findall(r" ?[A-Za-z]{1,12}|\d{1,3}| ?[!-/:-@\[-`{-~]{1,4}|\s{1,16}|.", text))
 
 
 def tokens_of(value: Any) -> int:

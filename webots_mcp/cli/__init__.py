@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from webots_mcp.cli.commands import CommandEntry
 
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
-_OFFER: Final = re.compile(r' Did you mean "?([^\s"?]+)"?\?')
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
@@ -108,7 +107,8 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
 
 def _named(error: CycloptsError) -> str:
     """Say what is wrong, and with which argument: cyclopts omits some names."""
-    text, argument = _OFFER.sub(_harmless_offer, str(error)), error.argument
+    text = re.sub(r' Did you mean "?([^\s"?]+)"?\?', _harmless_offer, str(error))
+    argument = error.argument
     if argument is None or any(name in text for name in argument.names):
         return text
     return f"Invalid value for {argument.names[0]}: {text}"

@@ -70,11 +70,6 @@ _FOLLOW: Final = Annotated[
     ),
 ]
 _FLOOD: Final = "more than {} rows came at once: --before {} shows those that were left out"
-_UNDER_WAY: Final = (
-    "the controller is still busy with it and goes on: do not send it again, but go on waiting "
-    "with\n\n    {}\n"
-)
-_END_IT: Final = "\nor end it with\n\n    {}\n"
 
 
 def command_of(question: Question) -> Callable[..., None]:
@@ -263,7 +258,11 @@ def _under_way(answer: Mapping[str, Any], where: Where) -> str:
     robot = ["--robot", answer["robot"]] if "robot" in answer else []
     end = shlex.join(["webots-mcp", "pause", *robot, *where.typed()])
     is_loop = answer.get("action") in LOOPING
-    return _UNDER_WAY.format(wait) + (_END_IT.format(end) if is_loop else "")
+    ending = f"\nor end it with\n\n    {end}\n" if is_loop else ""
+    return (
+        "the controller is still busy with it and goes on: do not send it again, but go on "
+        f"waiting with\n\n    {wait}\n{ending}"
+    )
 
 
 def _require_recorded(data: Mapping[str, Any]) -> None:

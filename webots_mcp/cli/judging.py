@@ -48,10 +48,6 @@ _ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
     "not judged": ("skipped", "skipped"),
 }
 _WAITING: Final = Waiting()
-_NOT_PERMITTED: Final = (
-    "py-spy may not look into process {}: allow it with 'sudo sysctl kernel.yama.ptrace_scope=0' "
-    "on Linux, with --cap-add SYS_PTRACE for a container, or ask as root (macOS)"
-)
 
 
 def check(
@@ -116,7 +112,9 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     def typed(cell: Any) -> Any:
         called = re.fullmatch(r"webots_(\w+)\(.*\)", str(cell))
         if called is None:
-            return cell.replace(_DESCRIBE, _DESCRIBE_TYPED) if isinstance(cell, str) else cell
+            if not isinstance(cell, str):
+                return cell
+            return cell.replace("webots_describe_signals(...)", _DESCRIBE_TYPED)
         if called[1] == "describe_signals":
             return _description_as_typed(cell)
         words = ["webots-mcp", commands_by_tool().get(called[1], called[1])]
@@ -135,7 +133,6 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     return answer | changed
 
 
-_DESCRIBE: Final = "webots_describe_signals(...)"
 _DESCRIBE_TYPED: Final = "webots-mcp signals --describe"
 
 
@@ -386,7 +383,11 @@ def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
     if found:
         return [(stack, int(count)) for stack, _, count in found]
     if re.search("permi", ended.stderr, re.IGNORECASE):
-        raise CommandRefusedError(_NOT_PERMITTED.format(pid))
+        raise CommandRefusedError(
+            f"py-spy may not look into process {pid}: allow it with 'sudo sysctl "
+            "kernel.yama.ptrace_scope=0' on Linux, with --cap-add SYS_PTRACE for a container, or "
+            "ask as root (macOS)"
+        )
     *_, said = ended.stderr.strip().splitlines() or ["it has written nothing"]
     raise CommandRefusedError(f"py-spy could not sample process {pid}: {said}")
 

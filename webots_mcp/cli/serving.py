@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 _AS_BEFORE: Final = RetentionOptions()
 _URL: Final = "WEBOTS_CONTROLLER_URL"
 _LOOK_EVERY_S: Final = 0.2
-_EXTERN_HERE: Final = "--robot NAME=FILE runs one"
 MAX_PORT: Final = 65_535
 
 
@@ -436,7 +435,7 @@ def _watch(recording: RecordingAccess, before: int, world: Path, patience_s: flo
             return _say(f"{begun[0].robot} records: run {begun[0].run_id}")
         if time.monotonic() > until_s:
             until_s = math.inf
-            reasons = why_silent(begun, world, extern=_EXTERN_HERE)
+            reasons = why_silent(begun, world, extern="--robot NAME=FILE runs one")
             why = "; ".join(reasons) or "no robot has published yet"
             _say(f"no controller has recorded within {patience_s:g} s: {why}")
         time.sleep(_LOOK_EVERY_S)
@@ -470,7 +469,7 @@ def _follow(
         time.sleep(_LOOK_EVERY_S)
     webots.wait_for_output()
     if first is None and _announce_first(launched) is None:
-        launched.record_last_words()
+        launched.record_unfollowed_output()
         _say(launched.silence())
     return code
 

@@ -24,12 +24,6 @@ if TYPE_CHECKING:
     from webots_mcp.setup.file_change import FileChange
     from webots_mcp.simulator.project import ProjectController
 
-_NO_CONTROLLER: Final = (
-    "there is no controller in controllers/. Once there is one, run this again. An extern "
-    "controller or a ROS 2 driver records with these two lines: 'from webots_mcp import MCPBridge' "
-    "and, where it has made its robot, 'bridge = MCPBridge.attach(robot)'"
-)
-
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -462,7 +456,12 @@ def _print_project(found: dict[str, Any], notes: list[str]) -> None:
         print("\nWhat mends that:\n")
         print("\n".join(f"    {fix}" for fix in fixes))
     if not found["controllers"]:
-        notes = [*notes, _NO_CONTROLLER]
+        notes = [
+            *notes,
+            "there is no controller in controllers/. Once there is one, run this again. An extern "
+            "controller or a ROS 2 driver records with these two lines: 'from webots_mcp import "
+            "MCPBridge' and, where it has made its robot, 'bridge = MCPBridge.attach(robot)'",
+        ]
     print()
     print_notes(notes)
 

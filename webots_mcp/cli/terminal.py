@@ -27,7 +27,6 @@ _HEAD: Final = {
     "age_s": "{} s old",
 }
 _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
-_AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
 _NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
 
 
@@ -271,7 +270,8 @@ class _Layout:
                 yield line
                 continue
             yield f"{name}:"
-            if name == _AS_READ and "rows" in part and not self._is_of_command:
+            # In rows of a database null is a value.
+            if name == "result" and "rows" in part and not self._is_of_command:
                 part = part | {
                     "rows": [["NULL" if v is None else v for v in row] for row in part["rows"]]
                 }

@@ -31,7 +31,6 @@ _FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a per
 _TOOL: Final = re.compile(
     r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
 )
-_CODE: Final = re.compile(r"(\b(?:bridge\.\w+|MCPBridge)\([^()]*\))")  # of a controller
 _running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 
 
@@ -69,7 +68,8 @@ def as_typed(text: str) -> str:
     A name that is a common word (`since`) is meant only where a value follows it, or where it is
     joined to another one ("since and until").
     """
-    parts = _CODE.split(text)
+    # Calls in a controller stay as they are.
+    parts = re.split(r"(\b(?:bridge\.\w+|MCPBridge)\([^()]*\))", text)
     parts[::2] = map(_text_as_typed, parts[::2])
     return "".join(parts)
 

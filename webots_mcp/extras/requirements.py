@@ -16,13 +16,8 @@ from collections.abc import Iterable
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
 from urllib.parse import unquote, urlparse
 from urllib.request import url2pathname
-
-_NAME: Final = re.compile(r"[\w.-]+")
-_EXTRA: Final = re.compile(r"""extra == ['"]([\w.-]+)['"]""")
-_PYTHON: Final = re.compile(r"""python_version (<|>=) ['"]3\.(\d+)['"]""")
 
 
 def missing_requirements(extra: str | None = None) -> list[str]:
@@ -55,7 +50,7 @@ def install_line(requirements: Iterable[str]) -> str:
 
 def package_of(requirement: str) -> str:
     """Return the package that a requirement names."""
-    found = _NAME.match(requirement)
+    found = re.match(r"[\w.-]+", requirement)
     return found.group() if found else requirement
 
 
@@ -97,13 +92,13 @@ def _requirements(extra: str | None) -> list[str]:
 
 
 def _extra_of(requirement: str) -> str | None:
-    found = _EXTRA.search(requirement)
+    found = re.search(r"""extra == ['"]([\w.-]+)['"]""", requirement)
     return found[1] if found else None
 
 
 def _is_for_us(requirement: str) -> bool:
     """Return whether this Python is as old, or as new, as those that need it."""
-    found = _PYTHON.search(requirement)
+    found = re.search(r"""python_version (<|>=) ['"]3\.(\d+)['"]""", requirement)
     is_older = found is not None and sys.version_info < (3, int(found[2]))
     return found is None or is_older == (found[1] == "<")
 

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.trends import trends
 from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, PlotImage, Sheet
-from webots_mcp.plotting.signals import plot_signals
+from webots_mcp.plotting.signal_plot import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
 from webots_mcp.plotting.trials import plot_trials
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range

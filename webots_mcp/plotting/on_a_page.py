@@ -19,7 +19,7 @@ from webots_mcp.plotting.colours import ON_A_PAGE
 from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.robot_path import thinned
-from webots_mcp.plotting.signals import SignalAxes, paint_signals
+from webots_mcp.plotting.signal_plot import SignalAxes, paint_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, paint_trajectory
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.series import MOST_POINTS

@@ -50,7 +50,7 @@ from webots_mcp.plotting.robot_path import (
     read_path,
     thinned,
 )
-from webots_mcp.plotting.signals import line_through
+from webots_mcp.plotting.signal_plot import line_through
 from webots_mcp.signals.naming import listed, spelled_out
 from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame

@@ -30,7 +30,7 @@ from webots_mcp.plotting.painting import (
     paint_y_label,
     rows_of,
 )
-from webots_mcp.plotting.signals import line_through
+from webots_mcp.plotting.signal_plot import line_through
 from webots_mcp.signals.naming import listed, nearest_first
 from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, trials_of
 

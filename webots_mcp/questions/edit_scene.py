@@ -14,8 +14,9 @@ from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidI
 from webots_mcp.questions.arguments import AnyNames, Cursor, RobotName
 from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, merged, question
 from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.store.loop_evidence import find_holder
 from webots_mcp.store.recording import RecordingAccess, view_robot
-from webots_mcp.store.robots import find_holder, list_robots
+from webots_mcp.store.robots import list_robots
 
 Path = Annotated[
     str,

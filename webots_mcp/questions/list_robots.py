@@ -28,10 +28,11 @@ from webots_mcp.answers.shortening import (
     shorten,
 )
 from webots_mcp.contract import CUSTOM_DATA
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
 from webots_mcp.questions.declaring import READS, question
+from webots_mcp.store.loop_evidence import rows_waiting
 from webots_mcp.store.recording import (
     GETTING_STARTED,
     RecordingAccess,
@@ -44,14 +45,10 @@ from webots_mcp.store.retention import described, unheeded
 from webots_mcp.store.retention_plan import file_sizes
 from webots_mcp.store.robots import (
     RobotRecord,
-    SessionRecord,
     WorldSeen,
-    companions,
     console_trouble,
-    fetch_session,
     list_robots,
     nothing_recorded,
-    rows_waiting,
     world_seen,
 )
 from webots_mcp.store.run_rows import (
@@ -60,6 +57,7 @@ from webots_mcp.store.run_rows import (
     pace_of,
     real_time_factor,
 )
+from webots_mcp.store.sessions import SessionRecord, companions, fetch_session
 
 _TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
 _PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
@@ -266,7 +264,7 @@ def _pace(view: RobotView, run: RunRecord) -> float | None:
 
 def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
     """Return what the run is; `rows` is as of its last heartbeat."""
-    end_reason = run.end_reason or dict(dead_sessions(view.connection)).get(run.session_id)
+    end_reason = run.end_reason or dict(find_dead_sessions(view.connection)).get(run.session_id)
     ended = {"ended_by": end_reason} if end_reason is not None else {}
     return {
         "id": run.id,

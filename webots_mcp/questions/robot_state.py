@@ -41,20 +41,18 @@ from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.list_robots import BY_OBSERVER
 from webots_mcp.questions.sensor_values import sensor_part, unnamed_devices
 from webots_mcp.signals.naming import OBSERVED
+from webots_mcp.store.loop_evidence import rows_waiting
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.observed_pose import pose_at
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, newest_kept
 from webots_mcp.store.recording import RecordingAccess, RobotView
-from webots_mcp.store.robots import (
-    fetch_session,
-    rows_waiting,
-)
 from webots_mcp.store.run_rows import (
     StateRecord,
     newest_events,
     pace_of,
     select,
 )
+from webots_mcp.store.sessions import fetch_session
 
 PagePath = Annotated[
     str,

@@ -76,7 +76,7 @@ async def webots_get_camera(
     caller: Caller,
     camera: Annotated[str, Field(max_length=200, description="Device; '' is any.")] = "",
     fresh: Annotated[
-        bool, Field(description="Taken now, of lidars and range finders too.")
+        bool, Field(description="Ingested now, of lidars and range finders too.")
     ] = False,
     at_s: Annotated[Seconds | None, Field(description="Nearest to this simulation time.")] = None,
     frames: Annotated[int, Field(ge=1, le=16, description="This many, in one picture.")] = 1,

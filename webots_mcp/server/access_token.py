@@ -21,7 +21,6 @@ from typing import Final
 from webots_mcp.database.files import full_path, make_folder
 from webots_mcp.errors import CommandRefusedError
 
-_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[0-9A-Za-z._-]+)(?::[0-9]{1,5})?")
 LOOPBACK: Final = ("127.0.0.1", "localhost", "[::1]")  # as a browser writes this computer
 _SHORTEST: Final = 20  # characters
 _AGAIN: Final = "'webots-mcp token --new' makes another"
@@ -86,7 +85,7 @@ def named_host(header: str) -> str | None:
 
     None if it is anything else than a host, or a host and a port: `127.0.0.1:80@evil` is neither.
     """
-    found = _HOST.fullmatch(header)
+    found = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[0-9A-Za-z._-]+)(?::[0-9]{1,5})?", header)
     return found[1].lower() if found else None
 
 

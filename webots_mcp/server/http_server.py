@@ -33,16 +33,6 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 PATH: Final = "/mcp"
-_STRANGER: Final = (
-    "This server answers requests with the header 'Authorization: Bearer TOKEN' only; "
-    "'webots-mcp token' shows the token to the user who started the server.\n"
-)
-_MISDIRECTED: Final = (
-    "This server answers requests for the host that it was started for; --allow-host NAME adds "
-    "another.\n"
-)
-_FOREIGN: Final = "This server answers pages of its own host only.\n"
-_CLOSED: Final = "This server has no valid token: there 'webots-mcp token' says what is wrong.\n"
 
 
 class Endpoint(NamedTuple):
@@ -193,20 +183,36 @@ def gate(app: ASGIApp, place: Endpoint) -> ASGIApp:
             headers = Headers(scope=scope)
             hosts, origins = headers.getlist("host"), headers.getlist("origin")
             if len(hosts) != 1 or named_host(hosts[0]) not in names:
-                return await PlainTextResponse(_MISDIRECTED, 421)(scope, receive, send)
+                return await PlainTextResponse(
+                    "This server answers requests for the host that it was started for; "
+                    "--allow-host NAME adds another.\n",
+                    421,
+                )(scope, receive, send)
             scheme = f"{place.scheme}://"
             for origin in origins:
                 host = named_host(origin.removeprefix(scheme))
                 if not origin.startswith(scheme) or host not in names:
-                    return await PlainTextResponse(_FOREIGN, 403)(scope, receive, send)
+                    return await PlainTextResponse(
+                        "This server answers pages of its own host only.\n", 403
+                    )(scope, receive, send)
             given = headers.getlist("authorization")
             try:
                 admitted = len(given) == 1 and is_admitted(given[0])
             except (CommandRefusedError, OSError):
-                return await PlainTextResponse(_CLOSED, 503)(scope, receive, send)
+                return await PlainTextResponse(
+                    "This server has no valid token: there 'webots-mcp token' says what is "
+                    "wrong.\n",
+                    503,
+                )(scope, receive, send)
             if not admitted:
                 refusal = {"WWW-Authenticate": "Bearer", "Connection": "close"}
-                return await PlainTextResponse(_STRANGER, 401, refusal)(scope, receive, send)
+                return await PlainTextResponse(
+                    "This server answers requests with the header 'Authorization: Bearer TOKEN' "
+                    "only; 'webots-mcp token' shows the token to the user who started the "
+                    "server.\n",
+                    401,
+                    refusal,
+                )(scope, receive, send)
             return await _follow(app, _lowered(scope), receive, send)
         await app(scope, receive, send)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 from webots_mcp.signals.naming import SOLIDS, WORLD, angle_unit, unit_in, words_of
@@ -33,8 +34,15 @@ _OF_OTHERS: Final = (f"{WORLD}.", f"{SOLIDS}.")
 SIDES: Final = (
     "left", "right", "front", "rear", "front left", "front right", "rear left", "rear right",
 )  # fmt: skip
+_UNITS: Final = {  # as people write them, and as names are understood
+    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "degree": "deg", "degrees": "deg",
+    "°": "deg", "radian": "rad", "radians": "rad", "°/s": "deg/s", "rev/min": "rpm", "1/min": "rpm",
+    "r/min": "rpm", "kph": "km/h", "kmh": "km/h", "mps": "m/s", "rad/sec": "rad/s",
+    "deg/sec": "deg/s",
+}  # fmt: skip
 LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is declared for
 _LONGEST_UNIT: Final = 20  # characters
+_BAD_UNIT: Final = "signal {!r}: unit must be a text of up to {} characters, such as 'm/s', not {}"
 _REMEMBERED: Final = 4096  # names whose words are kept
 
 # -- the words of names ------------------------------------------------------------------------
@@ -78,6 +86,10 @@ HOLDING: Final = frozenset(("gripper", "finger", "claw", "jaw", "hand"))  # they
 _FREE_MOTORS: Final = frozenset((  # motors that move no robot over the ground by wheels
     "fan", "propeller", "prop", "rotor", "engine", "brush", "pump", "spindle", "conveyor", "belt",
     "thruster", "vacuum", "drum", "blade", "turbine",
+))  # fmt: skip
+INPUTS: Final = frozenset((  # what a person moves by hand
+    "joystick", "stick", "gamepad", "joypad", "pad", "axis", "axe", "mouse", "touch", "cursor",
+    "keyboard", "key", "button", "input",
 ))  # fmt: skip
 _TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
 _GYROS: Final = frozenset(("gyro", "imu", "gyroscope"))
@@ -151,6 +163,7 @@ def understood_words() -> dict[str, list[str]]:
         "motor speed, not of a wheel": _FREE_MOTORS,
         "angular velocity": said.get("angular velocity", set()) | _GYROS,
         "count": _COUNTS,
+        "moved by hand, no position": INPUTS,
     }
     return {meaning: sorted(words) for meaning, words in groups.items()}
 
@@ -278,6 +291,53 @@ def meanings_by_name(
     }
 
 
+# -- meanings that only the values tell ----------------------------------------------------------
+
+_NEARLY_A_TURN: Final = 0.9  # of a turn, that an angle leaps where its scale ends
+_FEW_LEVELS: Final = 8  # different values of something that is quantised
+_LEAST_VALUES: Final = 20  # of fewer values nothing follows
+
+
+def meaning_by_behaviour(values: Sequence[float]) -> Meaning:
+    """Return what the values of a signal tell where neither a person, a device nor its name does.
+
+    Args:
+        values: Finite ones, in order; a part of them is enough.
+
+    Returns:
+        A meaning of the source `behaviour`, on which a warning may rest; else an unknown one. What
+        is constant or quantised has no quantity.
+    """
+    if len(values) < _LEAST_VALUES:
+        return UNKNOWN
+    levels = set(values)
+    if len(levels) == 1:
+        return _behaves(None, "its value never changed")
+    if levels == {0.0, 1.0}:
+        return _behaves("flag", "its values are 0 and 1")
+    steps = [after - before for before, after in pairwise(values) if after != before]
+    rises = [step for step in steps if step > 0]
+    is_whole = all(value == int(value) for value in values)
+    falls = [after for before, after in pairwise(values) if after < before]
+    falls_to_start = not falls or max(falls) <= min(levels) + 1
+    if is_whole and falls_to_start and len(rises) > len(steps) / 2 and len(levels) > _FEW_LEVELS:
+        return _behaves("count", "its whole numbers only rise, or begin again")
+    for turn, unit in ((math.tau, "rad"), (360.0, "deg")):
+        fits = max(map(abs, values)) <= turn * 1.01 and max(values) - min(values) <= turn * 1.01
+        leaps = [step for step in steps if abs(step) >= _NEARLY_A_TURN * turn]
+        others = [abs(step) for step in steps if abs(step) < _NEARLY_A_TURN * turn]
+        if fits and leaps and others and max(others) < turn / 4:
+            angle = _behaves("heading", "it leaps by a full turn, as an angle does")
+            return angle._replace(unit=unit)
+    if len(levels) <= _FEW_LEVELS:
+        return _behaves(None, f"it has only {len(levels)} different values")
+    return UNKNOWN
+
+
+def _behaves(quantity: Quantity | None, why: str) -> Meaning:
+    return Meaning(quantity, source="behaviour", why=why)
+
+
 # -- meanings that are declared, or known from a device ------------------------------------------
 
 
@@ -354,13 +414,11 @@ def _checked(name: str, field: str, value: object) -> Any:
             raise ValueError(f"signal {name!r}: {field} must be the name of one other signal")
         return other
     if field == "unit":
-        fits = isinstance(value, str) and value.isprintable() and len(value) <= _LONGEST_UNIT
-        if not fits or not value:
-            raise ValueError(
-                f"signal {name!r}: unit must be a text of up to {_LONGEST_UNIT} characters, such "
-                f"as 'm/s', not {value!r:.80}"
-            )
-        return value
+        if not isinstance(value, str) or not value or not value.isprintable():
+            raise ValueError(_BAD_UNIT.format(name, _LONGEST_UNIT, f"{value!r:.80}"))
+        if len(value) > _LONGEST_UNIT:
+            raise ValueError(_BAD_UNIT.format(name, _LONGEST_UNIT, f"{value!r:.80}"))
+        return _UNITS.get(value.lower(), value)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
         raise ValueError(f"signal {name!r}: {field} must be a finite number, not {value!r:.80}")
     return float(value)

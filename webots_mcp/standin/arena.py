@@ -11,9 +11,7 @@ from webots_mcp.standin.geometry import Color, CoordinateFrame, Disc, Shape, Upr
 from webots_mcp.standin.vrml import WorldNode, children_of, descendants_of
 from webots_mcp.standin.world import World, own_frame
 
-_GEOMETRIES: Final = ("Box", "Capsule", "Cylinder", "Sphere")
 _DEFAULT_COLOR: Final[Color] = (0.5, 0.5, 0.5)
-_LIGHTS: Final = ("DirectionalLight", "PointLight")
 _SLIDING_FRICTION: Final = 1.0
 """Coulomb friction of bodies on the floor: Webots' default."""
 
@@ -173,7 +171,11 @@ class Arena:
         self._sort()
 
     def _sort(self) -> None:
-        self.lights = [node for node in self.world.nodes if node.type_name in _LIGHTS]
+        self.lights = [
+            node
+            for node in self.world.nodes
+            if node.type_name in ("DirectionalLight", "PointLight")
+        ]
         self._obstacles = [body for body in self.bodies if body.is_obstacle]
         self._movable = [body for body in self._obstacles if body.is_movable]
 
@@ -297,7 +299,7 @@ def _geometries(
     node: WorldNode, frame: CoordinateFrame
 ) -> Iterator[tuple[WorldNode, CoordinateFrame]]:
     frame = frame.then(own_frame(node))
-    if node.type_name in _GEOMETRIES:
+    if node.type_name in ("Box", "Capsule", "Cylinder", "Sphere"):
         yield node, frame
     elif node.type_name in ("Group", "Pose", "Transform", "Shape"):
         for child in children_of(node):

@@ -10,14 +10,13 @@ from controller.session import Message
 from webots_mcp.standin.arena import Body
 from webots_mcp.standin.devices import FetchedSensor
 from webots_mcp.standin.errors import WorldError
-from webots_mcp.standin.pictures import Label
 from webots_mcp.standin.simulator import Mode, SimulatedRobot, Simulator, TrackedKey
+from webots_mcp.standin.view_pictures import Label
 from webots_mcp.standin.vrml import NODE_TYPES, FieldDefinition, Parser, WorldNode, descendants_of
 from webots_mcp.standin.world import as_text
 
 CUSTOM_DATA_TAG: Final = 0
 """Tag of the robot itself among the tags of its devices."""
-_LIVE_PROTO_FIELDS: Final = ("translation", "rotation", "name", "customData")
 """Fields of a PROTO node that can be set after it was built."""
 
 FieldReference = tuple[int, str]
@@ -268,7 +267,7 @@ class SupervisorRequests:
     def _follow(self, node: WorldNode, name: str, value: Any) -> None:
         if node.type_name == "Robot" and name == "customData":
             self._simulator.robot_of(node).fresh[CUSTOM_DATA_TAG] = value
-        elif node.proto_name and name not in _LIVE_PROTO_FIELDS:
+        elif node.proto_name and name not in ("translation", "rotation", "name", "customData"):
             self._simulator.log(
                 f"WARNING: {node.proto_name}.{name} was set, which changes nothing: "
                 "the stand-in builds PROTO nodes once"

@@ -25,7 +25,6 @@ _TERMINATION_S: Final = 1.0
 _LAST_LINES_S: Final = 0.5
 """How long to wait for the last lines of a process: a child of it may hold the pipes open."""
 
-_NO_CONTROLLER: Final = ("", "<none>", "void", "<generic>")
 _EXTERN: Final = "<extern>"
 _INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
 _EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
@@ -242,7 +241,7 @@ class Controller(ControllerEndpoint):
         name: str = robot.node.fields["controller"]
         if robot.name in self.launch.overrides:
             self.file = self.launch.overrides[robot.name].resolve()
-        elif name in (*_NO_CONTROLLER, _EXTERN):
+        elif name in ("", "<none>", "void", "<generic>", _EXTERN):
             return
         elif name == ".." or Path(name).name != name:
             self._warn(

@@ -21,7 +21,6 @@ from webots_mcp.standin.world import World, own_frame
 
 _SUN_M: Final = 1000.0
 """Distance of a DirectionalLight: far enough for its rays to be parallel."""
-_NOT_SENT: Final = ("children", "boundingObject", "physics")
 """Fields of a device's node that no getter of Webots returns."""
 
 
@@ -118,7 +117,7 @@ def _sent(node: WorldNode) -> dict[str, Any]:
     return {
         name: _sent(value) if isinstance(value, WorldNode) else value
         for name, value in node.fields.items()
-        if name not in _NOT_SENT
+        if name not in ("children", "boundingObject", "physics")
     }
 
 

@@ -20,8 +20,8 @@ from webots_mcp.standin.devices import (
     devices_in,
 )
 from webots_mcp.standin.errors import WorldError
-from webots_mcp.standin.pictures import Label, PictureRequest, save_picture
 from webots_mcp.standin.vehicle import Vehicle, joints_in
+from webots_mcp.standin.view_pictures import Label, PictureRequest, save_picture
 from webots_mcp.standin.vrml import WorldNode
 from webots_mcp.standin.world import World
 

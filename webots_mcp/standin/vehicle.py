@@ -9,9 +9,6 @@ from typing import Any
 from webots_mcp.standin.arena import Arena, Body
 from webots_mcp.standin.vrml import WorldNode, descendants_of
 
-_MOTORS = ("RotationalMotor", "LinearMotor")
-_JOINTS = ("HingeJoint", "SliderJoint")
-
 
 @dataclass
 class Joint:
@@ -32,7 +29,9 @@ class Joint:
     @staticmethod
     def of(node: WorldNode) -> Joint:
         """Return the joint that a node describes. Without a motor it never moves."""
-        motors = [n for n in node.fields["device"] if n.type_name in _MOTORS]
+        motors = [
+            n for n in node.fields["device"] if n.type_name in ("RotationalMotor", "LinearMotor")
+        ]
         fields: dict[str, Any] = motors[0].fields if motors else {}
         parameters = node.fields["jointParameters"]
         joint = Joint(
@@ -152,7 +151,11 @@ class Vehicle:
 
 def joints_in(robot: WorldNode) -> list[Joint]:
     """Return all joints of a robot, in the order of the scene tree."""
-    return [Joint.of(node) for node in descendants_of(robot) if node.type_name in _JOINTS]
+    return [
+        Joint.of(node)
+        for node in descendants_of(robot)
+        if node.type_name in ("HingeJoint", "SliderJoint")
+    ]
 
 
 def _wheel_of(joint: Joint) -> Wheel | None:

@@ -31,12 +31,10 @@ _FIELD_KEYWORDS: Final = (
     *("field", "vrmlField", "w3dField", "exposedField"),
     *("unconnectedField", "hiddenField", "deprecatedField"),
 )
-_FIRST_RELEASE: Final = "R2022"
 """The oldest release with the present axes."""
 
 _TOKEN: Final = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]|[^\s\[\]{}",#]+)')
 _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
-_NAME: Final = re.compile(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z")
 _WORDS: Final[dict[str, bool | None]] = {"TRUE": True, "FALSE": False, "NULL": None}
 
 
@@ -210,7 +208,7 @@ class Parser:
 
     def _name(self, what: str) -> Token:
         token = self._take()
-        if not _NAME.match(token.text):
+        if not re.match(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z", token.text):
             raise WorldError(f"expected {what}, found {token.text!r}", token.line)
         return token
 
@@ -313,7 +311,7 @@ def require_release(text: str, what: str = "world") -> None:
     release = re.match(r"#VRML_SIM (R20\d\d)[ab]?\S* utf8", first_line)
     if release is None:
         raise WorldError(f'a {what} begins with "{first}", not {first_line[:40]!r}', 1)
-    if release[1] < _FIRST_RELEASE:
+    if release[1] < "R2022":
         raise WorldError(
             f"{what}s of {release[1]} have other axes: "
             "open and save it with Webots R2022a or newer",

@@ -25,8 +25,8 @@ from webots_mcp.steering.target import find_target
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.recording import RecordingAccess, RobotView
-from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.runs import pace
+from webots_mcp.store.sessions import fetch_session
 
 ACTION: Final = "run"
 

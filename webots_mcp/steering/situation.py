@@ -20,8 +20,10 @@ from webots_mcp.simulator.instances import Instance, instance_at, instances
 from webots_mcp.simulator.orders import Order, WebotsAddress, address_of
 from webots_mcp.simulator.own_webots import belongs
 from webots_mcp.steering.target import find_target
+from webots_mcp.store.loop_evidence import find_holder
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
-from webots_mcp.store.robots import SessionRecord, find_holder, list_robots, live_observer
+from webots_mcp.store.robots import list_robots, live_observer
+from webots_mcp.store.sessions import SessionRecord
 
 
 class RecordedUntil(NamedTuple):
@@ -42,8 +44,8 @@ class Situation:
         address: Webots' address as named by the caller or by the robot's session.
         before: The newest moment of its recording.
         observer: The name of the live observer of its simulation, if there is one.
-        is_address_sure: Whether the wanted Webots is sure to listen at the address: the caller has
-            named it, or a live controller runs there. Else another Webots may listen by now.
+        is_address_sure: Whether the wanted Webots certainly listens at the address: the caller has
+            named it, or a live controller runs there. Otherwise another Webots may listen by now.
     """
 
     robot: str | None

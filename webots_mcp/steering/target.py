@@ -14,17 +14,11 @@ from typing import Any
 from webots_mcp.contract import BUILT_IN_ACTIONS, CUSTOM_DATA
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, UnknownActionError
 from webots_mcp.signals.naming import misfit_of_parameters, perhaps_meant
+from webots_mcp.store.loop_evidence import find_holder
 from webots_mcp.store.recording import RobotView, view_robot
-from webots_mcp.store.robots import (
-    SessionRecord,
-    companions,
-    find_holder,
-    list_robots,
-    live_observer,
-    may_return,
-    robot_name,
-    without_observers,
-)
+from webots_mcp.store.robot_status import may_return
+from webots_mcp.store.robots import list_robots, live_observer, robot_name, without_observers
+from webots_mcp.store.sessions import SessionRecord, companions
 
 
 def find_target(connection: sqlite3.Connection, robot: str | None, action: str) -> RobotView:

@@ -43,7 +43,8 @@ from webots_mcp.store.parameters import (
 )
 from webots_mcp.store.recording import Job, RecordingAccess, RobotView
 from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import find_block, robot_name
+from webots_mcp.store.robot_status import find_block
+from webots_mcp.store.robots import robot_name
 
 OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
 _ASKER: Final = "trials"
@@ -57,7 +58,7 @@ class TrialTimes:
 
     Attributes:
         poll_s: Between two reads of a command.
-        settle_s: Between two rounds of taking in rows that wait in files.
+        settle_s: Between two times of ingesting rows that wait in files.
         block_search_s: Between two searches for what keeps the loop from a command.
         patience_s: For a command that takes a round of the loop.
         end_patience_s: The same when the server ends.

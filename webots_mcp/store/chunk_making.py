@@ -25,7 +25,7 @@ from webots_mcp.database.connection import (
     AtomicStatements,
     FrozenConnection,
 )
-from webots_mcp.database.liveness import holder_of
+from webots_mcp.database.leases import holder_of
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import DatabaseError, warn
 from webots_mcp.signals.register import MAX_SIGNALS
@@ -61,7 +61,6 @@ _IDS_AT_ONCE: Final = 20_000
 _FIRST_AT_ONCE: Final = 100_000  # bytes
 _STEP_BYTES: Final = 5_000  # a chunk takes as long as so many bytes, and its own besides
 _NO_LIMIT: Final = 2**62
-_NO_IDS: Final = (1, 0)  # first and last id of no rows
 _STATE_BYTES: Final = 25  # of a record beside its text: run, two times, lengths
 _STATISTICS_BYTES: Final = 115  # of a chunk beside what is compressed
 _CHUNK_INDEX_BYTES: Final = 110  # in both indexes, measured
@@ -76,39 +75,6 @@ _COLUMNS: Final = (
     "labels",
 )
 _LIST: Final = ", ".join(_COLUMNS)
-_SET_WATERMARK: Final = (
-    "INSERT INTO watermark (name, state_id) VALUES ('chunk', ?) "
-    f"ON CONFLICT (name) DO UPDATE SET state_id = iif({IS_MARK}, "
-    "max(state_id, excluded.state_id), excluded.state_id)"
-)
-_LAST_ID: Final = "SELECT max(id) FROM (SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?)"
-_WITH_NEW_ROWS: Final = (  # one scan for all runs: late rows lie between the ids it finds
-    "SELECT n.run_id, r.robot_id, n.first_id, n.last_id FROM (SELECT run_id, min(id) AS first_id, "
-    "max(id) AS last_id FROM state WHERE id > ? AND id <= ? GROUP BY run_id) n "
-    "JOIN run r ON r.id = n.run_id"
-)
-_ENDED: Final = (
-    "SELECT id, robot_id FROM run WHERE ended_wall_time_s IS NOT NULL AND is_chunked = 0"
-)
-_NEWEST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
-_SET_CHUNKED: Final = "UPDATE run SET is_chunked = 1 WHERE id = ?"
-_ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
-_TAIL: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "AND id <= ? ORDER BY sim_time_s, id LIMIT ?"
-)
-_COUNT: Final = (  # answered by the index alone
-    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "AND id <= ? LIMIT ?)"
-)
-_LATE: Final = (  # by their ids, by which it is known up to where they were looked at
-    f"SELECT * FROM (SELECT {STATE_COLUMNS} FROM state WHERE id > ? AND id <= ? "
-    "AND +run_id = ? AND (sim_time_s, id) <= (?, ?) ORDER BY id LIMIT ?) ORDER BY sim_time_s, id"
-)
-_TEMPORARY: Final = (
-    f"CREATE TEMP TABLE IF NOT EXISTS new_chunk (number INTEGER PRIMARY KEY, {_LIST})"
-)
-_PREPARE: Final = f"INSERT INTO temp.new_chunk VALUES ({', '.join('?' * (len(_COLUMNS) + 1))})"
 _BEGIN_GROUP: Final = (
     "INSERT INTO row_group (run_id, start_sim_time_s, end_sim_time_s, last_state_id, "
     "max_state_id, row_count, stored_row_count, lost_value_count, stored_row_bytes, chunk_bytes, "
@@ -134,17 +100,6 @@ _COMPLETE: Final = AtomicStatements(  # unless another process has stored these 
     "(SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE run_id = NEW.run_id "
     "AND is_complete = 1) <> NEW.max_state_id",
 )
-_WHOLE_GROUP: Final = (
-    "SELECT g.run_id, r.robot_id, g.row_count, g.last_state_id, coalesce((SELECT min(min) FROM "
-    f"chunk WHERE group_id = g.id AND signal_id = {STATE_IDS}), 0), g.max_state_id, "
-    "g.start_sim_time_s, g.end_sim_time_s FROM row_group g JOIN run r ON r.id = g.run_id "
-    "WHERE g.id = ? AND g.is_complete = 1 AND g.stored_row_count = g.row_count"
-)
-_CHUNKS_OF: Final = "SELECT signal_id, codec, numbers, codes, labels FROM chunk WHERE group_id = ?"
-_ROWS_OF_GROUP: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id BETWEEN ? AND ? "
-    "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s, id LIMIT ?"
-)
 # Unless rows of the old group were deleted, or it was replaced meanwhile.
 _REPLACE: Final = AtomicStatements(
     "replace_group",
@@ -155,18 +110,9 @@ _REPLACE: Final = AtomicStatements(
     "AND stored_row_count = row_count)",
 )
 _LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
-_DELETE_CHUNKS: Final = (  # unless its maker has ended in the meantime what it was at
-    "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = (SELECT id "
-    "FROM row_group WHERE id = ? AND is_complete = 0) LIMIT 20)"
-)
-_DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
 MIN_ROWS_ON_DEMAND: Final = 2000  # a question reads fewer as they are
 _BATCH_ROWS: Final = 2000
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
-_LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
-    "SELECT max(0, (SELECT coalesce(max(id), 0) FROM state) - :mark - (SELECT "
-    "coalesce(sum(row_count), 0) FROM row_group WHERE is_complete = 1 AND max_state_id > :mark))"
-)
 _PAGE_HEAD_BYTES: Final = 8
 _CELL_HEAD_BYTES: Final = 7  # pointer, length and id
 _LINK_BYTES: Final = 4  # to the next page of a long row
@@ -204,14 +150,26 @@ def make_chunks(
     remake_reported_groups(connection, pause_s)
     _delete_left_behind(connection, pause_s)
     rows = 0
-    ended = connection.execute(_ENDED).fetchall()  # one scan, however many rounds follow
+    ended = connection.execute(
+        "SELECT id, robot_id FROM run WHERE ended_wall_time_s IS NOT NULL AND is_chunked = 0"
+    ).fetchall()  # one scan, however many rounds follow
     while rows < budget_rows:
         mark = watermark(connection)
-        last = connection.execute(_LAST_ID, (mark, _IDS_AT_ONCE)).fetchone()[0]
-        runs = dict.fromkeys(ended, _NO_IDS)
+        last = connection.execute(
+            "SELECT max(id) FROM (SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?)",
+            (mark, _IDS_AT_ONCE),
+        ).fetchone()[0]
+        # The bounds 1 and 0 hold no row.
+        runs = dict.fromkeys(ended, (1, 0))
         ended = []  # from the next round on only where they have new rows
         if last is not None:
-            for *run, first_id, last_id in connection.execute(_WITH_NEW_ROWS, (mark, last)):
+            # One scan serves all runs: late rows lie between the ids that it finds.
+            for *run, first_id, last_id in connection.execute(
+                "SELECT n.run_id, r.robot_id, n.first_id, n.last_id "
+                "FROM (SELECT run_id, min(id) AS first_id, max(id) AS last_id FROM state "
+                "WHERE id > ? AND id <= ? GROUP BY run_id) n JOIN run r ON r.id = n.run_id",
+                (mark, last),
+            ):
                 runs[tuple(run)] = (first_id, last_id)
         for (run_id, robot_id), new_ids in runs.items():
             work = _RunChunks(connection, run_id, robot_id, pause_s, new_ids)
@@ -220,16 +178,23 @@ def make_chunks(
                 return Made(rows, False)
         if last is None:
             return Made(rows, True)
-        connection.execute(_SET_WATERMARK, (last,))
+        connection.execute(
+            "INSERT INTO watermark (name, state_id) VALUES ('chunk', ?) "
+            f"ON CONFLICT (name) DO UPDATE SET state_id = iif({IS_MARK}, "
+            "max(state_id, excluded.state_id), excluded.state_id)",
+            (last,),
+        )
     return Made(rows, False)
 
 
 def chunk_whole_run(connection: sqlite3.Connection, run_id: int, pause_s: float = 0.0) -> bool:
     """Put every row of a run into chunks, however few are left; whether all of them are in one."""
-    (robot_id,) = connection.execute(_ROBOT, (run_id,)).fetchone() or (None,)
+    (robot_id,) = connection.execute(
+        "SELECT robot_id FROM run WHERE id = ?", (run_id,)
+    ).fetchone() or (None,)
     if robot_id is None:
         return False
-    newest_id = connection.execute(_NEWEST_ID).fetchone()[0]
+    newest_id = connection.execute("SELECT coalesce(max(id), 0) FROM state").fetchone()[0]
     work = _RunChunks(connection, run_id, robot_id, pause_s, (0, newest_id), least_rows=1)
     work.make(_NO_LIMIT, newest_id)
     return work.done
@@ -283,7 +248,9 @@ class _RunChunks:
                 if has_ended:
                     left = self._tail(at, last_id)  # few, read as they are, whose names are entered
                     _signals_of(self._connection, self._robot_id, left)
-                    self._connection.execute(_SET_CHUNKED, (self._run_id,))
+                    self._connection.execute(
+                        "UPDATE run SET is_chunked = 1 WHERE id = ?", (self._run_id,)
+                    )
                 return rows
             if not self._store(tail, at):
                 return rows
@@ -298,18 +265,38 @@ class _RunChunks:
         if at.end_s == -math.inf or last_id <= after_id:
             return StateColumns()
         place = (at.end_s, at.last_state_id)
-        return _read(self._connection, _LATE, (after_id, last_id, self._run_id, *place))
+        # Late rows are found by id, because the mark up to which they were read is an id.
+        return _read(
+            self._connection,
+            f"SELECT * FROM (SELECT {STATE_COLUMNS} FROM state WHERE id > ? AND id <= ? "
+            "AND +run_id = ? AND (sim_time_s, id) <= (?, ?) ORDER BY id LIMIT ?) "
+            "ORDER BY sim_time_s, id",
+            (after_id, last_id, self._run_id, *place),
+        )
 
     def _has_tail(self, at: ChunkProgress, last_id: int, least_rows: int) -> bool:
         """Whether there are so many rows after those that are in chunks."""
         place = (at.end_s, at.last_state_id)
         asked = (self._run_id, *place, last_id, least_rows)
-        return bool(self._connection.execute(_COUNT, asked).fetchone()[0] >= least_rows)
+        # The index alone answers this.
+        return bool(
+            self._connection.execute(
+                "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? "
+                "AND (sim_time_s, id) > (?, ?) AND id <= ? LIMIT ?)",
+                asked,
+            ).fetchone()[0]
+            >= least_rows
+        )
 
     def _tail(self, at: ChunkProgress, last_id: int) -> StateColumns:
         """The first rows after those that are in chunks."""
         place = (at.end_s, at.last_state_id)
-        return _read(self._connection, _TAIL, (self._run_id, *place, last_id))
+        return _read(
+            self._connection,
+            f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+            "AND id <= ? ORDER BY sim_time_s, id LIMIT ?",
+            (self._run_id, *place, last_id),
+        )
 
     def _has_ended(self) -> bool:
         ended = "SELECT ended_wall_time_s IS NOT NULL FROM run WHERE id = ?"
@@ -368,11 +355,16 @@ def _sizes_of(
 
 def _prepare(connection: sqlite3.Connection, chunks: Sequence[tuple[Any, ...]]) -> None:
     """Fill the temporary table, in a transaction that locks nothing but it."""
-    connection.execute(_TEMPORARY)
+    connection.execute(
+        f"CREATE TEMP TABLE IF NOT EXISTS new_chunk (number INTEGER PRIMARY KEY, {_LIST})"
+    )
     connection.execute("BEGIN")
     try:
         connection.execute("DELETE FROM temp.new_chunk")
-        connection.executemany(_PREPARE, ((number, *chunk) for number, chunk in enumerate(chunks)))
+        connection.executemany(
+            f"INSERT INTO temp.new_chunk VALUES ({', '.join('?' * (len(_COLUMNS) + 1))})",
+            ((number, *chunk) for number, chunk in enumerate(chunks)),
+        )
     finally:
         connection.execute("COMMIT")
 
@@ -408,15 +400,29 @@ def remake_if_damaged(connection: sqlite3.Connection, group_id: int, pause_s: fl
     Returns:
         The id of the new group; that of the old one if it stays as it is.
     """
-    group = connection.execute(_WHOLE_GROUP, (group_id,)).fetchone()
+    group = connection.execute(
+        "SELECT g.run_id, r.robot_id, g.row_count, g.last_state_id, coalesce((SELECT min(min) "
+        "FROM chunk WHERE group_id = g.id "
+        f"AND signal_id = {STATE_IDS}), 0), g.max_state_id, g.start_sim_time_s, g.end_sim_time_s "
+        "FROM row_group g JOIN run r ON r.id = g.run_id WHERE g.id = ? AND g.is_complete = 1 "
+        "AND g.stored_row_count = g.row_count",
+        (group_id,),
+    ).fetchone()
     if group is None:
         return group_id
     run_id, robot_id, count, last_state_id, *bounds = group
-    chunks = connection.execute(_CHUNKS_OF, (group_id,)).fetchall()
+    chunks = connection.execute(
+        "SELECT signal_id, codec, numbers, codes, labels FROM chunk WHERE group_id = ?", (group_id,)
+    ).fetchall()
     is_sound = {SIM_TIMES, WALL_TIMES, STATE_IDS} <= {signal_id for signal_id, *_ in chunks}
     if is_sound and not any(is_damaged(EncodedChunk(*each), count) for _, *each in chunks):
         return group_id
-    columns = _read(connection, _ROWS_OF_GROUP, (run_id, *bounds))
+    columns = _read(
+        connection,
+        f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id BETWEEN ? AND ? "
+        "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s, id LIMIT ?",
+        (run_id, *bounds),
+    )
     if len(columns) != count or columns.ids[-1] != last_state_id:
         return group_id
     new_id, made = store_group(connection, (run_id, robot_id), columns, pause_s)
@@ -525,9 +531,14 @@ def _in_short_steps(
 def _delete_left_behind(connection: sqlite3.Connection, pause_s: float) -> None:
     """Groups of which a process that ended meanwhile had not stored all chunks."""
     for (group_id,) in connection.execute(_LEFT_BEHIND).fetchall():
-        while connection.execute(_DELETE_CHUNKS, (group_id,)).rowcount:
+        # The maker of a group may have completed it in the meantime.
+        while connection.execute(
+            "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = (SELECT id "
+            "FROM row_group WHERE id = ? AND is_complete = 0) LIMIT 20)",
+            (group_id,),
+        ).rowcount:
             time.sleep(pause_s)
-        connection.execute(_DELETE_GROUP, (group_id,))
+        connection.execute("DELETE FROM row_group WHERE id = ? AND is_complete = 0", (group_id,))
 
 
 # Making chunks on demand, where no server does it in the background.
@@ -595,7 +606,15 @@ def make_missing_chunks(
 
 def _rows_left(connection: sqlite3.Connection) -> int:
     """About how many rows are in no chunk."""
-    return int(connection.execute(_LEFT, {"mark": watermark(connection)}).fetchone()[0])
+    # Ids have gaps only where rows were deleted.
+    return int(
+        connection.execute(
+            "SELECT max(0, (SELECT coalesce(max(id), 0) "
+            "FROM state) - :mark - (SELECT coalesce(sum(row_count), 0) FROM row_group "
+            "WHERE is_complete = 1 AND max_state_id > :mark))",
+            {"mark": watermark(connection)},
+        ).fetchone()[0]
+    )
 
 
 @contextmanager

@@ -34,16 +34,11 @@ Kind = Literal["null", "bool", "int", "num", "text"]
 
 MOST_NEW_ROWS: Final = 20_000  # that are in no chunk: they are parsed, and stay in memory
 _NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
-_UNCHUNKED: Final = (
-    "SELECT (SELECT count(*) FROM state WHERE run_id = :run) - (SELECT coalesce(sum(row_count), 0) "
-    "FROM row_group WHERE run_id = :run AND is_complete = 1)"
-)
 _INCOMPLETE: Final = (
     "SELECT EXISTS (SELECT 1 FROM row_group WHERE run_id = ? AND is_complete = 1 "
     "AND start_sim_time_s < ? AND end_sim_time_s >= ? "
     "AND (lost_value_count > 0 OR stored_row_count < row_count))"
 )
-_ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
 
 
 @dataclass(frozen=True)
@@ -91,7 +86,12 @@ def _part(
     connection: sqlite3.Connection, segment: Segment, count: int, last_id: int
 ) -> RunColumns | None:
     run_id = segment.run_id
-    (waiting,) = connection.execute(_UNCHUNKED, {"run": run_id}).fetchone()
+    (waiting,) = connection.execute(
+        "SELECT (SELECT count(*) FROM state "
+        "WHERE run_id = :run) - (SELECT coalesce(sum(row_count), 0) FROM row_group "
+        "WHERE run_id = :run AND is_complete = 1)",
+        {"run": run_id},
+    ).fetchone()
     asked = (run_id, segment.end_s, segment.start_s)
     if (
         waiting > MOST_NEW_ROWS
@@ -103,7 +103,7 @@ def _part(
     if len(frame) < count or not frame.is_as_stored:
         return None
     frame = frame.rows(0, count)  # others have come since they were counted
-    (robot_id,) = connection.execute(_ROBOT, (run_id,)).fetchone()
+    (robot_id,) = connection.execute("SELECT robot_id FROM run WHERE id = ?", (run_id,)).fetchone()
     known = registered(connection, robot_id)
     if count_lost(frame.new_rows, known):
         return None

@@ -38,7 +38,6 @@ _CODES_LEVEL: Final = 1
 _CHECKSUM_BYTES: Final = 4  # CRC-32: a decompressor is not asked what it makes of damaged bytes
 EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
-_NOTHING: Final = "none"  # no row holds a number
 _NUMBERS: Final = frozenset({int, float})
 _HOW_TO_INSTALL: Final = "install it: pip install --only-binary pcodec 'pcodec>=1.0'"
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
@@ -46,19 +45,6 @@ STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
 SIM_TIMES: Final = 0  # in the place of a signal's id
 WALL_TIMES: Final = -1
 STATE_IDS: Final = -2
-_GROUPS: Final = (
-    "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
-    "FROM row_group WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? "
-    "AND end_sim_time_s >= ? ORDER BY start_sim_time_s, end_sim_time_s, id"
-)
-_IN_CHUNKS: Final = (
-    "SELECT max(end_sim_time_s), max(max_state_id) FROM row_group WHERE run_id = :run "
-    "AND is_complete = 1"
-)
-_LAST_AT: Final = (
-    "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
-    "AND end_sim_time_s = ?"
-)
 NEWEST_STATE_ID: Final = (  # that was ever given
     "max((SELECT coalesce(max(id), 0) FROM state), (SELECT coalesce(max(CAST(reserved_state_id "
     "AS INTEGER)), 0) FROM recording))"
@@ -66,27 +52,12 @@ NEWEST_STATE_ID: Final = (  # that was ever given
 IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
     f"typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= {NEWEST_STATE_ID}"
 )
-_WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
-_PLACES: Final = (
-    "SELECT id, start_sim_time_s, end_sim_time_s, row_count, max_state_id FROM row_group "
-    "WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? "
-    "ORDER BY start_sim_time_s"
-)
-_LONG_STEPS: Final = f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?"
 _VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
-_FEW_VALUES: Final = f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))"
 _FEW: Final = 0.25  # of the groups between two: they are asked for one by one
-_SIGNALS_IN: Final = "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0"
 _SEEN: Final = ("signal", "row_group", "chunk", "watermark")
 _COPIED: Final = ("robot", "session", "run", *_SEEN)
-_OTHERS: Final = (
-    "SELECT type, name FROM main.sqlite_master WHERE type = 'view' OR type = 'table' AND name "
-    f"NOT IN {_COPIED} AND name NOT LIKE 'sqlite_%'"
-)
 _UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may have the number of a deleted one
-_MARK: Final = f"SELECT state_id FROM main.watermark WHERE name = 'chunk' AND {IS_MARK}"
-_LAST_ID: Final = "SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE is_complete = 1"
 
 
 class Absent:
@@ -301,7 +272,8 @@ def _is_exact(numbers: Array) -> bool:
 
 def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
     if not len(numbers):
-        return _NOTHING, None
+        # No row holds a number.
+        return "none", None
     codec = _INTEGERS if is_whole else _FLOATS
     config = _pcodec("pcodec").ChunkConfig(compression_level=_LEVEL)
     numbers = numbers.astype(np.int64) if is_whole else numbers
@@ -473,13 +445,6 @@ def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]
 # The chunks of a run as they are stored: which groups of rows there are, and what is in them.
 
 
-_STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
-_STATISTICS_OF_GROUP: Final = (
-    f"SELECT signal_id, {', '.join(Statistics._fields)} FROM chunk WHERE run_id = ? "
-    "AND signal_id > 0 AND group_id = ?"
-)
-
-
 class ChunkGroup(NamedTuple):
     """Rows that follow each other, of which each signal has a chunk. Columns of `row_group`."""
 
@@ -511,7 +476,12 @@ def groups_in(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[ChunkGroup]:
     """The groups of a run that reach into [start_s, end_s), in order of time."""
-    rows = connection.execute(_GROUPS, (run_id, end_s, start_s)).fetchall()
+    rows = connection.execute(
+        "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
+        "FROM row_group WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? "
+        "AND end_sim_time_s >= ? ORDER BY start_sim_time_s, end_sim_time_s, id",
+        (run_id, end_s, start_s),
+    ).fetchall()
     return list(map(ChunkGroup._make, rows))
 
 
@@ -519,29 +489,49 @@ def groups_as_array(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> Array:
     """The same as columns: id, times of the first and last row in s, how many rows, greatest id."""
-    rows = connection.execute(_PLACES, (run_id, end_s, start_s)).fetchall()
+    rows = connection.execute(
+        "SELECT id, start_sim_time_s, end_sim_time_s, row_count, max_state_id FROM row_group "
+        "WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? "
+        "ORDER BY start_sim_time_s",
+        (run_id, end_s, start_s),
+    ).fetchall()
     table: Array = np.reshape(np.array(rows, np.float64), (-1, 5))
     return table[np.lexsort((table[:, 0], table[:, 2], table[:, 1]))]
 
 
 def reached(connection: sqlite3.Connection, run_id: int) -> ChunkProgress:
     """Up to where a run is in chunks."""
-    end_s, max_id = connection.execute(_IN_CHUNKS, {"run": run_id}).fetchone()
+    end_s, max_id = connection.execute(
+        "SELECT max(end_sim_time_s), max(max_state_id) FROM row_group WHERE run_id = :run "
+        "AND is_complete = 1",
+        {"run": run_id},
+    ).fetchone()
     if end_s is None:
         return ChunkProgress(float("-inf"), 0, 0, 0)
-    (last_id,) = connection.execute(_LAST_AT, (run_id, end_s)).fetchone()
+    (last_id,) = connection.execute(
+        "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
+        "AND end_sim_time_s = ?",
+        (run_id, end_s),
+    ).fetchone()
     return ChunkProgress(end_s, last_id, max(max_id, watermark(connection)), max_id)
 
 
 def watermark(connection: sqlite3.Connection) -> int:
     """Rows with ids up to it have been looked at, of all runs: none of them comes late any more."""
-    row = connection.execute(_WATERMARK).fetchone()
+    row = connection.execute(
+        f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
+    ).fetchone()
     return int(row[0]) if row else 0
 
 
 def signals_in(connection: sqlite3.Connection, run_id: int) -> set[int]:
     """The ids of the signals that have chunks in a run."""
-    return {signal_id for (signal_id,) in connection.execute(_SIGNALS_IN, (run_id,))}
+    return {
+        signal_id
+        for (signal_id,) in connection.execute(
+            "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0", (run_id,)
+        )
+    }
 
 
 def statistics_in(
@@ -551,7 +541,10 @@ def statistics_in(
 
     The first column is the id of the group, the others are the fields of `Statistics`.
     """
-    rows = connection.execute(_STATISTICS, (run_id, signal_id, *between)).fetchall()
+    rows = connection.execute(
+        f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}",
+        (run_id, signal_id, *between),
+    ).fetchall()
     return np.reshape(np.array(rows, np.float64), (-1, 1 + len(Statistics._fields)))
 
 
@@ -559,7 +552,11 @@ def statistics_by_signal(
     connection: sqlite3.Connection, run_id: int, group_id: int
 ) -> dict[int, Statistics]:
     """Return the statistics of each signal in one group of a run, by the signal's id."""
-    rows = connection.execute(_STATISTICS_OF_GROUP, (run_id, group_id)).fetchall()
+    rows = connection.execute(
+        f"SELECT signal_id, {', '.join(Statistics._fields)} FROM chunk WHERE run_id = ? "
+        "AND signal_id > 0 AND group_id = ?",
+        (run_id, group_id),
+    ).fetchall()
     return {signal_id: Statistics(*figures) for signal_id, *figures in rows}
 
 
@@ -568,7 +565,12 @@ def groups_with_steps(
 ) -> list[int]:
     """The groups between two ids in which a signal once changes by more than that."""
     asked = (run_id, signal_id, *between, by)
-    return [group_id for (group_id,) in connection.execute(_LONG_STEPS, asked)]
+    return [
+        group_id
+        for (group_id,) in connection.execute(
+            f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?", asked
+        )
+    ]
 
 
 def values_in(
@@ -586,7 +588,10 @@ def values_in(
     """
     query, asked = _VALUES, [run_id, signal_id, min(wanted, default=0), max(wanted, default=-1)]
     if len(wanted) < _FEW * (asked[3] - asked[2]):
-        query, asked = _FEW_VALUES, [*asked, json.dumps([*wanted])]
+        query, asked = (
+            f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))",
+            [*asked, json.dumps([*wanted])],
+        )
     for group_id, *encoded in connection.execute(query, asked):
         rows = wanted.get(group_id)
         if rows is None:
@@ -623,7 +628,9 @@ def is_chunked_aside(connection: sqlite3.Connection, database: Path) -> bool:
         return False
     if made is None or connection.execute(_UUID.format("main")).fetchone() != (made.uuid,):
         return False
-    (mark,) = connection.execute(_MARK).fetchone() or (0,)
+    (mark,) = connection.execute(
+        f"SELECT state_id FROM main.watermark WHERE name = 'chunk' AND {IS_MARK}"
+    ).fetchone() or (0,)
     return mark < made.last_id
 
 
@@ -661,7 +668,9 @@ def chunks_aside(database: Path, *, frozen: bool) -> Generator[sqlite3.Connectio
         try:
             yield connection
         finally:
-            (last_id,) = connection.execute(_LAST_ID).fetchone()  # also of work that broke off
+            (last_id,) = connection.execute(
+                "SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE is_complete = 1"
+            ).fetchone()  # also of work that broke off
             _made[key] = _Made(file, uuid, max(last_id, watermark(connection)))
 
 
@@ -674,7 +683,10 @@ def _new_file() -> Path:
         create_schema(connection)
         connection.execute("PRAGMA foreign_keys=OFF")
         connection.execute("PRAGMA journal_mode=DELETE")
-        for kind, name in connection.execute(_OTHERS).fetchall():
+        for kind, name in connection.execute(
+            "SELECT type, name FROM main.sqlite_master WHERE type = 'view' OR type = 'table' "
+            f"AND name NOT IN {_COPIED} AND name NOT LIKE 'sqlite_%'"
+        ).fetchall():
             connection.execute(f"DROP {kind} {name}")
     return file
 

@@ -52,16 +52,6 @@ from webots_mcp.store.signals import RegisteredSignal, registered
 # recorded. What chunks do not hold (docs/database.md) is missing in them; `notes` says how much.
 
 
-_PURGED: Final = (
-    "SELECT id, row_count - stored_row_count, lost_value_count FROM row_group WHERE run_id = ? "
-    "AND is_complete = 1 AND stored_row_count < row_count"
-)
-_ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
-# What went from the states and lies in a kept stretch stands there.
-_MOVED: Final = (
-    "SELECT sim_time_s, wall_time_s FROM kept_state WHERE run_id = ? AND call IS NULL "
-    "AND sim_time_s BETWEEN ? AND ?"
-)
 _STEP: Final = re.compile(r'\."((?:[^"\\]|\\.)*)"|\.([^.\[]+)|\[(\d+)\]')
 _VALUE: Final = None  # in a tree, the key of the value that stands at the place itself
 
@@ -74,20 +64,9 @@ _IN_SEGMENT: Final = (
     "run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
     "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
 )
-_CHUNK: Final = (
-    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
-    "AND id <= :last_id AND (sim_time_s > :start_s OR id > :after_id) "
-    "ORDER BY sim_time_s, id LIMIT :limit"
-)
 # Where there are kept stretches, with negative ids for what only they have. Of several calls in one
 # step wall time gives the order.
 _AFTER_WALL: Final = "(sim_time_s > :start_s OR wall_time_s > :after_wall_s)"
-_CHUNK_WITH_KEPT: Final = (
-    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
-    f"AND id <= :last_id AND {_AFTER_WALL} UNION ALL "
-    f"SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state WHERE {_IN_SEGMENT} "
-    f"AND id <= :last_kept_id AND {_AFTER_WALL} ORDER BY sim_time_s, wall_time_s LIMIT :limit"
-)
 _COUNT: Final = (
     "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 )
@@ -97,8 +76,6 @@ _LARGEST_INT: Final = 2**63 - 1
 _PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
     float: "num", str: "text", bool: "bool", type(None): "null",
 }  # fmt: skip
-_STATE: Final = "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE id = ?"
-_TIME: Final = "SELECT sim_time_s FROM state WHERE id = ?"
 _OWN: Final = (
     ExportFormat("csv", ("csv",), "webots_mcp.store.export:write_csv", passes=2, is_text=True),
     ExportFormat(
@@ -112,8 +89,6 @@ _ALL: Final = (*_OWN, *export_formats())
 FORMATS: Final = {each.name: each for each in _ALL if not each.for_viewers}  # of tables
 FOR_VIEWERS: Final = {each.name: each for each in _ALL if each.for_viewers}
 BUNDLE: Final = "zip"
-_SPELLED: Final = ("bool", "text", "numbers")
-_FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
 _OF_TRIAL: Final = (
     "trial_set_id", "number", "run_id", "status", "score", "ended_by", "ended_sim_time_s", "error",
     "started_wall_time_s", "finished_wall_time_s",
@@ -139,7 +114,11 @@ class PurgedRows:
     def __init__(self, connection: sqlite3.Connection, segment: Segment) -> None:
         self._connection = connection
         self._segment = segment
-        found = connection.execute(_PURGED, (segment.run_id,)).fetchall()
+        found = connection.execute(
+            "SELECT id, row_count - stored_row_count, lost_value_count FROM row_group "
+            "WHERE run_id = ? AND is_complete = 1 AND stored_row_count < row_count",
+            (segment.run_id,),
+        ).fetchall()
         self._purged = {group_id: rows for group_id, rows, _ in found}
         inside = groups_in(connection, segment.run_id, segment.start_s, segment.end_s)
         self._groups = [group for group in inside if group.id in self._purged]
@@ -177,7 +156,12 @@ class PurgedRows:
         wanted &= (times >= part.start_s) & (times < part.end_s)
         wanted &= (walls >= part.wall_start_s) & (walls < part.wall_end_s)
         bounds = (part.run_id, group.start_s, group.end_s)
-        for time_s, wall_s in self._connection.execute(_MOVED, bounds):
+        # Rows that were purged from the states are here if a full-rate segment kept them.
+        for time_s, wall_s in self._connection.execute(
+            "SELECT sim_time_s, wall_time_s FROM kept_state WHERE run_id = ? AND call IS NULL "
+            "AND sim_time_s BETWEEN ? AND ?",
+            bounds,
+        ):
             wanted &= (times != time_s) | (walls != wall_s)
         return np.flatnonzero(wanted)
 
@@ -201,7 +185,9 @@ class PurgedRows:
     @cached_property
     def _signals(self) -> dict[str, RegisteredSignal]:
         run_id = self._segment.run_id
-        (robot_id,) = self._connection.execute(_ROBOT, (run_id,)).fetchone()
+        (robot_id,) = self._connection.execute(
+            "SELECT robot_id FROM run WHERE id = ?", (run_id,)
+        ).fetchone()
         here = signals_in(self._connection, run_id)
         known = registered(self._connection, robot_id)
         return {name: signal for name, signal in known.items() if signal.id in here}
@@ -451,11 +437,16 @@ class StateTable(ExportTable):
         return ByColumn(self._parts, list(columns.values()), self.total, self.progress)
 
     def _place_of(self, state_id: int) -> tuple[float, int]:
-        (time_s,) = self.connection.execute(_TIME, (state_id,)).fetchone() or (math.inf,)
+        (time_s,) = self.connection.execute(
+            "SELECT sim_time_s FROM state WHERE id = ?", (state_id,)
+        ).fetchone() or (math.inf,)
         return time_s, state_id
 
     def _state(self, run_id: int, state_id: int) -> FlatRow | None:
-        row = self.connection.execute(_STATE, (state_id,)).fetchone()
+        row = self.connection.execute(
+            "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE id = ?",
+            (state_id,),
+        ).fetchone()
         return flat_row(Recorded(run_id, *row)) if row else None
 
     def rows(self, pass_number: int = 1) -> Iterator[FlatRow]:
@@ -483,9 +474,19 @@ class StateTable(ExportTable):
             "last_id": self.last_id, "last_kept_id": self.last_kept_id,
             "after_id": 0, "after_wall_s": -math.inf, "limit": CHUNK_ROWS,
         }  # fmt: skip
-        query = _CHUNK
+        query = (
+            "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state "
+            f"WHERE {_IN_SEGMENT} AND id <= :last_id AND (sim_time_s > :start_s "
+            "OR id > :after_id) ORDER BY sim_time_s, id LIMIT :limit"
+        )
         if full_rate_parts(self.connection, segment.run_id, segment.start_s, segment.end_s):
-            query = _CHUNK_WITH_KEPT
+            query = (
+                "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state "
+                f"WHERE {_IN_SEGMENT} AND id <= :last_id AND {_AFTER_WALL} UNION ALL "
+                "SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state "
+                f"WHERE {_IN_SEGMENT} AND id <= :last_kept_id AND {_AFTER_WALL} "
+                "ORDER BY sim_time_s, wall_time_s LIMIT :limit"
+            )
         while chunk := self.connection.execute(query, values).fetchall():
             yield chunk
             values["after_id"], values["start_s"], values["after_wall_s"] = chunk[-1][:3]
@@ -725,7 +726,11 @@ def write_csv(source: ExportTable, sink: BinaryIO, *, safe_cells: bool = False) 
     columns = source.columns()
     names = [column.name for column in columns]
     # The writer itself turns numbers into text, and null into nothing.
-    spelled = [i for i, column in enumerate(columns, len(source.head)) if column.kind in _SPELLED]
+    spelled = [
+        i
+        for i, column in enumerate(columns, len(source.head))
+        if column.kind in ("bool", "text", "numbers")
+    ]
     text = io.TextIOWrapper(sink, "utf-8", newline="")
     writer = csv.writer(text)
     writer.writerow(map(spell, (*(column.name for column in source.head), *names)))
@@ -744,7 +749,7 @@ def _without_nul(text: str | None) -> str | None:
 
 def _harmless(text: str | None) -> str | None:
     plain = _without_nul(text)
-    return f"'{plain}" if plain and plain.startswith(_FORMULAS) else plain
+    return f"'{plain}" if plain and plain.startswith(("=", "+", "-", "@", "\t", "\r")) else plain
 
 
 def write_json_lines(source: ExportTable, sink: BinaryIO) -> None:

@@ -52,9 +52,6 @@ _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "
                   "retention_limit", "parameter", "parameter_value", "breakpoint", "trial_set",
                   "trial", "kept_stretch", "kept_state", "console_line",
                   "row_group", "chunk", "request")  # fmt: skip
-# Where several tables are read as one, a view of `main` would go on to read the tables themselves.
-_IS_SHADOWED: Final = "SELECT 1 FROM sqlite_temp_master WHERE name = 'robot'"
-_COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
 
 
 class InvalidValues:
@@ -102,7 +99,11 @@ def shadow_if_asked(connection: sqlite3.Connection) -> None:
     """Inside `past_invalid_rows` give a reader views of the valid rows under the tables' names."""
     if (invalid := _reading.get()) is None:
         return
-    if connection.execute(_IS_SHADOWED).fetchone() is None:
+    # A view of `main` reads the tables of `main`, also where several are read as one.
+    if (
+        connection.execute("SELECT 1 FROM sqlite_temp_master WHERE name = 'robot'").fetchone()
+        is None
+    ):
         _shadow(connection, invalid)
     else:  # by a question before, on a connection that is kept open
         connection.create_function("note_invalid", 4, invalid.note)
@@ -130,7 +131,9 @@ def _as_text(stored: bytes) -> str:
 
 
 def _view(connection: sqlite3.Connection, table: str) -> str:
-    columns = connection.execute(_COLUMNS, (table,)).fetchall()
+    columns = connection.execute(
+        'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)', (table,)
+    ).fetchall()
     keys = [name for name, _, _, _, key in columns if key]
     row = " || '/' || ".join(keys)
     shown: list[str] = []

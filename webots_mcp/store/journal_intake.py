@@ -42,13 +42,13 @@ from webots_mcp.contract import (
     is_extern,
     recorded_name,
 )
-from webots_mcp.database import liveness, waiting_file
+from webots_mcp.database import dead_sessions, processes, waiting_file
 from webots_mcp.database.connection import identify_files, in_transaction
 from webots_mcp.database.waiting_file import (
     FORMAT,
     STATEMENTS,
+    Ingested,
     Kind,
-    Taken,
     WaitingEntry,
     journal_parts,
 )
@@ -80,11 +80,7 @@ _SESSION_FIELDS: Final = (
     "O versions", "C throttle_interval",
 )  # fmt: skip
 _NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
-_OF_SESSION: Final = ("run", "session end")  # which name no run before their values
 _REASONS: Final[dict[str, str]] = {"run": "start", "run end": "finished", "session end": "finished"}
-# Where a line begins that can be read no further: that it tells of a row, or which run it tells of.
-_OF_ROWS: Final = re.compile(r'\s*\[[^"]*"(?:state|event|log|run end|session end)"')
-_UUID: Final = re.compile(r'"uuid"\s*:\s*"([^"\\]{1,100})"')
 # Of statements, which bridges alone know.
 _UNGIVEN: Final = dict.fromkeys(("rows", "monotonic", "own", "step_wait", "steps"))
 
@@ -93,9 +89,6 @@ _KNOWN: Final = (
     "(SELECT max(id) FROM run WHERE session_id = session.id) ORDER BY sim_time_s DESC, id DESC "
     "LIMIT 1), (SELECT uuid FROM run WHERE session_id = session.id ORDER BY id DESC LIMIT 1) "
     "FROM session WHERE uuid = ?"
-)
-_OF_BRIDGE: Final = (  # which takes in its own rows; journals know no monotonic clock
-    "SELECT 1 FROM session WHERE uuid = ? AND last_seen_monotonic_s IS NOT NULL"
 )
 _SEEN_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = max(last_seen_wall_time_s, :wall), "
@@ -109,17 +102,6 @@ _SEEN_RUN: Final = (
     "row_count = CASE WHEN ended_wall_time_s IS NULL THEN row_count + :rows ELSE "
     "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE uuid = :run"
 )
-_RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
-_NEWEST_RUN: Final = (
-    "SELECT uuid, last_sim_time_s, last_wall_time_s FROM run WHERE session_id = ? "
-    "ORDER BY id DESC LIMIT 1"
-)
-_DROPPED: Final = "SELECT rows_dropped FROM session WHERE id = ?"
-_DROP: Final = (
-    "UPDATE session SET rows_dropped = rows_dropped + :count, "
-    "last_error = coalesce(last_error, :why) WHERE id = :session"
-)
-_SEEN_S: Final = "SELECT last_seen_wall_time_s FROM session WHERE uuid = ?"
 
 
 class _Faults(NamedTuple):
@@ -218,7 +200,9 @@ def journals_behind(connection: sqlite3.Connection, database: Path) -> list[str]
     behind: list[str] = []
     kept = kept_journals(database)
     for uuid, parts in journal_parts(database).items():
-        (seen_s,) = connection.execute(_SEEN_S, (uuid,)).fetchone() or (0.0,)
+        (seen_s,) = connection.execute(
+            "SELECT last_seen_wall_time_s FROM session WHERE uuid = ?", (uuid,)
+        ).fetchone() or (0.0,)
         with suppress(OSError):
             if parts[-1].name not in kept and parts[-1].stat().st_mtime > seen_s + _LAG_S:
                 behind.append(parts[-1].name)
@@ -337,7 +321,7 @@ class _Reading:
             if entries := self._entries(lines, session_id):
                 finish = partial(self._finish, session_id, robot_id, session_state, lines)
                 begin = partial(self._begin, session_state)
-                taken = waiting_file.take_in(self.connection, session_id, entries, finish, begin)
+                taken = waiting_file.ingest(self.connection, session_id, entries, finish, begin)
                 done = _until(lines, taken.number)[-1].end
                 place = _JournalPosition(self.identity, done, taken.number, True, self.faults)
             else:
@@ -354,7 +338,9 @@ class _Reading:
         entries = [each.entry for each in lines if each.entry]
         for entry in entries:
             if entry.kind == "session end" and isinstance(entry.values, dict):
-                (dropped,) = self.connection.execute(_DROPPED, (session_id,)).fetchone()
+                (dropped,) = self.connection.execute(
+                    "SELECT rows_dropped FROM session WHERE id = ?", (session_id,)
+                ).fetchone()
                 entry.values["dropped"] += dropped
         return entries
 
@@ -371,7 +357,11 @@ class _Reading:
 
         def act() -> None:
             self._drop(session_id, place.faults)
-            if run := self.connection.execute(_NEWEST_RUN, (session_id,)).fetchone():
+            if run := self.connection.execute(
+                "SELECT uuid, last_sim_time_s, last_wall_time_s FROM run WHERE session_id = ? "
+                "ORDER BY id DESC LIMIT 1",
+                (session_id,),
+            ).fetchone():
                 uuid, *times = run
                 self._drop_event(
                     WaitingEntry(place.number, "event", uuid, tuple(times)), place.faults
@@ -384,7 +374,11 @@ class _Reading:
     def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
         """The ids of session and robot, the number of the last entry, newest state and run."""
         connection = self.connection
-        if connection.execute(_OF_BRIDGE, (self.uuid,)).fetchone():
+        # A bridge recovers its own rows. Journals have no monotonic clock.
+        if connection.execute(
+            "SELECT 1 FROM session WHERE uuid = ? AND last_seen_monotonic_s IS NOT NULL",
+            (self.uuid,),
+        ).fetchone():
             raise ValueError("its session is that of a bridge")
         if (known := connection.execute(_KNOWN, (self.uuid,)).fetchone()) is not None:
             return known
@@ -394,9 +388,11 @@ class _Reading:
 
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
-                liveness.reap(connection, time.time())
+                dead_sessions.reap(connection, time.time())
                 wanted = recorded_name(name)
-                free = liveness.free_name(connection, wanted, lambda it: it.kind == CUSTOM_DATA)
+                free = dead_sessions.free_name(
+                    connection, wanted, lambda it: it.kind == CUSTOM_DATA
+                )
                 robot = {"name": free, "kind": "Robot", "devices": "{}"}
                 now_s = session["started_wall_time_s"]
                 robot_id = waiting_file.enter_robot(connection, robot, now_s)
@@ -422,7 +418,7 @@ class _Reading:
         robot_id: int,
         session_state: _JournalState,
         lines: Sequence[_Line],
-        taken: Taken,
+        taken: Ingested,
     ) -> None:
         """Write what follows: names, changes, times, ends of runs, what was dropped."""
         written = {entry.number for entry in taken.written}
@@ -466,9 +462,9 @@ class _Reading:
             self.connection.execute(_SEEN_RUN, values)
             self.connection.execute(_SEEN_SESSION, values)
         if begun := ends.get("run"):
-            liveness.end_runs(self.connection, session_id, "reset", begun["uuid"])
+            dead_sessions.end_runs(self.connection, session_id, "reset", begun["uuid"])
         if end := ends.get("session end"):
-            liveness.end_runs(self.connection, session_id, end["reason"])
+            dead_sessions.end_runs(self.connection, session_id, end["reason"])
         dropped = self.faults.and_those(faults)
         self.faults = _NO_FAULTS if last else dropped
         if last and dropped.lines:
@@ -478,7 +474,11 @@ class _Reading:
     def _drop(self, session_id: int, dropped: _Faults) -> None:
         why = f"{self.path.name}: {dropped.first}"
         values = {"count": dropped.lines, "why": why, "session": session_id}
-        self.connection.execute(_DROP, values)
+        self.connection.execute(
+            "UPDATE session SET rows_dropped = rows_dropped + :count, "
+            "last_error = coalesce(last_error, :why) WHERE id = :session",
+            values,
+        )
 
     def _drop_event(self, entry: WaitingEntry, dropped: _Faults) -> None:
         data = {"row_count": dropped.lines, "why": f"{self.path.name}: {dropped.first}"}
@@ -490,7 +490,9 @@ class _Reading:
         return True
 
     def _event(self, entry: WaitingEntry, kind: str, name: str | None, data: str) -> None:
-        (run_id,) = self.connection.execute(_RUN_ID, (entry.run,)).fetchone()
+        (run_id,) = self.connection.execute(
+            "SELECT id FROM run WHERE uuid = ?", (entry.run,)
+        ).fetchone()
         values = (run_id, *cast("tuple[Any, ...]", entry.values)[:2], kind, name, data)
         self.connection.execute(STATEMENTS["event"], values)
 
@@ -521,7 +523,7 @@ def _described(
     is_here = host == host_name()
     started_s = modified_s if given["started_wall_time_s"] is None else given["started_wall_time_s"]
     pid = given["pid"] or 0  # no process has that one
-    lives = liveness.process_alive(pid, None, started_s)  # of one that is gone none can tell it
+    lives = processes.process_alive(pid, None, started_s)  # of one that is gone none can tell it
     versions = {
         key: value
         for key, value in _object(given["versions"]).items()
@@ -532,7 +534,7 @@ def _described(
         {
             "uuid": uuid,
             "pid": pid,
-            "process": liveness.process_identity(pid) if is_here and lives else None,
+            "process": processes.process_identity(pid) if is_here and lives else None,
             "host": host,
             "instance": instance_of(environment, parent) if is_here else f"{host} process {parent}",
             "extern": int(is_extern(environment)),
@@ -623,7 +625,8 @@ def _line(line: bytes, end: int) -> _Line:
         given, unfit = _checked(kind, values)
         if not (type(number) is int and 0 < number < 1 << 63):
             raise ValueError(f"its number is {number!r}")
-        if not (run is None if kind in _OF_SESSION else _fitted("s", run)):
+        # These lines name no run before their values.
+        if not (run is None if kind in ("run", "session end") else _fitted("s", run)):
             raise ValueError(f"its run is {run!r}")
         if kind == "run" and None in (given["uuid"], given["wall_time"], given["sim_time"]):
             raise ValueError(unfit)
@@ -640,11 +643,12 @@ def _fault(text: str, why: object) -> str:
 
 def _lost_run(text: str, given: dict[str, Any] | None = None) -> dict[str, Any] | None:
     """What is known of the run that a line without an entry may have begun; None of other lines."""
-    if _OF_ROWS.match(text):
+    # A damaged line may still show that it held a row, and of which run.
+    if re.match(r'\s*\[[^"]*"(?:state|event|log|run end|session end)"', text):
         return None
     if given is not None:
         return given
-    uuid = _UUID.search(text)
+    uuid = re.search(r'"uuid"\s*:\s*"([^"\\]{1,100})"', text)
     return {"uuid": uuid[1]} if uuid else {}
 
 

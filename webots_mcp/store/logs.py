@@ -31,11 +31,6 @@ _MATCHING: Final = (
     "AND sim_time_s >= :start_s AND sim_time_s < :end_s "
     f"AND (:before_id IS NULL OR id < :before_id) AND {_SAYING}"
 )
-_OF_RUN: Final = f"FROM log WHERE run_id = :run_id {_MATCHING}"
-# The newest lines are wanted: from the end of the table, not run by run.
-_OF_ROBOT: Final = (
-    f"FROM log WHERE +run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) {_MATCHING}"
-)
 # Of several robots in a simulation Webots does not show which one printed a line. Its lines
 # belong to none of them: they stand in the run of any of them, and are shown for all.
 _COMPANIONS: Final = (
@@ -48,17 +43,10 @@ _RUNS_BESIDE: Final = (
     "AND coalesce(o.ended_wall_time_s, 9e99) >= r.started_wall_time_s"
 )
 _CONSOLE_OF: Final = f"(source IN {OF_CONSOLE} AND +run_id IN ({{}}))"
-_BESIDE_RUN: Final = (
-    f"FROM log WHERE (run_id = :run_id OR {_CONSOLE_OF.format(_RUNS_BESIDE)}) {_MATCHING}"
-)
 _BESIDE_ROBOT: Final = (
     "FROM log WHERE (+run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) OR "
     + _CONSOLE_OF.format(f"SELECT id FROM run WHERE session_id IN ({_COMPANIONS})")
     + f") {_MATCHING}"
-)
-_WAITING: Final = (
-    "SELECT id, NULL, NULL, wall_time_s, level, source, message, logger FROM console_line "
-    f"WHERE {_SAYING} ORDER BY id DESC LIMIT :limit"
 )
 _LONGEST_FOLLOWED_TEXT: Final = 400  # of a state, log line or result; the database has it whole
 _MOST_FOLLOWED_LINES: Final = 500  # of one kind in one look
@@ -73,41 +61,22 @@ _MOST_RECORDED: Final = 2_000  # newest rows of bridges that a line is compared 
 _MOST_LOGGED: Final = 500
 _COMPARED_S: Final = 60.0  # a line that is as late is not taken for what a bridge recorded
 _MESSAGE: Final = 10_000  # characters, as of a bridge's row
-_PRINTED: Final = ("stdout", "stderr")  # loggers that are none
-_STARTING: Final = re.compile(r"INFO: (.+?): Starting controller: ")
 _NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
 _SESSIONS: Final = (
     "SELECT id, robot_id, controller FROM session WHERE instance = ? "
     f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_MOST_SESSIONS}"
-)
-_RUNS: Final = (
-    "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s, "
-    "r.last_wall_time_s "
-    f"FROM ({_SESSIONS}) s JOIN run r ON r.session_id = s.id JOIN robot b ON b.id = s.robot_id "
-    f"WHERE r.started_wall_time_s >= ? ORDER BY r.id DESC LIMIT {_MOST_RUNS}"
 )
 _SIM_TIME: Final = (
     "SELECT coalesce((SELECT sim_time_s FROM state WHERE run_id = :run AND wall_time_s <= :wall "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1), "
     "iif(last_wall_time_s <= :wall, last_sim_time_s, started_sim_time_s)) FROM run WHERE id = :run"
 )
-_RECORDED: Final = (
-    "SELECT l.id, l.message, l.logger, b.name, s.controller FROM log l "
-    "JOIN run r ON r.id = l.run_id JOIN session s ON s.id = r.session_id "
-    "JOIN robot b ON b.id = r.robot_id WHERE l.id > ? AND l.wall_time_s >= ? "
-    f"AND s.instance = ? AND l.source IN ('controller', 'bridge') "
-    f"ORDER BY l.id DESC LIMIT {_MOST_RECORDED}"
-)
 _IS_FOLLOWED: Final = (
     "SELECT EXISTS (SELECT 1 FROM console_line WHERE instance = ? AND wall_time_s >= ?)"
 )
-_FORGET: Final = "DELETE FROM console_line WHERE id = ?"
 _FORGET_OLDEST: Final = (
     "DELETE FROM console_line WHERE instance = :instance AND id <= (SELECT id FROM console_line "
     f"WHERE instance = :instance ORDER BY id DESC LIMIT 1 OFFSET {MOST_WAITING})"
-)
-_FORGET_PAST: Final = (
-    "DELETE FROM console_line WHERE (instance = ? AND wall_time_s < ?) OR wall_time_s < ?"
 )
 
 
@@ -231,7 +200,11 @@ def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -
 
 def waiting_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
     """The newest lines of Webots' console that wait for a run, oldest first; of no run or time."""
-    rows = connection.execute(_WAITING, {**_values(asked), "limit": limit}).fetchall()
+    rows = connection.execute(
+        "SELECT id, NULL, NULL, wall_time_s, level, source, message, logger FROM console_line "
+        f"WHERE {_SAYING} ORDER BY id DESC LIMIT :limit",
+        {**_values(asked), "limit": limit},
+    ).fetchall()
     return [LogLine(*row) for row in reversed(rows)]
 
 
@@ -242,8 +215,20 @@ def count_lines(connection: sqlite3.Connection, asked: LogFilter) -> int:
 
 
 def _rows_of(connection: sqlite3.Connection, asked: LogFilter) -> str:
+    # The newest lines are at the end of the table, so it is not read run by run.
     alone, with_others = (
-        (_OF_ROBOT, _BESIDE_ROBOT) if asked.run_id is None else (_OF_RUN, _BESIDE_RUN)
+        (
+            (
+                "FROM log WHERE +run_id IN (SELECT id FROM run "
+                f"WHERE robot_id = :robot_id) {_MATCHING}"
+            ),
+            _BESIDE_ROBOT,
+        )
+        if asked.run_id is None
+        else (
+            f"FROM log WHERE run_id = :run_id {_MATCHING}",
+            f"FROM log WHERE (run_id = :run_id OR {_CONSOLE_OF.format(_RUNS_BESIDE)}) {_MATCHING}",
+        )
     )
     if asked.robot_id is None:
         return alone
@@ -314,16 +299,7 @@ def _joined(*parts: object) -> str:
 # recorded, or why it never did.
 
 
-_COLUMNS_console_lines: Final = "wall_time_s, level, source, message, logger"
-_ADD: Final = (
-    f"INSERT INTO log (run_id, sim_time_s, {_COLUMNS_console_lines}) VALUES (?, ?, ?, ?, ?, ?, ?)"
-)
-_WAIT: Final = (
-    f"INSERT INTO console_line (instance, {_COLUMNS_console_lines}) VALUES (?, ?, ?, ?, ?, ?)"
-)
-_WAITING_console_lines: Final = (
-    f"SELECT id, {_COLUMNS_console_lines} FROM console_line WHERE instance = ? ORDER BY id"
-)
+_CONSOLE_COLUMNS: Final = "wall_time_s, level, source, message, logger"
 
 
 class Said(NamedTuple):
@@ -371,7 +347,10 @@ class ConsoleRows:
     def begin(self, connection: sqlite3.Connection) -> None:
         """Forget what waits for runs that will not come."""
         past = (self._instance, self._started_s - _EARLY_S, time.time() - _KEPT_WAITING_S)
-        connection.execute(_FORGET_PAST, past)
+        connection.execute(
+            "DELETE FROM console_line WHERE (instance = ? AND wall_time_s < ?) OR wall_time_s < ?",
+            past,
+        )
 
     def is_recorded(self, connection: sqlite3.Connection) -> bool:
         """Whether lines of this Webots wait for a run: then a process follows its console."""
@@ -402,7 +381,13 @@ class ConsoleRows:
     def _runs(self, connection: sqlite3.Connection) -> list[_Run]:
         """The newest runs of this Webots, the newest of them first."""
         since_s = self._started_s - _EARLY_S
-        found = connection.execute(_RUNS, (self._instance, since_s)).fetchall()
+        found = connection.execute(
+            "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s, "
+            f"r.last_wall_time_s FROM ({_SESSIONS}) s JOIN run r ON r.session_id = s.id JOIN "
+            "robot b ON b.id = s.robot_id WHERE r.started_wall_time_s >= ? ORDER BY r.id DESC "
+            f"LIMIT {_MOST_RUNS}",
+            (self._instance, since_s),
+        ).fetchall()
         return [_Run(*row) for row in found]
 
     def _fitting(self, runs: list[_Run]) -> list[_Run]:
@@ -416,7 +401,9 @@ class ConsoleRows:
 
     def _notice_start(self, line: Said, runs: list[_Run]) -> None:
         """A controller that records is started: what follows is of the run that it begins."""
-        found = None if line.is_old else _STARTING.match(line.message)
+        found = (
+            None if line.is_old else re.match(r"INFO: (.+?): Starting controller: ", line.message)
+        )
         if found and any(_is_called(run, found[1]) for run in runs):
             self._runs_since_s = line.wall_time_s - _EARLY_S
 
@@ -430,22 +417,32 @@ class ConsoleRows:
         begun = (run for run in fitting if run.started_wall_time_s <= line.wall_time_s)
         run = next(begun, fitting[-1])
         row = (run.id, _sim_time_s(connection, run, line.wall_time_s), *values)
-        connection.execute(_ADD, row)
+        connection.execute(
+            f"INSERT INTO log (run_id, sim_time_s, {_CONSOLE_COLUMNS}) "
+            "VALUES (?, ?, ?, ?, ?, ?, ?)",
+            row,
+        )
 
     def _keep_waiting(self, connection: sqlite3.Connection, values: tuple[object, ...]) -> None:
-        connection.execute(_WAIT, (self._instance, *values))
+        connection.execute(
+            f"INSERT INTO console_line (instance, {_CONSOLE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?)",
+            (self._instance, *values),
+        )
         left_out = connection.execute(_FORGET_OLDEST, {"instance": self._instance}).rowcount
         self._left_out += left_out
         self.waits = True
 
     def _write_waiting(self, connection: sqlite3.Connection, runs: list[_Run]) -> None:
-        rows = connection.execute(_WAITING_console_lines, (self._instance,)).fetchall()
+        rows = connection.execute(
+            f"SELECT id, {_CONSOLE_COLUMNS} FROM console_line WHERE instance = ? ORDER BY id",
+            (self._instance,),
+        ).fetchall()
         self.waits = bool(rows)
         if not (rows and self._fitting(runs)):
             return
         self.waits = False
         for line_id, *values in rows:
-            connection.execute(_FORGET, (line_id,))
+            connection.execute("DELETE FROM console_line WHERE id = ?", (line_id,))
             line = Said(*values)
             if not self._recorded.take(line):
                 self._write(connection, line, runs)
@@ -468,14 +465,22 @@ class _Recorded:
     def catch_up(self, connection: sqlite3.Connection) -> None:
         """Look at what has been recorded since the last time."""
         asked = (self._last_id, self._since_s, self._instance)
-        rows = connection.execute(_RECORDED, asked).fetchall()
+        rows = connection.execute(
+            "SELECT l.id, l.message, l.logger, b.name, s.controller FROM log l "
+            "JOIN run r ON r.id = l.run_id JOIN session s ON s.id = r.session_id "
+            "JOIN robot b ON b.id = r.robot_id WHERE l.id > ? AND l.wall_time_s >= ? "
+            f"AND s.instance = ? AND l.source IN ('controller', 'bridge') "
+            f"ORDER BY l.id DESC LIMIT {_MOST_RECORDED}",
+            asked,
+        ).fetchall()
         for log_id, message, logger, robot, controller in reversed(rows):
             self._last_id = log_id
             names = (robot, controller and PurePath(controller).stem)
             self._robots |= {name: robot for name in names if name}
             texts = self._texts.setdefault(robot, _OfRobot())
             first, *others = str(message).split("\n")
-            (texts.lines if logger in _PRINTED else texts.logged).add(first.strip())
+            # These names are not those of loggers.
+            (texts.lines if logger in ("stdout", "stderr") else texts.logged).add(first.strip())
             for other in others:
                 texts.lines.add(other.strip())
 

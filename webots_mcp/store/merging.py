@@ -27,8 +27,8 @@ from webots_mcp.database.connection import (
     require_shipped,
     transaction,
 )
+from webots_mcp.database.dead_sessions import end_session, reap
 from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
-from webots_mcp.database.liveness import end_session, reap
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.signals.meaning import MEANING_FIELDS
@@ -52,60 +52,12 @@ from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.signals import enter_signals
 
-_SESSIONS: Final = (
-    "SELECT id, uuid, robot_id FROM source.session s WHERE :run IS NULL "
-    "OR id = (SELECT session_id FROM source.run WHERE id = :run) ORDER BY id"
-)
-_SILENT_ELSEWHERE: Final = (
-    "SELECT id FROM session WHERE ended_wall_time_s IS NULL AND host IS NOT ? "
-    "AND last_seen_wall_time_s < ?"
-)
-_NEW_RUNS: Final = (
-    "SELECT id, uuid FROM source.run r WHERE session_id = :session AND (:run IS NULL OR id = :run) "
-    "AND NOT EXISTS (SELECT 1 FROM main.run n WHERE n.uuid = r.uuid) ORDER BY id"
-)
-_UNFIT: Final = (
-    "SELECT CASE WHEN :run IS NULL THEN "
-    "(SELECT count(*) FROM source.session WHERE ended_wall_time_s IS NULL) ELSE "
-    "(SELECT ended_wall_time_s IS NULL FROM source.run WHERE id = :run) END, "
-    "(SELECT count(*) FROM source.run WHERE uuid IS NULL AND id = :run)"
-)
-# Those of one run: what its parameters were set by, and what was claimed while it went on. One
-# that waits would be claimed here, and nobody here has asked for it.
-_COMMANDS: Final = (
-    "SELECT id, created_wall_time_s, action, params FROM source.command c "
-    "WHERE session_id = :session AND status <> 'pending' AND (:run IS NULL "
-    "OR id IN (SELECT command_id FROM source.parameter_value WHERE run_id = :run) "
-    "OR EXISTS (SELECT 1 FROM source.run r WHERE r.id = :run "
-    "AND coalesce(c.claimed_wall_time_s, c.created_wall_time_s) >= r.started_wall_time_s "
-    "AND coalesce(c.claimed_wall_time_s, c.created_wall_time_s) < coalesce((SELECT "
-    "min(n.started_wall_time_s) FROM source.run n WHERE n.robot_id = r.robot_id AND n.id > r.id), "
-    "9e99))) ORDER BY id"
-)
-_SAME_COMMAND: Final = (
-    "SELECT id FROM main.command WHERE session_id = ? AND created_wall_time_s = ? AND action = ? "
-    "AND params = ?"
-)
-_IS_PURGED: Final = "SELECT purged_rows > 0 FROM main.run WHERE id = ?"
-_OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value")
-_BUSY: Final = (
-    "SELECT EXISTS (SELECT 1 FROM main.session s JOIN main.robot b ON b.id = s.robot_id "
-    "WHERE b.name = ? AND s.ended_wall_time_s IS NULL)"
-)
-_ROBOT_OF: Final = "SELECT robot_id FROM main.session WHERE id = ?"
-_SET_BY: Final = (
-    "SELECT id, command_id FROM main.parameter_value WHERE run_id = ? AND command_id IS NOT NULL"
-)
 # With one run come those of its time, and those that its session's commands were sent for.
 _NEW_REQUESTS: Final = (
     "SELECT id FROM source.request s WHERE NOT EXISTS (SELECT 1 FROM main.request n "
     "WHERE n.uuid = s.uuid) AND (:run IS NULL OR run_id = :run OR id IN (SELECT request_id FROM "
     "source.command WHERE session_id = (SELECT session_id FROM source.run WHERE id = :run))) "
     "ORDER BY id"
-)
-_REQUEST_OF: Final = (
-    "SELECT n.id FROM source.command c JOIN source.request s ON s.id = c.request_id "
-    "JOIN main.request n ON n.uuid = s.uuid WHERE c.id = ?"
 )
 _RUN_OF_REQUESTS: Final = (
     "UPDATE main.request SET run_id = (SELECT n.id FROM source.request s JOIN source.run r "
@@ -115,34 +67,11 @@ _RUN_OF_REQUESTS: Final = (
 _OF_MEANING: Final = ", ".join(
     ("name", "source", *MEANING_FIELDS, "set_wall_time_s", "set_by", "why")
 )
-_COPY_MEANINGS: Final = (
-    f"INSERT OR IGNORE INTO main.meaning (robot_id, {_OF_MEANING}) SELECT :here, {_OF_MEANING} "
-    "FROM source.meaning WHERE robot_id = :there OR (robot_id IS NULL AND robot_name IN ('*', "
-    "(SELECT name FROM source.robot WHERE id = :there))) "
-    "ORDER BY robot_name IS NULL DESC, robot_name = '*', id"  # of two, the robot's own is taken
-)
-_TRIAL_SETS: Final = (
-    "SELECT id, uuid FROM source.trial_set s WHERE :run IS NULL "
-    "OR EXISTS (SELECT 1 FROM source.trial WHERE trial_set_id = s.id AND run_id = :run) ORDER BY id"
-)
-_TRIALS: Final = (
-    "SELECT t.id, t.uuid, n.id FROM source.trial t LEFT JOIN source.run r ON r.id = t.run_id "
-    "LEFT JOIN main.run n ON n.uuid = r.uuid WHERE t.trial_set_id = :set "
-    "AND (:run IS NULL OR t.run_id = :run) ORDER BY t.id"
-)
 # A trial that waits here and is over there: the set was gone on with in a copy of the recording.
 _RESULT: Final = ", ".join(
     ("status", "score", "ended_by", "ended_sim_time_s", "error", "started_wall_time_s",
      "finished_wall_time_s")
 )  # fmt: skip
-_TAKE_RESULT: Final = (
-    f"UPDATE main.trial SET ({_RESULT}, run_id, pid, process) = (SELECT {_RESULT}, ?, NULL, NULL "
-    "FROM source.trial WHERE id = ?) WHERE uuid = ? AND finished_wall_time_s IS NULL "
-    "AND (SELECT finished_wall_time_s FROM source.trial WHERE id = ?) IS NOT NULL"
-)
-_RUNS: Final = (
-    "SELECT n.uuid, n.id FROM source.run r JOIN main.run n ON n.uuid = r.uuid ORDER BY r.id"
-)
 _PIECE_BYTES: Final = 1_000_000
 # Rows that are all alike become a fiftieth of their size; who unpacks to far more wants to harm.
 _MOST_TIMES: Final = 100
@@ -155,22 +84,14 @@ END_SESSIONS: Final = (  # with the last of their runs that is here
 _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 # Ids between the first and the last row of a run; other robots could not have recorded more.
 _MOST_IDS: Final = 2**40
-_IDS: Final = (
-    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
-    "SELECT max_state_id FROM source.row_group WHERE run_id = :run "
-    f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
-    f"AND signal_id = {STATE_IDS})"
-)
 _NEWEST_HERE: Final = "SELECT coalesce(max(id), 0) FROM main.state"
 _RESERVED_HERE: Final = "SELECT coalesce(max(reserved_state_id), 0) FROM main.recording"
-_RESERVE: Final = "UPDATE main.recording SET reserved_state_id = max(reserved_state_id, ?)"
 _SIGNALS: Final = (
     "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
     "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
     f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} "
     "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id"
 )
-_MAP: Final = "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
 _FILL_MAP: Final = (
     "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
     "ON n.robot_id = :here AND n.name = s.name "
@@ -182,26 +103,8 @@ _GROUP: Final = (
     "stored_row_bytes, chunk_bytes, "
     "is_complete"
 )
-_GROUPS: Final = "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1"
-_COPY_GROUP: Final = (
-    f"INSERT INTO main.row_group (run_id, last_state_id, max_state_id, {_GROUP}) "
-    f"SELECT :run, last_state_id + :shift, max_state_id + :shift, {_GROUP} "
-    "FROM source.row_group WHERE id = :group"
-)
 _PACKED: Final = "codec, numbers, codes, labels"
 _VALUES: Final = f"{', '.join(Statistics._fields)}, {_PACKED}"
-_COPY_CHUNKS: Final = (
-    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
-    f"SELECT :here, :run, m.here, {_VALUES} FROM source.chunk c "
-    "JOIN temp.signal_here m ON m.there = c.signal_id WHERE c.group_id = :group"
-)
-_STATE_IDS: Final = (
-    f"SELECT {_PACKED} FROM source.chunk WHERE group_id = ? AND signal_id = {STATE_IDS}"
-)
-_INSERT: Final = (
-    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
-    f"VALUES ({', '.join('?' * (3 + len(_VALUES.split(','))))})"
-)
 
 
 def merge(
@@ -234,9 +137,18 @@ def merge(
         with transaction(connection):
             for (request_id,) in connection.execute(_NEW_REQUESTS, {"run": run_id}).fetchall():
                 _insert(connection, "request", "id = ?", request_id, {"run_id": None})
-        for session_id, uuid, robot_id in connection.execute(_SESSIONS, {"run": run_id}).fetchall():
+        for session_id, uuid, robot_id in connection.execute(
+            "SELECT id, uuid, robot_id FROM source.session s WHERE :run IS NULL "
+            "OR id = (SELECT session_id FROM source.run WHERE id = :run) ORDER BY id",
+            {"run": run_id},
+        ).fetchall():
             wanted = {"session": session_id, "run": run_id}
-            runs = connection.execute(_NEW_RUNS, wanted).fetchall()
+            runs = connection.execute(
+                "SELECT id, uuid FROM source.run r WHERE session_id = :session AND (:run IS NULL "
+                "OR id = :run) AND NOT EXISTS (SELECT 1 FROM main.run n WHERE n.uuid = r.uuid) "
+                "ORDER BY id",
+                wanted,
+            ).fetchall()
             if not runs and _id_of(connection, "session", uuid) is not None:
                 continue
             for run, run_uuid in runs:
@@ -246,7 +158,12 @@ def merge(
         with transaction(connection):
             connection.execute(_RUN_OF_REQUESTS)
             _ingest_trials(connection, run_id)
-        return dict(connection.execute(_RUNS).fetchall())
+        return dict(
+            connection.execute(
+                "SELECT n.uuid, n.id FROM source.run r JOIN main.run n ON n.uuid = r.uuid "
+                "ORDER BY r.id"
+            ).fetchall()
+        )
 
 
 def settled(database: Path) -> RecordingAccess:
@@ -263,7 +180,11 @@ def settled(database: Path) -> RecordingAccess:
         ingest_journals(connection, database)
         now_s = time.time()
         silent = (host_name(), now_s - REMOTE_SILENCE_S)  # their processes cannot be asked
-        for (session_id,) in connection.execute(_SILENT_ELSEWHERE, silent).fetchall():
+        for (session_id,) in connection.execute(
+            "SELECT id FROM session WHERE ended_wall_time_s IS NULL AND host IS NOT ? "
+            "AND last_seen_wall_time_s < ?",
+            silent,
+        ).fetchall():
             end_session(connection, session_id, "crashed")
         reap(connection, now_s)
     return recording
@@ -288,7 +209,13 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
             f"{source} has schema {versions[1]}, this webots-mcp needs {versions[0]}"
         )
     require_shipped(connection, schema="source")
-    recording, nameless = connection.execute(_UNFIT, {"run": run_id}).fetchone()
+    recording, nameless = connection.execute(
+        "SELECT CASE WHEN :run IS NULL THEN "
+        "(SELECT count(*) FROM source.session WHERE ended_wall_time_s IS NULL) ELSE "
+        "(SELECT ended_wall_time_s IS NULL FROM source.run WHERE id = :run) END, "
+        "(SELECT count(*) FROM source.run WHERE uuid IS NULL AND id = :run)",
+        {"run": run_id},
+    ).fetchone()
     subject = f"{source}" if run_id is None else f"run {run_id}"
     if recording:
         where = subject if run_id else f"in {subject}"
@@ -314,16 +241,24 @@ def _ingest_run_rows(
         owner = {"robot_id": _robot(connection, robot_id)}
         here = _insert(connection, "session", "id = ?", session_id, owner)
     else:
-        owner = {"robot_id": connection.execute(_ROBOT_OF, (here,)).fetchone()[0]}
+        owner = {
+            "robot_id": connection.execute(
+                "SELECT robot_id FROM main.session WHERE id = ?", (here,)
+            ).fetchone()[0]
+        }
     commands = _copy_commands(connection, wanted, owner | {"session_id": here}, is_new=is_new)
     own = owner | {"session_id": here, "is_chunked": 0}
     for run_id, run_uuid in runs:
         run = _insert(connection, "run", "id = ?", run_id, own)
         _copy_states(connection, run_id, run, owner["robot_id"])
-        for table in _OF_RUN:
+        for table in ("kept_stretch", "kept_state", "log", "event", "parameter_value"):
             _insert(connection, table, "run_id = ?", run_id, {"run_id": run})
         _copy_image_rows(connection, run_id, run, run_uuid)
-        set_by = connection.execute(_SET_BY, (run,)).fetchall()
+        set_by = connection.execute(
+            "SELECT id, command_id FROM main.parameter_value WHERE run_id = ? "
+            "AND command_id IS NOT NULL",
+            (run,),
+        ).fetchall()
         renamed = [(commands.get(command_id), value_id) for value_id, command_id in set_by]
         connection.executemany("UPDATE parameter_value SET command_id = ? WHERE id = ?", renamed)
     _copy_meanings(connection, robot_id, owner["robot_id"])
@@ -336,7 +271,14 @@ def _copy_meanings(connection: sqlite3.Connection, there: int, here: int) -> Non
 
     What the file of its project says is from now on said of this robot alone: here is another file.
     """
-    connection.execute(_COPY_MEANINGS, {"there": there, "here": here})
+    # Of two meanings the robot's own is taken.
+    connection.execute(
+        f"INSERT OR IGNORE INTO main.meaning (robot_id, {_OF_MEANING}) "
+        f"SELECT :here, {_OF_MEANING} FROM source.meaning WHERE robot_id = :there "
+        "OR (robot_id IS NULL AND robot_name IN ('*', (SELECT name FROM source.robot "
+        "WHERE id = :there))) ORDER BY robot_name IS NULL DESC, robot_name = '*', id",
+        {"there": there, "here": here},
+    )
 
 
 def _ingest_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
@@ -349,24 +291,44 @@ def _ingest_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
     missing: dict[str, Any] = dict.fromkeys(
         ("host", "pid", "process", "robot_id", "session_id", "former_values")
     )
-    for set_id, uuid in connection.execute(_TRIAL_SETS, {"run": run_id}).fetchall():
+    for set_id, uuid in connection.execute(
+        "SELECT id, uuid FROM source.trial_set s WHERE :run IS NULL OR EXISTS (SELECT 1 "
+        "FROM source.trial WHERE trial_set_id = s.id AND run_id = :run) ORDER BY id",
+        {"run": run_id},
+    ).fetchall():
         here = _id_of(connection, "trial_set", uuid)
         if here is None:
             here = _insert(connection, "trial_set", "id = ?", set_id, missing)
         asked = {"set": set_id, "run": run_id}
-        for trial_id, trial_uuid, run in connection.execute(_TRIALS, asked).fetchall():
+        for trial_id, trial_uuid, run in connection.execute(
+            "SELECT t.id, t.uuid, n.id FROM source.trial t LEFT "
+            "JOIN source.run r ON r.id = t.run_id LEFT JOIN main.run n ON n.uuid = r.uuid "
+            "WHERE t.trial_set_id = :set AND (:run IS NULL OR t.run_id = :run) ORDER BY t.id",
+            asked,
+        ).fetchall():
             if _id_of(connection, "trial", trial_uuid) is None:
                 own = {"trial_set_id": here, "run_id": run, "pid": None, "process": None}
                 _insert(connection, "trial", "id = ?", trial_id, own)
             elif not is_at_work(connection, fetch_trial_set(connection, here)):
-                connection.execute(_TAKE_RESULT, (run, trial_id, trial_uuid, trial_id))
+                connection.execute(
+                    "UPDATE main.trial "
+                    f"SET ({_RESULT}, run_id, pid, process) = (SELECT {_RESULT}, ?, NULL, NULL "
+                    "FROM source.trial WHERE id = ?) WHERE uuid = ? "
+                    "AND finished_wall_time_s IS NULL AND (SELECT finished_wall_time_s "
+                    "FROM source.trial WHERE id = ?) IS NOT NULL",
+                    (run, trial_id, trial_uuid, trial_id),
+                )
 
 
 def _robot(connection: sqlite3.Connection, robot_id: int) -> int:
     """The robot of that name here; where one records just now, the next name as bridges take it."""
     row = connection.execute("SELECT name FROM source.robot WHERE id = ?", (robot_id,)).fetchone()
     name, number = str(row[0]), 1
-    while connection.execute(_BUSY, (name,)).fetchone()[0]:
+    while connection.execute(
+        "SELECT EXISTS (SELECT 1 FROM main.session s JOIN main.robot b ON b.id = s.robot_id "
+        "WHERE b.name = ? AND s.ended_wall_time_s IS NULL)",
+        (name,),
+    ).fetchone()[0]:
         number += 1
         name = f"{row[0]}#{number}"
     known = connection.execute("SELECT id FROM main.robot WHERE name = ?", (name,)).fetchone()
@@ -385,11 +347,30 @@ def _copy_commands(
     """By their ids there, the ids that the commands have here; a key that is taken stays theirs."""
     own = own | {"idempotency_key": None}
     ids: dict[int, int] = {}
-    for old, *facts in connection.execute(_COMMANDS, wanted).fetchall():
+    # The commands of a run set its parameters or were claimed during it. A waiting command is left
+    # out: a controller would claim it here, where no caller asked for it.
+    for old, *facts in connection.execute(
+        "SELECT id, created_wall_time_s, action, params FROM source.command c WHERE session_id = "
+        ":session AND status <> 'pending' AND (:run IS NULL OR id IN (SELECT command_id FROM "
+        "source.parameter_value WHERE run_id = :run) OR EXISTS (SELECT 1 FROM source.run r WHERE "
+        "r.id = :run AND coalesce(c.claimed_wall_time_s, c.created_wall_time_s) >= "
+        "r.started_wall_time_s AND coalesce(c.claimed_wall_time_s, c.created_wall_time_s) < "
+        "coalesce((SELECT min(n.started_wall_time_s) FROM source.run n WHERE n.robot_id = "
+        "r.robot_id AND n.id > r.id), 9e99))) ORDER BY id",
+        wanted,
+    ).fetchall():
         same = None
         if not is_new:
-            same = connection.execute(_SAME_COMMAND, (own["session_id"], *facts)).fetchone()
-        request = connection.execute(_REQUEST_OF, (old,)).fetchone()
+            same = connection.execute(
+                "SELECT id FROM main.command WHERE session_id = ? AND created_wall_time_s = ? "
+                "AND action = ? AND params = ?",
+                (own["session_id"], *facts),
+            ).fetchone()
+        request = connection.execute(
+            "SELECT n.id FROM source.command c JOIN source.request s ON s.id = c.request_id "
+            "JOIN main.request n ON n.uuid = s.uuid WHERE c.id = ?",
+            (old,),
+        ).fetchone()
         own["request_id"] = request[0] if request else None
         ids[old] = same[0] if same else _insert(connection, "command", "id = ?", old, own)
     return ids
@@ -397,7 +378,9 @@ def _copy_commands(
 
 def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id: int) -> None:
     """The rows; where some are gone, with the chunks of all."""
-    (is_purged,) = connection.execute(_IS_PURGED, (run,)).fetchone()
+    (is_purged,) = connection.execute(
+        "SELECT purged_rows > 0 FROM main.run WHERE id = ?", (run,)
+    ).fetchone()
     shift = None
     if is_purged:
         shift = ingest_chunks(connection, run_id, run, robot_id)
@@ -663,18 +646,39 @@ def ingest_chunks(connection: sqlite3.Connection, there: int, here: int, robot_i
         for name, path, reduction, kind, role, first_s in connection.execute(_SIGNALS, asked)
     }
     enter_signals(connection, robot_id, seen)
-    connection.execute(_MAP)
+    connection.execute(
+        "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
+    )
     connection.execute("DELETE FROM temp.signal_here")
     connection.execute(_FILL_MAP, asked)
-    for group, rows in connection.execute(_GROUPS, (there,)).fetchall():
+    for group, rows in connection.execute(
+        "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1", (there,)
+    ).fetchall():
         values: dict[str, Any] = {"run": here, "shift": shift, "group": group}
-        values["here"] = connection.execute(_COPY_GROUP, values).lastrowid
-        connection.execute(_COPY_CHUNKS, values)
-        packed = connection.execute(_STATE_IDS, (group,)).fetchone()
+        values["here"] = connection.execute(
+            f"INSERT INTO main.row_group (run_id, last_state_id, max_state_id, {_GROUP}) "
+            f"SELECT :run, last_state_id + :shift, max_state_id + :shift, {_GROUP} "
+            "FROM source.row_group WHERE id = :group",
+            values,
+        ).lastrowid
+        connection.execute(
+            f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
+            f"SELECT :here, :run, m.here, {_VALUES} FROM source.chunk c "
+            "JOIN temp.signal_here m ON m.there = c.signal_id WHERE c.group_id = :group",
+            values,
+        )
+        packed = connection.execute(
+            f"SELECT {_PACKED} FROM source.chunk WHERE group_id = ? AND signal_id = {STATE_IDS}",
+            (group,),
+        ).fetchone()
         if packed is not None:
             with suppress(DamagedChunkError):  # who reads them is told that they are missing
                 shifted = _shifted(packed, rows, shift)
-                connection.execute(_INSERT, (values["here"], here, STATE_IDS, *shifted))
+                connection.execute(
+                    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
+                    f"VALUES ({', '.join('?' * (3 + len(_VALUES.split(','))))})",
+                    (values["here"], here, STATE_IDS, *shifted),
+                )
     return shift
 
 
@@ -687,7 +691,13 @@ def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
 
 def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
     last_here = max(_number(connection, _NEWEST_HERE), _number(connection, _RESERVED_HERE))
-    first, last = connection.execute(_IDS, {"run": there}).fetchone()
+    first, last = connection.execute(
+        "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
+        "SELECT max_state_id FROM source.row_group WHERE run_id = :run "
+        f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
+        f"AND signal_id = {STATE_IDS})",
+        {"run": there},
+    ).fetchone()
     if first is None:
         return 0
     if last - first > _MOST_IDS:
@@ -696,7 +706,9 @@ def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
             "gives: the recording is damaged"
         )
     shift = last_here + 1 - first
-    connection.execute(_RESERVE, (last + shift,))
+    connection.execute(
+        "UPDATE main.recording SET reserved_state_id = max(reserved_state_id, ?)", (last + shift,)
+    )
     return shift
 
 

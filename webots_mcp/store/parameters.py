@@ -13,15 +13,8 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.database.connection import transaction
-from webots_mcp.database.liveness import (
-    JobLease,
-    give_back,
-    holder_of,
-    lease_of,
-    process_alive,
-    process_identity,
-    take,
-)
+from webots_mcp.database.leases import JobLease, give_back, holder_of, lease_of, take
+from webots_mcp.database.processes import process_alive, process_identity
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.signals.parameter import Declaration, Value, require_known
 from webots_mcp.store.run_rows import RunRecord, columns_of
@@ -31,54 +24,13 @@ COLUMNS: Final = (
     "command_id", "doc",
 )  # fmt: skip
 
-_DECLARED: Final = (
-    "SELECT name, kind, default_value, low, high, choices, doc, unit, next_value FROM parameter "
-    "WHERE session_id = ? ORDER BY id"
-)
-_KINDS: Final = "SELECT name, kind FROM parameter ORDER BY id"
-_NAMES: Final = "SELECT DISTINCT name FROM parameter ORDER BY name"
 # Of a run `r`, and with the JSON object :parameters: whether it had all these values at some time.
 HAD_VALUES: Final = (
     "NOT EXISTS (SELECT 1 FROM json_each(:parameters) wanted WHERE NOT EXISTS ("
     "SELECT 1 FROM parameter_value v WHERE v.run_id = r.id AND v.name = wanted.key AND "
     "CASE WHEN json_valid(v.value) THEN json_extract(v.value, '$') = wanted.value END))"
 )
-_VALUES: Final = (
-    "SELECT run_id, name, sim_time_s, value, is_default, set_by, command_id FROM parameter_value "
-    "WHERE run_id IN (SELECT value FROM json_each(?)) ORDER BY id"
-)
-_NEW_SET: Final = (
-    "INSERT INTO trial_set (uuid, plan, created_wall_time_s, robot_id) VALUES (?, ?, ?, ?) "
-    "RETURNING id"
-)
-_NEW_TRIAL: Final = (
-    "INSERT INTO trial (trial_set_id, uuid, number, parameters, status) "
-    "VALUES (?, ?, ?, ?, 'waiting')"
-)
-_NEWEST: Final = "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)"
-_OF_ROBOT: Final = "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC"
-_STOP: Final = "UPDATE trial_set SET stop_reason = ? WHERE id = ?"
-_BORROW: Final = "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?"
 _WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
-_FORGET: Final = "UPDATE trial SET pid = NULL, process = NULL WHERE trial_set_id = ?"
-_BEGIN: Final = (
-    "UPDATE trial SET status = 'running', started_wall_time_s = ?, pid = ?, process = ? "
-    "WHERE id = ?"
-)
-_PUT_BACK: Final = (
-    "UPDATE trial SET status = 'waiting', started_wall_time_s = NULL, pid = NULL, process = NULL "
-    "WHERE id = ? AND status = 'running'"
-)
-_FINISH: Final = (
-    "UPDATE trial SET status = :status, run_id = :run_id, score = :score, ended_by = :ended_by, "
-    "ended_sim_time_s = :ended_sim_time_s, error = :error, finished_wall_time_s = :now, "
-    "pid = NULL, process = NULL WHERE id = :id"
-)
-_LABEL: Final = "UPDATE run SET label = coalesce(label, ?) WHERE id = ?"
-_PROGRESS: Final = (
-    "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial WHERE trial_set_id = "
-    "t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) FROM trial t WHERE trial_set_id = ?"
-)
 
 
 class Declared(NamedTuple):
@@ -150,7 +102,14 @@ RunParameters = Mapping[str, RunParameter]
 
 def declared_by(connection: sqlite3.Connection, session_id: int) -> dict[str, Declared]:
     """The parameters that the controller of a session declares, in its order."""
-    return {row[0]: _declared(row) for row in connection.execute(_DECLARED, (session_id,))}
+    return {
+        row[0]: _declared(row)
+        for row in connection.execute(
+            "SELECT name, kind, default_value, low, high, choices, doc, unit, next_value "
+            "FROM parameter WHERE session_id = ? ORDER BY id",
+            (session_id,),
+        )
+    }
 
 
 def parameters_of(
@@ -159,7 +118,9 @@ def parameters_of(
     """What the parameters were in each of these runs."""
     found: dict[int, dict[str, RunParameter]] = {run_id: {} for run_id in run_ids}
     for run_id, name, sim_time_s, value, *rest in connection.execute(
-        _VALUES, (json.dumps(list(found)),)
+        "SELECT run_id, name, sim_time_s, value, is_default, set_by, command_id "
+        "FROM parameter_value WHERE run_id IN (SELECT value FROM json_each(?)) ORDER BY id",
+        (json.dumps(list(found)),),
     ):
         setting = ParameterSetting(sim_time_s, json.loads(value), bool(rest[0]), rest[1], rest[2])
         found[run_id].setdefault(name, RunParameter()).add(setting)
@@ -206,7 +167,7 @@ def _ordered(had: RunParameters, unlike: Sequence[str]) -> list[str]:
 
 def kinds_of(connection: sqlite3.Connection) -> dict[str, str]:
     """The kinds of all parameters by name, each as it was declared last."""
-    return dict(connection.execute(_KINDS).fetchall())
+    return dict(connection.execute("SELECT name, kind FROM parameter ORDER BY id").fetchall())
 
 
 def as_filter(connection: sqlite3.Connection, values: Mapping[str, Value]) -> str:
@@ -217,7 +178,13 @@ def as_filter(connection: sqlite3.Connection, values: Mapping[str, Value]) -> st
     """
     if not values:
         return "{}"
-    require_known(list(values), [name for (name,) in connection.execute(_NAMES)])
+    require_known(
+        list(values),
+        [
+            name
+            for (name,) in connection.execute("SELECT DISTINCT name FROM parameter ORDER BY name")
+        ],
+    )
     try:
         return json.dumps(dict(values), allow_nan=False)
     except ValueError as error:
@@ -335,16 +302,6 @@ class TrialResult:
         return "failed" if self.score is None else "done"
 
 
-_SET: Final = f"SELECT {columns_of(TrialSetRecord)} FROM trial_set WHERE id = ?"
-_NEXT: Final = (
-    f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? AND status IN ('running', "
-    "'waiting') ORDER BY status = 'waiting', number LIMIT 1"
-)
-_TRIALS: Final = (
-    f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? ORDER BY number"
-)
-
-
 def create_trial_set(
     connection: sqlite3.Connection,
     plan: str,
@@ -366,7 +323,13 @@ def create_trial_set(
         if robot_id is not None:
             _require_free(connection, robot_id)
         values = (new_uuid(), plan, time.time(), robot_id)
-        set_id = int(connection.execute(_NEW_SET, values).fetchone()[0])
+        set_id = int(
+            connection.execute(
+                "INSERT INTO trial_set (uuid, plan, created_wall_time_s, robot_id) "
+                "VALUES (?, ?, ?, ?) RETURNING id",
+                values,
+            ).fetchone()[0]
+        )
         for number, values in enumerate(parameters, 1):
             _enter(connection, set_id, number, values)
     return set_id
@@ -382,12 +345,18 @@ def _enter(
     connection: sqlite3.Connection, set_id: int, number: int, values: dict[str, Any]
 ) -> None:
     text = json.dumps(values, ensure_ascii=False)
-    connection.execute(_NEW_TRIAL, (set_id, new_uuid(), number, text))
+    connection.execute(
+        "INSERT INTO trial (trial_set_id, uuid, number, parameters, status) "
+        "VALUES (?, ?, ?, ?, 'waiting')",
+        (set_id, new_uuid(), number, text),
+    )
 
 
 def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
     """In one simulation one set at a time."""
-    for (set_id,) in connection.execute(_OF_ROBOT, (robot_id,)).fetchall():
+    for (set_id,) in connection.execute(
+        "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC", (robot_id,)
+    ).fetchall():
         found = fetch_trial_set(connection, set_id)
         if is_at_work(connection, found):
             raise CommandRefusedError(
@@ -405,7 +374,9 @@ def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
 
 def find_trial_set(connection: sqlite3.Connection, plan: str | None = None) -> int | None:
     """The newest set with exactly this plan; without one the newest of all."""
-    return connection.execute(_NEWEST, (plan,)).fetchone()[0]
+    return connection.execute(
+        "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)", (plan,)
+    ).fetchone()[0]
 
 
 def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetRecord:
@@ -414,7 +385,9 @@ def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetReco
     Raises:
         InvalidInputError: There is none.
     """
-    row = connection.execute(_SET, (set_id,)).fetchone()
+    row = connection.execute(
+        f"SELECT {columns_of(TrialSetRecord)} FROM trial_set WHERE id = ?", (set_id,)
+    ).fetchone()
     if row is None:
         newest = find_trial_set(connection)
         there = "none was begun" if newest is None else f"the newest is {newest}"
@@ -429,13 +402,17 @@ def is_at_work(connection: sqlite3.Connection, found: TrialSetRecord) -> bool:
 
 def next_trial(connection: sqlite3.Connection, set_id: int) -> TrialRecord | None:
     """The trial that is to be run next, or was begun; None where all are over."""
-    row = connection.execute(_NEXT, (set_id,)).fetchone()
+    row = connection.execute(
+        f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? "
+        "AND status IN ('running', 'waiting') ORDER BY status = 'waiting', number LIMIT 1",
+        (set_id,),
+    ).fetchone()
     return TrialRecord(*row) if row else None
 
 
 def stop_trial_set(connection: sqlite3.Connection, set_id: int, reason: str | None) -> None:
     """Say why a set does not go on after its current trial; None has it go on."""
-    connection.execute(_STOP, (reason, set_id))
+    connection.execute("UPDATE trial_set SET stop_reason = ? WHERE id = ?", (reason, set_id))
 
 
 def borrow_parameters(
@@ -443,7 +420,10 @@ def borrow_parameters(
 ) -> None:
     """Note what the parameters of a controller were before; None once they are so again."""
     text = None if former is None else json.dumps(former, ensure_ascii=False)
-    connection.execute(_BORROW, (session_id, text, set_id))
+    connection.execute(
+        "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?",
+        (session_id, text, set_id),
+    )
 
 
 def trials_of(connection: sqlite3.Connection, set_id: int) -> list[TrialRecord]:
@@ -453,7 +433,13 @@ def trials_of(connection: sqlite3.Connection, set_id: int) -> list[TrialRecord]:
         InvalidInputError: There is no such set.
     """
     fetch_trial_set(connection, set_id)
-    return [TrialRecord(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
+    return [
+        TrialRecord(*row)
+        for row in connection.execute(
+            f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? ORDER BY number",
+            (set_id,),
+        ).fetchall()
+    ]
 
 
 def take_up(connection: sqlite3.Connection, set_id: int) -> JobLease:
@@ -471,7 +457,9 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> JobLease:
                 "or end it"
             )
         if found.host not in (None, host_name()):  # its simulators run on that host
-            connection.execute(_FORGET, (set_id,))
+            connection.execute(
+                "UPDATE trial SET pid = NULL, process = NULL WHERE trial_set_id = ?", (set_id,)
+            )
         own = os.getpid()
         connection.execute(_WORK, (host_name(), own, process_identity(own), set_id))
     return lease
@@ -489,21 +477,37 @@ def begin_trial(
     """It runs: in a simulator of that pid, or in that of a live controller."""
     process = None if pid is None else process_identity(pid)
     now_s = time.time()
-    connection.execute(_BEGIN, (now_s, pid, process, trial.id))
+    connection.execute(
+        "UPDATE trial SET status = 'running', started_wall_time_s = ?, pid = ?, process = ? "
+        "WHERE id = ?",
+        (now_s, pid, process, trial.id),
+    )
     return replace(trial, status="running", started_wall_time_s=now_s, pid=pid, process=process)
 
 
 def put_back(connection: sqlite3.Connection, trial: TrialRecord) -> None:
     """It was not run to its end, and waits again."""
-    connection.execute(_PUT_BACK, (trial.id,))
+    connection.execute(
+        "UPDATE trial "
+        "SET status = 'waiting', started_wall_time_s = NULL, pid = NULL, process = NULL "
+        "WHERE id = ? AND status = 'running'",
+        (trial.id,),
+    )
 
 
 def finish_trial(connection: sqlite3.Connection, trial: TrialRecord, result: TrialResult) -> None:
     """Enter what became of it; its run gets a label, unless it has one."""
     label = f"trial {trial.number} of set {trial.trial_set_id}: {spelled(trial.values)}"[:100]
     now = {"id": trial.id, "status": result.status, "now": time.time()}
-    connection.execute(_FINISH, vars(result) | now)
-    connection.execute(_LABEL, (label, result.run_id))
+    connection.execute(
+        "UPDATE trial SET status = :status, run_id = :run_id, score = :score, ended_by = "
+        ":ended_by, ended_sim_time_s = :ended_sim_time_s, error = :error, finished_wall_time_s = "
+        ":now, pid = NULL, process = NULL WHERE id = :id",
+        vars(result) | now,
+    )
+    connection.execute(
+        "UPDATE run SET label = coalesce(label, ?) WHERE id = ?", (label, result.run_id)
+    )
 
 
 def spelled(values: Mapping[str, Any]) -> str:
@@ -542,7 +546,12 @@ def count_planned(plan: Mapping[str, Any], trials: Sequence[TrialRecord]) -> int
 
 def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:
     """How many trials of a set are over, of how many, and a word."""
-    over, of, last = connection.execute(_PROGRESS, (set_id,)).fetchone()
+    over, of, last = connection.execute(
+        "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial "
+        "WHERE trial_set_id = t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) "
+        "FROM trial t WHERE trial_set_id = ?",
+        (set_id,),
+    ).fetchone()
     return over, of, f"{over} of {of} trials" + ("" if last is None else f", the last: {last:g}")
 
 

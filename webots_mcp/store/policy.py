@@ -67,12 +67,8 @@ ANY_ACTION: Final = (
     "webots_send_command"  # the tool that sends any: it stands for none of the others
 )
 _PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
-_OF_SCENE: Final = ("fields", "nodes")
 _HOLDS_FOR: Final = ("everyone", "assistants")
 _KEYS: Final = (*_PATTERNS, "parameters", LAUNCH, "holds_for")
-_HEADER: Final = re.compile(r"\s*\[{1,2}\s*([^\]]+?)\s*\]")
-# It has a controller read its stored breakpoints again, and is sent with each that is allowed.
-_HARMLESS: Final = "arm_breakpoints"
 _ASK: Final = (
     "Do not look for another way to the same: the person whose project it is can change that line, "
     "and it holds from the next request on"
@@ -121,7 +117,9 @@ class Policy:
         if action == LAUNCH:
             if not self.allow.get(LAUNCH, True):
                 raise self._refusal(LAUNCH, "starting Webots is not allowed")
-        elif action != _HARMLESS:
+        # This action only has a controller read its stored breakpoints again. It is sent along with
+        # every action that is allowed.
+        elif action != "arm_breakpoints":
             self._require("actions", [action], f"the action {action!r:.100} is not allowed")
         if action == "run" and params.get("reset"):
             self._require_route("reset", asked)
@@ -238,7 +236,7 @@ def line_of(text: str, key: str, inside: str | None = None) -> int:
     lines, table, found = text.splitlines(), "", 1
     parts = [re.escape(key)] + ([re.escape(inside)] if inside else [])
     for number, line in enumerate(lines, 1):
-        if header := _HEADER.match(line):
+        if header := re.match(r"\s*\[{1,2}\s*([^\]]+?)\s*\]", line):
             table = header[1].replace('"', "").replace(" ", "")
         own = table == ALLOW and re.match(rf"\s*[\"']?{parts[0]}[\"']?\s*[=.]", line)
         if own or table == f"{ALLOW}.{key}":
@@ -309,7 +307,7 @@ def _faults(allow: Any) -> Iterator[tuple[str, str]]:
             yield key, f"allow.{key} is unknown; there is {', '.join(_KEYS)}"
         elif key in _PATTERNS and not _is_list_of(str, value):
             yield key, f"{key} must be a list of texts, not {value!r:.80}"
-        elif key in _OF_SCENE and any(each.startswith("!") for each in value):
+        elif key in ("fields", "nodes") and any(each.startswith("!") for each in value):
             yield key, f"{key} cannot forbid, as a node has many names: list what is allowed"
         elif key == LAUNCH and not isinstance(value, bool):
             yield key, f"launch must be true or false, not {value!r:.80}"

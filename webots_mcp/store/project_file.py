@@ -31,33 +31,16 @@ from typing import Any, Final, NamedTuple, cast
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, recorded_name
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.location import find_project
-from webots_mcp.database.pauses import OF_PROJECT
+from webots_mcp.database.stored_breakpoints import OF_PROJECT
 from webots_mcp.errors import InvalidInputError, warn
 from webots_mcp.signals.conditions.compiler import Expectation, parse_expectation
 from webots_mcp.signals.meaning import MEANING_FIELDS, DeclaredMeaning, declare_meaning
 
 ALL: Final = "*"
 _KEYS: Final = ("name", "condition", "during", "robot")
-_HEADER: Final = re.compile(r"\s*\[\[\s*expect\s*\]\]")
-_STORED: Final = (
-    "SELECT name, expects, during, robot_name, id FROM breakpoint "
-    f"WHERE created_by = '{OF_PROJECT}'"
-)
-_ADD: Final = (
-    "INSERT INTO breakpoint (name, expects, during, robot_name, condition, action, "
-    f"created_wall_time_s, created_by) VALUES (?, ?, ?, ?, ?, 'keep', ?, '{OF_PROJECT}')"
-)
 
 
 _OF_MEANING: Final = ("robot_name", "name", *MEANING_FIELDS)
-_STORED_MEANINGS: Final = (
-    f"SELECT {', '.join(_OF_MEANING)}, id FROM meaning WHERE robot_id IS NULL "
-    f"AND set_by = '{OF_PROJECT}'"
-)
-_ADD_MEANING: Final = (
-    f"INSERT INTO meaning ({', '.join(_OF_MEANING)}, source, set_wall_time_s, set_by) "
-    f"VALUES ({', '.join('?' * len(_OF_MEANING))}, 'declared', ?, '{OF_PROJECT}')"
-)
 
 
 class Expected(NamedTuple):
@@ -191,7 +174,7 @@ def _entry(file: Path, text: str, number: int, table: dict[str, Any]) -> Expecte
 def _line_of(text: str, number: int, why: str, table: dict[str, Any]) -> int:
     """That of the key that is wrong, else where its table begins."""
     lines = text.splitlines()
-    starts = [at for at, line in enumerate(lines) if _HEADER.match(line)]
+    starts = [at for at, line in enumerate(lines) if re.match(r"\s*\[\[\s*expect\s*\]\]", line)]
     if number >= len(starts):  # written as an array of inline tables
         return 1
     end = starts[number + 1] if number + 1 < len(starts) else len(lines)
@@ -206,11 +189,23 @@ def _line_of(text: str, number: int, why: str, table: dict[str, Any]) -> int:
 def compile_project(connection: sqlite3.Connection, project: ProjectFile) -> None:
     """Let the database say what the file says, and nothing that it does not say any more."""
     wanted = {(*each.expectation.asks, each.robot): each.expectation for each in project.expected}
-    there = {tuple(row[:4]): row[4] for row in connection.execute(_STORED).fetchall()}
+    there = {
+        tuple(row[:4]): row[4]
+        for row in connection.execute(
+            "SELECT name, expects, during, robot_name, id FROM breakpoint "
+            f"WHERE created_by = '{OF_PROJECT}'"
+        ).fetchall()
+    }
     gone = [(number,) for asks, number in there.items() if asks not in wanted]
     new = [asks for asks in wanted if asks not in there]
     meanings = {(each.robot, *each.meaning) for each in project.signals}
-    stored = {tuple(row[:-1]): row[-1] for row in connection.execute(_STORED_MEANINGS).fetchall()}
+    stored = {
+        tuple(row[:-1]): row[-1]
+        for row in connection.execute(
+            f"SELECT {', '.join(_OF_MEANING)}, id FROM meaning WHERE robot_id IS NULL "
+            f"AND set_by = '{OF_PROJECT}'"
+        ).fetchall()
+    }
     old_meanings = [(stored[each],) for each in stored if each not in meanings]
     new_meanings = sorted(meanings - stored.keys(), key=repr)
     if not (gone or new or old_meanings or new_meanings):
@@ -219,9 +214,17 @@ def compile_project(connection: sqlite3.Connection, project: ProjectFile) -> Non
     with transaction(connection):
         connection.executemany("DELETE FROM breakpoint WHERE id = ?", gone)
         rows = [(*asks, wanted[asks].violation.text, now_s) for asks in new]
-        connection.executemany(_ADD, rows)
+        connection.executemany(
+            "INSERT INTO breakpoint (name, expects, during, robot_name, condition, action, "
+            f"created_wall_time_s, created_by) VALUES (?, ?, ?, ?, ?, 'keep', ?, '{OF_PROJECT}')",
+            rows,
+        )
         connection.executemany("DELETE FROM meaning WHERE id = ?", old_meanings)
-        connection.executemany(_ADD_MEANING, [(*each, now_s) for each in new_meanings])
+        connection.executemany(
+            f"INSERT INTO meaning ({', '.join(_OF_MEANING)}, source, set_wall_time_s, set_by) "
+            f"VALUES ({', '.join('?' * len(_OF_MEANING))}, 'declared', ?, '{OF_PROJECT}')",
+            [(*each, now_s) for each in new_meanings],
+        )
 
 
 class ProjectWatch:

@@ -32,25 +32,6 @@ REST_S: Final = 0.005  # at least, between two writes
 HURRIED_REST_S: Final = 0.001  # where no robot records: a checkpoint still gets its turn
 RESTS: Final = 9  # the lock is held for a tenth of the time at most
 
-_OLD_COMMANDS: Final = f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit"
-# A group that is not complete is none to readers; what is left of it when this process ends, the
-# maker of chunks deletes.
-_HIDE_GROUP: Final = (
-    "UPDATE row_group SET is_complete = 0 WHERE id = ? AND is_complete = 1 "
-    f"AND stored_row_count = 0 AND NOT EXISTS (SELECT 1 FROM run WHERE id = ? AND {KEPT})"
-)
-_CHUNKS: Final = "SELECT id FROM chunk WHERE group_id = ?"
-_DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
-_GROUPS_WITH_ROWS: Final = (
-    "SELECT id, stored_row_count FROM row_group WHERE run_id = ? AND is_complete = 1 "
-    "AND stored_row_count > 0 ORDER BY max_state_id"
-)
-_SET_STORED: Final = (  # what others deleted was not counted
-    "UPDATE row_group SET stored_row_count = (SELECT count(*) FROM json_each(?) j "
-    "CROSS JOIN state s ON s.id = j.value) WHERE id = ?"
-)
-# Many rows go at once, in one statement: see `AtomicStatements`. What is left in `going` went.
-_GOING: Final = "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
 _NOT_GOING: Final = (
     "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
     "OR NOT EXISTS (SELECT 1 FROM {table} WHERE id = going.id)"
@@ -98,17 +79,10 @@ _STEPS: Final = {
     )
     for table in ("state", "chunk", "kept_state", "log", "event", "image", "command", "run")
 }
-# Frames whose kept stretch is gone.
-_LEFT_FRAMES: Final = (
-    f"SELECT id, run_id FROM image i WHERE kind = '{KEPT_FRAME}' AND id > ? AND NOT EXISTS ("
-    "SELECT 1 FROM kept_stretch k WHERE k.run_id = i.run_id "
-    "AND i.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) ORDER BY id LIMIT ?"
-)
 _PATHS: Final = {  # of the pictures that go with rows
     "image": "SELECT path FROM image WHERE id IN (SELECT id FROM temp.going)",
     "run": "SELECT path FROM image WHERE run_id IN (SELECT id FROM temp.going)",
 }
-_IN_USE: Final = "SELECT 1 FROM image WHERE path = ? LIMIT 1"
 _MOST_FAILURES: Final = 200
 INTERVAL_S: Final = 60.0  # between two checks; one of ten million rows takes about a second
 BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
@@ -263,7 +237,11 @@ class _Purge:
         """Delete states that are in no group; they become one first."""
         while not self._unless_locked(lambda: self._chunked(portion.run_id)):
             yield self.purged
-        found = self._connection.execute(_GROUPS_WITH_ROWS, (portion.run_id,)).fetchall()
+        found = self._connection.execute(
+            "SELECT id, stored_row_count FROM row_group WHERE run_id = ? AND is_complete = 1 "
+            "AND stored_row_count > 0 ORDER BY max_state_id",
+            (portion.run_id,),
+        ).fetchall()
         for group_id, rows in found:
             yield from self._rows(portion._replace(group_id=group_id, rows=rows))
         yield from self._rows(portion)  # what no bridge writes is in no chunk
@@ -281,22 +259,44 @@ class _Purge:
             portion.table, [(row_id, portion.run_id) for row_id in ids], portion.group_id
         )
         if portion.group_id:
-            self._execute(_SET_STORED, json.dumps(ids), portion.group_id)
+            # Rows that other programs deleted were not counted.
+            self._execute(
+                "UPDATE row_group SET stored_row_count = (SELECT count(*) FROM json_each(?) j "
+                "CROSS JOIN state s ON s.id = j.value) WHERE id = ?",
+                json.dumps(ids),
+                portion.group_id,
+            )
 
     def _chunks(self, step: Going, portion: Portion) -> Iterator[Purged]:
         """The chunks of a group, which no reader sees any more."""
-        if not self._execute(_HIDE_GROUP, portion.group_id, step.owner_id):
+        # Readers skip a group that is not complete. If this process ends now, the maker of chunks
+        # deletes the rest.
+        if not self._execute(
+            "UPDATE row_group SET is_complete = 0 WHERE id = ? AND is_complete = 1 "
+            f"AND stored_row_count = 0 AND NOT EXISTS (SELECT 1 FROM run WHERE id = ? AND {KEPT})",
+            portion.group_id,
+            step.owner_id,
+        ):
             return
-        found = self._connection.execute(_CHUNKS, (portion.group_id,)).fetchall()
+        found = self._connection.execute(
+            "SELECT id FROM chunk WHERE group_id = ?", (portion.group_id,)
+        ).fetchall()
         yield from self._delete("chunk", [(chunk_id, 0) for (chunk_id,) in found])
-        self._execute(_DELETE_GROUP, portion.group_id)
+        self._execute("DELETE FROM row_group WHERE id = ? AND is_complete = 0", portion.group_id)
         self.purged.rows["chunk"] += step.rows
         yield self.purged
 
     def forget_frames(self) -> Iterator[Purged]:
         """Delete the frames of kept stretches that are gone, with their files."""
         after = 0
-        while found := self._connection.execute(_LEFT_FRAMES, (after, BATCH_ROWS)).fetchall():
+        # These frames belong to no full-rate segment any more.
+        while found := self._connection.execute(
+            f"SELECT id, run_id FROM image i WHERE kind = '{KEPT_FRAME}' AND id > ? "
+            "AND NOT EXISTS (SELECT 1 FROM kept_stretch k WHERE k.run_id = i.run_id "
+            "AND i.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) ORDER BY id "
+            "LIMIT ?",
+            (after, BATCH_ROWS),
+        ).fetchall():
             after = found[-1][0]
             yield from self._delete("image", found)
 
@@ -305,7 +305,9 @@ class _Purge:
         keys = [(step.owner_id, step.owner_id)]
         if step.table == "command":
             before = {"robot_id": step.owner_id, "before_s": step.newest_s, "limit": step.rows}
-            found = self._connection.execute(_OLD_COMMANDS, before).fetchall()
+            found = self._connection.execute(
+                f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit", before
+            ).fetchall()
             keys = [(row_id, 0) for (row_id,) in found]
         yield from self._delete(step.table, keys)
 
@@ -321,7 +323,11 @@ class _Purge:
         """One short transaction; returns how many of the keys are done."""
         pace = self._paces[table]
         some = keys[: pace.count]
-        self._connection.execute(_GOING)
+        # One statement deletes many rows at once, see `AtomicStatements`. Rows that are left in
+        # `going` were deleted.
+        self._connection.execute(
+            "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
+        )
         self._connection.execute("DELETE FROM going")
         self._connection.executemany("INSERT INTO going VALUES (?, ?)", some)
         paths = self._connection.execute(_PATHS[table]).fetchall() if table in _PATHS else []
@@ -333,7 +339,7 @@ class _Purge:
             self.purged.rows[table] += self._first("SELECT count(*) FROM going")
         self._note(held_s)
         for (path,) in paths:
-            if not self._first(_IN_USE, path):
+            if not self._first("SELECT 1 FROM image WHERE path = ? LIMIT 1", path):
                 self._delete_file(path)
         return len(some)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database import liveness
+from webots_mcp.database import dead_sessions
 from webots_mcp.database.connection import (
     FAILURES,
     LONGEST_READ_S,
@@ -34,7 +34,7 @@ from webots_mcp.database.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.database.liveness import JobLease, still_held
+from webots_mcp.database.leases import JobLease, still_held
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.queue import any_unfinished
@@ -56,19 +56,14 @@ from webots_mcp.store.journal_intake import (
     journals_behind,
     kept_journals,
 )
+from webots_mcp.store.loop_evidence import ask_stuck
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
-from webots_mcp.store.robots import (
-    RobotRecord,
-    SessionRecord,
-    Status,
-    ask_stuck,
-    console_trouble,
-    judge,
-    stopped_for,
-)
+from webots_mcp.store.robot_status import Status, decide_status, stopped_for
+from webots_mcp.store.robots import RobotRecord, console_trouble
 from webots_mcp.store.run_rows import RunRecord, StateRecord, current_run, newest_state
+from webots_mcp.store.sessions import SessionRecord
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "
@@ -78,16 +73,10 @@ GETTING_STARTED: Final = (
 )
 
 _MOST_IDLE: Final = 8  # connections: each may hold 2 MB of pages
-_NO_DATABASE: Final = "file is not a database"  # SQLite's words
 _FROZEN: Final = "the file cannot be written from here: read as it is on the disk"
 _BEHIND: Final = (
     "newer rows of {} are not in the database yet: ask again, or start 'webots-mcp serve' (not "
     "--read-only), which takes them in"
-)
-_SEEN_BY: Final = "observer {!r} saw the position (observer.x_m, ...); the robot publishes none"
-_KEPT: Final = (
-    "{} could not be read and was left as it is: {}. Correct the program that writes it, then move "
-    "or delete the file"
 )
 _LEFT: Final = (
     "{} of controllers that have ended wait in files next to the database (...-waiting-...) and "
@@ -158,7 +147,16 @@ class RobotView:
         newest, state = StateColumns(), self.state
         newest.add([(state.id, state.sim_time_s, state.wall_time_s, state.data, state.replaced)])
         found = find_observed(self.connection, self.run.id, newest)
-        return {"position_by": _SEEN_BY.format(found.observer)} if found else {}
+        return (
+            {
+                "position_by": (
+                    f"observer {found.observer!r} saw the position (observer.x_m, ...); the robot "
+                    "publishes none"
+                )
+            }
+            if found
+            else {}
+        )
 
     def _newest_times(self) -> tuple[float, float] | tuple[None, None]:
         """Of the newest state; before the first one, of the run's last sign of life."""
@@ -309,7 +307,7 @@ class RecordingAccess:
             if any_unfinished(connection):
                 if isinstance(self.database, Path):
                     adopt(connection, self.database)  # a command's result may wait there
-                liveness.reap(connection, time.time())
+                dead_sessions.reap(connection, time.time())
 
     def ingest(self) -> None:
         """Take in what controllers wrote into journals; nothing where the asker may not write."""
@@ -395,7 +393,7 @@ def view_of(
     current = current_run(connection, robot.id)
     run = run or current
     if run is None or run == current:
-        status = judge(connection, robot.session, run, now_s)
+        status = decide_status(connection, robot.session, run, now_s)
     else:
         status = _of_earlier_run(run, now_s)
     state = newest_state(connection, run.id) if run else None
@@ -414,7 +412,13 @@ def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     if not file:
         return {}
     behind, kept = journals_behind(connection, Path(file)), kept_journals(Path(file))
-    said = [_KEPT.format(name, why) for name, why in kept.items()]
+    said = [
+        (
+            f"{name} could not be read and was left as it is: {why}. Correct the program that "
+            "writes it, then move or delete the file"
+        )
+        for name, why in kept.items()
+    ]
     if held := held_log(Path(file)):
         said.append(f"{held}: {FREE_THE_LOG}")
     if isinstance(connection, FrozenConnection):
@@ -458,7 +462,8 @@ def _explain(error: Exception, database: Database) -> str:
             f"reading the database at {name} was stopped: one statement took longer than "
             f"{LONGEST_READ_S:g} s; ask for less, by run and time"
         )
-    if _NO_DATABASE in text:
+    # This is the message of SQLite.
+    if "file is not a database" in text:
         moved = isinstance(database, Path) and database.name == DATABASE_NAME
         aside = "; a bridge that finds it there moves it aside and begins a new one"
         return (

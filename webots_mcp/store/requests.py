@@ -35,28 +35,11 @@ _SECRET: Final = re.compile(
 )
 _PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")  # of an address
 _LEFT_OUT: Final = "(left out)"
-_BEGIN: Final = (
-    "INSERT INTO request (uuid, wall_time_s, client, client_version, transport, tool, arguments, "
-    "run_id, sim_time_s) SELECT :uuid, :now, :client, :version, :transport, :tool, :arguments, "
-    "r.id, coalesce((SELECT sim_time_s FROM state WHERE run_id = r.id ORDER BY id DESC LIMIT 1), "
-    "r.last_sim_time_s) FROM (SELECT 1) LEFT JOIN (SELECT run.* FROM run JOIN robot b "
-    "ON b.id = run.robot_id WHERE run.ended_wall_time_s IS NULL "
-    "AND (:robot IS NULL OR b.name = :robot) ORDER BY run.id DESC LIMIT 1) r"
-)
 _LIVE: Final = (
     "SELECT world FROM run WHERE ended_wall_time_s IS NULL AND world IS NOT NULL UNION SELECT "
     "controller FROM session WHERE ended_wall_time_s IS NULL AND controller IS NOT NULL"
 )
-_REFUSE: Final = "UPDATE request SET rule = ? WHERE id = ?"
 _END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
-_NEWEST: Final = (
-    "SELECT id, wall_time_s, sim_time_s, run_id, client, client_version, transport, tool, "
-    "arguments, rule, outcome, (SELECT json_group_array(json_array(id, action, status)) FROM "
-    "(SELECT value ->> 0 AS id, value ->> 1 AS action, value ->> 2 AS status "
-    "FROM json_each(coalesce(request.purged_commands, '[]')) UNION ALL "
-    "SELECT id, action, status FROM command WHERE request_id = request.id ORDER BY id)) "
-    "FROM request WHERE (:refused = 0 OR rule IS NOT NULL) ORDER BY id DESC LIMIT :limit"
-)
 
 
 class Requester(NamedTuple):
@@ -177,7 +160,9 @@ class OpenRequest:
                 if self.id is None:
                     self._insert()
                 with self.recording.writer() as connection:
-                    connection.execute(_REFUSE, (_bounded(error.rule), self.id))
+                    connection.execute(
+                        "UPDATE request SET rule = ? WHERE id = ?", (_bounded(error.rule), self.id)
+                    )
                     connection.execute(_END, (time.time(), "refused", self.id))
             raise
 
@@ -193,7 +178,16 @@ class OpenRequest:
             "robot": self._arguments.get("robot"),
         }
         with self.recording.writer() as connection:
-            self.id = connection.execute(_BEGIN, row).lastrowid
+            self.id = connection.execute(
+                "INSERT INTO request (uuid, wall_time_s, client, client_version, transport, "
+                "tool, arguments, run_id, sim_time_s) SELECT :uuid, :now, :client, :version, "
+                ":transport, :tool, :arguments, r.id, coalesce((SELECT sim_time_s FROM state "
+                "WHERE run_id = r.id ORDER BY id DESC LIMIT 1), r.last_sim_time_s) FROM (SELECT "
+                "1) LEFT JOIN (SELECT run.* FROM run JOIN robot b ON b.id = run.robot_id WHERE "
+                "run.ended_wall_time_s IS NULL AND (:robot IS NULL OR b.name = :robot) ORDER BY "
+                "run.id DESC LIMIT 1) r",
+                row,
+            ).lastrowid
 
     def _end(self, error: BaseException | None) -> None:
         if self.id is None and error is None:
@@ -247,7 +241,15 @@ def newest_requests(
     connection: sqlite3.Connection, limit: int, *, refused: bool = False
 ) -> list[dict[str, Any]]:
     """The newest requests, newest first, with the commands that they have sent."""
-    cursor = connection.execute(_NEWEST, {"limit": limit, "refused": refused})
+    cursor = connection.execute(
+        "SELECT id, wall_time_s, sim_time_s, run_id, client, client_version, transport, tool, "
+        "arguments, rule, outcome, (SELECT json_group_array(json_array(id, action, status)) FROM "
+        "(SELECT value ->> 0 AS id, value ->> 1 AS action, value ->> 2 AS status "
+        "FROM json_each(coalesce(request.purged_commands, '[]')) UNION ALL "
+        "SELECT id, action, status FROM command WHERE request_id = request.id ORDER BY id)) "
+        "FROM request WHERE (:refused = 0 OR rule IS NOT NULL) ORDER BY id DESC LIMIT :limit",
+        {"limit": limit, "refused": refused},
+    )
     names = [column[0] for column in cursor.description[:-1]]
     return [
         {

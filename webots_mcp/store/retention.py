@@ -20,26 +20,18 @@ KEPT: Final = (
     "(keep <> 0 OR coalesce(note, '') <> '' "
     "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *'))"
 )
-_MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
 SERVE: Final = "serve"
 KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
-_READ: Final = (
-    "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
-    "FROM retention_limit"
-)
 _SET: Final = (
     "INSERT OR REPLACE INTO retention_limit "
     "(kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s) "
     "VALUES (?, ?, ?, ?, ?, ?, ?)"
 )
-_RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
-_PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
 _BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
 NO_LIMIT: Final = "all"  # is kept
-_ROWS: Final = {"row": 1, "rows": 1}
 
 
 @dataclass(frozen=True)
@@ -130,7 +122,9 @@ def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: b
     with transaction(connection):
         for run_id in run_ids:
             fetch_run(connection, run_id)
-        connection.executemany(_MARK, [(int(keep), run_id) for run_id in run_ids])
+        connection.executemany(
+            "UPDATE run SET keep = ? WHERE id = ?", [(int(keep), run_id) for run_id in run_ids]
+        )
 
 
 # The limits of a database belong to it, not to who maintains it: set once, they hold for all.
@@ -158,7 +152,10 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, StoredLimit]:
         InvalidInputError: The table holds something that is not a limit.
     """
     settings: dict[str, StoredLimit] = {}
-    for kind, size_bytes, rows, age_s, factor, set_by, set_s in connection.execute(_READ):
+    for kind, size_bytes, rows, age_s, factor, set_by, set_s in connection.execute(
+        "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
+        "FROM retention_limit"
+    ):
         try:
             name = _NAME_OF[kind]
             if name == "outlive":
@@ -194,7 +191,7 @@ def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> Non
         for name, value in asked.items():
             kind = _KIND_OF[name]
             if value is None:
-                connection.execute(_RESET, (kind,))
+                connection.execute("DELETE FROM retention_limit WHERE kind = ?", (kind,))
             elif isinstance(value, Limit):
                 limit = (value.size_bytes, value.rows, value.age_s, None)
                 connection.execute(_SET, (kind, *limit, set_by, now_s))
@@ -280,14 +277,14 @@ def parse_limit(text: str, default: Limit) -> Limit:
 
 
 def _parse_part(part: str, text: str) -> tuple[str, float]:
-    found = _PART.fullmatch(part)
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z]+)", part, flags=re.IGNORECASE)
     if found is not None:
         number, unit = float(found[1]), found[2].lower()
         if unit in _BYTES:
             return "size_bytes", round(number * _BYTES[unit])
         if unit in _SECONDS:
             return "age_s", number * _SECONDS[unit]
-        if unit in _ROWS:
+        if unit in {"row": 1, "rows": 1}:
             return "rows", round(number)
     raise InvalidInputError(
         f"{part!r} in {text!r} is not a limit: write a size (500MB), an age (30d), a number of "

@@ -30,21 +30,6 @@ _BLOCK_IDS: Final = {
 _SAMPLE: Final = 100  # rows of mean size, from which the size of a block is estimated
 _COMMAND_BYTES: Final = 400
 
-_RUNS: Final = (
-    f"SELECT id, robot_id, row_count, started_wall_time_s, last_wall_time_s, {KEPT}, "
-    "ended_wall_time_s IS NULL OR id = (SELECT max(id) FROM run n WHERE n.robot_id = run.robot_id)"
-    " AS is_current, is_chunked FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
-    "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"
-)
-_GROUPS: Final = (
-    "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_count, "
-    "g.stored_row_bytes, g.chunk_bytes, coalesce(i.min, 0), w.max FROM row_group g "
-    "LEFT JOIN chunk i ON i.run_id = g.run_id AND i.group_id = g.id "
-    f"AND i.signal_id = {STATE_IDS} "
-    "LEFT JOIN chunk w ON w.run_id = g.run_id AND w.group_id = g.id "
-    f"AND w.signal_id = {WALL_TIMES} WHERE g.is_complete = 1"
-)
-_ROW_COUNT: Final = "SELECT row_count FROM row_group WHERE id = ?"
 # A damaged time (after the year 5000) must not keep the rows around it.
 _WALL_TIME: Final = (
     "max(CASE WHEN CAST(wall_time_s AS REAL) < 1e11 THEN CAST(wall_time_s AS REAL) END)"
@@ -64,7 +49,6 @@ _FILE_BYTES: Final = "iif(size_bytes BETWEEN 0 AND 1e12, size_bytes, 0)"
 _FRAMES: Final = (
     f"SELECT run_id, sum({_FILE_BYTES}) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
 )
-_COLUMNS: Final = "SELECT name, type, pk FROM pragma_table_info(?)"
 # Those that were created during a kept run stay with it.
 OLD_COMMANDS: Final = (
     f"FROM command c WHERE robot_id = :robot_id AND status IN {FINAL_STATUSES} "
@@ -202,13 +186,24 @@ def read_runs(connection: sqlite3.Connection) -> dict[int, RetainedRun]:
 
     Runs whose times are not numbers, which no bridge writes, are left out: they stay.
     """
-    return {row[0]: RetainedRun(*row) for row in connection.execute(_RUNS).fetchall()}
+    return {
+        row[0]: RetainedRun(*row)
+        for row in connection.execute(
+            f"SELECT id, robot_id, row_count, started_wall_time_s, last_wall_time_s, {KEPT}, "
+            "ended_wall_time_s IS NULL OR id = (SELECT max(id) FROM run n WHERE n.robot_id = "
+            "run.robot_id) AS is_current, is_chunked FROM run WHERE typeof(started_wall_time_s) IN "
+            "('real', 'integer') AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY "
+            "started_wall_time_s, id"
+        ).fetchall()
+    }
 
 
 def ids_of(connection: sqlite3.Connection, portion: Portion) -> list[int]:
     """Return the ids of the rows of a portion, in order; the oldest of a group go first."""
     if portion.group_id:
-        (rows,) = connection.execute(_ROW_COUNT, (portion.group_id,)).fetchone()
+        (rows,) = connection.execute(
+            "SELECT row_count FROM row_group WHERE id = ?", (portion.group_id,)
+        ).fetchone()
         wanted = {portion.group_id: rows}
         for _, values in values_in(connection, portion.run_id, STATE_IDS, wanted):
             if isinstance(values, Decoded):
@@ -256,7 +251,14 @@ def _portions(
 
 def _grouped(connection: sqlite3.Connection, runs: dict[int, RetainedRun]) -> Iterator[Portion]:
     """Yield the states and chunks of row groups."""
-    for facts in connection.execute(_GROUPS).fetchall():
+    for facts in connection.execute(
+        "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_count, "
+        "g.stored_row_bytes, g.chunk_bytes, coalesce(i.min, 0), w.max FROM row_group g "
+        "LEFT JOIN chunk i ON i.run_id = g.run_id AND i.group_id = g.id "
+        f"AND i.signal_id = {STATE_IDS} "
+        "LEFT JOIN chunk w ON w.run_id = g.run_id AND w.group_id = g.id "
+        f"AND w.signal_id = {WALL_TIMES} WHERE g.is_complete = 1"
+    ).fetchall():
         group_id, run_id, last_id, rows, left, row_bytes, chunk_bytes, first_id, wall_s = facts
         if run_id not in runs:
             continue
@@ -292,7 +294,9 @@ def _payloads(connection: sqlite3.Connection, table: str) -> str:
     if table == "image":
         return f"sum({_FILE_BYTES})"
     parts = ["2"]  # each column takes a byte or two in the head of the record too
-    for name, kind, is_key in connection.execute(_COLUMNS, (table,)).fetchall():
+    for name, kind, is_key in connection.execute(
+        "SELECT name, type, pk FROM pragma_table_info(?)", (table,)
+    ).fetchall():
         if kind == "TEXT":
             parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
         elif not is_key:

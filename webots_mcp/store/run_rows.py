@@ -24,13 +24,6 @@ from webots_mcp.signals.naming import nearest_first
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_NEWEST_RUN_IDS: Final = (
-    "SELECT id FROM run WHERE :robot_id IS NULL OR robot_id = :robot_id ORDER BY id DESC LIMIT 10"
-)
-_RUN_COUNT: Final = "SELECT count(*) FROM run WHERE robot_id = ?"
-_CHUNKS_END: Final = (
-    "SELECT max(end_sim_time_s) FROM row_group WHERE run_id = ? AND is_complete = 1"
-)
 _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
@@ -44,7 +37,6 @@ _PACE_WINDOW_ROWS: Final = 500
 _ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
 OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
 STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
-_ROUND: Final = f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?"
 _SETS_PACE: Final = 0.8  # of a round's time
 _SHOWN_KEYS: Final = 20
 _SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
@@ -54,16 +46,6 @@ MAX_FILE_BYTES: Final = 64_000_000
 MAX_PIXELS: Final = 50_000_000  # 200 MB in memory
 _SHOWN_PATH: Final = 100
 _OF_CAMERA: Final = f"kind IN ('camera', '{KEPT_FRAME}')"
-_NEWEST_FIRST: Final = "sim_time_s DESC"
-_NEAREST_FIRST: Final = "abs(sim_time_s - :at_s)"
-_KEPT_FRAMES: Final = (
-    f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
-    "AND sim_time_s BETWEEN ? AND ?"
-)
-_CAMERAS: Final = (
-    f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} AND run_id IN "
-    "(SELECT id FROM run WHERE robot_id = ?) GROUP BY run_id ORDER BY run_id DESC"
-)
 
 
 def columns_of(row: type[Any]) -> str:
@@ -161,9 +143,6 @@ def reading_texts(
 
 
 _RUN_COLUMNS: Final = columns_of(RunRecord)
-_CURRENT_RUN: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
-_RUN_BY_ID: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE id = ?"
-_RUNS_OF_ROBOT: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id"
 _STATE_COLUMNS: Final = columns_of(StateRecord)
 # Of a crash only a kept stretch has the newest state; it has a negative id.
 _NEWEST_STATE: Final = (
@@ -174,14 +153,13 @@ _NEWEST_STATE: Final = (
     "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
 ).format(columns=_STATE_COLUMNS, kept=_STATE_COLUMNS.partition(", ")[2])
 _EVENT_COLUMNS: Final = columns_of(EventRecord)
-_NEWEST_EVENTS: Final = (
-    f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT ?"
-)
 
 
 def current_run(connection: sqlite3.Connection, robot_id: int) -> RunRecord | None:
     """The robot's newest run, going on or not."""
-    row = connection.execute(_CURRENT_RUN, (robot_id,)).fetchone()
+    row = connection.execute(
+        f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1", (robot_id,)
+    ).fetchone()
     return RunRecord(*row) if row else None
 
 
@@ -198,7 +176,7 @@ def fetch_run(
     Raises:
         UnknownRunError: There is no such run, or it is another robot's.
     """
-    row = connection.execute(_RUN_BY_ID, (run_id,)).fetchone()
+    row = connection.execute(f"SELECT {_RUN_COLUMNS} FROM run WHERE id = ?", (run_id,)).fetchone()
     if row is None or robot_id not in (None, RunRecord(*row).robot_id):
         raise UnknownRunError(_no_such_run(connection, run_id, robot_id))
     return RunRecord(*row)
@@ -206,16 +184,30 @@ def fetch_run(
 
 def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[RunRecord]:
     """All runs of the robot, oldest first."""
-    return [RunRecord(*row) for row in connection.execute(_RUNS_OF_ROBOT, (robot_id,)).fetchall()]
+    return [
+        RunRecord(*row)
+        for row in connection.execute(
+            f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id", (robot_id,)
+        ).fetchall()
+    ]
 
 
 def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
     """How many runs of the robot were recorded."""
-    return int(connection.execute(_RUN_COUNT, (robot_id,)).fetchone()[0])
+    return int(
+        connection.execute("SELECT count(*) FROM run WHERE robot_id = ?", (robot_id,)).fetchone()[0]
+    )
 
 
 def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None) -> str:
-    ids = [row[0] for row in connection.execute(_NEWEST_RUN_IDS, {"robot_id": robot_id}).fetchall()]
+    ids = [
+        row[0]
+        for row in connection.execute(
+            "SELECT id FROM run WHERE :robot_id IS NULL OR robot_id = :robot_id ORDER BY id DESC "
+            "LIMIT 10",
+            {"robot_id": robot_id},
+        ).fetchall()
+    ]
     whose = "" if robot_id is None else " of this robot"
     known = f"the newest runs{whose} are {ids}" if ids else f"no run{whose} was recorded"
     return f"no run {run_id}{whose}: {known}"
@@ -226,7 +218,9 @@ def newest_state(connection: sqlite3.Connection, run_id: int) -> StateRecord | N
     state = _state_up_to(connection, run_id, _LATER_THAN_ANY)
     if state is None or state.id > 0:
         return state
-    (ended_s,) = connection.execute(_CHUNKS_END, (run_id,)).fetchone()
+    (ended_s,) = connection.execute(
+        "SELECT max(end_sim_time_s) FROM row_group WHERE run_id = ? AND is_complete = 1", (run_id,)
+    ).fetchone()
     return None if ended_s is not None and ended_s > state.sim_time_s else state
 
 
@@ -261,7 +255,9 @@ def real_time_factor(connection: sqlite3.Connection, run_id: int) -> float | Non
 
 def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | None:
     """Who sets the pace of a run, in a sentence; None where too few of its steps were seen."""
-    own_ms, wait_ms, steps = connection.execute(_ROUND, (run_id,)).fetchone()
+    own_ms, wait_ms, steps = connection.execute(
+        f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?", (run_id,)
+    ).fetchone()
     if own_ms is None:
         return None
     share = own_ms / max(own_ms + wait_ms, 1e-9)
@@ -329,7 +325,11 @@ def put_back(value: Any, parts: list[str], replaced: object) -> None:
 
 def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[EventRecord]:
     """The latest events of a run, oldest first; with a limit of -1 all of them."""
-    rows = connection.execute(_NEWEST_EVENTS, (run_id, limit)).fetchall()
+    rows = connection.execute(
+        f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC "
+        "LIMIT ?",
+        (run_id, limit),
+    ).fetchall()
     return [EventRecord(*row) for row in reversed(rows)]
 
 
@@ -361,9 +361,6 @@ _FRAMES: Final = (
     f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
     "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
     "ORDER BY {order}, id DESC LIMIT :count"
-)
-_NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM image WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 
 
@@ -437,7 +434,7 @@ def camera_frames(
         at_s: The frames nearest to this simulation time; None is the newest.
         count: The most to return, of one kind.
     """
-    order = _NEWEST_FIRST if at_s is None else _NEAREST_FIRST
+    order = "sim_time_s DESC" if at_s is None else "abs(sim_time_s - :at_s)"
     values = {"run_id": run_id, "device": device, "kind": None, "at_s": at_s, "count": 1}
     query = _FRAMES.format(order=order)
     found = connection.execute(query, values).fetchall()
@@ -449,7 +446,10 @@ def camera_frames(
 
 def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | None:
     """The newest picture of a run, of whatever kind."""
-    row = connection.execute(_NEWEST, (run_id,)).fetchone()
+    row = connection.execute(
+        f"SELECT {_COLUMNS} FROM image WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1",
+        (run_id,),
+    ).fetchone()
     return StoredImage(*row) if row else None
 
 
@@ -457,9 +457,22 @@ def count_kept_frames(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> int:
     """How many camera frames a kept stretch has, from its start to its end."""
-    return int(connection.execute(_KEPT_FRAMES, (run_id, start_s, end_s)).fetchone()[0])
+    return int(
+        connection.execute(
+            f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
+            "AND sim_time_s BETWEEN ? AND ?",
+            (run_id, start_s, end_s),
+        ).fetchone()[0]
+    )
 
 
 def cameras(connection: sqlite3.Connection, robot_id: int) -> dict[int, str]:
     """The cameras whose frames there are, by run of the robot, the newest run first."""
-    return dict(connection.execute(_CAMERAS, (robot_id,)).fetchall())
+    return dict(
+        connection.execute(
+            f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} "
+            "AND run_id IN (SELECT id FROM run WHERE robot_id = ?) GROUP BY run_id "
+            "ORDER BY run_id DESC",
+            (robot_id,),
+        ).fetchall()
+    )

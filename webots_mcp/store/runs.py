@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.database.connection import transaction
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.database.pauses import paused_s
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.parameter import Value
@@ -41,28 +41,6 @@ _WHAT: Final = (
     "start_reason", "end_reason", "label", "note", "purged_rows",
     "own_ms", "step_wait_ms", "row_count",
 )  # fmt: skip
-_PAGE: Final = (
-    f"{_RUNS} WHERE (:robot IS NULL OR r.robot_id = :robot) AND (:before IS NULL OR r.id < :before)"
-    f" AND {HAD_VALUES} ORDER BY r.id DESC LIMIT :limit"
-)
-_ONE: Final = f"{_RUNS} WHERE r.id = ?"
-_TOTAL: Final = (
-    f"SELECT count(*) FROM run r WHERE (:robot IS NULL OR robot_id = :robot) AND {HAD_VALUES}"
-)
-_NOTABLE: Final = (
-    "SELECT 'log ' || level, count(*) FROM log WHERE run_id = :run "
-    "AND level IN ('warning', 'error', 'critical') GROUP BY level UNION ALL "
-    "SELECT kind, count(*) FROM event WHERE run_id = :run "
-    "AND kind NOT IN ('change', 'start', 'reset', 'reload') GROUP BY kind UNION ALL "
-    "SELECT 'command ' || status, count(*) FROM command c JOIN run r ON r.id = :run "
-    "AND r.session_id = c.session_id WHERE c.status IN ('failed', 'lost') "
-    "AND c.claimed_wall_time_s BETWEEN r.started_wall_time_s AND r.last_wall_time_s "
-    "GROUP BY status"
-)
-_ANNOTATE: Final = (
-    "UPDATE run SET label = CASE WHEN :label IS NULL THEN label ELSE nullif(:label, '') END, "
-    "note = CASE WHEN :note IS NULL THEN note ELSE nullif(:note, '') END WHERE id = :run"
-)
 
 
 @dataclass(frozen=True)
@@ -151,9 +129,16 @@ def list_runs(
     robot_id = None if robot is None else resolve_robot(connection, robot, time.time()).id
     asked = {"robot": robot_id, "parameters": as_filter(connection, parameters or {})}
     page = {**asked, "before": before_id, "limit": limit + 1}
-    rows: list[Any] = connection.execute(_PAGE, page).fetchall()
+    rows: list[Any] = connection.execute(
+        f"{_RUNS} WHERE (:robot IS NULL OR r.robot_id = :robot) AND (:before IS NULL OR r.id < "
+        f":before) AND {HAD_VALUES} ORDER BY r.id DESC LIMIT :limit",
+        page,
+    ).fetchall()
     runs = tuple(_infos(connection, rows[:limit]))
-    total = connection.execute(_TOTAL, asked).fetchone()[0]
+    total = connection.execute(
+        f"SELECT count(*) FROM run r WHERE (:robot IS NULL OR robot_id = :robot) AND {HAD_VALUES}",
+        asked,
+    ).fetchone()[0]
     return RunList(runs, total, runs[-1].run_id if len(rows) > limit else None)
 
 
@@ -174,7 +159,10 @@ def run_infos(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list[Ru
         UnknownRunError: One of these ids is no run's.
     """
     ids = [fetch_run(connection, run_id).id for run_id in run_ids]
-    return _infos(connection, [connection.execute(_ONE, (each,)).fetchone() for each in ids])
+    return _infos(
+        connection,
+        [connection.execute(f"{_RUNS} WHERE r.id = ?", (each,)).fetchone() for each in ids],
+    )
 
 
 def annotate_run(
@@ -205,7 +193,12 @@ def annotate_run(
             )
     values = {"run": run_id, "label": label, "note": note}
     with transaction(connection):  # it waits for the lock, and Ctrl-C ends that
-        if not connection.execute(_ANNOTATE, values).rowcount:
+        if not connection.execute(
+            "UPDATE run SET label = CASE WHEN :label IS NULL THEN label ELSE nullif(:label, '') "
+            "END, note = CASE WHEN :note IS NULL THEN note ELSE nullif(:note, '') END WHERE id = "
+            ":run",
+            values,
+        ).rowcount:
             fetch_run(connection, run_id)  # says which there are
 
 
@@ -215,7 +208,7 @@ def pace(duration_s: float, wall_s: float) -> float | None:
 
 
 def _infos(connection: sqlite3.Connection, rows: Sequence[tuple[Any, ...]]) -> list[RunInfo]:
-    ended = dict(dead_sessions(connection))
+    ended = dict(find_dead_sessions(connection))
     parameters = notable_parameters(connection, [row[0] for row in rows])
     return [_info(connection, row, ended, parameters[row[0]]) for row in rows]
 
@@ -236,7 +229,19 @@ def _info(
         wall_duration_s=last_wall_s - started_wall_s,
         held_s=paused_s(connection, row[0], last_wall_s),
         duration_s=last_s - started_s,
-        notable=dict(connection.execute(_NOTABLE, {"run": row[0]}).fetchall()),
+        notable=dict(
+            connection.execute(
+                "SELECT 'log ' || level, count(*) FROM log WHERE run_id = :run "
+                "AND level IN ('warning', 'error', 'critical') GROUP BY level UNION ALL "
+                "SELECT kind, count(*) FROM event WHERE run_id = :run "
+                "AND kind NOT IN ('change', 'start', 'reset', 'reload') GROUP BY kind UNION ALL "
+                "SELECT 'command ' || status, count(*) FROM command c JOIN run r ON r.id = :run "
+                "AND r.session_id = c.session_id WHERE c.status IN ('failed', 'lost') "
+                "AND c.claimed_wall_time_s BETWEEN r.started_wall_time_s AND r.last_wall_time_s "
+                "GROUP BY status",
+                {"run": row[0]},
+            ).fetchall()
+        ),
         parameters=parameters,
     )
 

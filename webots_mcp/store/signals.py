@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.signals.meaning import StatedMeaning
-from webots_mcp.signals.naming import Value, find_mode
+from webots_mcp.signals.meaning import ANGLES, StatedMeaning
+from webots_mcp.signals.naming import METRES, Value, find_mode, metres_in
 from webots_mcp.signals.register import (
     MOST_CHOICES,
     Kind,
@@ -30,11 +31,8 @@ from webots_mcp.store.chunks import ABSENT, Absent, Replaced, parse, shown
 if TYPE_CHECKING:
     from webots_mcp.store.chunks import StateColumns
 
-_OF_ROBOT: Final = (
-    "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
-    "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
-)
 
+_TURNING: Final = ("heading", "roll", "pitch")  # in radians where no unit is known
 _NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
 _TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as it is
     "null": _NO_VALUES,
@@ -71,7 +69,26 @@ class RegisteredSignal:
     @property
     def turn(self) -> float | None:
         """A whole turn of an angle, in its unit; None of what is no angle."""
-        return turn_of(self.name, self.kind)
+        if not self.stated or not self.is_number:
+            return turn_of(self.name, self.kind)
+        quantity = next(filter(None, (each.said.quantity for each in self.stated)), None)
+        unit = self.stated_unit
+        if quantity is not None and quantity not in ANGLES:
+            return None
+        if unit in ("rad", "deg"):
+            return math.tau if unit == "rad" else 360.0
+        named = turn_of(self.name, self.kind)
+        return named if quantity is None or named else math.tau if quantity in _TURNING else None
+
+    @property
+    def stated_unit(self) -> str | None:
+        """The unit that was declared, or that its device has; None without any."""
+        return next(filter(None, (each.said.unit for each in self.stated)), None)
+
+    @property
+    def metres(self) -> float:
+        """What one of its unit is in metres: 1 of a length without a unit."""
+        return METRES.get(self.stated_unit or "") or metres_in(self.name)
 
     @property
     def is_index(self) -> bool:
@@ -86,7 +103,11 @@ class RegisteredSignal:
 
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, RegisteredSignal]:
     """The signals of a robot in the register, by name."""
-    rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
+    rows = connection.execute(
+        "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
+        "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id",
+        (robot_id,),
+    ).fetchall()
     signals = (_registered(RegisteredSignal(*row)) for row in rows)
     return {signal.name: signal for signal in signals}
 

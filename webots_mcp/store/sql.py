@@ -44,12 +44,8 @@ _READING: Final = frozenset(
 _REFUSED_FUNCTIONS: Final = frozenset(
     {"load_extension", "fts3_tokenizer", "zeroblob", "randomblob"}
 )
-# Their first use on a connection defines them, which an authorizer would see as writing.
-_LOAD_JSON_TABLES: Final = "SELECT 1 FROM json_each('[]'), json_tree('[]')"
-_BEGINS: Final = re.compile(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(\w*)", re.DOTALL)
 TOO_LARGE: Final = "it needs too much memory: read fewer or shorter values at a time"
 _LONGEST_ERROR: Final = 300
-_MISSING: Final = re.compile(r"no such (column|table): (\S+)")
 
 Cell = int | float | str | None
 LINE: Final = (sys.executable, "-m", __name__)
@@ -81,8 +77,6 @@ _BOOKKEEPING_COLUMNS: Final = (
     "mode_before_pause",
     "is_chunked",
 )
-_COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
-_COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
 _RULES: Final = (
     "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
     "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
@@ -174,7 +168,7 @@ def require_select(statement: str) -> None:
     """
     if not statement.strip():
         raise InvalidInputError("the statement is empty: give one such as SELECT count(*) FROM run")
-    begin = _BEGINS.match(statement)
+    begin = re.match(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(\w*)", statement, flags=re.DOTALL)
     word = begin.group(1).upper() if begin else ""
     if word not in ("SELECT", "WITH", "VALUES", "EXPLAIN"):
         raise InvalidInputError(
@@ -186,7 +180,8 @@ def require_select(statement: str) -> None:
 @contextlib.contextmanager
 def _only_reading(connection: sqlite3.Connection) -> Generator[None]:
     """Refuse all but reading, and values beyond 10 MB, until the end of the block."""
-    connection.execute(_LOAD_JSON_TABLES).fetchall()
+    # The first use on a connection defines these functions, which an authorizer takes for writing.
+    connection.execute("SELECT 1 FROM json_each('[]'), json_tree('[]')").fetchall()
     before = _limit_values(connection, (MAX_VALUE_BYTES, MAX_COLUMNS))
     connection.set_authorizer(_authorize)
     try:
@@ -284,7 +279,7 @@ def _explain(connection: sqlite3.Connection, statement: str, error: Exception) -
         return (
             "?, :name, @name and $name are placeholders without values: write values in the SELECT"
         )
-    if missing := _MISSING.search(text):
+    if missing := re.search(r"no such (column|table): (\S+)", text):
         return f"{text}; {_near(connection, statement, *missing.groups())}"
     return f"SQLite says: {text}"
 
@@ -403,7 +398,12 @@ def _ask(asked: Statement) -> SqlResult:
 def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
     """The columns of each table and view of ours; those of a person are not looked into."""
     return {
-        name: [column for (column,) in connection.execute(_COLUMNS, (name,))]
+        name: [
+            column
+            for (column,) in connection.execute(
+                "SELECT name FROM pragma_table_info(?) ORDER BY cid", (name,)
+            )
+        ]
         for name, _, _ in connection.execute(_OBJECTS).fetchall()
         if name in shipped_objects()
     }
@@ -425,7 +425,11 @@ def describe_schema(connection: sqlite3.Connection) -> str:
         same = frozenset(columns[name]).difference(_BOOKKEEPING_COLUMNS)
         names.setdefault(same, []).append(f"{kind} {name}")
         if same not in listed:
-            found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())
+            found = dict.fromkeys(
+                re.findall(r'^\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', sql, flags=re.MULTILINE)
+                if kind == "table"
+                else ()
+            )
             listed[same] = _listed(columns[name], dict(e for e in found if e not in listed_before))
             listed_before.update(found)
     lines = (f"{', '.join(alike)}: {listed[same]}" for same, alike in names.items())

@@ -21,7 +21,7 @@ from webots_mcp.database.waiting_file import adopt, waiting_paths
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import RecordingAccess as Store
-from webots_mcp.store.robots import WAITING_IN_STEP, Status
+from webots_mcp.store.robot_status import WAITING_IN_STEP, Status
 
 Script = Callable[..., "subprocess.Popen[str]"]
 

@@ -11,6 +11,7 @@ import os
 import sqlite3
 import time
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def require_rows(folder: Path, expected: dict[str, Any]) -> None:
     assert "dropped" in expected or rows(folder, "dropped") == [[0]]
 
 
-@pytest.mark.parametrize("pieces", [1, 2, pytest.param(211, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("pieces", [1, 2, pytest.param(67, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_a_journal_comes_to_its_rows(
     file: Path, pieces: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -148,10 +149,12 @@ def test_what_there_is_no_time_for_waits_also_where_there_are_many_journals(
         (tmp_path / name).write_text(text.replace('"5f', f'"{start}f'))
     with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
         create_schema(connection)
-        for begun in (1, 1, 2, 2, 3, 3, 4, 4):  # read, and then found to be at its end
+        begun = [0]
+        while journal_parts(tmp_path / "webots.db"):
             ingest_journals(connection, tmp_path / "webots.db", budget_s=0.0)
-            assert len(rows(tmp_path, "session")) == begun
-    assert journal_parts(tmp_path / "webots.db") == {}
+            begun.append(len(rows(tmp_path, "session")))
+    assert all(after - before in (0, 1) for before, after in pairwise(begun))
+    assert begun[-1] == 4
 
 
 def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(

@@ -26,11 +26,16 @@ from webots_mcp.store.recording import RecordingAccess
 LINES = 30
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """With a journal of long states, each of many signals."""
+@pytest.fixture(scope="module")
+def text() -> str:
+    """A long state, of many signals."""
     data = {f"b{i}": {f"c{j}": [1, 2, 3] for j in range(100)} for i in range(2000)}
-    text = json.dumps(data, separators=(",", ":"))
+    return json.dumps(data, separators=(",", ":"))
+
+
+@pytest.fixture
+def folder(text: str, tmp_path: Path) -> Path:
+    """With a journal of long states."""
     with part(tmp_path).open("w") as journal:
         journal.write(f"{json.dumps(HEADER)}\n{json.dumps([1, 'run', None, RUN_VALUES])}\n")
         for number in range(2, LINES + 2):

@@ -21,7 +21,7 @@ from mcp import Client
 
 from tests.server.test_parameters import TunableDriver
 from webots_mcp.cli import main
-from webots_mcp.plugins.page.steering import steer, tune
+from webots_mcp.plugins.page.page_orders import steer, tune
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.recording import RecordingAccess
 

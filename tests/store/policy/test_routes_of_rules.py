@@ -16,8 +16,8 @@ from mcp import Client
 from tests.server.conftest import fail
 from tests.store.policy.test_requests import allow, client_of, run
 from webots_mcp.contract import BUILT_IN_ACTIONS
+from webots_mcp.plugins.page.page_orders import steer, tune
 from webots_mcp.plugins.page.page_server import ORDERS
-from webots_mcp.plugins.page.steering import steer, tune
 from webots_mcp.questions import all_questions
 from webots_mcp.store.policy import LAUNCH, TOOLS_OF_ACTIONS
 from webots_mcp.store.recording import RecordingAccess

@@ -8,13 +8,19 @@ from typing import Any, Final, cast
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
-from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times, total_s
-from webots_mcp.judging.detection.fall import FALL
+from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times, total_s
+from webots_mcp.judging.coverage import Coverage, Fault
+from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
-from webots_mcp.judging.detection.standstill import COMMAND_NOISE, ON_THE_SPOT, TURNED_RAD
-from webots_mcp.judging.detection.targets import OFF_TARGET, pursuits_in
+from webots_mcp.judging.detection.standstill import (
+    COMMAND_NOISE,
+    ON_THE_SPOT,
+    SPEED_UNITS,
+    TURNED_RAD,
+)
+from webots_mcp.judging.detection.targets import OFF_S, OFF_SHARE, OFF_TARGET, pursuits_in
 from webots_mcp.signals.meaning import words_in
 from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, unit_in, words_of
 from webots_mcp.signals.register import PLACES
@@ -58,25 +64,27 @@ _MEASURES: Final = frozenset((
 _HEADINGS: Final = frozenset(("attitude", "deg", "degree", "euler", "heading", "rad", "rpy", "yaw"))
 
 
-def moves_when_commanded(run: RunUnderCheck) -> Finding:
+def moves_when_commanded(run: RunUnderCheck) -> Examined:
     """Fails where it stood although a command, its wheels or its mode say that it should move.
 
     Warns where only a mode that is the same in the whole run says so, or motors that lift it.
     """
     stood = run.events("standstill")
-    stuck = [each for each in run.events("stuck") if each.duration_s >= APART_S]
-    if stuck:
+    if stuck := run.events("stuck"):
         evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
         first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"
         first += f", but {against}" if (against := stuck[0].details.get("evidence_against")) else ""
-        outcome = "fail" if any(_is_shown(run, each) for each in stuck) else "warn"
-        return Finding(outcome, first, stuck[0].start_s, len(stuck), run.more("stuck"))
-    if undecided := run.found.verdicts.reasons.get("stuck"):
-        return Finding("not judged", "; ".join(undecided))
-    return Finding("pass", f"{counted(len(stood), 'standstill')}, none against a command")
+        severity = "fail" if any(_is_shown(run, each) for each in stuck) else "warn"
+        return Fault(severity, first, stuck[0].start_s, len(stuck), run.more("stuck"))
+    options = run.search.options
+    return run.covered(
+        f"{counted(len(stood), 'standstill')}, none against a command",
+        of="stuck",
+        limit=f"limit {options.stuck_m:g} m in {options.stuck_s:g} s",
+    )
 
 
-def rests_when_commanded(run: RunUnderCheck) -> Finding:
+def rests_when_commanded(run: RunUnderCheck) -> Examined:
     """Warns where it turned by 0.1 rad or went 5 cm while every command was 0."""
     motion = run.motion
     commands = [*filter(None, (motion.commanded, motion.turn_command)), *motion.wheel_commands]
@@ -92,11 +100,13 @@ def rests_when_commanded(run: RunUnderCheck) -> Finding:
             part = frame.between(rest.start_s + ROLLS_OUT_S, just_after(rest.end_s))
             moved += ((rest.start_s, each) for each in _moved_in(run, part))
     if not moved:
-        return Finding("pass", "it rested whenever every command was 0")
+        rested = "it rested whenever every command was 0"
+        judged = counted(len(commands), "command")
+        return run.covered(rested, judged=judged, limit=f"limit {TURNED_RAD:g} rad or 5 cm")
     names = listed([each.name for each in commands], 3)
     evidence = f"{moved[0][1]} although {names} {'was' if len(commands) == 1 else 'were'} 0"
     shown = run.shows(*(each.name for each in commands[:2]))
-    return Finding("warn", evidence, moved[0][0], len(moved), shown)
+    return Fault("warn", evidence, moved[0][0], len(moved), shown)
 
 
 def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
@@ -147,7 +157,7 @@ def _flies(run: RunUnderCheck) -> bool:
 # -- command and measurement -----------------------------------------------------------------------
 
 
-def follows_targets(run: RunUnderCheck) -> Finding:
+def follows_targets(run: RunUnderCheck) -> Examined:
     """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
 
     Places where a robot shall go are no targets, and grippers hold things. A target that is always
@@ -159,7 +169,8 @@ def follows_targets(run: RunUnderCheck) -> Finding:
         if not pursuits:
             raise NotSearchableError("no target is published next to what it is the target of")
         said = f"{counted(len(pursuits), 'target')} followed, as by {pursuits[0].measured.name}"
-        return Finding("pass", said)
+        limit = f"limit {100 * OFF_SHARE:g} % off for {OFF_S:g} s"
+        return run.covered(said, of=OFF_TARGET.name, limit=limit)
     names = listed(list(dict.fromkeys(each.name or "" for each in found)), 3)
     longest = max(found, key=lambda each: each.duration_s)
     details = longest.details
@@ -167,28 +178,31 @@ def follows_targets(run: RunUnderCheck) -> Finding:
         f"{names}: {details['off_percent']:g} % off {details['target']} for "
         f"{longest.duration_s:.3g} s without coming nearer"
     )
-    return Finding("fail", evidence, found[0].start_s, len(found), run.more(OFF_TARGET.name))
+    firm = run.firmest(each.name or "" for each in found)
+    more = run.more(OFF_TARGET.name)
+    return Fault("fail", evidence, found[0].start_s, len(found), more, signals=firm)
 
 
 # -- attitude --------------------------------------------------------------------------------------
 
 
-def stays_upright(run: RunUnderCheck) -> Finding:
+def stays_upright(run: RunUnderCheck) -> Examined:
     """Fails where it fell: tilted by over 60 degrees, and lay for a second or more."""
     falls = run.events(FALL.name)
     if not falls:
-        return Finding("pass", run.found.verdicts.not_found.get(FALL.name) or "it never fell")
+        said = run.found.verdicts.not_found.get(FALL.name) or "it never fell"
+        return run.covered(said, of=FALL.name, limit=f"limit {math.degrees(FALLEN_RAD):.0f}°")
     first = falls[0]
     got_up = first.details.get("got_up")
     after = f"and got up {first.duration_s:.3g} s later" if got_up else "and stayed down"
     evidence = f"fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
-    return Finding("fail", evidence, first.start_s, len(falls), run.more(FALL.name))
+    return Fault("fail", evidence, first.start_s, len(falls), run.more(FALL.name))
 
 
 # -- wheels and motion -----------------------------------------------------------------------------
 
 
-def wheels_grip(run: RunUnderCheck) -> Finding:
+def wheels_grip(run: RunUnderCheck) -> Examined:
     """Fails where the wheels drove ahead for 3 s and it went less than half as far as usual."""
     motion, position = run.motion, run.motion.position
     wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
@@ -214,14 +228,20 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
     rolls = f"rolls {usual:.3g} m/s{unit}"
     if not found:
-        return Finding("pass", f"{rolls}, over {np.count_nonzero(known) * lasts_s:.3g} s")
+        against = position[0].name.partition(".")[0]
+        return run.covered(
+            rolls,
+            judged=f"{counted(len(wheels), 'wheel')} against {against}",
+            limit=f"slip limit {100 * _SLIPS:g} %",
+            lasts_s=int(np.count_nonzero(known)) * lasts_s,
+        )
     longest_s = max(each.duration_s for each in found) + 2 * lasts_s
     least = min(float(np.nanmin(ratios[each.start : each.stop])) for each in found)
     evidence = f"slipped {times(len(found))}, up to {longest_s:.3g} s; {rolls}, then {least:.3g}"
-    return Finding("fail", evidence, found[0].start_s, len(found), run.shows(wheels[0].name))
+    return Fault("fail", evidence, found[0].start_s, len(found), run.shows(wheels[0].name))
 
 
-def _turns_though_straight(run: RunUnderCheck, wheels: list[RegisteredSignal]) -> Finding | None:
+def _turns_though_straight(run: RunUnderCheck, wheels: list[RegisteredSignal]) -> Fault | None:
     """A robot that turned for long while the wheels of both sides turned alike: one side slips.
 
     A robot that steers turns so by nature, and where none of its wheels has a side nothing is said.
@@ -259,7 +279,7 @@ def _turns_though_straight(run: RunUnderCheck, wheels: list[RegisteredSignal]) -
             "sides turned alike"
         )
         since_s = float(clock[cells[far[0]]])
-        return Finding("fail", evidence, since_s, 1, run.shows(heading.name, wheels[0].name))
+        return Fault("fail", evidence, since_s, 1, run.shows(heading.name, wheels[0].name))
     return None
 
 
@@ -327,7 +347,7 @@ def _ratios_in(columns: Sequence[Array], lasts_s: float) -> tuple[Array, Array, 
 # -- two estimates of one thing --------------------------------------------------------------------
 
 
-def estimates_agree(run: RunUnderCheck) -> Finding:
+def estimates_agree(run: RunUnderCheck) -> Examined:
     """Warns where two positions came apart by 5 % of the way, and fails from 15 % on.
 
     So for two headings by 0.35 and 1 rad for 3 s. Each may have a frame of its own: they are laid
@@ -338,23 +358,33 @@ def estimates_agree(run: RunUnderCheck) -> Finding:
     by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}
     pairs = [(by_role.get(f"x{place}"), by_role.get(f"y{place}")) for place in PLACES]
     positions = [(x, y) for x, y in pairs if x and y]
-    made = [_drift(run, positions[0], other) for other in positions[1:]]
-    findings = [each for each in made if each is not None]
+    if not positions and run.motion.position is not None:
+        positions = [run.motion.position]
+    made: list[Examined | None] = []
+    if positions:
+        declared = _same_positions(run, positions[0])
+        others = [each for each in positions[1:] if each not in declared]
+        made = [_drift(run, positions[0], each) for each in others]
+        made += [_drift(run, positions[0], each, is_declared=True) for each in declared]
     headings = [name for name in known if name in run.frame and _is_own_heading(run, name)]
-    findings += [_turned_apart(run, headings[0], other) for other in headings[1:]]
-    if not findings:
+    made += [_turned_apart(run, headings[0], other) for other in headings[1:]]
+    made += [_values_apart(run, *each) for each in _same_values(run)]
+    if not (examined := [each for each in made if each is not None]):
         raise NotSearchableError(
-            "no second position of the robot that goes along with the first"
-            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
+            "no second heading, and no second position of the robot that goes along with the first"
+            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say, or declare same_as"
         )
-    return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
+    faults = [each for each in examined if isinstance(each, Fault)]
+    return min(faults, key=lambda each: each.severity, default=examined[0])
 
 
 def _drift(
     run: RunUnderCheck,
     one: tuple[RegisteredSignal, RegisteredSignal],
     other: tuple[RegisteredSignal, RegisteredSignal],
-) -> Finding | None:
+    *,
+    is_declared: bool = False,
+) -> Examined | None:
     """None where they are no two of one thing, or it went too little to tell."""
     both = [in_metres(each, run.frame.numbers(each.name)) for each in (*one, *other)]
     there = np.flatnonzero(np.isfinite(both).all(axis=0))
@@ -369,7 +399,8 @@ def _drift(
     first = max(5, int(np.count_nonzero(way_m < _FITTED * way_m[-1])) * thin)
     a, b = a - a[:first].mean(), b - b[:first].mean()
     off = min((_laid_over(a, each, first) for each in (b, b.conj())), key=lambda each: each.max())
-    if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1) and not _are_own(one, other):
+    is_apart = off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1)
+    if is_apart and not is_declared and not _are_own(one, other):
         return None
     names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
     warns_m, fails_m = (max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS))
@@ -379,10 +410,11 @@ def _drift(
     if not 1 / _OTHER_LENGTH < ratio < _OTHER_LENGTH:
         evidence += f"; the second path is {ratio:.3g} times as long"
     if worst_m <= warns_m:
-        return Finding("pass", evidence)
+        limit = f"limit {100 * _WARNS[0]:g} % of the path"
+        return run.covered(evidence, judged="2 positions", limit=limit)
     since_s = float(run.frame.times[there][int(np.argmax(off > warns_m))])
-    outcome = "fail" if worst_m > fails_m else "warn"
-    return Finding(outcome, evidence, since_s, 1, run.shows(one[0].name, other[0].name))
+    severity = "fail" if worst_m > fails_m else "warn"
+    return Fault(severity, evidence, since_s, 1, run.shows(one[0].name, other[0].name))
 
 
 def _is_own_heading(run: RunUnderCheck, name: str) -> bool:
@@ -394,7 +426,7 @@ def _is_own_heading(run: RunUnderCheck, name: str) -> bool:
     return is_heading and meaning.role in ("measured", None) and words <= _MEASURES | _HEADINGS
 
 
-def _turned_apart(run: RunUnderCheck, one: str, other: str) -> Finding:
+def _turned_apart(run: RunUnderCheck, one: str, other: str) -> Examined:
     """How far two headings came apart; they may differ in sense and where they begin to count."""
     courses: list[Array] = []
     for name in (one, other):
@@ -404,7 +436,7 @@ def _turned_apart(run: RunUnderCheck, one: str, other: str) -> Finding:
     there = np.isfinite(courses[0]) & np.isfinite(courses[1])
     clock = run.frame.times[there]
     if len(clock) < 2:
-        return Finding("not applicable", f"{one} and {other} are never known at once")
+        return Coverage.lacking(f"{one} and {other} are never known at once", "absent")
     a, b = (each[there] for each in courses)
     cells = np.flatnonzero(np.diff(clock // _HEADING_CELL_S, prepend=-1))
     off = min((_cells_apart(a - sense * b, cells) for sense in (1, -1)), key=lambda e: median(e))
@@ -412,17 +444,93 @@ def _turned_apart(run: RunUnderCheck, one: str, other: str) -> Finding:
     long = apart.only(apart.durations_s + _HEADING_CELL_S >= APART_S)
     evidence = f"{one} and {other}: {off.max():.3g} rad apart at most"
     if not len(long):
-        return Finding("pass", evidence)
+        limit = f"limit {_HEADING_WARNS_RAD:g} rad for {APART_S:g} s"
+        return run.covered(evidence, signals=[one, other], judged="2 headings", limit=limit)
     worst = max(float(np.median(off[each.start : each.stop])) for each in long.spans())
-    outcome = "fail" if worst > _HEADING_FAILS_RAD else "warn"
     evidence = f"{one} and {other}: {worst:.3g} rad apart, {times(len(long))} for 3 s or more"
-    return Finding(outcome, evidence, float(long.starts_s[0]), len(long), run.shows(one, other))
+    return Fault(
+        "fail" if worst > _HEADING_FAILS_RAD else "warn",
+        evidence,
+        float(long.starts_s[0]),
+        len(long),
+        run.shows(one, other),
+        signals=(one, other),
+    )
 
 
 def _cells_apart(difference: Array, cells: Indexes) -> Array:
     """The mean angle of a difference in each cell, from that of the first cell on."""
     turned = np.add.reduceat(np.exp(1j * difference), cells)
     return np.abs(np.angle(turned * np.conj(turned[0])))
+
+
+def _same_positions(
+    run: RunUnderCheck, one: tuple[RegisteredSignal, RegisteredSignal]
+) -> list[tuple[RegisteredSignal, RegisteredSignal]]:
+    """Positions of which it was declared that they measure the same as the first."""
+    known, same = run.search.known, _declared_same(run)
+    both = [[b if a == each.name else a for a, b in same if each.name in (a, b)] for each in one]
+    return [(known[x], known[y]) for x, y in zip(*both, strict=False)]
+
+
+def _declared_same(run: RunUnderCheck) -> list[tuple[str, str]]:
+    """Pairs of signals that were published and declared to measure the same thing."""
+    return [
+        (name, each.same_as)
+        for name, each in run.meanings.items()
+        if each.same_as is not None and name in run.frame and each.same_as in run.frame
+        if not each.sets and not run.meanings[each.same_as].sets
+    ]
+
+
+def _same_values(run: RunUnderCheck) -> list[tuple[RegisteredSignal, RegisteredSignal]]:
+    """The declared pairs that are no coordinates of a position, which may have its own frame."""
+    return [
+        (run.search.known[one], run.search.known[other])
+        for one, other in _declared_same(run)
+        if not {run.meanings[one].quantity, run.meanings[other].quantity} & {"x", "y"}
+    ]
+
+
+def _values_apart(
+    run: RunUnderCheck, one: RegisteredSignal, other: RegisteredSignal
+) -> Examined | None:
+    """Whether two measurements of one value are apart for 3 s, by medians of a second each."""
+    a, b = (_in_one_unit(each, run.frame.numbers(each.name)) for each in (one, other))
+    there = np.flatnonzero(np.isfinite(a) & np.isfinite(b))
+    reach = float(np.ptp(np.concatenate((a[there], b[there])))) if len(there) else 0.0
+    if len(there) < _LEAST_CELLS or not reach:
+        return None
+    off = np.abs(a[there] - b[there])
+    if one.turn:
+        off = np.abs(np.remainder(a[there] - b[there] + math.pi, math.tau) - math.pi)
+    clock = run.frame.times[there]
+    starts = np.flatnonzero(np.diff(np.floor(clock), prepend=-1))
+    middles = np.array([float(np.median(part)) for part in np.split(off, starts[1:].tolist())])
+    noises = [_in_one_unit(each, np.array([run.noise.of(each.name)]))[0] for each in (one, other)]
+    noise = _NOISE * float(max(noises))
+    names = f"{one.name} and {other.name}"
+    for limits in (_FAILS, _WARNS):
+        severity, share = ("fail" if limits is _FAILS else "warn"), limits[0]
+        apart = runs_of(middles > max(share * reach, noise), clock[starts])
+        long = apart.only(apart.durations_s >= APART_S)
+        if len(long):
+            span = next(iter(long.spans()))
+            far = float(np.median(middles[span.start : span.stop]))
+            evidence = f"{names}: {far:.3g} apart, {100 * far / reach:.3g} % of their range"
+            more = run.shows(one.name, other.name)
+            firm = run.firmest([one.name])
+            return Fault(severity, evidence, span.start_s, len(long), more, signals=firm)
+    judged, limit = "2 measurements", f"limit {100 * _WARNS[0]:g} % of their range"
+    return run.covered(f"{names}: {float(middles.max()):.3g} apart", judged=judged, limit=limit)
+
+
+def _in_one_unit(signal: RegisteredSignal, values: Array) -> Array:
+    """Values in metres, radians, m/s or rad/s, where they have such a unit."""
+    if signal.turn:
+        return values * (math.tau / signal.turn)
+    unit = signal.unit or ""
+    return values * SPEED_UNITS.get(unit, METRES.get(unit, 1.0))
 
 
 def _laid_over(a: Any, b: Any, first: int) -> Array:
@@ -438,13 +546,15 @@ def _are_own(*positions: tuple[RegisteredSignal, RegisteredSignal]) -> bool:
     )
 
 
-def stays_in_place(run: RunUnderCheck) -> Finding:
+def stays_in_place(run: RunUnderCheck) -> Examined:
     """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
     if run.motion.position is None:
         raise NotSearchableError("no position is published")
     leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
     if not leaps:
-        return Finding("pass", "its position never jumped")
+        limit = f"limit {run.search.options.jump_m:g} m"
+        names = [each.name for each in run.motion.position]
+        return run.covered("its position never jumped", signals=names, limit=limit)
     far_m = max(float(each.details.get("distance_m", 0.0)) for each in leaps)
     evidence = f"its position jumped {times(len(leaps))}, up to {far_m:.3g} m"
-    return Finding("warn", evidence, leaps[0].start_s, len(leaps), run.more(JUMP.name))
+    return Fault("warn", evidence, leaps[0].start_s, len(leaps), run.more(JUMP.name))

@@ -9,8 +9,9 @@ from functools import cached_property
 from typing import Any, Final, Literal, cast
 
 from webots_mcp.analysis.arrays import Array, Runs, median, np, runs_of
-from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times
-from webots_mcp.judging.detection.degradation import DEGRADATION
+from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times
+from webots_mcp.judging.coverage import Fault
+from webots_mcp.judging.detection.degradation import DEGRADATION, TIMES
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
@@ -33,7 +34,7 @@ _BRIEFLY: Final = 3  # rows: what is cut off comes back soon, what rests at a st
 _UNIQUE: Final = 0.95  # of all values but the extreme: so many differ from all others
 
 
-def sensors_speak(run: RunUnderCheck) -> Finding:
+def sensors_speak(run: RunUnderCheck) -> Examined:
     """Fails where a signal was NaN for a second or more, warns where it was null.
 
     Null may be meant, of what is not seen now; an infinite range is. Warns of one that was NaN in
@@ -52,19 +53,23 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
         if many := [name for name, share in shares.items() if share >= least]:
             most, up_to = 100 * max(shares.values()), "up to " * (len(many) > 1)
             evidence = f"{listed(many, MOST_NAMED)}: NaN in {up_to}{most:.3g} % of the rows"
-            return Finding("warn", evidence, None, len(many), run.shows(many[0]))
-        return Finding("pass", "none that had a value was without one for a second")
+            firm = run.firmest(many)
+            return Fault("warn", evidence, None, len(many), run.shows(many[0]), signals=firm)
+        says = "none that had a value was without one for a second"
+        return run.covered(says, of="missing", limit=f"limit {100 * _MANY:g} % of the rows")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]
+    firm = run.firmest([*never, *(each.name or "" for each in silent)])
     silent = by_array(silent)
     longest_s = max((each.duration_s for each in silent), default=0.0)
     evidence = f"{_names(silent)}: {times(len(silent))}, up to {longest_s:.4g} s without a value"
     evidence = f"{listed(never, MOST_NAMED)}: NaN in every row" if never else evidence
     since_s = silent[0].start_s if silent and not never else run.search.began_s
     outcome = "fail" if nan or never else "warn"
-    return Finding(outcome, evidence, since_s, len(silent) + len(never), run.more("missing"))
+    often, more = len(silent) + len(never), run.more("missing")
+    return Fault(outcome, evidence, since_s, often, more, signals=firm)
 
 
-def _missing_items(run: RunUnderCheck) -> Finding | None:
+def _missing_items(run: RunUnderCheck) -> Fault | None:
     """Of long arrays: items that are NaN in all of a sample of the run's rows."""
     frame = run.frame
     arrays = [each for each in run.search.known.values() if each.reduction == "count"]
@@ -89,7 +94,7 @@ def _missing_items(run: RunUnderCheck) -> Finding | None:
         if never >= _MANY * total:
             evidence = f"{name}: {never} of {total} items are NaN in every row"
             since_s = run.search.began_s
-            return Finding("warn", evidence, since_s, never, run.shows(f"{name}.count"))
+            return Fault("warn", evidence, since_s, never, run.shows(f"{name}.count"))
     return None
 
 
@@ -101,7 +106,7 @@ def _array_at(state: dict[str, Any], name: str) -> list[Any]:
     return cast("list[Any]", value) if isinstance(value, list) else []
 
 
-def sensors_live(run: RunUnderCheck) -> Finding:
+def sensors_live(run: RunUnderCheck) -> Examined:
     """Fails where a signal froze that is noisy otherwise, or whose target went on.
 
     Warns of others that changed otherwise, and rested for 20 s while the robot moved.
@@ -109,13 +114,16 @@ def sensors_live(run: RunUnderCheck) -> Finding:
     judged = [(each, _frozen(run, each)) for each in run.events(FLAT.name)]
     frozen = by_array([each for each, outcome in judged if outcome])
     if not frozen:
-        return Finding("pass", "none froze")
+        limit = f"limit {run.search.options.flat_s:g} s"
+        return run.covered("none froze", of=FLAT.name, limit=limit)
     first, outcomes = frozen[0], [outcome for _, outcome in judged]
     says = f"; {first.details['says']}" if "says" in first.details else ""
     longest_s = max(each.duration_s for each in frozen)
     evidence = f"{_names(frozen)}: {times(len(frozen))}, up to {longest_s:.3g} s the same{says}"
     outcome = "fail" if "fail" in outcomes else "warn"
-    return Finding(outcome, evidence, first.start_s, len(frozen), run.more(FLAT.name))
+    firm = run.firmest(each.name or "" for each, said in judged if said == outcome)
+    more = run.more(FLAT.name)
+    return Fault(outcome, evidence, first.start_s, len(frozen), more, signals=firm)
 
 
 def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
@@ -188,7 +196,7 @@ def _names_in(run: RunUnderCheck) -> _NamesIn:
 _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
 
 
-def sensors_within_limits(run: RunUnderCheck) -> Finding:
+def sensors_within_limits(run: RunUnderCheck) -> Examined:
     """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
 
     Also where a noisy one, whose values never repeat, came back to one extreme again and again.
@@ -196,12 +204,14 @@ def sensors_within_limits(run: RunUnderCheck) -> Finding:
     """
     found = list(_saturated(run))
     if not found:
-        return Finding("pass", "none was cut off at a limit")
+        names = _names_in(run).sensors
+        limit = f"limit {100 * _AT_LIMIT:g} % of the rows"
+        return run.covered("none was cut off at a limit", signals=names, limit=limit)
     name, limit, share, since_s, count = max(found, key=lambda each: each[2])
     others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
     evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
     evidence += f"; also {others}" if others else ""
-    return Finding("warn", evidence, since_s, count, run.shows(name))
+    return Fault("warn", evidence, since_s, count, run.shows(name), signals=(name,))
 
 
 def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
@@ -244,7 +254,7 @@ def _is_cut_off(others: Array, hits: Runs) -> bool:
     return bool(brief and unique and is_noisy(others))
 
 
-def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
+def sensors_drop_nothing(run: RunUnderCheck) -> Examined:
     """Warns where a signal went away and back at once, fails where it went to one value 3 times."""
     sensors = _names_in(run).sensors
     gone = [
@@ -254,14 +264,15 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     ]
     if not gone:
         near = run.found.verdicts.nearest.get(JUMP.name)
-        return Finding("pass", "none dropped out" + (f" ({near})" if near else ""))
+        return run.covered("none dropped out" + (f" ({near})" if near else ""), of=JUMP.name)
     to = Counter((each.name, float(each.details["after"])) for each in gone)
     ((name, value), most) = to.most_common(1)[0]
     gone = by_array(gone)
     evidence = f"{_names(gone)}: away and back {times(len(gone))}"
     evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
-    return Finding(outcome, evidence, gone[0].start_s, len(gone), run.more(JUMP.name))
+    more = run.more(JUMP.name)
+    return Fault(outcome, evidence, gone[0].start_s, len(gone), more, signals=(name or "",))
 
 
 def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
@@ -276,18 +287,20 @@ def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
     return False
 
 
-def sensors_keep_noise(run: RunUnderCheck) -> Finding:
+def sensors_keep_noise(run: RunUnderCheck) -> Examined:
     """Warns where the noise of a sensor became three times as large, or more, for good."""
     found = run.events(DEGRADATION.name)
     if not found:
-        return Finding("pass", "none became noisier for good")
+        limit = f"limit {TIMES:g} times the noise"
+        return run.covered("none became noisier for good", of=DEGRADATION.name, limit=limit)
     worst = max(found, key=lambda each: each.details["noise_after"] / each.details["noise_before"])
     before, after = (worst.details[name] for name in ("noise_before", "noise_after"))
     evidence = f"noise of {worst.name} grew from {before:g} to {after:g} for good"
     others = listed([e.name or "" for e in found if e is not worst], MOST_NAMED)
     evidence += f"; also {others}" if others else ""
     more = run.more(DEGRADATION.name)
-    return Finding("warn", evidence, worst.start_s, len(found), more)
+    firm = run.firmest(each.name or "" for each in found)
+    return Fault("warn", evidence, worst.start_s, len(found), more, signals=firm)
 
 
 def by_array(events: Iterable[Event]) -> list[Event]:

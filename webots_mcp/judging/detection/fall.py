@@ -39,6 +39,7 @@ def fall_events(search: Search) -> Iterator[Event]:
     times, tilt = tilt_of(search.frame, signals["roll"], signals["pitch"])
     if len(times) < 2:
         raise NotSearchableError("roll and pitch have no value in that range")
+    search.judged("fall", filter(None, signals.values()), [(float(times[0]), float(times[-1]))])
     fell_s = -math.inf
     for run in runs_of(tilt > DOWN_RAD, times).spans():
         lies = tilt[run.start : run.stop]

@@ -71,6 +71,7 @@ def off_target_events(search: Search) -> Iterator[Event]:
             "no target, other than always 0, is published next to what it is the target of"
         )
     targets = {each.measured.name: each for each in pursuits}
+    search.judged("off_target", [each.target for each in pursuits])
     for signal in search.in_time("off_target", [each.measured for each in pursuits]):
         yield from _apart(search, targets[signal.name])
 

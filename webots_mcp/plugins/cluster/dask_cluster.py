@@ -50,10 +50,6 @@ _CONNECT_S: Final = 10.0
 _PATIENCE_S: Final = 0.5  # Between two checks for a request to stop.
 _COUNT_EVERY_S: Final = 2.0
 _WITHOUT_WORKERS_S: Final = 60.0
-_SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
-_ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}")
-_WITH_TLS: Final = ("tls://", "wss://")
-_TASK: Final = "webots_mcp.plugins.cluster.dask_cluster:run_on_worker"
 _BUNDLE: Final = "recording.zip"
 _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
 _SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
@@ -132,7 +128,11 @@ def _require_pool(url: str) -> None:
 def digest_of(world: str) -> str:
     """Return the hash of a world and of the sources of its project's controllers."""
     controllers = Path(world).parent.parent / "controllers"
-    sources = (each for each in controllers.rglob("*.*") if each.suffix in _SOURCES)
+    sources = (
+        each
+        for each in controllers.rglob("*.*")
+        if each.suffix in (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
+    )
     digest = hashlib.sha256()
     for file in (Path(world), *sorted(sources)):
         digest.update(f"{file}\0".encode())
@@ -286,7 +286,10 @@ class ClusterSimulators:
         """Run a trial; see `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text
-        future: Future[TrialReturn] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
+        future: Future[TrialReturn] = self._executor.submit(
+            _call(asdict(self._needs), text),
+            "webots_mcp.plugins.cluster.dask_cluster:run_on_worker",
+        )
         while not wait([future], _PATIENCE_S).done:
             if attempt.stopping.wait(0):
                 future.cancel()
@@ -376,11 +379,11 @@ def _connected(address: str) -> Generator[Any]:
         raise InvalidInputError(explain_extra("a cluster of Dask", "cluster")) from error
     # A lost scheduler is reported in a sentence where it is noticed, not by Dask's traceback.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-    if not _ADDRESS.fullmatch(address):
+    if not re.fullmatch(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}", address):
         raise InvalidInputError(
             f"scheduler {address!r} is no address, such as tcp://HOST:8786 or tls://HOST:8786"
         )
-    if address.startswith(_WITH_TLS) and distributed.Security().tls_ca_file is None:
+    if address.startswith(("tls://", "wss://")) and distributed.Security().tls_ca_file is None:
         raise InvalidInputError(
             f"{address} needs certificates, of which Dask's configuration tells: "
             "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..._TLS__CLIENT__CERT and ..._TLS__CLIENT__KEY"

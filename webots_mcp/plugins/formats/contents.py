@@ -56,13 +56,6 @@ _COMMANDS: Final = (
     f"SELECT {{columns}} FROM placed WHERE {_IN_SEGMENT} "
     "AND wall_time_s >= started_wall_time_s AND wall_time_s < next_s ORDER BY sim_time_s, id"
 )
-_RUN: Final = (
-    "SELECT r.uuid, r.world, r.basic_time_step_ms, r.start_reason, r.end_reason, r.label, r.note, "
-    "strftime('%Y-%m-%dT%H:%M:%fZ', r.started_wall_time_s, 'unixepoch') AS started, "
-    "s.controller, s.controller_sha256, s.git_commit, s.versions "
-    "FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?"
-)
-_PARAMETERS: Final = "SELECT name, value FROM parameter_value WHERE run_id = ? ORDER BY id"
 
 
 @dataclass(frozen=True)
@@ -205,11 +198,19 @@ class Contents:
 
     def about(self, run_id: int) -> dict[str, str]:
         """Return the known facts of a run: uuid, robot, world, code, parameters."""
-        cursor = self.connection.execute(_RUN, (run_id,))
+        cursor = self.connection.execute(
+            "SELECT r.uuid, r.world, r.basic_time_step_ms, r.start_reason, r.end_reason, "
+            "r.label, r.note, strftime('%Y-%m-%dT%H:%M:%fZ', r.started_wall_time_s, 'unixepoch') "
+            "AS started, s.controller, s.controller_sha256, s.git_commit, s.versions FROM run r "
+            "JOIN session s ON s.id = r.session_id WHERE r.id = ?",
+            (run_id,),
+        )
         names = [column[0] for column in cursor.description]
         facts: dict[str, Any] = {"run_id": run_id, "robot": self.wanted.robot}
         facts |= dict(zip(names, cursor.fetchone(), strict=True))
-        for name, value in self.connection.execute(_PARAMETERS, (run_id,)):
+        for name, value in self.connection.execute(
+            "SELECT name, value FROM parameter_value WHERE run_id = ? ORDER BY id", (run_id,)
+        ):
             facts[f"parameter {name}"] = value  # The last value.
         return {name: str(value) for name, value in facts.items() if value is not None}
 

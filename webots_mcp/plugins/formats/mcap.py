@@ -32,9 +32,7 @@ from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import EventRecord, StoredImage
 
-_PROFILE: Final = ""  # No middleware.
 _LEVELS: Final = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
-_NOT_IN_JSON: Final = re.compile("NaN|Infinity")  # Python accepts them as numbers, viewers do not.
 
 
 def write_mcap(contents: Contents, sink: BinaryIO) -> Counter[str]:
@@ -50,7 +48,8 @@ def write_mcap(contents: Contents, sink: BinaryIO) -> Counter[str]:
         InvalidInputError: The library is not installed.
     """
     writer = _library().Writer(sink)
-    writer.start(profile=_PROFILE, library="webots-mcp")
+    # An empty profile says that no middleware is involved.
+    writer.start(profile="", library="webots-mcp")
     writing = _McapWriter(contents, writer)
     writing.begin()
     for item in contents.items(pass_number=2):
@@ -202,7 +201,8 @@ class _McapWriter:
 def _state_text(item: Recorded, state: dict[str, Any]) -> str:
     """Return the text of a state as it is stored, unless it has to be changed."""
     renamed = _renamed(state)
-    if renamed is not state or not state or _NOT_IN_JSON.search(item.data):
+    # Python accepts these words as numbers, viewers do not.
+    if renamed is not state or not state or re.search("NaN|Infinity", item.data):
         return json_text(
             renamed | ({"replaced": json.loads(item.replaced)} if item.replaced else {})
         )

@@ -9,8 +9,6 @@ from webots_mcp.plugins.formats.contents import Contents
 from webots_mcp.plugins.formats.mcap_topics import WORLD_FRAME, Topics
 from webots_mcp.store.signals import RegisteredSignal
 
-# Message paths without quotes. Signals with other paths have to be plotted by hand.
-_PLAIN_PATH: Final = re.compile(r"\$(\.[A-Za-z_]\w*|\[\d+\])+")
 _MOST_PLOTTED: Final = 8
 _MOST_CAMERAS: Final = 4
 _GRID: Final = {
@@ -68,7 +66,8 @@ def _add_signals(panels: dict[str, dict[str, Any]], contents: Contents, topics: 
 
 
 def _paths(contents: Contents, topics: Topics, signal: RegisteredSignal) -> list[dict[str, Any]]:
-    if signal.reduction or not _PLAIN_PATH.fullmatch(signal.path):
+    # Only message paths without quotes can be plotted; others have to be plotted by hand.
+    if signal.reduction or not re.fullmatch(r"\$(\.[A-Za-z_]\w*|\[\d+\])+", signal.path):
         return []
     return [
         {

@@ -10,9 +10,6 @@ from webots_mcp.plugins.formats.contents import Contents
 from webots_mcp.store.run_rows import StoredImage
 
 WORLD_FRAME: Final = "world"
-_NOT_IN_TOPICS: Final = re.compile(
-    r"[^A-Za-z0-9_-]+"
-)  # Message paths accept the rest without quotes.
 
 
 class Topics:
@@ -55,4 +52,5 @@ class Topics:
 
 
 def _named(name: str) -> str:
-    return _NOT_IN_TOPICS.sub("_", name)
+    # Message paths accept these characters without quotes.
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", name)

@@ -50,7 +50,6 @@ from webots_mcp.store.run_rows import EventRecord
 
 _COPY_BYTES: Final = 1 << 16
 _GROUP_ROWS: Final = 10_000  # About 10 MB of rows in memory at a time.
-_LEVELS: Final = {"warning": "WARN"}  # Rerun's other names are ours in capitals.
 _MEDIA_TYPES: Final = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg"}
 _WORLD: Final = "world"
 _Item = TypeVar("_Item", bound=Item)
@@ -366,7 +365,8 @@ def _identifiers(about: dict[str, str]) -> dict[str, str]:
 
 def _log_text(line: LogLine) -> tuple[str, str]:
     who = ": ".join(filter(None, (line.source, line.logger)))
-    return f"[{who}] {line.message}", _LEVELS.get(line.level, line.level.upper())
+    # The other names of Rerun are those of the recording in capitals.
+    return f"[{who}] {line.message}", {"warning": "WARN"}.get(line.level, line.level.upper())
 
 
 def _event_text(event: EventRecord) -> tuple[str, str]:

@@ -28,7 +28,7 @@ from webots_mcp.errors import (
 from webots_mcp.judging.checks import check_run
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
-from webots_mcp.plotting.signals import SignalAxes, compose_signals
+from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.signals.naming import spelled_out
@@ -37,7 +37,8 @@ from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
-from webots_mcp.store.robots import RUNNING, list_robots, nothing_recorded, without_observers
+from webots_mcp.store.robot_status import RUNNING
+from webots_mcp.store.robots import list_robots, nothing_recorded, without_observers
 from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
 from webots_mcp.store.runs import RunInfo, list_runs
 
@@ -82,7 +83,6 @@ _OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
 """Marks of ended runs by database, run and start. The result of a check of them is final."""
 _CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp lights")
 """Checks runs in the background, so that no request waits for a check."""
-_OUTCOME_MARKS: Final = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}
 _NO_OUTCOME: Final = "⚪"
 """Mark of runs that were not checked yet, or cannot be checked."""
 
@@ -250,7 +250,7 @@ def _check(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
     try:
         with recording.reader() as connection:
             outcome = check_run(connection, key[1], deadline_s=_LIMITS.check_s).outcome
-        _OUTCOMES[key] = _OUTCOME_MARKS.get(outcome, _NO_OUTCOME)
+        _OUTCOMES[key] = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}.get(outcome, _NO_OUTCOME)
     except (WebotsMCPError, sqlite3.Error):
         del _OUTCOMES[key]
     except Exception:  # noqa: BLE001 - No request waits for it and could report it.

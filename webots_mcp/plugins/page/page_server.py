@@ -26,7 +26,7 @@ from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.page_data import draw, page_request, picture, problem, robot_status
-from webots_mcp.plugins.page.steering import steer, tune
+from webots_mcp.plugins.page.page_orders import steer, tune
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.store.recording import RecordingAccess
 
@@ -58,19 +58,6 @@ ORDERS: Final = ("pause", "resume", "step", "reset")
 _log: Final = logging.getLogger(__name__)
 _PARTS: Final = Path(__file__).parent / "parts"
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
-_FOREIGN: Final = (
-    "This page is shown to requests for 127.0.0.1 and localhost only: another name may be one that "
-    "a web site has pointed here.\n"
-)
-_UNTOLD: Final = (
-    "The address of this page has a key, without which nothing is shown: open the address that "
-    "'webots-mcp view' prints.\n"
-)
-_CLOSED: Final = "There is no valid token: 'webots-mcp token' says what is wrong.\n"
-_FULL: Final = (
-    f"{LIMITS.tabs} tabs of this page are open: close one, wait a quarter of a minute, and open "
-    "this one again.\n"
-)
 # No other page may embed the page or learn its address. It loads only its own files.
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; "
@@ -92,6 +79,9 @@ class PageServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = 128
+    """Connections that wait until they are accepted. With the 5 of `socketserver`, some of those
+    that a browser opens at once wait for a second or more."""
 
     def __init__(self, recording: RecordingAccess, port: int, *, read_only: bool) -> None:
         super().__init__((HOST, port), _Request)
@@ -148,8 +138,8 @@ class PageServer(ThreadingHTTPServer):
     def set_idle(self, connection: socket.socket, *, is_idle: bool) -> None:
         """Mark a connection as waiting for a request, or as being answered."""
         with self._lock:
-            if is_idle:
-                self._waiting[connection] = time.monotonic()
+            if is_idle:  # A new connection has waited since it was accepted.
+                self._waiting.setdefault(connection, time.monotonic())
             else:
                 self._waiting.pop(connection, None)
 
@@ -316,20 +306,34 @@ class _Request(BaseHTTPRequestHandler):
         """Return the path after the key; None if the request was refused."""
         hosts = self.headers.get_all("Host") or [""]
         if len(hosts) != 1 or named_host(hosts[0]) not in LOOPBACK:
-            return self._refuse(403, _FOREIGN)
+            return self._refuse(
+                403,
+                "This page is shown to requests for 127.0.0.1 and localhost only: another name "
+                "may be one that a web site has pointed here.\n",
+            )
         key, slash, rest = self.path.partition("?")[0].removeprefix("/").partition("/")
         try:
             own = page_key()
         except (WebotsMCPError, OSError):
-            return self._refuse(503, _CLOSED)
+            return self._refuse(
+                503, "There is no valid token: 'webots-mcp token' says what is wrong.\n"
+            )
         if not slash or not secrets.compare_digest(key.encode(), own.encode()):
-            return self._refuse(403, _UNTOLD)
+            return self._refuse(
+                403,
+                "The address of this page has a key, without which nothing is shown: open the "
+                "address that 'webots-mcp view' prints.\n",
+            )
         return rest
 
     def _ask(self, question: Callable[[PageServer, dict[str, str]], dict[str, Any]]) -> None:
         asked = dict(parse_qsl(self.path.partition("?")[2]))
         if not self._page.admit_tab(asked.get("tab", "")):
-            return self._refuse(503, _FULL)
+            return self._refuse(
+                503,
+                f"{LIMITS.tabs} tabs of this page are open: close one, wait a quarter of a "
+                "minute, and open this one again.\n",
+            )
         try:
             answer = question(self._page, asked)
         except WebotsMCPError as error:

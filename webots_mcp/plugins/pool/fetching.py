@@ -22,7 +22,7 @@ from typing import Final
 
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import transaction
-from webots_mcp.database.liveness import process_alive
+from webots_mcp.database.processes import process_alive
 from webots_mcp.plugins.pool.pool_contents import ChosenRuns, PooledRun
 from webots_mcp.plugins.pool.pool_interface import Pool, is_whole, table
 from webots_mcp.store.chunk_making import chunk_whole_run
@@ -35,27 +35,6 @@ _MOST_RUNS: Final = 100  # In one temporary recording.
 _MOST_ROWS: Final = 200_000  # In one temporary recording, unless a single run has more.
 _PAUSE_S: Final = 0.002  # Between two short writes, for robots that record here.
 _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value", "image")
-_LOCAL_RUNS: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
-# States that retention moved to kept_state may have been shipped before that as well.
-_DROP_MOVED: Final = (
-    "DELETE FROM kept_state WHERE call IS NULL AND EXISTS (SELECT 1 FROM state s "
-    "WHERE s.run_id = kept_state.run_id AND s.sim_time_s = kept_state.sim_time_s "
-    "AND s.wall_time_s = kept_state.wall_time_s)"
-)
-_COUNTED: Final = (
-    "SELECT id, row_count, purged_rows, (SELECT count(*) FROM state WHERE run_id = run.id), "
-    "(SELECT count(*) FROM state s WHERE run_id = run.id AND EXISTS (SELECT 1 FROM kept_stretch k "
-    "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)) "
-    "FROM run ORDER BY id"
-)
-_PURGED: Final = "UPDATE run SET purged_rows = ? WHERE id = ?"
-_MOVE_KEPT: Final = (
-    "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, replaced) "
-    "SELECT run_id, sim_time_s, wall_time_s, data, replaced FROM state WHERE run_id = ? ORDER BY id"
-)
-_DROP_STATES: Final = "DELETE FROM state WHERE run_id = ?"
-_DROP_RUN: Final = "DELETE FROM run WHERE id = ?"
-_DROP_SESSIONS: Final = "DELETE FROM session WHERE id NOT IN (SELECT session_id FROM run)"
 _OF_GROUP: Final = {
     "stored_row_count": "0", "stored_row_bytes": "0", "chunk_bytes": "0", "is_complete": "1",
 }  # fmt: skip
@@ -63,14 +42,6 @@ _LEFT: Final = (
     f"FROM state s, chunk c WHERE c.group_id = row_group.id AND c.signal_id = {STATE_IDS} "
     "AND s.run_id = row_group.run_id AND s.id BETWEEN c.min AND c.max"
 )
-_COUNT_ROOM: Final = (
-    f"UPDATE row_group SET stored_row_count = (SELECT count(*) {_LEFT}), stored_row_bytes = "
-    f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {_LEFT}), 0), chunk_bytes = coalesce(("
-    "SELECT sum(coalesce(length(numbers), 0) + coalesce(length(codes), 0) "
-    "+ coalesce(length(labels), 0)) "
-    "FROM chunk WHERE group_id = row_group.id), 0)"  # A group with damaged times has no chunks.
-)
-_IN_CHUNKS: Final = "SELECT coalesce(sum(row_count), 0) FROM row_group WHERE run_id = ?"
 
 
 @dataclass
@@ -140,7 +111,7 @@ def fetch(
 
 
 def _local_run_ids(connection: sqlite3.Connection) -> dict[str, int]:
-    return dict(connection.execute(_LOCAL_RUNS).fetchall())
+    return dict(connection.execute("SELECT uuid, id FROM run WHERE uuid IS NOT NULL").fetchall())
 
 
 def _parts(runs: Sequence[PooledRun]) -> Iterator[list[PooledRun]]:
@@ -186,9 +157,20 @@ class _Fetcher:
                     "row_group", "run_id", lacking
                 )  # For the other runs they are made locally.
                 copy.rows("chunk", "run_id", lacking)
-                small.execute(_COUNT_ROOM)
+                # A group with damaged times has no chunks.
+                small.execute(
+                    f"UPDATE row_group SET stored_row_count = (SELECT count(*) {_LEFT}), "
+                    "stored_row_bytes = "
+                    f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {_LEFT}), 0), "
+                    "chunk_bytes = coalesce((SELECT sum(coalesce(length(numbers), 0) "
+                    "+ coalesce(length(codes), 0) + coalesce(length(labels), 0)) "
+                    "FROM chunk WHERE group_id = row_group.id), 0)"
+                )
                 for run in runs:
-                    (chunked,) = small.execute(_IN_CHUNKS, (run.run_id,)).fetchone()
+                    (chunked,) = small.execute(
+                        "SELECT coalesce(sum(row_count), 0) FROM row_group WHERE run_id = ?",
+                        (run.run_id,),
+                    ).fetchone()
                     if run.uuid in self._found.only_chunks and chunked < run.row_count:
                         self._found.unchunked[run.uuid] = chunked
             here = merge(self._connection, self._data_dir, folder / DATABASE_NAME)
@@ -220,21 +202,37 @@ class _Fetcher:
         """
         lacking: list[int] = []
         uuids = {run.run_id: run.uuid for run in runs}
-        small.execute(_DROP_MOVED)
-        for run_id, rows, purged, left, kept in small.execute(_COUNTED).fetchall():
+        # States that retention moved to kept_state may have been shipped before it moved them.
+        small.execute(
+            "DELETE FROM kept_state WHERE call IS NULL AND EXISTS (SELECT 1 FROM state s "
+            "WHERE s.run_id = kept_state.run_id AND s.sim_time_s = kept_state.sim_time_s "
+            "AND s.wall_time_s = kept_state.wall_time_s)"
+        )
+        for run_id, rows, purged, left, kept in small.execute(
+            "SELECT id, row_count, purged_rows, (SELECT count(*) FROM state "
+            "WHERE run_id = run.id), (SELECT count(*) FROM state s WHERE run_id = run.id "
+            "AND EXISTS (SELECT 1 FROM kept_stretch k WHERE k.run_id = s.run_id "
+            "AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)) FROM run "
+            "ORDER BY id"
+        ).fetchall():
             gone = max(0, rows - left)
             if gone and left == kept:
                 gone = rows
-                small.execute(_MOVE_KEPT, (run_id,))
-                small.execute(_DROP_STATES, (run_id,))
+                small.execute(
+                    "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, replaced) "
+                    "SELECT run_id, sim_time_s, wall_time_s, data, replaced FROM state "
+                    "WHERE run_id = ? ORDER BY id",
+                    (run_id,),
+                )
+                small.execute("DELETE FROM state WHERE run_id = ?", (run_id,))
                 self._found.only_chunks.append(uuids[run_id])
             elif left < rows - purged:
                 self._found.arriving.append(uuids[run_id])
-                small.execute(_DROP_RUN, (run_id,))
+                small.execute("DELETE FROM run WHERE id = ?", (run_id,))
                 continue
             lacking += [run_id] if gone else []
-            small.execute(_PURGED, (gone, run_id))
-        small.execute(_DROP_SESSIONS)
+            small.execute("UPDATE run SET purged_rows = ? WHERE id = ?", (gone, run_id))
+        small.execute("DELETE FROM session WHERE id NOT IN (SELECT session_id FROM run)")
         small.execute(END_SESSIONS)
         return lacking
 

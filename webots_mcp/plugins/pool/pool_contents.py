@@ -28,7 +28,6 @@ _MOST_COMPARED: Final = 2000  # Names or UUIDs to search for similar ones.
 _CONNECTION_STRING: Final = re.compile(
     r"(^|\s)(host|hostaddr|dbname|user|password|passfile|service)\s*=", re.IGNORECASE
 )
-_NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 
 
 def open_pool(url: str, *, ships: bool = False) -> Pool:
@@ -72,7 +71,7 @@ def is_postgres(url: str) -> bool:
             "a connection string of PostgreSQL is no URL: write postgresql://USER@HOST/DATABASE, "
             "and give the password in PGPASSWORD, ~/.pgpass or a service file"
         )
-    if _NEARLY_A_URL.match(url):
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", url):
         raise InvalidInputError(
             f"{url!r} is neither a URL nor a folder: write postgresql://HOST/DATABASE, "
             "s3://BUCKET/PREFIX or ./FOLDER"

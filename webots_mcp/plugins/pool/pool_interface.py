@@ -29,9 +29,6 @@ BATCH_ROWS: Final = 20_000
 _VALUE_BYTES: Final = 8
 _DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
 CHUNKS: Final = ("row_group", "chunk")
-# Tables of one machine or moment, which are not shipped: leases, retention, console lines that wait
-# to become log lines, and requests.
-_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "request")
 # Columns that are not shipped: about ids, rows that wait for chunks and space on the disk.
 _LOCAL_COLUMNS: Final = {
     "recording": ("reserved_state_id",),
@@ -39,7 +36,6 @@ _LOCAL_COLUMNS: Final = {
     "command": ("request_id",),
     "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
 }
-_OF_TRIALS: Final = ("trial_set", "trial")
 _TYPES: Final[dict[str, ValueType]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
 }  # fmt: skip
@@ -104,7 +100,9 @@ def tables() -> tuple[ShippedTable, ...]:
     from webots_mcp.store import models
 
     ordered: list[Any] = cast("Any", models).SQLModel.metadata.sorted_tables
-    return tuple(_table(each) for each in ordered if each.name not in _LOCAL)
+    # These tables hold for one machine or moment. Console lines become log lines later.
+    local = ("lease", "watermark", "retention_limit", "console_line", "request")
+    return tuple(_table(each) for each in ordered if each.name not in local)
 
 
 def table(name: str) -> ShippedTable:
@@ -146,7 +144,7 @@ def _table(model: Any) -> ShippedTable:
         time_column="wall_time_s" if name in _DATED else None,
         run_column=column_of("run"),
         session_column=column_of("session"),
-        outlasts_runs=name in _OF_TRIALS,
+        outlasts_runs=name in ("trial_set", "trial"),
     )
 
 

@@ -28,10 +28,6 @@ _LASTING: Final = re.compile(
     "definition of service|invalid|not allowed|no encryption",
     re.IGNORECASE,
 )
-# SQLSTATEs, or their classes, of errors after which a retry may succeed.
-_PASSING: Final = ("08", "40", "53", "57", "58", "55P03", "25P03", "XX")
-_PRIVILEGE: Final = "42501"
-_THERE_ALREADY: Final = ("42P07", "42723")  # a table, a function
 
 
 def connect(url: str, address: str) -> Connection:
@@ -81,15 +77,17 @@ def _explained(error: psycopg.Error, address: str) -> PoolError:
     state = error.sqlstate or ""
     said = one_line(error.diag.message_primary or str(error))
     is_lost = not state and isinstance(error, psycopg.OperationalError)  # The connection was lost.
-    if state == _PRIVILEGE:
+    if state == "42501":  # insufficient_privilege
         return PoolError(f"{address} forbids it: {said}; see docs/pool.md for what to grant")
-    if state in _THERE_ALREADY:
+    # The table or the function exists already.
+    if state in ("42P07", "42723"):
         return PoolError(
             f"{address} holds tables of something else that are called as those of a pool ({said}):"
             " give a database of its own, or a schema of its own by "
             "'?options=-csearch_path%3DNAME' in the URL"
         )
-    if state.startswith(_PASSING) or is_lost:
+    # A retry may succeed after errors with these SQLSTATEs or in these classes.
+    if state.startswith(("08", "40", "53", "57", "58", "55P03", "25P03", "XX")) or is_lost:
         return PoolUnavailableError(f"{address} could not do it now: {said}")
     return PoolError(f"{address} refused it: {said}")
 

@@ -46,7 +46,6 @@ _REFUSED: Final = (
     psycopg.errors.StatementTooComplex,
 )  # fmt: skip
 _FETCHED: Final = 2000  # Rows that are read from the server at a time.
-_AS_THEY_ARE: Final = ("bool", "int2", "int4", "int8", "oid", "float4", "float8", "bytea")
 _PARAMETER: Final = "08P01"  # SQLSTATE of a parameter without a value.
 _ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A", _PARAMETER)
 """SQLSTATEs, or their beginnings, of errors in the question itself."""
@@ -164,7 +163,7 @@ class PostgresPool:
 def _as_texts(adapters: AdaptersMap) -> None:
     """Load all values but numbers, flags and bytes as the texts that PostgreSQL writes."""
     for each in psycopg.adapters.types:
-        if each.name not in _AS_THEY_ARE:
+        if each.name not in ("bool", "int2", "int4", "int8", "oid", "float4", "float8", "bytea"):
             adapters.register_loader(each.oid, TextLoader)
         if each.array_oid:
             adapters.register_loader(each.array_oid, TextLoader)

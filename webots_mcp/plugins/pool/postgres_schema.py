@@ -52,8 +52,6 @@ CREATE TABLE picture (
 ALTER TABLE picture ALTER content SET STORAGE EXTERNAL;
 COMMENT ON TABLE picture IS 'the files of image, where they were shipped';
 """
-_VIEW: Final = re.compile(r"CREATE VIEW (\w+) AS\n.*?(?=;\n)", re.DOTALL)
-_NOW_S: Final = "extract(epoch FROM clock_timestamp())::double precision"
 _EPOCH_MS: Final = "210866760000000::double precision"  # From the first Julian day to 1970.
 # A time as text, rounded to milliseconds by the same additions as in SQLite's strftime.
 _UTC: Final = (
@@ -157,8 +155,15 @@ def _column(column: sa.Column[Any], shipped: ShippedTable) -> sa.Column[Any]:
 def views() -> dict[str, str]:
     """Return the statements that create the views, by name."""
     text = Path(__file__).with_name("postgres_views.sql").read_text("utf-8")
-    written_out = re.sub(r"UTC\((.*?)\)", _UTC, text.replace("NOW_S", _NOW_S))
-    return {made[1]: made[0] for made in _VIEW.finditer(written_out)}
+    written_out = re.sub(
+        r"UTC\((.*?)\)",
+        _UTC,
+        text.replace("NOW_S", "extract(epoch FROM clock_timestamp())::double precision"),
+    )
+    return {
+        made[1]: made[0]
+        for made in re.finditer(r"CREATE VIEW (\w+) AS\n.*?(?=;\n)", written_out, flags=re.DOTALL)
+    }
 
 
 def _view_statements() -> Iterator[str]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from webots_mcp.database.connection import FrozenConnection
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
@@ -82,25 +82,11 @@ _LIMITS: Final = _ShippingLimits()
 # Names in the progress: the last shipped picture file, and the last state of a full-rate segment.
 _PICTURE: Final = "picture"
 _STRETCH: Final = "kept_stretch/"
-# The highest id that a table ever used.
-_SEQUENCE: Final = (
-    "SELECT max((SELECT coalesce(max(id), 0) FROM {0}), iif('{0}' = 'state', "
-    "(SELECT reserved_state_id FROM recording), "
-    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = '{0}')))"
-)
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {}"
 # The last group before the first incomplete one: groups with lower ids are not checked again.
 LAST_GROUP: Final = (
     "SELECT coalesce((SELECT min(id) - 1 FROM row_group WHERE is_complete = 0), "
     "(SELECT max(id) FROM row_group), 0)"
-)
-_NEXT_GROUPS: Final = "SELECT id FROM row_group WHERE id > ? AND id <= ? ORDER BY id LIMIT ?"
-_IN_NO_CHUNK: Final = (
-    "SELECT count(*) FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) AND id > ?"
-)
-_STRETCHES: Final = (
-    "SELECT k.id, k.run_id, k.start_sim_time_s, k.end_sim_time_s, u.ended_wall_time_s IS NOT NULL "
-    "FROM kept_stretch k JOIN run u ON u.id = k.run_id ORDER BY k.id"
 )
 # States that were not shipped with a full-rate segment. The parameter is a JSON object of the last
 # shipped state by id of the segment.
@@ -321,7 +307,11 @@ class Shipper:
             for run_id in source.runs().keys() - source.foreign:
                 at = reached(connection, run_id)
                 place = (run_id, at.end_s, at.last_state_id, shipped)
-                behind += source.number(_IN_NO_CHUNK, *place)
+                behind += source.number(
+                    "SELECT count(*) FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+                    "AND id > ?",
+                    *place,
+                )
         if behind:
             fix = "ship again when their run has ended, or with --full"
             if isinstance(connection, FrozenConnection):
@@ -333,7 +323,7 @@ class Shipper:
     def _end_killed_runs(self, connection: sqlite3.Connection) -> None:
         """End runs in the recording whose process was killed. A pool could not know that."""
         database = self._order.recording.database
-        if not isinstance(database, Path) or not dead_sessions(connection):
+        if not isinstance(database, Path) or not find_dead_sessions(connection):
             return
         try:
             settled(database)
@@ -376,7 +366,13 @@ class Shipper:
             before = self._progress.get(f"{each.name}.check", UNCHECKED)
             now = source.fingerprint(each, known)
             is_other = before != now and UNCHECKED not in (before, now)
-            if source.number(_SEQUENCE.format(each.name)) < known or is_other:
+            highest_id_ever = source.number(
+                f"SELECT max((SELECT coalesce(max(id), 0) FROM {each.name}), "
+                f"iif('{each.name}' = 'state', (SELECT reserved_state_id FROM recording), "
+                "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence "
+                f"WHERE name = '{each.name}')))"
+            )
+            if highest_id_ever < known or is_other:
                 raise PoolError(
                     f"the recording {self._uuid} is not the one that was shipped to {self.address} "
                     f"before: its table {each.name!r} is not the same up to row {known}. It is an "
@@ -440,7 +436,10 @@ class Shipper:
         """Ship the next row groups with their chunks; return whether these were all."""
         groups, chunks = table("row_group"), table("chunk")
         bounds = (self._progress.get(groups.name, 0), self._last_ids[groups.name])
-        found = source.connection.execute(_NEXT_GROUPS, (*bounds, _LIMITS.row_groups)).fetchall()
+        found = source.connection.execute(
+            "SELECT id FROM row_group WHERE id > ? AND id <= ? ORDER BY id LIMIT ?",
+            (*bounds, _LIMITS.row_groups),
+        ).fetchall()
         ids = [group_id for (group_id,) in found]
         for group_id in ids:
             self._add(Batch(chunks, source.rows(chunks, "group_id = ?", group_id)), {})
@@ -483,7 +482,10 @@ class Shipper:
         """Ship the states of full-rate segments, if not all states are shipped."""
         where = "run_id = ? AND sim_time_s BETWEEN ? AND ? AND id > ? AND id <= ?"
         states, up_to = table("state"), self._last_ids["state"]
-        for stretch_id, *bounds, is_over in source.connection.execute(_STRETCHES).fetchall():
+        for stretch_id, *bounds, is_over in source.connection.execute(
+            "SELECT k.id, k.run_id, k.start_sim_time_s, k.end_sim_time_s, u.ended_wall_time_s IS "
+            "NOT NULL FROM kept_stretch k JOIN run u ON u.id = k.run_id ORDER BY k.id"
+        ).fetchall():
             name, is_all = f"{_STRETCH}{stretch_id}", False
             if name in self._progress and is_over and not thorough:
                 continue

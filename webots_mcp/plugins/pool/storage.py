@@ -25,7 +25,6 @@ from webots_mcp.extras.requirements import explain_extra, install_line
 from webots_mcp.plugins.pool.pool_interface import redacted
 
 _AT_ONCE: Final = 16  # Parallel reads.
-_EXTRA: Final = ("pyarrow", "fsspec")
 # Filesystems whose single put is atomic.
 _PUT_WHOLE: Final = frozenset(
     {"memory", "s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "hf"}
@@ -46,7 +45,7 @@ def package(name: str) -> Any:
         return import_module(name)
     except ImportError as error:
         whose = name.partition(".")[0]
-        if whose in _EXTRA:
+        if whose in ("pyarrow", "fsspec"):
             raise PoolError(explain_extra("a pool of Parquet files", "parquet")) from error
         asked = f"a SELECT over a pool of Parquet files needs {whose}"
         raise PoolError(f"{asked}: {install_line([whose])}") from error

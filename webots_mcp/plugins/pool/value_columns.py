@@ -36,7 +36,6 @@ from webots_mcp.store.chunks import (
 _PLACES: Final = {"state_id": STATE_IDS, "sim_time_s": SIM_TIMES, "wall_time_s": WALL_TIMES}
 _FIXED: Final = frozenset({"group_id", "others", *_PLACES, "recording", "recording_uuid", "run",
                            "run_id", "table"})  # fmt: skip
-_TYPES: Final = {"bool": "bool", "text": "string"}  # By kind of signal; others are doubles.
 _HELD: Final[Mapping[str, type]] = {"bool": bool, "string": str}
 
 
@@ -127,7 +126,9 @@ def _type_of(values: Decoded, kind: str) -> Any:
     for label, count in zip(values.labels, counts[FIRST_LABEL:], strict=True):
         found.update({name: count for name, held in _HELD.items() if isinstance(label, held)})
     ((most, count),) = found.most_common(1)
-    return package("pyarrow").type_for_alias(most if count else _TYPES.get(kind, "double"))
+    return package("pyarrow").type_for_alias(
+        most if count else {"bool": "bool", "text": "string"}.get(kind, "double")
+    )
 
 
 def _array(values: Decoded, name: str, kind: Any, others: dict[int, dict[str, Any]]) -> Any:

@@ -39,13 +39,6 @@ _DEFAULTS: Final = {"robot": ROVER, "timeout_wall_s": SOON_S}
 _FOLDER: Final = re.compile(
     r"""(?<![\w/\\])(?:[A-Za-z]:(?:[/\\][^/\\:*?"<>|\n]+)*|(?:~|[A-Z]{4,})?(?:/[^\s/:'"]+)+)[/\\]"""
 )
-_LAST_ROW: Final = "SELECT coalesce(max(id), 0) FROM state"
-_NEWEST: Final = (
-    "SELECT s.id, s.pid, run.id, run.world, state.sim_time_s, state.data "
-    "FROM state JOIN run ON run.id = state.run_id JOIN session s ON s.id = run.session_id "
-    "JOIN robot ON robot.id = s.robot_id WHERE robot.name = ? AND state.id > ? "
-    "ORDER BY state.id DESC LIMIT 1"
-)
 
 
 class OtherwiseError(Exception):
@@ -123,7 +116,7 @@ class Bench:
         self.end()
         if runs in self._never:
             raise NotTriedError("a Webots that was started so has not recorded")
-        ((self._last_row,),) = self.rows(_LAST_ROW) or [(0,)]
+        ((self._last_row,),) = self.rows("SELECT coalesce(max(id), 0) FROM state") or [(0,)]
         start = Start(self.world, mode, headless=True, streams=stream, port=port or free_port())
         environment = {DATA_DIR_VARIABLE: str(self.recording.data_dir)}
         launch = self._launch = WebotsLaunch(self.recording, start, environment, lambda line: None)
@@ -161,7 +154,14 @@ class Bench:
 
     def newest(self, robot: str = ROVER) -> RobotRow | None:
         """Return the newest row of a robot since Webots was started; None if there is none."""
-        found = self.rows(_NEWEST, robot, self._last_row)
+        found = self.rows(
+            "SELECT s.id, s.pid, run.id, run.world, state.sim_time_s, state.data FROM state "
+            "JOIN run ON run.id = state.run_id JOIN session s ON s.id = run.session_id "
+            "JOIN robot ON robot.id = s.robot_id WHERE robot.name = ? AND state.id > ? "
+            "ORDER BY state.id DESC LIMIT 1",
+            robot,
+            self._last_row,
+        )
         return RobotRow._make((*found[0][:-1], json.loads(found[0][-1]))) if found else None
 
     def row(self, robot: str = ROVER) -> RobotRow:

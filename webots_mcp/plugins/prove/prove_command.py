@@ -16,7 +16,6 @@ from webots_mcp.cli.options import Json, Parameter, whole_number
 from webots_mcp.cli.terminal import print_json, printable
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
-_PRINTED: Final = ("expected", "seen", "works still")
 _OUTCOMES: Final = ("as expected", "otherwise", "not tried")
 
 
@@ -90,7 +89,11 @@ def _run_checks(only: list[str] | None, patience_s: int, *, as_json: bool) -> li
                 answer: dict[str, Any] = {"outcome": "not tried", "seen": NOT_TRIED.get(name)}
                 answer = run_check(CHECKS[name], bench) if name in CHECKS else answer
                 parts = [f"{name}: {answer['outcome']}"]
-                parts += [f"{key}: {answer[key]}" for key in _PRINTED if answer.get(key)]
+                parts += [
+                    f"{key}: {answer[key]}"
+                    for key in ("expected", "seen", "works still")
+                    if answer.get(key)
+                ]
                 found.append({"check": name, **answer})
                 print(printable("; ".join(parts)), file=sys.stderr if as_json else None, flush=True)
         finally:

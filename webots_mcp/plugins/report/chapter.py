@@ -12,8 +12,9 @@ from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.judging.checks import check_run
 from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.coverage import Verdicts
 from webots_mcp.judging.detection.events import KINDS, Found, choose, search_events, stored_kinds
-from webots_mcp.judging.detection.kinds import Event, EventOptions, Verdicts
+from webots_mcp.judging.detection.kinds import Event, EventOptions
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.plugins.report.grid import Grid, GridRow
 from webots_mcp.plugins.report.words import (
@@ -42,9 +43,9 @@ from webots_mcp.store.logs import (
 from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.robots import SessionRecord, fetch_session
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_info
+from webots_mcp.store.sessions import SessionRecord, fetch_session
 
 
 @dataclass(frozen=True)

@@ -58,11 +58,6 @@ _LIMITS: Final = _ReportLimits()
 
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
-# The report loads nothing, whatever a text of the recording contains. Its script is inline.
-_POLICY: Final = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
-)
 FOLDER: Final = "reports"  # In the data folder.
 
 
@@ -232,9 +227,13 @@ def render(page: ReportContent) -> bytes:
     """Return the file. Every text of the recording is escaped: it is shown, and never run."""
     from markupsafe import Markup
 
+    # Under this policy the report loads nothing, whatever a text of the recording contains.
     values: Mapping[str, Any] = {
         "page": page,
-        "policy": _POLICY,
+        "policy": (
+            "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+            "img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
+        ),
         "version": VERSION,
         "made": clock(page.made_wall_time_s),
         "size": size(page.size_bytes or 0),

@@ -17,7 +17,6 @@ _LONGEST_VALUE: Final = 400
 """Characters of a value within a cell."""
 _RELATIVE_ZERO: Final = 1e-9
 """Fraction of a signal's range below which a number is a rounding error."""
-_UNIT: Final = re.compile(r"(.+)_(s|m|rad)")
 _HIDDEN_DETAILS: Final = ("id", "image_id", "first_times_s")
 
 
@@ -115,7 +114,7 @@ def format_signal_values(values: Mapping[str, Any]) -> str:
 
 
 def _named(name: str, value: Any) -> str:
-    found = _UNIT.fullmatch(name)
+    found = re.fullmatch(r"(.+)_(s|m|rad)", name)
     if isinstance(value, str) and " " in value:
         return f"{name.replace('_', ' ')}: {format_value(value)}"
     if found is None or not isinstance(value, (int, float)):

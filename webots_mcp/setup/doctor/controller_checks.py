@@ -32,9 +32,6 @@ from webots_mcp.store.signals import registered
 _NO_PROJECT: Final = (
     "this folder is in no Webots project: run 'webots-mcp doctor' in the folder of one"
 )
-_NONE: Final = (
-    "the project has no controllers that Webots would start; the code of extern ones lies elsewhere"
-)
 
 
 @check("Controllers")
@@ -44,7 +41,12 @@ def controllers(subject: Examined) -> Iterator[Diagnosis]:
     if project is None:
         yield unclear(_NO_PROJECT)
         return
-    findings = list(_of_each(subject, project)) or [ok(_NONE)]
+    findings = list(_of_each(subject, project)) or [
+        ok(
+            "the project has no controllers that Webots would start; the code of extern ones lies "
+            "elsewhere"
+        )
+    ]
     seen = "; ".join(each.seen for each in findings)  # those that record are named as well
     yield replace(worst(findings), seen=seen)
 

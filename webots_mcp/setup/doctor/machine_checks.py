@@ -37,9 +37,7 @@ _NETWORK: Final = (
     "nfs", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afpfs", "webdav", "ncpfs", "afs", "ceph",
     "glusterfs", "lustre", "beegfs", "fuse.sshfs", "fuse.glusterfs", "fuse.s3fs", "fuse.rclone",
 )  # fmt: skip
-_SHARED_WITH_HOST: Final = ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs")
 _WINDOWS_FROM_WSL: Final = ("9p", "drvfs")
-_WSL_FROM_WINDOWS: Final = ("//wsl$/", "//wsl.localhost/")
 _IN_MEMORY: Final = "the recording is in memory"
 _LOCAL: Final = (
     f"record in a folder of this machine's own disk: {DATA_DIR_VARIABLE}, --data-dir, or "
@@ -163,7 +161,7 @@ def file_system(subject: Examined) -> Iterator[Diagnosis]:
 def judge_file_system(folder: str, mounts: Iterable[Mount], *, in_wsl: bool) -> Diagnosis:
     """Return whether a recording may lie in a folder, on a machine with these file systems."""
     path = folder.replace("\\", "/")
-    if path.lower().startswith(_WSL_FROM_WINDOWS):
+    if path.lower().startswith(("//wsl$/", "//wsl.localhost/")):
         return _across_the_border(folder, "a folder of WSL, seen from Windows")
     if path.startswith("//"):
         return _on_the_network(folder, "a network drive")
@@ -176,7 +174,7 @@ def judge_file_system(folder: str, mounts: Iterable[Mount], *, in_wsl: bool) -> 
         return _across_the_border(folder, f"a drive of Windows, seen from WSL ({kind})")
     if mount.is_remote or kind in _NETWORK:
         return _on_the_network(folder, f"a network drive ({mount.kind} at {mount.point})")
-    if kind in (*_SHARED_WITH_HOST, *_WINDOWS_FROM_WSL):
+    if kind in ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs", *_WINDOWS_FROM_WSL):
         seen = f"{folder} is shared with a virtual machine's host ({mount.kind} at {mount.point})"
         return warning(f"{seen}: both at once would not see each other's locks", _LOCAL)
     return ok(f"{mount.kind or 'of an unnamed kind'} at {mount.point}")

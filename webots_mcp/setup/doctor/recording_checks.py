@@ -34,13 +34,10 @@ from webots_mcp.setup.doctor import (
     wrong,
 )
 from webots_mcp.store.journal_intake import kept_journals
+from webots_mcp.store.loop_evidence import handler_at_work, rows_waiting
 from webots_mcp.store.recording import GETTING_STARTED, RobotView, name_of
-from webots_mcp.store.robots import (
-    fetch_session,
-    handler_at_work,
-    nothing_recorded,
-    rows_waiting,
-)
+from webots_mcp.store.robots import nothing_recorded
+from webots_mcp.store.sessions import fetch_session
 
 _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "

@@ -31,17 +31,15 @@ from webots_mcp.setup.doctor import (
 from webots_mcp.simulator.instances import shown_of
 from webots_mcp.simulator.orders import address_of
 from webots_mcp.store.recording import RobotView
-from webots_mcp.store.robots import SILENT, WAITING_IN_STEP, SessionRecord, companions
+from webots_mcp.store.robot_status import SILENT, WAITING_IN_STEP
+from webots_mcp.store.sessions import SessionRecord, companions
 
 if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 
 _SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
-_MEND_LINE: Final = f"mend that line; else {_SEE_PAGE}"
-_PRESS_PLAY: Final = "press play in Webots"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
-_OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def _judged(view: RobotView) -> Diagnosis:
             return wrong(seen, "see 'webots-mcp logs --level error', mend the controller and start "
                          "it again")  # fmt: skip
         return ok(seen)
-    hangs = _MEND_LINE if "silent for " in (status.why or "") else None
+    hangs = f"mend that line; else {_SEE_PAGE}" if "silent for " in (status.why or "") else None
     if status.is_moving:
         return Diagnosis("warning" if status.why else "ok", seen, hangs)
     if status.text == PAUSED:
@@ -127,7 +125,7 @@ def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
     webots = _webots_of(subject, session)
     reload, play = (
         _also_by_websocket(fix, order, webots)
-        for fix, order in ((_RELOAD, "reload"), (_PRESS_PLAY, "resume"))
+        for fix, order in ((_RELOAD, "reload"), ("press play in Webots", "resume"))
     )
     others = None if session.host != host_name() else _controllers_beside(view, session, webots)
     busy = None if others is None else _computing({session.pid, *others.pids})
@@ -168,7 +166,9 @@ def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
 def _also_by_websocket(fix: str, order: str, webots: Instance | None) -> str:
     """Return what a person can do, and what a client can if Webots was started with --stream."""
     is_open = webots is not None and webots.streams and webots.is_listening
-    return _OBEYS.format(fix, order) if is_open else fix
+    if not is_open:
+        return fix
+    return f"{fix}; or webots_simulation_control('{order}'): this Webots obeys it by its WebSocket"
 
 
 def _webots_of(subject: Examined, session: SessionRecord) -> Instance | None:

@@ -16,6 +16,7 @@ from webots_mcp.signals.naming import REDUCTIONS, Value, nearest_first
 from webots_mcp.signals.register import MAX_SIGNALS, Kind
 from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
 from webots_mcp.store.meanings import meanings_of, with_stated
+from webots_mcp.store.reading.behaviour import with_behaviour
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.observed_pose import with_observed_pose
 from webots_mcp.store.reading.ranges import TimeRange, find_subject
@@ -263,7 +264,7 @@ def list_signals(
     there = with_observed_pose(connection, subject.robot_id, there, own)
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)
-    meanings = meanings_of(there)
+    meanings = with_behaviour(meanings_of(there), there, frame)
     infos = tuple(_info(frame, signal, meanings[signal.name]) for signal in matching[:limit])
     notes = [str(each) for each in frame.unread]
     if len(known) >= MAX_SIGNALS:

@@ -23,8 +23,6 @@ _MEMORY: Final = [0.4375, -0.0625, 1.2890625, 0.734375]
 """What Webots reads from memory before an InertialUnit's first value: any numbers."""
 _UNKNOWN: Final = [nan, nan, nan]
 _NO_GPS: Final = [_UNKNOWN, _UNKNOWN]
-_DISTANCE_SENSOR_TYPES: Final = ("generic", "infra-red", "sonar", "laser")
-_TOUCH_SENSOR_TYPES: Final = ("bumper", "force", "force-3d")
 
 
 def _field(name: str, default: Any = None) -> Callable[[Any], Any]:
@@ -172,7 +170,7 @@ class DistanceSensor(_NumberSensor, _LookupTable):
 
     def getType(self) -> int:
         """Return the `type` field, such as `DistanceSensor.SONAR`."""
-        return _index_of(self._fields["type"], _DISTANCE_SENSOR_TYPES)
+        return _index_of(self._fields["type"], ("generic", "infra-red", "sonar", "laser"))
 
 
 class TouchSensor(_NumberSensor, _LookupTable):
@@ -189,7 +187,7 @@ class TouchSensor(_NumberSensor, _LookupTable):
 
     def getType(self) -> int:
         """Return `TouchSensor.BUMPER`, `FORCE` or `FORCE3D`."""
-        return _index_of(self._fields["type"], _TOUCH_SENSOR_TYPES)
+        return _index_of(self._fields["type"], ("bumper", "force", "force-3d"))
 
 
 class PositionSensor(_NumberSensor):

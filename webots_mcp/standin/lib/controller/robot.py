@@ -18,7 +18,6 @@ from .session import ControllerSession, NodeFacts, SimulatorLink, SocketLink
 from .surface import Completed, integer, lacking, number, say, text
 
 _NULL_NODE: Final = (0, "", "", "", -1)
-_DEADLY_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 _MAX_CUSTOM_DATA_BYTES: Final = 65_534
 """Webots' library sends the length in 16 bits, and takes the rest of a longer text for messages."""
 
@@ -214,7 +213,11 @@ class Robot(Completed):
 
 def _restore_signals() -> None:
     """Let signals end the process at once, without KeyboardInterrupt, `finally` or atexit."""
-    numbers = [getattr(signal, name) for name in _DEADLY_SIGNALS if hasattr(signal, name)]
+    numbers = [
+        getattr(signal, name)
+        for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+        if hasattr(signal, name)
+    ]
     if (
         os.name == "posix"
     ):  # As in Webots, set the handler of C, which `signal.getsignal` cannot see.

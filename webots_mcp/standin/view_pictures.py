@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 SIZE_PX: Final = (800, 600)
 _MARGIN_PX: Final = 20
-_FORMATS: Final = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def save_picture(
     """
     from PIL import Image, ImageDraw  # Imported late: most simulations never need a picture.
 
-    kind = _FORMATS.get(picture.path.suffix.lower())
+    kind = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}.get(picture.path.suffix.lower())
     if kind is None:
         raise ValueError(f"unknown extension {picture.path.suffix!r}, use .png or .jpg")
     image = Image.new("RGB", SIZE_PX, _rgb(arena.colors.sky))

@@ -1,0 +1,56 @@
+"""What the values of signals tell of their meaning, where nothing else does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+from webots_mcp.signals.meaning import Meaning, meaning_by_behaviour
+from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.signals import RegisteredSignal
+
+_PARTS: Final = 4  # of a run, whose rows are read
+_ROWS: Final = 512  # of each part
+
+
+def with_behaviour(
+    meanings: Mapping[str, Meaning], known: Mapping[str, RegisteredSignal], frame: Frame
+) -> dict[str, Meaning]:
+    """Return the meanings with what some values of each number of unknown meaning tell.
+
+    Args:
+        meanings: As declared, known from devices or named.
+        known: The signals.
+        frame: The rows of a run.
+    """
+    found = dict(meanings)
+    for name in _unknown(meanings, known):
+        zones = frame.zone_map(name)
+        if not zones.value_count.any():
+            continue
+        found[name] = _told_by(frame, name)
+    return found
+
+
+def _unknown(
+    meanings: Mapping[str, Meaning], known: Mapping[str, RegisteredSignal]
+) -> Iterable[str]:
+    return (
+        name
+        for name, each in meanings.items()
+        if each.quantity is None and each.source == "unknown"
+        if known[name].is_number and known[name].reduction is None
+    )
+
+
+def _told_by(frame: Frame, name: str) -> Meaning:
+    """What parts of the run tell together: the first that tells something, if no other differs."""
+    starts = range(0, len(frame), max(_ROWS, -(-len(frame) // _PARTS)))
+    parts = [frame.rows(start, start + _ROWS).usable(name)[1].tolist() for start in starts]
+    told = [meaning_by_behaviour(part) for part in parts if part]
+    kinds = {each.why for each in told}
+    if len(kinds) == 1:
+        return told[0]
+    joined = meaning_by_behaviour([value for part in parts for value in part])
+    angles = [each for each in told if each.quantity == "heading"]
+    return angles[0] if angles and joined.quantity in (None, "heading") else joined

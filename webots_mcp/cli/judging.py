@@ -399,7 +399,7 @@ def _place_of(stack: str, own: str) -> tuple[str, str | None]:
         function, file, line = (
             found.groups() if (found := re.match(r"(.*) \((.*):(\d+)\)$", each)) else ("", "", "")
         )
-        is_own = file.startswith(own) and not INSTALLED.search(file)
+        is_own = file.startswith(own) and not re.search(INSTALLED, file)
         if function.rpartition(".")[2] in STEPPING and not is_own:
             return ("waiting in step()", None)
         if is_own:

@@ -74,7 +74,7 @@ def moments(interval_s: float, *, is_held: bool) -> Iterator[Moment]:
         turns = [0.0 if stops else each + bool(v) * rng.normal(0, 0.01) for each in (left, right)]
         yield Moment(
             t, x + off[0], y + off[1], math.remainder(yaw, math.tau), v, w,
-            v_is, w_is, left, right, (left_rad, right_rad), *turns, aim, joint + off[2],
+            v_is, w_is, left, right, (left_rad, right_rad), turns[0], turns[1], aim, joint + off[2],
         )  # fmt: skip
 
 

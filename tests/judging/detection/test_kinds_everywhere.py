@@ -10,7 +10,7 @@ from contextlib import closing
 from typing import Any
 
 import pytest
-from webots_mcp.plotting.signals import compose_signals, plot_signals
+from webots_mcp.plotting.signal_plot import compose_signals, plot_signals
 
 from tests.judging.asking import ask
 from tests.recordings.rows import Recorded, RecordedRobot

@@ -23,7 +23,7 @@ from webots_mcp.judging.detection.standstill import (
 )
 from webots_mcp.judging.detection.targets import OFF_S, OFF_SHARE, OFF_TARGET, pursuits_in
 from webots_mcp.signals.meaning import words_in
-from webots_mcp.signals.naming import BRANCHES, counted, listed, words_of
+from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, words_of
 from webots_mcp.signals.register import PLACES
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.segment import just_after
@@ -33,6 +33,7 @@ APART_S: Final = 3.0  # command and measurement for so long
 NO_COMMAND: Final = (
     "nothing says when it should move: publish commanded_m_s, the speeds of its wheels, or mode"
 )
+_LEAST_CELLS: Final = 10  # rows that two measurements are compared in
 _OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
 _NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
 _NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance

@@ -10,7 +10,6 @@ from contextlib import closing
 from typing import Any
 
 import pytest
-from webots_mcp.plotting.signal_plot import compose_signals, plot_signals
 
 from tests.judging.asking import ask
 from tests.recordings.rows import Recorded, RecordedRobot
@@ -21,6 +20,7 @@ from webots_mcp.judging.detection.events import KINDS, drawn_kinds
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.plotting.canvas import Sheet
 from webots_mcp.plotting.on_a_page import signals_figure
+from webots_mcp.plotting.signal_plot import compose_signals, plot_signals
 from webots_mcp.plugins.report.chapter import chapter_of
 from webots_mcp.store.reading.ranges import Scope, find_range
 

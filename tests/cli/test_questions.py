@@ -218,7 +218,7 @@ def test_examples_can_be_typed() -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("signals", "'*' means any text. (*)"),
+        ("signals", "'*' is any text. (*)"),
         ("events", "without a value that count as missing. (1)"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 import shutil
 import signal
@@ -42,15 +43,40 @@ _MEMORY_BYTES = 4_000_000_000  # all tests at once take a tenth of it
 if _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free > _MEMORY_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
 
-# The longest of the slow files begin first, so that no process is left with one at the end.
+# Files that take longest begin first where several processes share the tests, so that these end
+# at about the same time. `python -m pytest --durations=60` shows what belongs in this list.
 _LONGEST = (
+    "tests/plugins/prove/test_prove.py",
+    "tests/server/test_blocked_loops.py",
+    "tests/accuracy/test_accuracy.py",
+    "tests/setup/test_skills.py",
+    "tests/examples/test_conversation.py",
+    "tests/bridge/processes/test_hangs.py",
+    "tests/steering/trials/test_killed.py",
+    "tests/judging/checks/test_judged.py",
+    "tests/store/reading/test_cut.py",
+    "tests/bridge/test_interrupts.py",
+    "tests/server/test_http.py",
+    "tests/plugins/page/test_server.py",
+    "tests/plugins/page/test_in_a_browser.py",
     "tests/judging/detection/test_detected.py",
     "tests/benchmarks/test_benchmarks.py",
-    "tests/plugins/pool/parquet/test_reading.py",
+    "tests/server/test_routes.py",
+    "tests/store/journal/test_long_lines.py",
+    "tests/store/journal/test_c_header.py",
+    "tests/steering/trials/test_trials.py",
+    "tests/testing/test_plugin.py",
+    "tests/cli/test_launch.py",
+    "tests/server/test_answer_sizes.py",
     "tests/plugins/cluster/test_cluster.py",
-    "tests/steering/trials/test_killed.py",
-    "tests/bridge/test_interrupts.py",
+    "tests/server/test_observer.py",
+    "tests/plugins/pool/parquet/test_reading.py",
 )
+
+# Tests spend a third of their time waiting for simulations, servers and locks: three processes
+# keep two cores busy. Each of them collects all tests, and takes 0.7 GB at its end.
+_PROCESSES_PER_CORE = 1.5
+_MOST_PROCESSES = 6
 
 # The same examples each time, so that a red run was made red by the change that it tests;
 # `pytest --hypothesis-profile=explore` looks for new ones. No machine is too slow for them.
@@ -74,18 +100,29 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--fast", action="store_true", help="leave out what is marked slow")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return how many processes `-n auto` starts."""
+    return min(math.ceil(_PROCESSES_PER_CORE * (os.cpu_count() or 1)), _MOST_PROCESSES)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Slow tests run last, or not at all: what fails quickly is seen quickly."""
+    """Leave out slow tests on request, and put all in the order in which they begin.
+
+    In one process slow tests run last: what fails quickly is seen quickly. Where several share
+    the tests, the longest files begin first.
+    """
     slow = [item for item in items if item.get_closest_marker("slow")]
-    slow.sort(key=_begins)
     fast = [item for item in items if not item.get_closest_marker("slow")]
     if config.getoption("--fast"):
         config.hook.pytest_deselected(items=slow)
         slow = []
     items[:] = [*fast, *slow]
+    if hasattr(config, "workerinput"):
+        items.sort(key=_rank_of_file)
 
 
-def _begins(item: pytest.Item) -> int:
+def _rank_of_file(item: pytest.Item) -> int:
     file = item.nodeid.partition("::")[0]
     return _LONGEST.index(file) if file in _LONGEST else len(_LONGEST)
 

@@ -99,7 +99,7 @@ def test_only_an_observer_and_the_public_names_import_the_bridge() -> None:
     }
     assert known <= {
         "simulator/observer.py",
-        "simulator/observed_world.py",
+        "simulator/observed_bodies.py",
         *(name for name in known if name[:8] == "plugins/"),
     }
 

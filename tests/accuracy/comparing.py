@@ -113,20 +113,23 @@ def _said(
     return {each.name: each.different[1] for each in figures} | spreads
 
 
-def _answers(
-    pairs: int,
-    sizes: tuple[int, int],
-    effect_sd: float,
-    scatter: str = "normal",
-    noisier: float = 1.0,
-) -> list[dict[str, bool | None]]:
+def comparisons(bench: Bench) -> Iterator[str]:
+    """Equal groups, and groups of which one drives faster, is noisier or has rare events."""
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        yield from _comparisons(bench, pool)
+
+
+def _comparisons(bench: Bench, pool: ProcessPoolExecutor) -> Iterator[str]:
+    def _answers(
+        pairs: int,
+        sizes: tuple[int, int],
+        effect_sd: float,
+        scatter: str = "normal",
+        noisier: float = 1.0,
+    ) -> list[dict[str, bool | None]]:
         given = (repeat(each) for each in (sizes, effect_sd, scatter, noisier))
         return list(pool.map(_said, range(pairs), *given))
 
-
-def comparisons(bench: Bench) -> Iterator[str]:
-    """Equal groups, and groups of which one drives faster, is noisier or has rare events."""
     pairs, equal, wrong, of = bench.count(100), list[list[str]](), 0, 0
     for scatter, kind in _KINDS.items():
         for sizes in _EQUAL:

@@ -37,8 +37,8 @@ from tests.benchmarks.ways import (
     make_states,
 )
 from webots_mcp import MCPBridge
-from webots_mcp.bridge.keeping import scale_down
-from webots_mcp.bridge.pictures import encode_png
+from webots_mcp.bridge.camera_frames import scale_down
+from webots_mcp.bridge.picture_files import encode_png
 from webots_mcp.contract import KEEP_LAST_S
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.simulator.observer import Observer
@@ -97,7 +97,8 @@ def _ways(bench: Bench, encoding: str) -> Iterable[Line]:
         taken = _between_steps(bench, {name: _both(robot, way) for name, way in ways.items()})
     ours, raw = taken["bridge"], taken["raw"]
     step = f"publish and get_command, {encoding}"
-    yield compared(f"{step}, p50", ours.p50, "raw sqlite3", raw.p50, ratio(ours, raw), 2)
+    # A row must cost little more than the INSERT itself. On a busy machine the ratio is higher.
+    yield compared(f"{step}, p50", ours.p50, "raw sqlite3", raw.p50, ratio(ours, raw), 1.25)
     yield compared(f"{step}, p99.9", ours.p999, "raw sqlite3", raw.p999, ours.p999 / raw.p999)
 
 

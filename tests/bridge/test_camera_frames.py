@@ -15,7 +15,7 @@ from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge.keeping import LONGEST_SIDE_PX, MOST_FRAMES, scale_down
+from webots_mcp.bridge.camera_frames import LONGEST_SIDE_PX, MOST_FRAMES, scale_down
 from webots_mcp.contract import KEEP_AFTER_S, KEEP_LAST_S
 from webots_mcp.standin import InProcessSupervisor
 

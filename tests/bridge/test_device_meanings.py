@@ -298,7 +298,7 @@ def test_a_failure_is_counted_and_costs_no_value(
     def fail(*_: Any, **__: Any) -> Any:
         raise sqlite3.Error("broken")
 
-    monkeypatch.setattr("webots_mcp.bridge.session.describe_devices", fail)
+    monkeypatch.setattr("webots_mcp.bridge.device_meanings.describe_devices", fail)
     with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
         robot.step(STEP_MS)
         assert bridge.auto_publish()["motors"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,22 +11,26 @@ import pytest
 
 from tests.bridge.conftest import send
 from webots_mcp import MemoryDatabase
-from webots_mcp.bridge.breakpoints import Breakpoints, Watch, read_goal
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.log_handler import LogHandler
+from webots_mcp.bridge.output_channel import OutputChannel
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
-from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.picture_files import PictureFiles
+from webots_mcp.bridge.printed_lines import PrintedLines
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.redirection import Redirection
 from webots_mcp.bridge.registration import identify
+from webots_mcp.bridge.run_goal import Watch, read_goal
 from webots_mcp.bridge.running_actions import RunningActions
-from webots_mcp.bridge.scene_changes import SceneActions
-from webots_mcp.bridge.scene_edits import SceneEdits
+from webots_mcp.bridge.scene_actions import SceneActions
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog
@@ -60,18 +66,18 @@ class Base:
     def pause(self) -> Pause:
         return Pause(self.simulation, self.journal, self.heartbeat, lambda: None, lambda: None)
 
-    def keeper(self, throttle: Throttle, last_s: float = 1.0) -> Keeper:
-        album = Album(self.recorder, self.clock, self.folder)
-        return Keeper(self.clock, self.recorder, self.journal, album, throttle, last_s)
+    def full_rate(self, throttle: Throttle, last_s: float = 1.0) -> FullRateRecorder:
+        files = PictureFiles(self.recorder, self.clock, self.folder)
+        return FullRateRecorder(self.clock, self.recorder, self.journal, files, throttle, last_s)
 
     def parameters(self, pause: Pause) -> Parameters:
         handlers = Handlers(self.recorder, self.journal, pause)
         parts = (self.clock, self.recorder, self.journal)
         return Parameters(*parts, handlers, self.errors, "rover")
 
-    def breakpoints(self, pause: Pause, keeper: Keeper) -> Breakpoints:
+    def breakpoints(self, pause: Pause, full_rate: FullRateRecorder) -> Breakpoints:
         parts = (self.simulation, self.clock, self.recorder, self.journal)
-        return Breakpoints(*parts, pause, keeper)
+        return Breakpoints(*parts, pause, full_rate)
 
 
 @pytest.fixture
@@ -88,14 +94,14 @@ def test_a_throttle_admits_each_nth_call_and_a_wanted_one() -> None:
 
 def test_a_keeper_writes_the_throttled_calls_before_a_moment(base: Base) -> None:
     throttle = Throttle(5)
-    keeper = base.keeper(throttle)
+    full_rate = base.full_rate(throttle)
     for n in range(3):
         assert not throttle.admits(force=False)  # it also numbers the calls
-        keeper.add({"n": n})
-    keeper.keep("a crash")
-    keeper.write_all()
+        full_rate.add({"n": n})
+    full_rate.keep("a crash")
+    full_rate.write_all()
     assert len(base.rows("SELECT data FROM kept_state")) == 3
-    keeper.close()
+    full_rate.close()
 
 
 def test_a_pause_stops_the_simulation_and_its_end_lets_it_run(base: Base) -> None:
@@ -118,7 +124,7 @@ def test_parameters_are_declared_and_set(base: Base) -> None:
 
 
 def test_breakpoints_hit_on_the_state_where_their_condition_begins_to_hold(base: Base) -> None:
-    breakpoints = base.breakpoints(base.pause(), base.keeper(Throttle(1)))
+    breakpoints = base.breakpoints(base.pause(), base.full_rate(Throttle(1)))
     breakpoints.begin()
     breakpoints.set("n > 1", "log", 1)
     hits = [len(breakpoints.evaluate({"n": n})) for n in (1, 2, 3)]
@@ -127,16 +133,16 @@ def test_breakpoints_hit_on_the_state_where_their_condition_begins_to_hold(base:
 
 def test_a_publisher_records_what_its_throttle_admits(base: Base) -> None:
     throttle = Throttle(2)
-    keeper, pause = base.keeper(throttle), base.pause()
+    full_rate, pause = base.full_rate(throttle), base.pause()
     publisher = Publisher(
         base.clock,
         base.recorder,
         base.journal,
         base.heartbeat,
         throttle,
-        base.breakpoints(pause, keeper),
+        base.breakpoints(pause, full_rate),
         Watch(base.clock, 0.0),
-        keeper,
+        full_rate,
         DeviceReader(base.simulation, base.journal, base.errors, lambda: None),
         Reloads(base.errors.failed),
         begin_run=lambda: None,
@@ -170,7 +176,7 @@ def test_the_actions_that_run_the_simulation_need_no_session(base: Base) -> None
         pause,
         throttle,
         Watch(base.clock, 0.0),
-        base.breakpoints(pause, base.keeper(throttle)),
+        base.breakpoints(pause, base.full_rate(throttle)),
         base.parameters(pause),
         world.reset_world,
         check_clock=lambda: None,
@@ -196,8 +202,7 @@ def test_the_goal_of_a_run_is_watched_without_a_session(
 
 
 def test_the_actions_on_the_scene_need_no_session(base: Base) -> None:
-    edits = SceneEdits(base.simulation, base.journal, base.errors)
-    scene = SceneActions(base.simulation, base.clock, base.journal, edits)
+    scene = SceneActions(base.simulation, base.clock, base.journal, base.errors)
     with pytest.raises(StopIteration) as answer:
         progress = scene.by_name()["get_scene"](ClaimedCommand(1, "get_scene", {}, 1))
         for _ in range(1000):
@@ -213,3 +218,53 @@ def test_a_watchdog_writes_its_file_next_to_the_database(base: Base) -> None:
     assert [each.name for each in base.folder.iterdir() if base.recorder.uuid in each.name]
     watchdog.close()
     assert not [each.name for each in base.folder.iterdir() if base.recorder.uuid in each.name]
+
+
+def test_printed_lines_are_whole_and_the_rest_becomes_one_at_the_end() -> None:
+    lines = PrintedLines()
+    lines.take(b"one\n\ntwo\nth")
+    assert lines.remove() == ["one", "two"]
+    lines.take(b"ree")
+    lines.end()
+    assert lines.remove() == ["three"]
+
+
+def test_a_redirected_descriptor_is_read_until_it_is_restored(tmp_path: Path) -> None:
+    with (tmp_path / "output").open("w+b", buffering=0) as file:
+        redirection = Redirection(file.fileno(), blocking=True)
+        file.write(b"into the pipe")
+        redirection.restore()
+        file.write(b"into the file")
+        assert os.read(redirection.read_end, 100) == b"into the pipe"
+        redirection.close()
+        assert (tmp_path / "output").read_bytes() == b"into the file"
+
+
+def test_an_output_channel_forwards_and_records(tmp_path: Path) -> None:
+    recorded = list[tuple[str, str]]()
+    with (tmp_path / "output").open("w+b", buffering=0) as file:
+        channel = OutputChannel(
+            "stdout",
+            Redirection(file.fileno(), blocking=os.name != "posix"),
+            PrintedLines(),
+            lambda name, lines: recorded.extend((name, line) for line in lines),
+            writes_to_descriptor=False,
+        )
+        print("of Python")
+        file.write(b"of C code\n")
+        channel.close()
+    assert sorted(recorded) == [("stdout", "of C code"), ("stdout", "of Python")]
+    assert (tmp_path / "output").read_bytes() == b"of C code\n"
+
+
+def test_a_log_handler_records_level_and_logger_and_ignores_lines_of_the_recording() -> None:
+    logger, recorded = logging.Logger("wheels"), list[object]()
+
+    def record(text: object, level: object, name: str | None) -> None:
+        recorded.append((text, level, name))
+        logger.error("written while recording")
+
+    logger.addHandler(LogHandler(record, "info"))
+    logger.debug("too low")
+    logger.warning("slip %s", "left")
+    assert recorded == [("slip left", logging.WARNING, "wheels")]

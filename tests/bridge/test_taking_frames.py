@@ -12,7 +12,8 @@ from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge
-from webots_mcp.bridge.pictures import encode_png, take_picture
+from webots_mcp.bridge.device_pictures import take_picture
+from webots_mcp.bridge.picture_files import encode_png
 from webots_mcp.standin import InProcessSupervisor
 
 Drive = Callable[[int], None]

@@ -126,7 +126,7 @@ def test_a_port_that_is_taken_is_told_by_the_one_that_webots_took(
 def test_it_says_why_nobody_records(
     launch: Launch, project: Callable[..., Path], controller: str, said: str
 ) -> None:
-    _assert_told(launch, project(controller), "--mode", "fast", text=said)
+    _assert_told(launch, project(controller), text=said)
 
 
 def test_an_extern_controller_that_is_missing_is_named(

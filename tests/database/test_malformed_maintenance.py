@@ -10,7 +10,7 @@ import pytest
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.database.waiting_file import FORMAT, adopt
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
@@ -95,7 +95,7 @@ def test_a_row_without_a_time_does_not_keep_others_from_being_purged(
 def test_the_process_of_a_session_need_not_be_text(recorded: Recorded) -> None:
     recorded.robot(process="x")
     recorded.connection.execute("UPDATE session SET process = CAST(x'7bff' AS TEXT)")
-    assert dead_sessions(recorded.connection) == [(1, "crashed")]
+    assert find_dead_sessions(recorded.connection) == [(1, "crashed")]
 
 
 HEADER = {"webots_mcp_waiting": FORMAT, "robot": {}, "session": {"uuid": "u"}}

@@ -20,6 +20,7 @@ from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.connection import connect
 from webots_mcp.questions import all_questions
+from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.anyio
 RICH_TOKENS: Final = 1_500
@@ -71,6 +72,8 @@ def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
             )
         _add_runs(connection)
         connection.execute("COMMIT")
+    while not make_chunks(connection, 100_000).done:
+        pass
     connection.close()
     return file
 

@@ -41,6 +41,7 @@ while robot.step(16) != -1:
     bridge.publish({"kp": kp.value, "ran": len(ran)})
     bridge.get_command()
 """
+TRIALS = "webots_run_trials"
 LONG: dict[str, Any] = {"timeout_wall_s": 90}
 # Each would wait longer than this test may take, if it waited for its time to be up.
 ASKED: list[tuple[str, dict[str, Any]]] = [
@@ -55,7 +56,7 @@ ASKED: list[tuple[str, dict[str, Any]]] = [
     ("webots_take_screenshot", LONG),
     ("webots_get_scene", {}),
     ("webots_breakpoint", {"condition": "kp > 9"}),
-    ("webots_run_trials", {"parameters": {"kp": [1.0]}, "score": "last(kp)", "for_s": 0.2, **LONG}),
+    (TRIALS, {"parameters": {"kp": [1.0]}, "score": "last(kp)", "for_s": 0.2, **LONG}),
 ]
 
 
@@ -82,9 +83,11 @@ async def test_while_a_person_has_paused_webots_every_command_is_withdrawn_and_n
     server = create_server(data_dir / "webots.db", data_dir)
     async with Client(server, read_timeout_seconds=60) as client:
         await paused_by_hand(simulation, client)
-        for tool, given in ASKED:
-            said = text_of(await client.call_tool(tool, given))
-            assert "paused by hand in Webots" in said, (tool, said)
+        said = await ask_all(client)
+        said[TRIALS] = text_of(await client.call_tool(TRIALS, dict(ASKED)[TRIALS]))
+        assert len(said) == len(ASKED)
+        for asked, text in said.items():
+            assert "paused by hand in Webots" in text, (asked, text)
         assert set(filed.rows("SELECT status FROM command")) == {"cancelled"}
         errors = filed.rows("SELECT error FROM command")
         assert {error.startswith(WAITING_IN_STEP) for error in errors} == {True}
@@ -101,6 +104,20 @@ async def test_while_a_person_has_paused_webots_every_command_is_withdrawn_and_n
     assert statuses == ["cancelled"]
     assert filed.rows("SELECT DISTINCT json_extract(data, '$.kp') FROM state") == [2.0]
     assert filed.rows("SELECT count(*) FROM run") == [1]
+
+
+async def ask_all(client: Client) -> dict[str, str]:
+    """Ask at the same time for everything but trials, which refuse others; return the answers."""
+    said: dict[str, str] = {}
+
+    async def send(tool: str, given: dict[str, Any]) -> None:
+        said[f"{tool} {given}"] = text_of(await client.call_tool(tool, given))
+
+    async with anyio.create_task_group() as tasks:
+        for tool, given in ASKED:
+            if tool != TRIALS:
+                tasks.start_soon(send, tool, given)
+    return said
 
 
 async def paused_in_webots(
@@ -306,16 +323,8 @@ async def test_whatever_blocks_the_loop_each_command_is_withdrawn_and_none_runs_
     if how == "stopped by a signal":
         os.kill(pid, signal.SIGSTOP)
     reasons = {"stopped by a signal": f"(process {pid}) is stopped"}
-    said: dict[str, str] = {}
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
-
-        async def send(tool: str, given: dict[str, Any]) -> None:
-            said[f"{tool} {given}"] = text_of(await client.call_tool(tool, given))
-
-        async with anyio.create_task_group() as tasks:
-            for tool, given in ASKED:
-                if tool != "webots_run_trials":  # which refuses others meanwhile
-                    tasks.start_soon(send, tool, given)
+        said = await ask_all(client)
     for asked, text in said.items():
         assert reasons.get(how, "in rover.py:") in text, (asked, text)
     sent = "SELECT max(sent) FROM (SELECT count(*) AS sent FROM command GROUP BY action)"

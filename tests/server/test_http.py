@@ -45,7 +45,7 @@ from webots_mcp.cli import main
 http_limits.HEADERS_S, http_limits.BODY_S = {}
 raise SystemExit(main())
 """
-_LOAD = 500  # calls of each of two clients
+_LOAD = 250  # calls of each of two clients
 _AT_ONCE = 10
 
 
@@ -311,7 +311,7 @@ async def test_from_the_network_it_is_reached_by_tls_and_by_an_allowed_name(
 async def test_two_clients_under_load_lose_nothing_and_nobody_else_gets_in(
     serve: Callable[..., Http], driver: Driver
 ) -> None:
-    """Of 1,000 calls some are cancelled and some cut off, while strangers knock.
+    """Of 500 calls some are cancelled and some cut off, while strangers knock.
 
     What was answered belongs to its question; a command ran as often as it is recorded as done;
     none is left open; none is a stranger's.

@@ -28,6 +28,7 @@ from webots_mcp.server.mcp_server import create_server
 pytestmark = pytest.mark.anyio
 
 HANGS = """
+import time
 from controller import Supervisor
 from webots_mcp import MCPBridge
 
@@ -38,8 +39,7 @@ while robot.step(16) != -1:
     bridge.get_command()
     if robot.getTime() > 0.2:
         print("hangs", flush=True)
-        while True:
-            pass
+        time.sleep(600)
 """
 PLAIN = CONTROLLER.replace("Supervisor", "Robot")
 

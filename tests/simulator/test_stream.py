@@ -126,7 +126,7 @@ def test_another_program_at_the_port_is_no_webots() -> None:
 
         thread = threading.Thread(target=answer)
         thread.start()
-        with pytest.raises(CommandRefusedError, match="is no Webots"):
+        with pytest.raises(CommandRefusedError, match="is not Webots"):
             give_order(address, "pause", 5)
         thread.join()
 
@@ -140,7 +140,7 @@ def test_who_hangs_up_in_the_handshake_is_no_webots() -> None:
 
         thread = threading.Thread(target=hang_up)
         thread.start()
-        with pytest.raises(CommandRefusedError, match="is no Webots"):
+        with pytest.raises(CommandRefusedError, match="is not Webots"):
             give_order(WebotsAddress("127.0.0.1", door.getsockname()[1]), "pause", 5)
         thread.join()
 

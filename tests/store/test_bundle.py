@@ -49,7 +49,7 @@ class Folder:
             write_bundle(connection, self.database, self.path, run_id, file)
         return file
 
-    def take_in(self, bundle: Path) -> list[int]:
+    def ingest(self, bundle: Path) -> list[int]:
         with unpacked(bundle) as source, self.opened() as connection:
             settled(source)
             return list(merge(connection, self.path, source).values())
@@ -108,7 +108,7 @@ def here(tmp_path: Path) -> Folder:
 
 
 def test_a_run_comes_into_an_empty_recording_as_what_it_was(there: Folder, here: Folder) -> None:
-    assert here.take_in(there.bundled(2)) == [1]
+    assert here.ingest(there.bundled(2)) == [1]
     before, after = there.everything(2), here.everything(1)
     assert after == before
     assert [len(before[name]) for name in ("state", "command", "trial")] == [6, 1, 1]
@@ -132,7 +132,7 @@ def test_what_a_bridge_recorded_comes_with_kept_stretches_and_frames(
             bridge.publish({"n": number, "odd": float("nan")})
         bridge.log("a line")
         bridge.keep("a look")
-    assert here.take_in(there.bundled(1)) == [1]
+    assert here.ingest(there.bundled(1)) == [1]
     before = there.everything(1)
     assert here.everything(1) == before
     assert all(before[name] for name in ("kept_stretch", "kept_state", "image", "log", "event"))
@@ -142,9 +142,9 @@ def test_a_run_that_is_there_is_not_doubled(there: Folder, here: Folder) -> None
     bundle = there.bundled(1)
     with here.opened() as connection:
         Recorded(connection, here.path).add_run(3)
-        assert here.take_in(bundle) == [2]
+        assert here.ingest(bundle) == [2]
         once = counts(connection)
-        assert here.take_in(bundle) == [2]
+        assert here.ingest(bundle) == [2]
         assert counts(connection) == once
 
 
@@ -156,7 +156,7 @@ def test_runs_of_one_session_come_one_by_one(there: Folder, here: Folder) -> Non
         connection.execute("UPDATE command SET session_id = 1")
     bundles = [there.bundled(run_id) for run_id in (1, 2)]
     for bundle in (bundles[1], bundles[0], bundles[1]):
-        here.take_in(bundle)
+        here.ingest(bundle)
     with there.opened() as before, here.opened() as after:
         runs = "SELECT uuid FROM run ORDER BY uuid"
         assert after.execute(runs).fetchall() == before.execute(runs).fetchall()
@@ -166,9 +166,9 @@ def test_runs_of_one_session_come_one_by_one(there: Folder, here: Folder) -> Non
 
 
 def test_a_bundle_of_a_bundle_is_the_same(there: Folder, here: Folder, tmp_path: Path) -> None:
-    here.take_in(there.bundled(1))
+    here.ingest(there.bundled(1))
     last = Folder(tmp_path / "last")
-    last.take_in(here.bundled(1))
+    last.ingest(here.bundled(1))
     assert last.everything(1) == there.everything(1)
     with here.opened() as one, last.opened() as other:
         paths = "SELECT path FROM image"
@@ -180,7 +180,7 @@ def test_of_a_session_that_goes_on_a_run_that_is_over_can_be_sent(
 ) -> None:
     with there.opened() as connection:
         connection.execute("UPDATE session SET ended_wall_time_s = NULL")
-    here.take_in(there.bundled(1))
+    here.ingest(there.bundled(1))
     with here.opened() as connection:
         query = (
             "SELECT s.end_reason, s.ended_wall_time_s = r.ended_wall_time_s FROM session s, run r"
@@ -262,7 +262,7 @@ def test_what_is_no_part_of_a_bundle_is_not_unpacked(
 ) -> None:
     monkeypatch.setattr("webots_mcp.store.merging._HARMLESS_BYTES", 1_000_000)
     with pytest.raises(InvalidInputError, match=said):
-        here.take_in(changed(there.bundled(1), change))
+        here.ingest(changed(there.bundled(1), change))
     assert not here.database.exists()
     assert not list(here.path.parent.rglob("evil*"))
 
@@ -272,7 +272,7 @@ def test_an_archive_without_a_database_is_no_bundle(tmp_path: Path, here: Folder
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("camera/a.png", "x")
     with pytest.raises(InvalidInputError, match=r"holds no webots\.db"):
-        here.take_in(file)
+        here.ingest(file)
 
 
 @pytest.mark.parametrize("where", [-30, 200, 20_000])
@@ -284,10 +284,10 @@ def test_a_damaged_bundle_is_told_as_such(there: Folder, here: Folder, where: in
     bundle.write_bytes(data)
     assert is_bundle(bundle)
     with pytest.raises(InvalidInputError, match="damaged"):
-        here.take_in(bundle)
+        here.ingest(bundle)
     bundle.write_bytes(data[: len(data) // 2])
     with pytest.raises(InvalidInputError, match="damaged"):
-        here.take_in(bundle)
+        here.ingest(bundle)
 
 
 @pytest.mark.parametrize(
@@ -316,7 +316,7 @@ def test_a_database_that_is_none_of_ours_is_refused(
                 archive.writestr(name, data)
         (source.parent.parent / "secret.png").unlink()
     with pytest.raises(error, match=said):
-        here.take_in(bundle)
+        here.ingest(bundle)
     with here.opened() as connection:
         assert counts(connection)["run"] == 0
     assert not list(here.path.rglob("*.png"))
@@ -332,7 +332,7 @@ def test_a_database_that_is_none_of_ours_is_refused(
 def test_no_file_that_is_here_is_replaced_whatever_a_foreign_recording_calls_its_pictures(
     there: Folder, here: Folder, uuid: str, path: str, said: str | None
 ) -> None:
-    here.take_in(there.bundled(2))
+    here.ingest(there.bundled(2))
     own = here.path / "camera" / "front.000001.png"
     own.parent.mkdir(exist_ok=True)
     own.write_bytes(b"own")
@@ -346,7 +346,7 @@ def test_no_file_that_is_here_is_replaced_whatever_a_foreign_recording_calls_its
             archive.write(source, DATABASE_NAME)
             archive.writestr("camera/front.000001.png", b"theirs")
     with pytest.raises(InvalidInputError, match=said) if said else nullcontext():
-        here.take_in(bundle)
+        here.ingest(bundle)
     assert here.everything(1) == before
     assert own.read_bytes() == b"own"
 

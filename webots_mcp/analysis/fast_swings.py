@@ -20,6 +20,7 @@ _WINDOW: Final = 64  # rows
 _HOP: Final = 32
 _LOCAL: Final = 14  # rows over which an amplitude is local
 _LEAST_WINDOWS: Final = 3  # that follow each other: filtered noise seldom makes two
+LEAST_FAST_ROWS: Final = _WINDOW + (_LEAST_WINDOWS - 1) * _HOP  # of a fast one that is found
 _DEGREE: Final = 3  # of the polynomial that takes slow motion out of a window
 _CERTAIN: Final = 4.0  # standard errors: an amplitude beyond is none of noise
 _SAME_PHASE_RAD: Final = 1.0  # from one period to the next

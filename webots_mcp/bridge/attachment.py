@@ -1,10 +1,12 @@
-"""What each step of an attached robot does in addition: publish the devices and serve commands.
+"""What the bridge adds to each step of an attached robot: it publishes devices and serves commands.
 
-A round of the controller's loop lies between two steps. The devices' values are published when a
-step ends, so that they are recorded whatever the controller does next. Commands are served when the
-next step begins, as a call of `get_command()` at the end of the loop would: by then the controller
-has computed its reaction to the last step. Where the controller publishes by itself, the bridge
-does not publish a second time: the devices' values become part of the controller's own row.
+One round of the controller's loop runs from the end of a step to the beginning of the next one. At
+the end of a step the devices' values are published, so that they are recorded whatever the
+controller does next. Before the next step commands are served, as if the loop called
+`get_command()` at its end.
+
+If the controller publishes by itself, the bridge does not publish a second time: the devices'
+values become part of the controller's own row.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ class UnseenSteps:
         self._reported = False
 
     def check(self, seen_s: float) -> None:
-        """Warn where simulation time is ahead of what the bridge saw.
+        """Warn if simulation time has advanced beyond the steps that the bridge saw.
 
         Args:
             seen_s: The newest simulation time at which the bridge saw the loop.
@@ -99,7 +101,7 @@ class Attachment:
         self._pause.listen_to_steps(None)
 
     def take_command(self) -> ClaimedCommand | None:
-        """The command that was served last, for a loop that also calls `get_command()`."""
+        """Return the command served last, once: for a loop that also calls `get_command()`."""
         self._handlers.loop_polls = True
         command, self._last_served = self._last_served, None
         if self._clock.sim_time_s > self._clock.stepped_s:
@@ -107,11 +109,11 @@ class Attachment:
         return command
 
     def report_unseen(self) -> None:
-        """Warn once where simulation time advanced by steps that the bridge did not see."""
+        """Warn once if simulation time advanced by steps that the bridge did not see."""
         self._unseen.check(self._clock.stepped_s)
 
     def before(self, step: Step) -> None:
-        """The controller's round is over: publish its state if it did not, and serve commands."""
+        """Before a step: publish the state if the controller did not, and serve commands."""
         if step.finishes or self._pause.in_user_code:
             return
         try:
@@ -121,7 +123,7 @@ class Attachment:
             self._errors.failed(_WHAT, error)
 
     def after(self, step: Step, answer: int) -> None:
-        """A step has ended, or Webots asks the controller to quit."""
+        """After a step: publish the devices' values, or end if Webots asks for it."""
         try:
             if answer == QUIT:
                 self._end_session()
@@ -131,7 +133,7 @@ class Attachment:
             self._errors.failed(_WHAT, error)
 
     def publish_missing(self) -> None:
-        """Publish the devices where the controller published a round ago, but not in this one."""
+        """Publish the devices if the controller published in the last round but not in this one."""
         over = self._simulation.over
         if self._left_to_controller and self._throttle.calls == self._calls and not over:
             self._publish()

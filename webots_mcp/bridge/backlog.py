@@ -1,4 +1,4 @@
-"""Writes that the database could not take yet: in a file next to it, else in memory."""
+"""Holds rows that the database could not take yet: in a file next to it, else in memory."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Row:
 class Backlog:
     """The waiting rows, oldest first: the entries of the file, then the rows in memory.
 
-    A row stays in memory only where the file cannot take it (a full disk, a database in memory), or
-    until the next call where another thread was writing. Any thread may call `put`; all other
-    methods require the connection lock. The order of the statements matters: an interrupt at any
-    place may leave a row here that is already written, which its number shows, but never loses one.
+    A row stays in memory only if the file cannot take it (a full disk, a database in memory), or
+    until the next call if another thread was writing. Any thread may call `put`; all other methods
+    require the connection lock. The order of the statements matters: an interrupt at any place may
+    leave a row here that is written already, which its number shows. It never loses one.
 
     Args:
         file: Where rows survive the process; None for memory alone.
@@ -110,7 +110,7 @@ class Backlog:
             self._remove_oldest()
 
     def next_entries(self) -> list[WaitingEntry]:
-        """The oldest entries, which stay until `forget`; an empty list where nothing waits."""
+        """Return the oldest entries, which stay until `forget`; an empty list if nothing waits."""
         if self._in_file and self._file is not None:
             self._read = self._read or self._file.read(self._offset)
             if self._read:
@@ -126,7 +126,7 @@ class Backlog:
         return entries
 
     def forget(self, number: int) -> None:
-        """The database has the entries up to that number."""
+        """Remove the entries up to that number, which the database now has."""
         done = [item for item in self._read if item[1].number <= number]
         if done:
             self._offset = done[-1][0]
@@ -160,7 +160,7 @@ class Backlog:
         return str(file.path) if self._in_file else None
 
     def abandon(self) -> None:
-        """In a forked child: forget the waiting rows, which belong to the parent."""
+        """Forget the waiting rows in a forked child: they belong to the parent."""
         if self._file is not None:
             self._file.close(remove=False)
             self._file = None
@@ -185,7 +185,7 @@ class Backlog:
         self._in_file = 0
 
     def _entries(self, row: Row, described: set[str]) -> list[WaitingEntry]:
-        """The row's entry, after that of its run if it is not among those described."""
+        """Return the row's entry; before it that of its run, unless that is described already."""
         if row.number is None:
             self._last_number += 2  # two numbers: the run's own entry precedes that of the row
             row.number = self._last_number
@@ -197,6 +197,6 @@ class Backlog:
 
 
 def _weight(row: Row) -> int:
-    """The approximate memory of a waiting row, in bytes: its texts and a constant."""
+    """Return the approximate memory of a waiting row, in bytes: its texts and a constant."""
     values = row.values if isinstance(row.values, tuple) else row.values.values()
     return 200 + sum(len(value) for value in values if isinstance(value, str))

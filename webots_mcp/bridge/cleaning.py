@@ -27,7 +27,6 @@ depth.
 
 from __future__ import annotations
 
-import base64
 import enum
 import math
 import time
@@ -166,6 +165,8 @@ class Cleaner:
     def _encode_bytes(self, value: memoryview, path: _Path) -> str:
         if value.nbytes > MAX_BLOB_BYTES:
             raise TooLargeError
+        import base64  # only here: few states hold bytes
+
         text = base64.b64encode(value.tobytes()).decode("ascii")
         if len(text) > self._texts_bytes_left:
             raise TooLargeError

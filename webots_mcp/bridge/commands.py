@@ -1,6 +1,6 @@
-"""Commands of this robot, its own actions, and its callbacks of reloads.
+"""Claims and answers the commands of this robot; holds its custom actions and reload callbacks.
 
-The SQL statements and their guarantees are in `webots_mcp.database.queue`.
+The SQL statements and their guarantees are in `webots_mcp.database.queue_statements`.
 """
 
 from __future__ import annotations
@@ -17,25 +17,22 @@ from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
-from webots_mcp.database.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
+from webots_mcp.database.queue_statements import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.signals.naming import harmless_first
 
 Progress = Generator[None, None, object]
 """A running built-in action: it yields until its outcome is known, and returns the result."""
 
-_MOST_NAMED: Final = 10
-
 _INTERRUPTED: Final = "the controller was interrupted before the command began; it was not run"
 _MOST_NAME_CHARACTERS: Final = 100
-_MOST_DOC_CHARACTERS: Final = 4000
 
 
 def whole_number(params: dict[str, Any], name: str, least: int, most: int, *, default: int) -> int:
-    """A parameter of a command; missing or null it is the default.
+    """Return a parameter of a command, or the default if it is missing or null.
 
     Raises:
-        InvalidInputError: It is no whole number from `least` to `most`.
+        InvalidInputError: If it is not a whole number from `least` to `most`.
     """
     value = default if params.get(name) is None else params[name]
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
@@ -65,7 +62,7 @@ class ClaimedCommand:
         self.requested_by = requested_by
 
     def as_dict(self) -> dict[str, Any]:
-        """What handlers receive; the parameters are keys too, except `id`, `action`, `params`."""
+        """Return the dict that handlers receive; the parameters are keys of it too."""
         return {**self.params, "id": self.id, "action": self.action, "params": self.params}
 
 
@@ -82,9 +79,10 @@ class ClaimedCommands:
         self._claiming = False
 
     def claim(self, sim_time_s: float) -> ClaimedCommand | None:
-        """Claim the oldest pending command of this robot; None, without a lock, where none is.
+        """Claim the oldest pending command of this robot; None, without a lock, if none is pending.
 
-        Call `begin` with it. Where an interrupt prevents that, the next call writes it as failed.
+        The caller passes the command to `begin`. If an interrupt prevents that, the next call of
+        `claim` writes the command as failed.
         """
         recorder, now = self._recorder, time.time()
         registration = recorder.registration
@@ -96,7 +94,7 @@ class ClaimedCommands:
         times = {"now": now, "sim_time": sim_time_s}
         self._claiming = True
         rows = recorder.fetch(CLAIM, {**ids, **times})
-        if rows is None:  # the next call asks whether it was claimed
+        if rows is None:  # not known: the next call checks whether it was claimed
             return None
         command = self._read(rows[0], registration.session_id, sim_time_s) if rows else None
         if command is None:
@@ -105,7 +103,7 @@ class ClaimedCommands:
         return command
 
     def begin(self, command: ClaimedCommand) -> None:
-        """The caller runs it from here on, and writes its outcome whatever happens."""
+        """Note that the caller runs the command now and will write its outcome in any case."""
         self._last_begun = command.id
         self._claiming = False
 
@@ -159,7 +157,7 @@ class ClaimedCommands:
             time.sleep(0.002)
 
     def succeed(self, command: ClaimedCommand, result: object, sim_time_s: float) -> str | None:
-        """Write `done` with the result; returns (and writes) what had to be replaced in it."""
+        """Write `done` with the result; return (and write) what had to be replaced in it."""
         encoded = encode(result)
         replaced = _name_replaced(encoded.replaced)
         self._finish(command, "done", encoded.text, replaced, sim_time_s)
@@ -188,10 +186,10 @@ class ClaimedCommands:
 
 
 def _name_replaced(replaced: Mapping[str, str]) -> str | None:
-    """The parts of a result that JSON cannot hold, by path and kind."""
+    """Name the values of a result that JSON cannot hold, by path and kind."""
     if not replaced:
         return None
-    first = list(replaced.items())[:_MOST_NAMED]
+    first = list(replaced.items())[:10]
     named = [f"{path or 'all of it'} ({kind})" for path, kind in first]
     more = f" and {len(replaced) - len(first)} more" if len(replaced) > len(first) else ""
     return f"values of the result that JSON cannot hold were replaced: {', '.join(named)}{more}"
@@ -207,8 +205,8 @@ class Handlers:
     """The registered functions by the name of their action.
 
     Attributes:
-        running: A function is being called: the present call comes from within it.
-        loop_polls: The loop itself calls `get_command()`, and may handle the command it returns.
+        running: Whether a function is being called now.
+        loop_polls: Whether the loop itself calls `get_command()`, and may handle what it returns.
     """
 
     def __init__(self, recorder: Recorder, journal: Journal, pause: Pause) -> None:
@@ -221,14 +219,14 @@ class Handlers:
         self.loop_polls = True
 
     def register(self, action: str, handler: Handler) -> None:
-        """Register a custom action, here and in the session's row.
+        """Register a custom action, in this process and in the session's row.
 
         A built-in action cannot be replaced, except for `reset_state`, which calls functions of the
         controller anyway.
 
         Raises:
-            ValueError: The name is empty, too long, or not printable.
-            TypeError: The name is not a text, or the handler is not a plain function.
+            ValueError: If the name is empty, too long, or not printable.
+            TypeError: If the name is not a text, or the handler is not a plain function.
         """
         _require_name(action)
         built_in = BUILT_IN_ACTIONS.get(action)
@@ -245,18 +243,19 @@ class Handlers:
             why = "this function is called instead of the callbacks of on_reload()"
             self._journal.log("info", "bridge", f"the controller has registered {action!r}: {why}")
         self._handlers[action] = handler
-        self._recorder.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
+        self._recorder.actions[action] = storable(cut(doc, 4_000))
         self._recorder.update_actions()
 
     def knows(self, action: str) -> bool:
-        """Whether the controller has registered a function for the action."""
+        """Return whether the controller has registered a function for the action."""
         return action in self._handlers
 
     def run(self, command: ClaimedCommand) -> object:
-        """Call the function of the command's action; whatever it raises is passed on.
+        """Call the function of the command's action.
 
         Raises:
-            CommandRefusedError: There is no function for this action.
+            CommandRefusedError: If no function is registered for this action.
+            Exception: Whatever the function raises.
         """
         handler = self._handlers.get(command.action)
         if handler is None:
@@ -276,7 +275,7 @@ class Handlers:
         self._recorder.errors.failed(f"register_command({action!r})", ValueError(why))
 
     def _unknown(self, action: str) -> str:
-        """The error of a command whose action is neither built in nor registered."""
+        """Return the error of a command whose action is neither built in nor registered."""
         known = harmless_first(action, (*self._handlers, *BUILT_IN_ACTIONS))
         text = f"no action {action!r}; this robot has {', '.join(known)}"
         if self._handlers:
@@ -337,11 +336,11 @@ class Reloads:
         self._callbacks.append(callback)
 
     def happened(self) -> None:
-        """The world was reloaded or reset."""
+        """Note that the world was reloaded or reset."""
         self._undetected = self._unfired = True
 
     def detect(self) -> bool:
-        """Whether a reload or reset happened since the last call."""
+        """Return whether a reload or reset happened since the last call."""
         detected, self._undetected = self._undetected, False
         return detected
 

@@ -1,9 +1,8 @@
 """Serves the command queue: claims commands, runs their actions, and writes the outcomes.
 
-Each built-in action (`contract.BUILT_IN_ACTIONS`) is a function that returns a generator. The
-generator yields until its outcome is known (once per round of the user's loop, or of the pause),
-returns the command's result, or raises the command's error. A command that is refused before its
-generator exists does not interrupt another one.
+Each built-in action (`contract.BUILT_IN_ACTIONS`) is a function that returns a generator. In each
+round of the controller's loop, or of a pause, the generator is advanced once. It yields while the
+command is running. In the end it returns the command's result or raises the command's error.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S, Pause
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import BUILT_IN_ACTIONS, ENDING, LOOPING
-from webots_mcp.database.liveness import EXTERN
+from webots_mcp.database.dead_sessions import EXTERN
 from webots_mcp.errors import (
     CommandRefusedError,
     ControllerEndedError,
@@ -38,14 +37,14 @@ POLL_INTERVAL_S: Final = 0.005
 
 
 class Control:
-    """Claims commands, runs them, and keeps the loop while the simulation is paused.
+    """Claims commands, runs them, and keeps serving while the simulation is paused.
 
     Args:
         actions: The built-in actions, by name.
 
     Attributes:
-        handlers: The controller's own actions.
-        why_ended: The error of commands that are still running when the process ends.
+        handlers: The functions that the controller registered for its own actions.
+        why_ended: The error written to commands that still run when the process ends.
     """
 
     def __init__(
@@ -76,7 +75,11 @@ class Control:
         pause.serve = self._serve_pause
 
     def report_end(self, *, extern: bool) -> None:
-        """The process is about to end: answer the commands that no successor will answer."""
+        """Before the process ends, answer the commands that no later session will answer.
+
+        Args:
+            extern: Whether Webots does not start this controller, and so not its successor.
+        """
         for running in [c for c in self._running if c.action in (*LOOPING, *ENDING)]:
             self._end(running, ControllerEndedError(self.why_ended))
         command = self._reloads.requested_by
@@ -86,7 +89,7 @@ class Control:
             self._succeed(command, {"controller": f"it has ended; {EXTERN}"})
 
     def serve(self) -> ClaimedCommand | None:
-        """One round: advance running actions, begin one new command, and stay in a pause.
+        """Advance the running actions, begin one new command, and stay as long as a pause lasts.
 
         Returns:
             The command that was handled last in this call, if any.
@@ -98,7 +101,7 @@ class Control:
         self._advance_all()
         if due:
             handled = self._serve_one()
-            # Commands often come in groups: after one, the next round looks for another.
+            # Commands often come in groups: after one, the next round polls at once.
             self._next_poll_s = now + POLL_INTERVAL_S if handled is None else now
         return self._serve_pause() or handled
 
@@ -142,8 +145,8 @@ class Control:
         """Return the generator of a built-in action.
 
         Raises:
-            CommandRefusedError: It needs a Supervisor and this robot is not one.
-            InvalidInputError: A parameter is unknown or missing.
+            CommandRefusedError: If it needs a Supervisor and this robot is not one.
+            InvalidInputError: If a parameter is unknown or missing.
         """
         action = BUILT_IN_ACTIONS[command.action]
         if action.needs_supervisor:
@@ -163,7 +166,10 @@ class Control:
                 self._advance(command)
 
     def _abandon(self, command: ClaimedCommand) -> None:
-        """Drop an action after Webots said quit; a reload is left for the successor to confirm."""
+        """End an action after Webots has ended the controller.
+
+        A `reload` stays claimed: the next session confirms it.
+        """
         if command.action == "reload":
             del self._running[command]
         else:
@@ -172,8 +178,8 @@ class Control:
     def _advance(self, command: ClaimedCommand) -> None:
         """Advance a built-in action by one round.
 
-        It is taken out meanwhile: a callback of the user may call `get_command()` and so come back
-        to here, and a generator cannot be entered twice.
+        It is not among the running actions meanwhile: a callback of the user may call
+        `get_command()`, which advances those, and a generator cannot be entered twice.
         """
         progress = self._running.pop(command, None)
         if progress is None:
@@ -189,12 +195,12 @@ class Control:
                 raise
 
     def _interrupt(self, why: str) -> None:
-        """Another command controls the loop from now on: end the ones that let it run."""
+        """End the commands that let the loop run, since another command controls it now."""
         for command in [c for c in self._running if c.action in LOOPING]:
             self._end(command, InterruptedCommandError(why))
 
     def _end(self, command: ClaimedCommand, interruption: InterruptedCommandError) -> None:
-        """End a running built-in action, which may answer how far it got."""
+        """Interrupt a running action, which may answer with what it has done so far."""
         progress = self._running.pop(command)
         try:
             progress.throw(interruption)

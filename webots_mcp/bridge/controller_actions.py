@@ -11,7 +11,7 @@ from typing import cast
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress, Reloads
 from webots_mcp.bridge.error_report import describe
-from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.parameters import Parameters, setter_of
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.simulation import Clock
@@ -28,14 +28,14 @@ class ControllerActions:
         reloads: Reloads,
         parameters: Parameters,
         breakpoints: Breakpoints,
-        keeper: Keeper,
+        full_rate: FullRateRecorder,
     ) -> None:
         self._clock = clock
         self._pause = pause
         self._reloads = reloads
         self._parameters = parameters
         self._breakpoints = breakpoints
-        self._keeper = keeper
+        self._full_rate = full_rate
 
     def by_name(self) -> dict[str, Action]:
         """Return the functions by the name of their action."""
@@ -96,7 +96,7 @@ class ControllerActions:
         reason, sim_time_s = command.params.get("reason"), self._clock.sim_time_s
         if not isinstance(reason, str) or not reason.strip():
             raise InvalidInputError(f"reason must be a text that is not empty, not {reason!r:.80}")
-        if not self._keeper.keep(reason):
-            raise CommandRefusedError(self._keeper.why_not)
+        if not self._full_rate.keep(reason):
+            raise CommandRefusedError(self._full_rate.why_not)
         return {"run_id": self._clock.run.id, "kept_around_s": sim_time_s}
         yield

@@ -1,4 +1,4 @@
-"""Recordings of robots without a bridge, made by an observer from their field `customData`.
+"""Records robots without a bridge: an observer reads their field `customData`.
 
 A controller in any language publishes with one call (`wb_robot_set_custom_data` in C). The field
 holds one text, which supervisors see a step later. A JSON object gives the signals of a state, any
@@ -17,6 +17,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final, NamedTuple, Protocol, cast
 
@@ -28,19 +29,37 @@ from webots_mcp.bridge.registration import Identity, same_simulation
 from webots_mcp.bridge.scene_nodes import SceneNode, find_field
 from webots_mcp.bridge.simulation import Clock, LoopMeter, Simulation
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
-from webots_mcp.database.liveness import is_living
+from webots_mcp.database.processes import is_living
 from webots_mcp.signals.register import SignalNames, StateChanges
 
 TEXT: Final = "custom_data"  # the signal of a text that is no JSON object
 MISSED: Final = "seq_missed"  # how many messages of this run were overwritten before a reading
 SEEN: Final = "seen"  # the branch of the pose where a robot publishes one of its keys itself
 LONGEST_TEXT: Final = 65_536  # characters that are taken for JSON, and sent with each step
-_LONGEST_SIGNAL: Final = 1_000  # characters of a text that is not JSON
-_READ_LONG_AGAIN_S: Final = 1.0  # of wall time
-_MOST_FOUND: Final = 10  # new robots whose fields are searched in one round
-_STALE_S: Final = 1.0  # of simulation time in which a text from before a reset is not believed
-_EPSILON_S: Final = 1e-9
-_DELAY_STEPS: Final = 2  # after a reset in which a text that is new may be from before it
+
+
+@dataclass(frozen=True)
+class CustomDataLimits:
+    """How `customData` is read.
+
+    Attributes:
+        signal_characters: Characters of a text that is not JSON, as a signal.
+        long_text_s: Wall time between two readings of a long text.
+        new_robots: New robots whose fields are searched in one round.
+        stale_s: Simulation time after a reset in which the text from before it is not recorded.
+        delay_steps: Steps after a reset in which a new text may be from before it.
+        epsilon_s: Tolerance for rounding in summed steps.
+    """
+
+    signal_characters: int = 1_000
+    long_text_s: float = 1.0
+    new_robots: int = 10
+    stale_s: float = 1.0
+    delay_steps: int = 2
+    epsilon_s: float = 1e-9
+
+
+_LIMITS: Final = CustomDataLimits()
 # Strings, which stay as they are, and what C prints of numbers that JSON lacks.
 _C_NUMBERS: Final = re.compile(
     r'"(?:\\.|[^"\\])*"?|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
@@ -76,7 +95,7 @@ def signals_of(text: str) -> dict[str, Any]:
 
     `nan` and `inf`, as C prints them, are read like JSON's NaN and Infinity.
     """
-    value: Any = cut(text, _LONGEST_SIGNAL)
+    value: Any = cut(text, _LIMITS.signal_characters)
     if len(text) <= LONGEST_TEXT:
         for read in (str, _with_json_numbers):
             with suppress(ValueError, RecursionError):
@@ -132,7 +151,7 @@ class CustomDataReader:
         robots = {id(body): body for body in bodies}
         for key in self._robots.keys() - robots.keys():
             self._robots.pop(key).end("finished")
-        for key in list(robots.keys() - self._robots.keys())[:_MOST_FOUND]:
+        for key in list(robots.keys() - self._robots.keys())[: _LIMITS.new_robots]:
             self._robots[key] = _Robot(robots[key], self._observer)
         waiting = [robot for robot in self._robots.values() if self._read(robot, now_s, is_due)]
         if waiting:  # one in a round, since it takes milliseconds
@@ -252,7 +271,7 @@ class _Robot:
             self._field.enableSFTracking(self._step_ms)
 
     def _read_text(self, now_s: float) -> str:
-        """Return the text of the field; a long one is read once a second, not sent with steps."""
+        """Read the text of the field; a long one is read once a second, not sent with steps."""
         if self._read_again_s is not None and now_s < self._read_again_s:
             return self._text
         try:
@@ -264,7 +283,7 @@ class _Robot:
             self._field.disableSFTracking()
         elif not is_long and self._read_again_s is not None:
             self._field.enableSFTracking(self._step_ms)
-        self._read_again_s = now_s + _READ_LONG_AGAIN_S if is_long else None
+        self._read_again_s = now_s + _LIMITS.long_text_s if is_long else None
         return "" if _OF_CAR.match(text) else text
 
 
@@ -293,7 +312,7 @@ class _Recording:
         self._names, self._changes = SignalNames(), StateChanges()
         self._values: Mapping[str, Any] = {}
         self._stale_until_s = -1.0
-        self._delay_s = _DELAY_STEPS * observer.simulation.basic_time_step_s
+        self._delay_s = _LIMITS.delay_steps * observer.simulation.basic_time_step_s
         self._sequence = _Sequence()
         registration = self.recorder.registration
         if registration is not None and registration.reloaded:
@@ -325,7 +344,7 @@ class _Recording:
     def _may_be_of_former_run(self) -> bool:
         """Whether a new text may have been sent before the world was reset."""
         was_reset = self._stale_until_s >= 0.0
-        return was_reset and self._clock.sim_time_s < self._delay_s + _EPSILON_S
+        return was_reset and self._clock.sim_time_s < self._delay_s + _LIMITS.epsilon_s
 
     def _begin_run(self) -> None:
         """Begin a run after a reset; the field still holds the text from before it."""
@@ -334,7 +353,7 @@ class _Recording:
         self.recorder.run = self._clock.run
         self._sequence = _Sequence()
         self._changes.forget()
-        self._stale_until_s = self._clock.sim_time_s + _STALE_S
+        self._stale_until_s = self._clock.sim_time_s + _LIMITS.stale_s
         self._journal.event("reset")
 
     def _record(self) -> None:

@@ -1,7 +1,7 @@
-"""What the devices of a robot say of the signals that `auto_publish` makes of them.
+"""Describes the signals that `auto_publish` makes of devices: quantity, unit and limits.
 
-Devices are asked once, at the first reading. Where a method fails or is missing in a release of
-Webots, its part of the description is left out. For a supervisor, the scene shows which motors turn
+The devices are queried once, at the first reading. If a method fails or is missing in a release of
+Webots, its part of the description is omitted. For a supervisor, the scene shows which motors turn
 a propeller and which a wheel.
 """
 
@@ -16,13 +16,13 @@ from webots_mcp.signals.meaning import LONGEST_NAME, DeclaredMeaning, Quantity
 
 _MOST_MOTORS: Final = 64  # that are looked up in the scene: each takes about ten requests
 _AXLE: Final = 0.9  # of an axle's direction lies across the robot
-_ALIKE: Final = 0.25  # share of its distance from the middle by which a wheel's partner may differ
+_PARTNER: Final = 0.25  # by this share of its distance from the middle a wheel's partner may differ
 _MOST_LEVELS: Final = 4  # of nodes within a bounding object
 _ROUND: Final = ("Cylinder", "Sphere", "Capsule")
 _WGS84: Final = 1  # GPS.WGS84: degrees, not metres
 
 Described = tuple[DeclaredMeaning, str]
-"""What is said of a signal, and the device that says it."""
+"""The meaning of a signal, and the device that it comes from, in words."""
 
 
 class _Limits(NamedTuple):
@@ -31,11 +31,11 @@ class _Limits(NamedTuple):
 
 
 def describe_devices(robot: Any, *, is_supervisor: bool) -> list[Described]:
-    """Return what the devices say of each signal, in the order of the devices.
+    """Return the meaning of each signal of the devices, in the order of the devices.
 
     Args:
         robot: A Webots `Robot`.
-        is_supervisor: Whether it may look into the scene.
+        is_supervisor: Whether it may read the scene.
     """
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
     motors = {name: each for name, each in devices.items() if type(each).__name__ == "Motor"}
@@ -63,7 +63,7 @@ def describe_devices(robot: Any, *, is_supervisor: bool) -> list[Described]:
 
 
 def _ask(device: Any, method: str, *arguments: Any) -> Any:
-    """What a device answers; None where it has no such method, or the method fails."""
+    """Return what a device answers; None if it has no such method, or the method fails."""
     try:
         return getattr(device, method)(*arguments)
     except Exception:  # noqa: BLE001  (what is not known changes nothing)
@@ -77,7 +77,7 @@ def _number(value: object) -> float | None:
 
 
 def _why(device: Any, moved_by_motor: _MovedBody | None) -> str:
-    """The device in words: its type, model and sampling period, and what its motor turns."""
+    """Describe the device in words: type, model, sampling period, and what its motor turns."""
     model, period_ms = _ask(device, "getModel"), _ask(device, "getSamplingPeriod")
     words = [f"Webots device {type(device).__name__}"]
     if moved_by_motor is not None:
@@ -101,7 +101,7 @@ def _measured(name: str, quantity: Quantity, unit: str | None = None, **more: An
 
 
 def _table_of(device: Any) -> list[tuple[float, float]]:
-    """The rows of a lookup table: what is measured, and the value that the sensor gives."""
+    """Return the rows of a lookup table: what is measured, and the value that the sensor gives."""
     table = _ask(device, "getLookupTable")
     if not isinstance(table, (list, tuple)):
         return []
@@ -118,7 +118,7 @@ def _range_of(device: Any) -> _Limits:
 
 
 def _of_distance_sensor(name: str, device: Any) -> Iterator[DeclaredMeaning]:
-    """A distance; in metres where the lookup table does not convert them."""
+    """Yield a distance; it is in metres if the lookup table does not convert it."""
     table = _table_of(device)
     unit = "m" if table and all(measured == given for measured, given in table) else None
     limits = _Limits(*(_number(_ask(device, each)) for each in ("getMinValue", "getMaxValue")))
@@ -145,7 +145,7 @@ def _of_one_number(quantity: Quantity, unit: str | None) -> Any:
 
 
 def _of_gps(name: str, device: Any) -> Iterator[DeclaredMeaning]:
-    """Where it is; latitude and longitude are no position in metres."""
+    """Yield the coordinates, unless they are latitude and longitude, which are not in metres."""
     if _ask(device, "getCoordinateSystem") in (None, _WGS84):
         return
     quantities: tuple[Quantity, ...] = ("x", "y", "height")
@@ -228,7 +228,7 @@ def _is_linear(motor: Any) -> bool:
 
 
 def _limits_of(motor: Any) -> _Limits:
-    """The limits of a joint's position; equal ones mean that there are none."""
+    """Return the limits of a joint's position; equal limits mean that it has none."""
     low, high = (_number(_ask(motor, each)) for each in ("getMinPosition", "getMaxPosition"))
     has_limits = low is not None and high is not None and low < high
     return _Limits(low, high) if has_limits else _Limits()
@@ -279,8 +279,8 @@ class _Wheel(NamedTuple):
     z: float
 
     def is_partner_of(self, other: _Wheel) -> bool:
-        """Whether it lies at the same place on the other side."""
-        reach = _ALIKE * max(abs(self.y), abs(other.y))
+        """Return whether it lies at the same place on the other side."""
+        reach = _PARTNER * max(abs(self.y), abs(other.y))
         return (
             self.y * other.y < 0
             and abs(abs(self.y) - abs(other.y)) <= reach
@@ -290,7 +290,7 @@ class _Wheel(NamedTuple):
 
 
 def _moved_by(robot: Any, motors: dict[str, Any]) -> dict[str, _MovedBody]:
-    """What those motors turn of which the scene shows it: propellers, and pairs of wheels."""
+    """Return what motors turn, as far as the scene shows it: propellers and pairs of wheels."""
     own = _ask(robot, "getSelf")
     moved_by_motor: dict[str, _MovedBody] = {}
     wheels: dict[str, _Wheel] = {}
@@ -316,10 +316,13 @@ def _moved_by(robot: Any, motors: dict[str, Any]) -> dict[str, _MovedBody]:
 
 
 def _wheel_on(own: Any, joint: Any) -> _Wheel | None:
-    """The wheel that a hinge joint turns; None where its end is not round, or its axle not across.
+    """Return the wheel that a hinge joint turns.
+
+    Returns:
+        None if the joint's end is not round, or its axle does not lie across the robot.
 
     Raises:
-        Exception: Something cannot be read.
+        Exception: If something cannot be read.
     """
     end = joint.getField("endPoint").getSFNode()
     parameters = joint.getField("jointParameters").getSFNode()
@@ -337,7 +340,7 @@ def _wheel_on(own: Any, joint: Any) -> _Wheel | None:
 
 
 def _is_round(node: Any) -> bool:
-    """Whether a bounding object is a cylinder, a sphere or a capsule."""
+    """Return whether a bounding object is a cylinder, a sphere or a capsule."""
     for _ in range(_MOST_LEVELS):
         kind = node.getTypeName()
         if kind in _ROUND:
@@ -350,10 +353,10 @@ def _is_round(node: Any) -> bool:
 
 
 def _turned(matrix: Sequence[float], vector: Sequence[float]) -> list[float]:
-    """A vector moved_by_motor by a rotation matrix, which is given by rows."""
+    """Rotate a vector by a matrix, which is given by rows."""
     return [sum(matrix[3 * row + i] * vector[i] for i in range(3)) for row in range(3)]
 
 
 def _inverse(matrix: Sequence[float], vector: Sequence[float]) -> list[float]:
-    """A vector moved_by_motor back."""
+    """Rotate a vector by the inverse of a rotation matrix."""
     return [sum(matrix[3 * i + row] * vector[i] for i in range(3)) for row in range(3)]

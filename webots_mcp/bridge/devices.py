@@ -1,8 +1,8 @@
-"""Reading the values of a robot's enabled devices, for `auto_publish`.
+"""Reads the values of a robot's enabled devices, for `auto_publish`.
 
-Nothing is enabled, changed or consumed here: a sensor's sampling period and a receiver's packets
-belong to the user's code. A disabled sensor is not read, since Webots prints an error line at every
-such reading.
+Reading enables, changes and consumes nothing: a sensor's sampling period and a receiver's packets
+belong to the user's code. A disabled sensor is not read, since Webots prints an error line for
+every such reading.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def _sensor(read: Callable[[Any], object]) -> Rule:
 
 
 def _actuator(group: str, read: Callable[[Any], object]) -> Rule:
-    """The rule of an actuator: its command can be read without enabling anything."""
+    """Return the rule of an actuator: its command can be read without enabling anything."""
     return Rule(group, None, read)
 
 
 def read_devices(robot: Any, failed: Failed) -> dict[str, object]:
-    """The values of all enabled sensors, and the commands of the actuators.
+    """Return the values of all enabled sensors, and the commands of the actuators.
 
     Args:
         robot: A Webots `Robot`.
@@ -119,7 +119,7 @@ def _battery(robot: Any) -> dict[str, object]:
 
 
 def _read_motor(motor: Any) -> dict[str, float]:
-    """The commands of a motor in its unit; Webots has one class for rotational and linear ones."""
+    """Return the commands of a motor; Webots has one class for rotational and linear ones."""
     if motor.getType() == motor.LINEAR:
         values = {
             "target_position_m": motor.getTargetPosition(),
@@ -146,7 +146,7 @@ def _read_vacuum_gripper(gripper: Any) -> dict[str, object]:
 
 
 def _presence(device: Any) -> dict[str, object]:
-    """Whether an object is present to grip; the presence sensor is enabled separately."""
+    """Return whether an object is present to grip; the presence sensor is enabled separately."""
     enabled = device.getPresenceSamplingPeriod() > 0
     return {"presence": device.getPresence()} if enabled else {}
 
@@ -156,7 +156,7 @@ def _recognition_period(camera: Any) -> int:
 
 
 def _summarise_recognised(camera: Any) -> dict[str, object]:
-    """The objects that a camera recognises: count and nearest ones, in the camera's axes."""
+    """Return the objects that a camera recognises: count and nearest ones, in the camera's axes."""
     count = camera.getRecognitionNumberOfObjects()
     if not count:
         return _nearest_of(0, [])  # Webots returns a null pointer then, which must not be read
@@ -175,9 +175,9 @@ def _summarise_recognised(camera: Any) -> dict[str, object]:
 
 
 def _colors_of(recognised: Any) -> list[float]:
-    """Red, green and blue of each color of an object; Webots returns a bare pointer to them.
+    """Return red, green and blue of each color of an object.
 
-    It is read at once, since Webots frees the memory at the next step.
+    Webots returns a bare pointer to them, whose memory it frees at the next step.
     """
     count = recognised.getNumberOfColors()
     colors = recognised.getColors() if count else None
@@ -185,7 +185,7 @@ def _colors_of(recognised: Any) -> list[float]:
 
 
 def _summarise_targets(radar: Any) -> dict[str, object]:
-    """The targets of a radar: count and nearest ones."""
+    """Return the targets of a radar: count and nearest ones."""
     count = radar.getNumberOfTargets()
     seen: list[Any] = radar.getTargets()[:_MOST_READ] if count else []
     targets = [
@@ -207,7 +207,7 @@ def _nearest_of(count: int, read: list[dict[str, Any]]) -> dict[str, object]:
 
 
 def _read_touch(device: Any) -> object:
-    """A vector from a force-3d sensor, a number from the others."""
+    """Return a vector from a force-3d sensor, a number from the others."""
     if device.getType() != getattr(device, "FORCE3D", None):
         return device.getValue()
     force = device.getValues()  # in Webots a bare pointer to the three
@@ -215,17 +215,17 @@ def _read_touch(device: Any) -> object:
 
 
 def _summarise_lidar(device: Any) -> dict[str, object] | None:
-    """A lidar's ranges; its image is layer after layer, each from left to right."""
+    """Return a lidar's ranges; its image is layer after layer, each from left to right."""
     return _summarise_ranges(device, device.getHorizontalResolution())
 
 
 def _summarise_range_finder(device: Any) -> dict[str, object] | None:
-    """A range finder's ranges; its image is row after row, each from left to right."""
+    """Return a range finder's ranges; its image is row after row, each from left to right."""
     return _summarise_ranges(device, device.getWidth())
 
 
 def _summarise_ranges(device: Any, columns: int) -> dict[str, object] | None:
-    """The smallest distance, its index, and the minimum of eight sectors; None before data.
+    """Return the smallest distance, its index, and the minimum of eight sectors; None before data.
 
     The raw pointer is tested first: reading a null pointer can crash the interpreter.
     """
@@ -246,7 +246,7 @@ def _summarise_ranges(device: Any, columns: int) -> dict[str, object] | None:
 
 
 def _column_minima(ranges: list[float], columns: int) -> list[float]:
-    """The smallest distance in each direction, over all layers or rows."""
+    """Return the smallest distance in each direction, over all layers or rows."""
     if not 0 < columns < len(ranges):
         return ranges
     rows = [ranges[i : i + columns] for i in range(0, len(ranges), columns)]
@@ -254,7 +254,7 @@ def _column_minima(ranges: list[float], columns: int) -> list[float]:
 
 
 def _sector_minima(directions: list[float]) -> list[float]:
-    """The sectors' minima from left to right; with fewer than eight directions, one each."""
+    """Return the sectors' minima from left to right; with fewer than eight directions, one each."""
     count = min(SECTORS, len(directions))
     bounds = [len(directions) * i // count for i in range(count + 1)]
     return [min(directions[i:j]) for i, j in pairwise(bounds)]
@@ -320,7 +320,7 @@ class DeviceReader:
         self.why = ""
 
     def read(self) -> dict[str, object]:
-        """The devices' values, without those that cannot be read; these are counted as failures."""
+        """Return the devices' values; each device that cannot be read counts as a failure."""
         if self._simulation.over:
             return {}
         started_s = time.perf_counter()
@@ -373,7 +373,7 @@ def _why(interval: int, usual_us: float) -> str:
 
 
 def restart_motors(robot: Any, journal: Journal, failed: Failed) -> None:
-    """After a reset: restart the motors in velocity control, at their last velocity."""
+    """Restart the motors in velocity control after a reset, at their last velocity."""
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
     motors = [each for each in devices.items() if type(each[1]).__name__ == "Motor"]
     restarted = [text for name, motor in motors if (text := _restart(name, motor, failed))]
@@ -384,7 +384,7 @@ def restart_motors(robot: Any, journal: Journal, failed: Failed) -> None:
 
 
 def _restart(name: str, motor: Any, failed: Failed) -> str | None:
-    """Restart a motor; returns its name and velocity, or None where it was not in that mode."""
+    """Restart a motor; return its name and velocity, or None if it was not in velocity control."""
     try:
         target, velocity = motor.getTargetPosition(), motor.getVelocity()
         if not math.isinf(target):

@@ -13,9 +13,7 @@ keys that are not text. Integers beyond 64 bits become the nearest float.
 
 from __future__ import annotations
 
-import io
 import json
-import pickle
 import sys
 from collections import deque
 from collections.abc import Mapping
@@ -75,27 +73,6 @@ def encode(state: object) -> Encoded:
             with suppress(RuntimeError):  # another thread changes the user's dict
                 remember_non_finite(state, encoded.replaced)
         return encoded
-
-
-def copy_or_encode(state: object) -> bytes | Encoded:
-    """Return a copy for `encode_copy`, which makes the text that `encode` would, or that text.
-
-    Copying costs less than encoding. Only dicts of plain values are copied.
-    """
-    if state.__class__ is not dict:
-        return encode(state)
-    file = io.BytesIO()
-    try:
-        require_plain(state)
-        _Copier(file, pickle.HIGHEST_PROTOCOL).dump(state)
-    except Exception:  # noqa: BLE001  (the user's objects may raise anything)
-        return encode(state)
-    return file.getvalue()
-
-
-def encode_copy(copy: bytes) -> Encoded:
-    """Encode a state as it was when it was copied."""
-    return encode(pickle.loads(copy))
 
 
 def plain(value: Any) -> Any:
@@ -180,15 +157,3 @@ _encode_with_json: Final = json.JSONEncoder(
     separators=(",", ":"),
     default=_in_lists,
 ).encode
-
-
-class _Copier(pickle.Pickler):
-    """Copies dicts, lists, tuples, texts, numbers and None, but no subclasses of them.
-
-    The check before does not see subclasses among keys and in long arrays, and copies of those
-    could differ.
-    """
-
-    def reducer_override(self, obj: object) -> Any:
-        """Refuse every other type."""
-        raise NotPlainError

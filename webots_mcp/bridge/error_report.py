@@ -1,4 +1,4 @@
-"""What a bridge reports of its errors, and texts for the database."""
+"""Counts and reports the errors of a bridge, and makes texts of them that a database can hold."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from webots_mcp.errors import DatabaseError, WebotsMCPError, warn
 if TYPE_CHECKING:
     from types import TracebackType
 
-_LONGEST_WARNING = 2000
-_LONGEST_TEXT: Final = 2000  # of what an error says
+_LONGEST_TEXT: Final = 2000  # characters of an error
 
 
 class ErrorReport:
@@ -33,7 +32,7 @@ class ErrorReport:
 
     def warn(self, kind: str, text: str) -> None:
         """Keep an error as the newest one; print the first of its kind; raise in strict mode."""
-        text = text[:_LONGEST_WARNING].encode("utf-8", "replace").decode()
+        text = text[:_LONGEST_TEXT].encode("utf-8", "replace").decode()
         self.last_error = text
         if kind not in self._warned:
             self._warned.add(kind)
@@ -50,21 +49,21 @@ class ErrorReport:
 
 
 def cut(text: str, most_characters: int) -> str:
-    """The text, or its beginning with the original length."""
+    """Return the text, or its beginning with the original length."""
     if len(text) <= most_characters:
         return text
     return f"{text[:most_characters]}... (cut: it had {len(text)} characters)"
 
 
 def storable(text: str) -> str:
-    """A text without surrogates, which UTF-8 lacks, and NULs, at which SQLite's shell ends it."""
+    """Replace what the database cannot show: surrogates, and NULs, where SQLite's shell stops."""
     return text.encode("utf-8", "replace").decode().replace("\0", "\\0")
 
 
 def describe(error: BaseException) -> str:
-    """The text of an error; for one of the user's code also its type, file and line.
+    """Return the text of an error; for one of the user's code also its type, file and line.
 
-    The line is the innermost one in the user's own files: what they can change. Where a library
+    The line is the innermost one in the user's own files, which they can change. If a library
     raised the error, its line follows.
     """
     text = _text_of(error)

@@ -1,4 +1,4 @@
-"""The rows of the current run: states with their signals and changes, logs, events, heartbeats."""
+"""Records the rows of the current run (states, logs, events) and the heartbeat of the session."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S
-from webots_mcp.database.liveness import LoopStatus
+from webots_mcp.database.heartbeat import LoopStatus
 from webots_mcp.database.pauses import PAUSED
 
 MOST_LOG_CHARACTERS: Final = 10_000
@@ -73,7 +73,7 @@ class Journal:
 
 
 class Heartbeat:
-    """Written twice a second, and at once where a command pauses the loop or lets it run.
+    """The sign of life: written twice a second, and at once when a command changes the loop.
 
     Attributes:
         loop: How a command controls the loop now: `PAUSED`, `STEPPING`, or None.
@@ -93,7 +93,7 @@ class Heartbeat:
         return self._last_poll_s is not None
 
     def poll(self) -> None:
-        """The loop asked for commands; beat if that is due."""
+        """Note that the loop asked for commands, and beat if that is due."""
         self._last_poll_s = time.monotonic()
         self.beat_if_due()
 
@@ -103,7 +103,7 @@ class Heartbeat:
             self.beat()
 
     def beat(self) -> None:
-        """Write a heartbeat now: the loop is alive, and when it last saw time advance."""
+        """Write a heartbeat now, with the time at which the loop last saw time advance."""
         self._next_s = time.monotonic() + HEARTBEAT_INTERVAL_S
         meter = self._clock.meter
         meter.leave_bridge()  # a sign of life also from within a long pause
@@ -114,11 +114,13 @@ class Heartbeat:
         )
 
     def change_loop(self, loop: str | None, mode_before: str | None = None) -> None:
-        """Write the new status at once: a reader of the command's answer must not see the old one.
+        """Write how a command controls the loop from now on.
+
+        It is written at once: a reader of the command's answer must not see the old status.
 
         Args:
             loop: The new value of `loop`.
-            mode_before: The simulation mode to return to, where it is paused.
+            mode_before: The simulation mode to return to after a pause.
         """
         self.loop, self._mode_before = loop, mode_before
         if loop != PAUSED:
@@ -127,5 +129,5 @@ class Heartbeat:
 
 
 def _wall_time_s(monotonic_s: float | None) -> float | None:
-    """The wall time of a moment of the monotonic clock, as the wall clock is set now."""
+    """Return the wall time of a moment of the monotonic clock, as the wall clock is set now."""
     return None if monotonic_s is None else time.time() - (time.monotonic() - monotonic_s)

@@ -14,7 +14,7 @@ from webots_mcp.bridge.commands import ClaimedCommand, Handler
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport, describe
 from webots_mcp.bridge.parameters import Parameter, V
-from webots_mcp.bridge.pictures import MOST_FRAMES
+from webots_mcp.bridge.picture_files import MOST_FRAMES
 from webots_mcp.bridge.session import BridgeSession
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.throttle import Throttle
@@ -75,9 +75,9 @@ class MCPBridge:
             a crash or a hit, and cost a throttled call some microseconds, one of `auto_publish` up
             to 100 us on average for reading devices (see `stats().ring_interval`). 0 holds nothing;
             the environment variable `WEBOTS_MCP_KEEP_LAST_S` overrides it.
-        hang_after_s: Where the loop gives no sign of life for so many seconds of wall time, and
-            does not wait for Webots in `step`, the stacks of all threads are recorded. 0 turns it
-            off, as it is for a database in memory; the environment variable
+        hang_after_s: If the loop gives no sign of life for this many seconds of wall time, and does
+            not wait for Webots in `step`, the stacks of all threads are recorded. 0 turns it off;
+            it is also off for a database in memory. The environment variable
             `WEBOTS_MCP_HANG_AFTER_S` overrides it.
         capture_output: Also record what the process prints on stdout and stderr, as log lines of
             the logger `stdout` or `stderr`, up to 500 a second of each. The output still appears
@@ -92,7 +92,7 @@ class MCPBridge:
             0 to 3600.
     """
 
-    _kind: str | None = None  # the robot's kind, where a subclass sets one (the observer's)
+    _kind: str | None = None  # the robot's kind, if a subclass sets one, as the observer does
 
     def __init__(
         self,
@@ -177,7 +177,7 @@ class MCPBridge:
         return bridge
 
     def detach(self) -> None:
-        """Undo `attach`; from now on the loop itself publishes and calls `get_command()`."""
+        """Undo `attach`: from now on the loop itself publishes and calls `get_command()`."""
         if self._attachment is not None:
             self._attachment.end()
             self._attachment = None
@@ -274,7 +274,7 @@ class MCPBridge:
             reason: Why they are kept; it is stored with the stretch.
         """
         try:
-            self._session.keeper.keep(text_of(reason))
+            self._session.full_rate.keep(text_of(reason))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep", error)
 
@@ -296,10 +296,10 @@ class MCPBridge:
                 the camera's sampling period allows. A later call for the same camera changes it.
         """
         try:
-            keeper = self._session.keeper
-            if not keeper.enabled:
-                raise CommandRefusedError(keeper.why_not)
-            keeper.frames.watch(camera, frames_per_s)
+            full_rate = self._session.full_rate
+            if not full_rate.enabled:
+                raise CommandRefusedError(full_rate.why_not)
+            full_rate.frames.watch(camera, frames_per_s)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep_camera", error)
 
@@ -316,7 +316,7 @@ class MCPBridge:
         self._log(message, level, None)
 
     def log_handler(self, level: int | str = 0) -> logging.Handler:
-        """A handler that records what a controller logs with Python's `logging`.
+        """Return a handler that records what a controller logs with Python's `logging`.
 
             logging.getLogger().addHandler(bridge.log_handler())
 
@@ -326,7 +326,7 @@ class MCPBridge:
         Args:
             level: The handler records this level and those above it.
         """
-        from webots_mcp.bridge.capture import LogHandler  # `logging` costs a tenth of a start
+        from webots_mcp.bridge.log_handler import LogHandler  # `logging` is a tenth of a start
 
         return LogHandler(self._log, level)
 
@@ -339,7 +339,7 @@ class MCPBridge:
             text = text_of(message)
             self._session.journal.log(known or "info", "controller", text, logger)
             if known in _KEEPING:
-                self._session.keeper.ask(f"{known}: {text}")
+                self._session.full_rate.ask(f"{known}: {text}")
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
@@ -354,7 +354,7 @@ class MCPBridge:
             The file's path relative to the data folder; None where there is no image yet.
         """
         try:
-            return self._session.album.save_frame(camera, max_frames)
+            return self._session.picture_files.save_frame(camera, max_frames)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("save_camera_frame", error)
             return None
@@ -435,7 +435,7 @@ class MCPBridge:
         low: float | None = None,
         high: float | None = None,
     ) -> None:
-        """Say what a published signal means, where its name does not.
+        """Say what a published signal means if its name does not.
 
             bridge.describe("u", quantity="speed", role="commanded", unit="m/s")
             bridge.describe("q.*", quantity="joint position", unit="rad", low=-1.5, high=1.5)
@@ -469,7 +469,7 @@ class MCPBridge:
     def breakpoint(
         self, condition: str, action: BreakpointAction = "pause", after_hits: int = 1
     ) -> int | None:
-        """Do something when a condition begins to hold, as long as this session lasts.
+        """Pause, keep or log when a condition begins to hold, as long as this session lasts.
 
             bridge.breakpoint("front_m < 0.1 for 0.5", action="log")
 
@@ -496,20 +496,20 @@ class MCPBridge:
     def expect(
         self, condition: str, *, during: str | None = None, name: str | None = None
     ) -> int | None:
-        """Say what shall hold, always or while `during` holds, as long as this session lasts.
+        """State what must hold, always or while `during` holds, as long as this session lasts.
 
             bridge.expect("front_m > 0.1", during="mode == 'drive'", name="keeps its distance")
 
-        It is evaluated as a breakpoint is. Where it begins not to hold, that is an event of the
-        kind `violation`, and the seconds around it are kept at full rate (see `keep`). States that
-        lack a value of the condition are not judged. `webots-mcp check` says in which share of
-        the time it held.
+        It is evaluated like a breakpoint. When it stops holding, an event of the kind `violation`
+        is recorded, and the seconds around it are kept at full rate (see `keep`). States without a
+        value of the condition are not judged. `webots-mcp check` reports the share of the time in
+        which it held.
 
         Args:
-            condition: In the language of docs/conditions.md. With `within 20` at its end it shall
-                hold once, within so many seconds from the begin of the run.
+            condition: In the language of docs/conditions.md. With `within 20` at its end it must
+                hold once, within 20 seconds from the start of the run.
             during: Only while this condition holds.
-            name: As it is reported; without one the condition is its name.
+            name: The name in reports; by default the condition.
 
         Returns:
             Its id among the breakpoints; None while the database cannot be written.
@@ -529,7 +529,7 @@ class MCPBridge:
         self._session.reloads.add(callback)
 
     def detect_reload(self) -> bool:
-        """Whether the world was reloaded or reset since the last call; true once for each."""
+        """Return whether the world was reloaded or reset since the last call, once for each."""
         reloads = self._session.reloads
         try:
             self._session.check_clock()
@@ -551,7 +551,7 @@ class MCPBridge:
         return self._session.clock.run.id
 
     def stats(self) -> BridgeStats:
-        """Counts of what was recorded so far and what was not, and the time that it took."""
+        """Return how much was recorded so far and how much was not, and how long it took."""
         recorder, throttle = self._session.recorder, self._session.throttle
         publisher = self._publisher
         return BridgeStats(
@@ -564,7 +564,7 @@ class MCPBridge:
             publish_mean_us=1e6 * publisher.total_s / max(1, publisher.recorded),
             publish_max_us=1e6 * publisher.longest_s,
             ring_interval=publisher.devices.ring_interval,
-            frames_missed=self._session.keeper.frames.missed,
+            frames_missed=self._session.full_rate.frames.missed,
             failures=self._errors.failures,
             last_error=self._errors.last_error,
         )
@@ -590,7 +590,7 @@ class MCPBridge:
             elif self._session.clock.moved_s is None:
                 self._session.unseen.check(self._session.clock.sim_time_s)
             self.detach()
-            self._session.let_go()
+            self._session.release_loop()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("close", error)
         _bridges.pop(id(self.robot), None)
@@ -646,7 +646,7 @@ class MCPBridge:
             self._errors.failed("capture_output", error)
 
     def _leave_to_parent(self) -> None:
-        """In a forked child: leave the session to the parent; the child records nothing."""
+        """Leave the session to the parent of a forked child, which records nothing."""
         self._closed = True
         self.detach()
         if self._capture is not None:
@@ -654,7 +654,7 @@ class MCPBridge:
         self._session.abandon()
 
     def _close_at_exit(self) -> None:
-        """Close when the interpreter ends, and find out whether an exception ended it."""
+        """Close when the interpreter ends, and record the exception that ended it, if any."""
         # `sys.last_value` is that exception, but at a prompt (ps1) it is the last one printed.
         error = None if hasattr(sys, "ps1") else getattr(sys, "last_value", None)
         if isinstance(error, BaseException):

@@ -1,4 +1,4 @@
-"""What the controller's code and its devices say of the meaning of signals.
+"""Records what signals mean, as declared by the controller's code and described by its devices.
 
 Each declaration is written when it is made, and again into a new database.
 """
@@ -28,10 +28,10 @@ class SignalMeanings:
         recorder.new_database_entries.append(self._entries_for_new_database)
 
     def declare(self, declared: DeclaredMeaning) -> None:
-        """Record what the controller says of a signal; a later declaration replaces it.
+        """Record what the controller declares about a signal, in place of an earlier declaration.
 
         Raises:
-            ValueError: There are 2,000 declarations already.
+            ValueError: If there are 2,000 declarations already.
         """
         if self._declared.get(declared.name) == declared:
             return
@@ -44,10 +44,10 @@ class SignalMeanings:
         self._recorder.record("meaning", None, _values_of(declared))
 
     def record_devices(self, known: Sequence[tuple[DeclaredMeaning, str]]) -> None:
-        """Record what devices say of the signals that `auto_publish` makes of them.
+        """Record the meaning of the signals that `auto_publish` makes of devices.
 
         Args:
-            known: What is said of each signal, and the device that says it.
+            known: The meaning of each signal, and the device in words.
         """
         self._of_devices = [(*said, why) for said, why in known]
         for values in self._rows_of_devices():
@@ -59,7 +59,7 @@ class SignalMeanings:
             yield {"rows": json.dumps(rows, ensure_ascii=False), "now": time.time()}
 
     def _entries_for_new_database(self) -> Iterable[tuple[Kind, bool, Values]]:
-        """The entries that a new database needs: kind, whether it belongs to the run, values."""
+        """Yield the entries for a new database: kind, whether it belongs to the run, values."""
         for declared in tuple(self._declared.values()):  # the maintainer's thread may call this
             yield "meaning", False, _values_of(declared)
         for values in self._rows_of_devices():

@@ -22,7 +22,6 @@ MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database
 
 V = TypeVar("V", float, int, bool, str)
 SETTERS: Final = ("command", "trial")  # the kinds that a command may name
-_MOST_NAMED: Final = 5
 
 
 class Parameter(Generic[V]):
@@ -93,7 +92,7 @@ class _Held:
         self.setter = setter
 
     def row(self) -> tuple[object, ...]:
-        """As the statement "parameter values" takes it."""
+        """Return the row for the statement "parameter values"."""
         is_default = self.value == self.declaration.default
         value = json.dumps(self.value, ensure_ascii=False)
         return (self.declaration.name, value, int(is_default), *self.setter)
@@ -107,7 +106,7 @@ class Parameters:
     """Holds the declared parameters, changes their values, and records each change.
 
     Args:
-        robot_name: Of whom the environment may have values.
+        robot_name: The robot for which the environment may have values.
     """
 
     def __init__(
@@ -132,10 +131,10 @@ class Parameters:
         recorder.new_database_entries.append(self._entries_for_new_database)
 
     def declare(self, declaration: Declaration) -> Parameter[Any]:
-        """The parameter of that name, created or updated to this declaration.
+        """Return the parameter of that name, created or updated to this declaration.
 
         Raises:
-            ValueError: There are 500 parameters already.
+            ValueError: If there are 500 parameters already.
         """
         held = self._held.get(declaration.name)
         if held is None:
@@ -151,11 +150,11 @@ class Parameters:
     def set_now(
         self, values: Mapping[str, object], setter: Setter
     ) -> dict[str, tuple[Value, Value]]:
-        """Set several, all or none; returns the old and the new value of each.
+        """Set several, all or none; return the old and the new value of each.
 
         Raises:
-            InvalidInputError: A name is unknown or a value is invalid; then none is set.
-            CommandRefusedError: There were too many changes in this run.
+            InvalidInputError: If a name is unknown or a value is invalid; then none is set.
+            CommandRefusedError: If there were too many changes in this run.
         """
         checked = self._checked(values)
         before = {name: self._held[name].value for name in checked}
@@ -174,10 +173,10 @@ class Parameters:
     def set_from_reset(
         self, values: Mapping[str, object], setter: Setter
     ) -> dict[str, tuple[Value, Value]]:
-        """Set several at the next reset, all or none; returns each value now and from then on.
+        """Set several at the next reset, all or none; return each value now and from then on.
 
         Raises:
-            InvalidInputError: As `set_now`.
+            InvalidInputError: If a name is unknown or a value is invalid; then none is set.
         """
         checked = self._checked(values)
         self._from_reset |= {name: (value, setter) for name, value in checked.items()}
@@ -209,7 +208,7 @@ class Parameters:
                 self._errors.failed("Parameter.set", error)
 
     def begin_run(self) -> None:
-        """The world was reset: apply the values that waited for it, and record all values."""
+        """Apply the values that waited for this reset of the world, and record all values."""
         self._changes = 0
         waiting, self._from_reset = self._from_reset, {}
         for name, (value, setter) in waiting.items():
@@ -218,7 +217,7 @@ class Parameters:
         self._record_next(dict.fromkeys(waiting))
 
     def _entries_for_new_database(self) -> Iterable[tuple[Kind, bool, Values]]:
-        """The entries that a new database needs: kind, whether it belongs to the run, values."""
+        """Yield the entries for a new database: kind, whether it belongs to the run, values."""
         held = tuple(self._held.values())  # a copy: the maintainer's thread may be the caller
         for each in held:
             yield "parameter", False, {**each.declaration.as_row(), "now": time.time()}
@@ -276,7 +275,7 @@ class Parameters:
 
 
 def _declared_anew(before: Declaration, now: Declaration) -> str:
-    """The log line of a changed declaration: two parameters may share a name by mistake."""
+    """Return the log line of a changed declaration: two parameters may share a name by mistake."""
     pairs = zip(before._asdict().items(), now._asdict().values(), strict=True)
     changed = [f"{name} {new!r}, not {old!r}" for (name, old), new in pairs if new != old]
     return (
@@ -286,7 +285,7 @@ def _declared_anew(before: Declaration, now: Declaration) -> str:
 
 
 def _next(values: Mapping[str, Value | None]) -> dict[str, Any]:
-    """The values of the statement "parameter next"."""
+    """Return the values of the statement "parameter next"."""
     rows = [
         (name, None if value is None else json.dumps(value, ensure_ascii=False))
         for name, value in values.items()
@@ -297,9 +296,9 @@ def _next(values: Mapping[str, Value | None]) -> dict[str, Any]:
 class StartValues:
     """The value of `WEBOTS_MCP_PARAMETERS`: a JSON object of values by the names of parameters.
 
-    In addition it may have objects by the names of robots, whose values are for that robot alone:
-    `{"kp": 3.0, "rover": {"kp": 4.0}}`. A value that cannot be used is warned of, and the code's
-    value is used.
+    An object under the name of a robot holds values for that robot alone:
+    `{"kp": 3.0, "rover": {"kp": 4.0}}`. For a value that cannot be used a warning is printed, and
+    the code's value is used.
 
     Args:
         robot: The name of this robot.
@@ -314,7 +313,7 @@ class StartValues:
         self._unknown_reported = not text
 
     def take(self, declaration: Declaration) -> Value | None:
-        """The first value of a parameter; None for the one in the code."""
+        """Return the first value of a parameter; None for the one in the code."""
         values = self._read()
         if declaration.name not in values:
             return None
@@ -335,7 +334,7 @@ class StartValues:
             if name not in declared and not isinstance(value, dict)
         ]
         if unknown:
-            named = ", ".join(f"{name!r:.80}" for name in unknown[:_MOST_NAMED])
+            named = ", ".join(f"{name!r:.80}" for name in unknown[:5])
             self._warn("unknown", f"the controller declares no parameter {named}")
 
     def _read(self) -> dict[str, Any]:

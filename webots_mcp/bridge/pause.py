@@ -28,11 +28,11 @@ class StepListener(Protocol):
     """Called before and after each step of the controller."""
 
     def before(self, step: Step) -> None:
-        """The controller asks for a step."""
+        """Handle that the controller asks for a step."""
         ...
 
     def after(self, step: Step, answer: int) -> None:
-        """Webots has answered the step; the controller receives the answer next."""
+        """Handle that Webots has answered the step; the controller receives the answer next."""
         ...
 
 
@@ -44,13 +44,13 @@ class Pause:
     runs there (a handler, a callback) may step nevertheless: time advances for just that step.
 
     Args:
-        before_pause: Called before a pause begins: no call of the loop follows that could write.
-        after_step: Called after each step that was guarded, before the loop's own code runs.
+        before_pause: Called before a pause begins, since no call of the loop follows to write rows.
+        after_step: Called after each intercepted step, before the loop's own code runs.
 
     Attributes:
-        active: The loop is paused.
+        active: Whether the loop is paused.
         cause: Why the newest pause was begun.
-        serve: Serves commands until the pause has ended: for a loop that steps during it.
+        serve: Serves commands until the pause has ended, for a loop that steps during it.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Pause:
         self._heartbeat = heartbeat
         self._before_pause = before_pause
         self._after_step = after_step
-        self._mode_before: str | None = None  # a pause, a run's pace or steps; None where none is
+        self._mode_before: str | None = None  # before a pause, a run's pace or steps; None without
         self._user_code_depth = 0  # a count: a handler may call get_command(), which runs another
         self._awaiting_step = False
         self._ask_before_steps: Callable[[], object] | None = None
@@ -112,8 +112,8 @@ class Pause:
     def world_waits(self) -> Generator[None]:
         """Let the world wait for this robot's steps meanwhile.
 
-        The heartbeat has it first: where the process is killed meanwhile, the session after this
-        one lets the world go on (`set_world_free`).
+        The heartbeat records it first: if the process is killed meanwhile, the next session lets
+        the world continue (`set_world_free`).
         """
         self._heartbeat.change_loop(STEPPING_WORLD)
         with self._simulation.world_waits():
@@ -122,7 +122,7 @@ class Pause:
             self._heartbeat.change_loop(STEPPING)
 
     def set_world_free(self) -> None:
-        """Let a world go on that the bridge of an ended process had made wait for its steps."""
+        """Let a world continue that the bridge of an ended process had made wait for its steps."""
         if self._simulation.supervisor and self._simulation.set_world_free():
             self._journal.log("warning", "bridge", SET_FREE)
 
@@ -177,7 +177,7 @@ class Pause:
 
     @contextmanager
     def awaiting_step(self) -> Generator[None]:
-        """Guard steps while a reset is awaited, so that its step is seen before the loop's code."""
+        """Intercept steps while a reset is awaited: it is noticed before the loop's code runs."""
         self._awaiting_step = True
         self._guard_steps()
         try:
@@ -188,7 +188,7 @@ class Pause:
 
     @contextmanager
     def user_code(self) -> Generator[None]:
-        """Make the steps of a handler or a callback that runs here, also during a pause."""
+        """Let the steps of a handler or a callback advance time, even during a pause."""
         self._user_code_depth += 1
         self._guard_steps()
         try:
@@ -213,9 +213,9 @@ class Pause:
         self._guard_steps()
 
     def _guard_steps(self) -> None:
-        """Guard the steps while anything needs them, and else let them go to Webots directly.
+        """Intercept the steps while anything needs that, and else let them go to Webots directly.
 
-        User code is guarded outside a pause too: its steps show that the loop is alive.
+        Steps of a handler are intercepted outside a pause too: they show that the loop is alive.
         """
         asked = self._ask_before_steps is not None or self._step_listener is not None
         needed = self.active or self.in_user_code or self._awaiting_step or asked
@@ -264,5 +264,5 @@ class Pause:
 
 
 def _running(mode_before: str) -> str:
-    """The mode in which time advances: the one before, or real time if that was a pause."""
+    """Return the mode in which time advances: the one before, or real time if that was a pause."""
     return "fast" if mode_before == "fast" else "real_time"

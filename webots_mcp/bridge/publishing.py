@@ -10,32 +10,33 @@ from collections.abc import Callable, Mapping
 from itertools import islice
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.breakpoints import Breakpoints, Watch
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.commands import Reloads
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut
+from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.signals.register import SignalNames, StateChanges
 
-_BYTES_OF_A_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
+_BYTES_PER_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
 
 
 class Publisher:
     """Handles each call of `publish` and `auto_publish`.
 
     Args:
-        begin_run: Called where simulation time has gone back since the last call.
+        begin_run: Called if simulation time has gone back since the last call.
 
     Attributes:
-        recorded: Recorded calls.
-        total_s: The time that they took.
-        longest_s: The longest of them.
+        recorded: Number of recorded calls.
+        total_s: The time that they took together, in seconds.
+        longest_s: The time that the longest of them took.
         devices: Reads the devices for `auto_publish`.
     """
 
@@ -48,7 +49,7 @@ class Publisher:
         throttle: Throttle,
         breakpoints: Breakpoints,
         watch: Watch,
-        keeper: Keeper,
+        full_rate: FullRateRecorder,
         devices: DeviceReader,
         reloads: Reloads,
         begin_run: Callable[[], None],
@@ -60,7 +61,7 @@ class Publisher:
         self._throttle = throttle
         self._breakpoints = breakpoints
         self._watch = watch
-        self._keeper = keeper
+        self._full_rate = full_rate
         self._reloads = reloads
         self._begin_run = begin_run
         self._changes = StateChanges()
@@ -76,65 +77,65 @@ class Publisher:
         """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
         if self._clock.update():
             self._begin_run()
-        wanted, hit, keeper, breakpoints = force, None, self._keeper, self._breakpoints
-        # Tested here, since even an empty call would slow down every `publish`.
+        wanted, hit, full_rate, breakpoints = force, None, self._full_rate, self._breakpoints
+        # Checked before the call, since even a call that does nothing slows down every `publish`.
         if breakpoints.armed or breakpoints.run is not self._clock.run:
             hit = breakpoints.evaluate(state)
-            wanted |= breakpoints.reaches  # the past, asked of rows, is the same
+            wanted |= breakpoints.reaches  # `check` evaluates the recorded rows, and needs this one
         if self._watch.asks_states:
             wanted = self._watch.evaluate(state) or wanted
         if self._throttle.admits(wanted or hit or self._heartbeat.loop):
             self._record(state)
-        elif keeper.fills:
-            keeper.add(state, own_bytes)
-        if keeper.frames.cameras:
+        elif full_rate.fills:
+            full_rate.add(state, own_bytes)
+        if full_rate.frames.cameras:
             self._take_camera_frames(at_once=bool(hit))
         if hit:
             breakpoints.act(hit, state)  # after recording: a pause must show the state of the hit
-        if keeper.busy:
-            keeper.go_on()
+        if full_rate.busy:
+            full_rate.go_on()
 
     def publish_devices(
         self, extra: Mapping[Any, Any], include_time: bool, force: bool = False
     ) -> dict[Any, Any] | None:
-        """Record the devices' values; they are read if this call is due.
+        """Record the devices' values; they are read only if this call is due.
 
-        Where breakpoints are armed or a run has a goal, they are read in every call; for the ring
-        buffer as often as the limit on the time for reading allows.
+        While breakpoints are armed or a run has a goal, every call reads them. For the ring buffer
+        they are read as often as the limit on reading time allows.
 
         Returns:
-            The state; None where the devices were not read.
+            The state; None if the devices were not read.
         """
         state = None
         if self._clock.update():
             self._begin_run()
-        keeper, throttle = self._keeper, self._throttle
-        due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
-        if due or self._breakpoints.ask_states() or self._watch.asks_states:
+        full_rate, throttle = self._full_rate, self._throttle
+        due = full_rate.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
+        if due or self._breakpoints.must_evaluate() or self._watch.asks_states:
             state = self._read(extra, include_time)
-            # What the devices say is made anew each time: nothing else can change it.
+            # The devices' values are new objects in each call: no other code can change them.
             self.publish(state, force, own_bytes=0 if extra else self._own_bytes)
             return state
         if throttle.admits(force or self._heartbeat.loop is not None):
             state = self._read(extra, include_time)
             self._record(state)
-        elif keeper.fills:
-            keeper.leave_out(self.devices.why)
-        if keeper.frames.cameras:
+        elif full_rate.fills:
+            full_rate.leave_out(self.devices.why)
+        if full_rate.frames.cameras:
             self._take_camera_frames(at_once=False)
-        if keeper.busy:
-            keeper.go_on()
+        if full_rate.busy:
+            full_rate.go_on()
         return state
 
     def unread(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
-        """A state without the devices."""
+        """Return the state without the devices: the time and `extra`."""
         return ({"time": self._clock.sim_time_s} if include_time else {}) | _finite(extra)
 
     def _take_camera_frames(self, *, at_once: bool) -> None:
         """Hold due camera frames with the states; at a hit take one of each camera."""
-        keeper = self._keeper
-        if at_once or keeper.frames.is_due(self._clock.sim_time_s):
-            keeper.take_camera_frames(at_once=at_once)
+        full_rate = self._full_rate
+        if at_once or full_rate.frames.is_due(self._clock.sim_time_s):
+            full_rate.take_camera_frames(at_once=at_once)
 
     def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
         return self.devices.read() | self.unread(extra, include_time)
@@ -148,7 +149,7 @@ class Publisher:
         self._journal.state(encoded)
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             self._record_changes(state)
-        self._own_bytes = _BYTES_OF_A_CHARACTER * len(encoded.text)
+        self._own_bytes = _BYTES_PER_CHARACTER * len(encoded.text)
         self._names.register(state, encoded.text, self._recorder.enter_signals)
         self._heartbeat.beat_if_due()
         self._count(time.perf_counter() - started_s)
@@ -169,7 +170,7 @@ class Publisher:
 
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
-    """A mapping as a dict of `len` items: the iterator of a user's own mapping may be endless."""
+    """Return a mapping as a dict of `len` items, since a user's own mapping may be endless."""
     if extra.__class__ is dict:
         return cast("dict[Any, Any]", extra)
     if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]

@@ -9,9 +9,9 @@ the next process that opens the database. Beyond the limits of the backlog the o
 are dropped, and so is a row that the database will never accept; dropped rows are counted, and
 reported as an event as soon as one can be written.
 
-A KeyboardInterrupt may come between any two lines, and nothing here relies on the lines after it: a
+A KeyboardInterrupt may come between any two lines, and no promise depends on the lines after it. A
 statement is either written or not, the next call rolls back an open transaction, waiting rows are
-recognised by their number, and the connection lock is free when the call that took it has ended.
+recognised by their number, and the connection lock is free once the call that took it has ended.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from webots_mcp.database.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.database.liveness import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
+from webots_mcp.database.heartbeat import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.database.location import Database
 from webots_mcp.database.waiting_file import (
     STATEMENTS,
@@ -63,8 +63,8 @@ from webots_mcp.database.waiting_file import (
     WaitingFile,
     adopt,
     bind,
+    ingest,
     is_unfit,
-    take_in,
     waiting_path,
 )
 from webots_mcp.errors import (
@@ -141,7 +141,7 @@ class Recorder:
         self._backlog = Backlog(self._waiting_file(), self.describe_run, self._drop)
         self._files: tuple[int, ...] = ()
         self._retry_at_s = 0.0
-        self._confirmed = 0  # rows that were written when the files were looked after
+        self._confirmed = 0  # rows that were written when the files were checked
         self._reported_dropped = 0  # by events in the database
         self._unreported = False  # there are dropped rows that none reports yet
         self._why_dropped = ""
@@ -170,7 +170,7 @@ class Recorder:
         Args:
             kind: What is written.
             run: The run that the row belongs to; its id may not be known yet.
-            values: The values of the statement, see `entries.STATEMENTS`.
+            values: The values of the statement, see `waiting_file.STATEMENTS`.
 
         Returns:
             How many rows the statement changed, or None where it was deferred.
@@ -223,7 +223,7 @@ class Recorder:
             self._lock.release()
 
     def fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
-        """The rows that a statement reads or returns; None while that is not possible."""
+        """Return the rows that a statement reads or returns; None while that is not possible."""
         if self.connection is None:
             return None
         return self._locked(lambda: self._fetch(statement, values))
@@ -287,7 +287,7 @@ class Recorder:
         uses after a second is left open: SQLite forbids to close it meanwhile.
         """
         self._closing = get_ident()
-        self._locked(self._look_after_files)  # what went into a deleted file is counted as dropped
+        self._locked(self._check_files)  # what went into a deleted file is counted as dropped
         if self.off is None:
             self.end(reason, sim_time_s)
         until_s = time.monotonic() + 1
@@ -305,7 +305,7 @@ class Recorder:
                 self._lock.release()
 
     def abandon(self) -> None:
-        """In a forked child: leave connection and session to the parent, which continues."""
+        """Leave connection and session of a forked child to the parent, which continues."""
         # Kept for ever, so that it is never closed: SQLite forbids any use after a fork.
         _of_parents.append(self.connection)
         self.connection = self.registration = None
@@ -314,7 +314,7 @@ class Recorder:
         self.off = "a forked process does not record for its parent"
 
     def describe_run(self, run: CurrentRun) -> dict[str, Any]:
-        """The values of a run's own row."""
+        """Return the values of a run's own row."""
         return {
             "uuid": run.uuid,
             "world": self._identity.world,
@@ -327,7 +327,7 @@ class Recorder:
     # -- writing: the caller has the connection lock -------------------------------------------
 
     def _write(self, kind: Kind, run: CurrentRun | None, values: Values) -> int | None:
-        """Write a row; returns how many rows the statement changed, or None if it was deferred."""
+        """Write a row; return how many rows the statement changed, or None if it was deferred."""
         if not self._is_ready(run):
             self._keep(Row(kind, run, values))
             return None
@@ -347,7 +347,7 @@ class Recorder:
         return changed
 
     def _write_together(self, kind: Kind, run: CurrentRun, rows: Sequence[tuple[Any, ...]]) -> bool:
-        """Write rows in one transaction; False where it fails: one by one, each fails by itself."""
+        """Write rows in one transaction; False if it fails: then they are written one by one."""
         if not self._is_ready(run):
             return False
         bound = [bind(run.id, self._ids.session_id, values) for values in rows]
@@ -365,7 +365,7 @@ class Recorder:
         return self._opened.execute(statement, values).fetchall()
 
     def _enter_signals(self, seen: Mapping[str, Seen]) -> bool:
-        """Enter names; what fails for another reason than a lock is left to the maintainer."""
+        """Enter names; what fails for another reason than a lock is entered by the maintainer."""
         if not self._is_ready(None):
             return False
         connection, robot_id = self._opened, self._ids.robot_id
@@ -378,7 +378,7 @@ class Recorder:
         return True
 
     def _beat(self, loop: LoopStatus) -> None:
-        self._look_after_files()
+        self._check_files()
         run = self.run
         if self._is_ready(run):
             status = RecordingStatus(self.rows_waiting, self.rows_dropped, self.errors.last_error)
@@ -386,7 +386,7 @@ class Recorder:
             self._transact(partial(write_heartbeat, self._opened, loop, status, *ids))
 
     def _is_ready(self, run: CurrentRun | None) -> bool:
-        """Whether all rows that precede a new row of that run are written; tries to write them."""
+        """Write what precedes a new row of that run; return whether all of it is written."""
         connection = self.connection
         if (
             connection is None
@@ -418,7 +418,7 @@ class Recorder:
     def _take_in_waiting(self) -> None:
         until_s, run = time.monotonic() + _CATCH_UP_S, self.run
         while self._backlog.waits and (entries := self._backlog.next_entries()):
-            taken = take_in(self._opened, self._ids.session_id, entries)
+            taken = ingest(self._opened, self._ids.session_id, entries)
             self._backlog.forget(taken.number)
             self.rows_written += sum(entry.kind != "run" for entry in taken.written)
             run.rows += sum(e.kind == "state" and e.run == run.uuid for e in taken.written)
@@ -481,7 +481,7 @@ class Recorder:
         self._write("event", self.run, values)
 
     def _waiting_file(self) -> WaitingFile | None:
-        """The file for waiting rows; None for a database in memory, which no process outlives."""
+        """Return the file for waiting rows; None for a database in memory, which ends with us."""
         if not isinstance(self.database, Path):
             return None
         return WaitingFile(waiting_path(self.database, self.uuid), self._describe_session)
@@ -513,7 +513,7 @@ class Recorder:
         return self.registration
 
     def _is_connected(self) -> bool:
-        """Whether a write may be tried now; tries to open a closed database once a second."""
+        """Return whether a write may be tried; try to open a closed database once a second."""
         if self.off is not None or time.monotonic() < self._retry_at_s:
             return False
         return self.connection is not None or self._open(patient=False)
@@ -573,7 +573,7 @@ class Recorder:
             connection.close()
 
     def _describe_session(self) -> dict[str, Any]:
-        """The values of robot and session, for a database that does not have this session."""
+        """Return the values of robot and session, for a database without this session."""
         name = self.registration.robot_name if self.registration else self._identity.robot_name
         return {
             "robot": describe_robot(self._identity, name),
@@ -600,8 +600,8 @@ class Recorder:
         else:
             self.errors.warn(text, f"not recorded yet, trying again each second: {text}")
 
-    def _look_after_files(self) -> None:
-        """Start over where the open files would lose rows: deleted ones still accept them."""
+    def _check_files(self) -> None:
+        """Start over if the database was deleted: its open file would still accept rows."""
         if self.connection is None:
             return
         if self._files != identify_files(self.database):
@@ -610,11 +610,11 @@ class Recorder:
             self._confirmed = self.rows_written
 
     def _replace_damaged(self, why: str) -> bool:
-        """Move a damaged database aside, if it has our name, or the header of a database.
+        """Move a damaged database aside if it has our name or the header of a database.
 
-        The header is judged by SQLite's error text. Closing a file that was read here would drop
-        the locks of this process on it, on which a maintainer's or another bridge's connection may
-        depend (SQLite, How To Corrupt, 2.2).
+        SQLite's error text shows whether it has that header. Reading the file ourselves is not
+        safe: closing it would drop the locks of this process on it, which a maintainer's or another
+        bridge's connection may need (SQLite, How To Corrupt, 2.2).
         """
         database = self.database
         if not isinstance(database, Path) or (
@@ -695,7 +695,7 @@ class ConnectionLock:
         self._held: dict[str, tuple[int, FrameType]] = {}
 
     def acquire(self, call: FrameType, patience_s: float = 0.0) -> bool:
-        """Whether `call` has the lock now; then `release` follows.
+        """Try to take the lock; return whether `call` has it now, and has to call `release`.
 
         Args:
             call: The frame that calls `release`.
@@ -726,7 +726,7 @@ class ConnectionLock:
 
 
 def _is_under_way(call: FrameType) -> bool:
-    """Whether a call is still executing: Python refuses to clear the frame of one that is."""
+    """Return whether a call is still executing: then Python refuses to clear its frame."""
     try:
         call.clear()
     except RuntimeError:

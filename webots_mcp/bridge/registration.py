@@ -1,4 +1,4 @@
-"""Who records: the identity of a controller process, its robot, and its session."""
+"""Registers a controller process: its identity, its robot, and its session in the database."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from webots_mcp.contract import (
     is_extern,
     recorded_name,
 )
-from webots_mcp.database import liveness
+from webots_mcp.database import dead_sessions
 from webots_mcp.database.connection import transaction
-from webots_mcp.database.liveness import process_identity
 from webots_mcp.database.pauses import PAUSED, STEPPING_WORLD
+from webots_mcp.database.processes import process_identity
 from webots_mcp.database.waiting_file import enter_robot, enter_session
 
 _KIND: Final = "SELECT kind FROM robot WHERE name = ?"
@@ -113,14 +113,14 @@ def identify(
 
 
 def controller_file() -> Path | None:
-    """The file of the main program; None where there is none, as at a prompt."""
+    """Return the file of the main program; None where there is none, as at a prompt."""
     main = getattr(sys.modules.get("__main__"), "__file__", None) or sys.argv[0]
     path = Path(main).absolute() if main else None
     return path if path and path.is_file() else None
 
 
 def _plain_text(path: object) -> str:
-    """A path as valid text: file names may have any bytes, the database needs UTF-8."""
+    """Return a path as valid text: file names may have any bytes, the database needs UTF-8."""
     return str(path).encode("utf-8", "replace").decode()
 
 
@@ -129,7 +129,7 @@ def _devices(robot: Any) -> dict[str, Any]:
 
 
 def same_simulation(instance: str, other: str) -> bool:
-    """Whether two instances are, or may be, one Webots: that of some extern ones is not known."""
+    """Return whether two instances are one Webots, or may be: some extern ones are not known."""
     return instance == other or any(BY_PROCESS in each for each in (instance, other))
 
 
@@ -141,7 +141,7 @@ def _sha256(file: Path) -> str | None:
 
 
 def _sha256_of(data: bytes) -> str:
-    """By the interpreter's own module: hashlib would load OpenSSL, for 5 ms and 4 MB more."""
+    """Hash with the interpreter's own module: hashlib loads OpenSSL, which takes 5 ms and 4 MB."""
     for name in ("_sha2", "_sha256"):  # since Python 3.12, and before it
         try:
             return __import__(name).sha256(data).hexdigest()
@@ -153,7 +153,7 @@ def _sha256_of(data: bytes) -> str:
 
 
 def _git_commit(folder: Path) -> str | None:
-    """The commit that is checked out, read from git's files: no child process in a controller."""
+    """Return the commit that is checked out; read git's files, since a child process is slow."""
     try:
         for place in (folder, *folder.parents):
             if (place / ".git").exists():
@@ -164,7 +164,7 @@ def _git_commit(folder: Path) -> str | None:
 
 
 def _git_dir(git: Path) -> Path:
-    """In a worktree or submodule `.git` is a file that names the folder."""
+    """Return git's folder; in a worktree or submodule `.git` is a file that names it."""
     if git.is_dir():
         return git
     return (git.parent / git.read_text("utf-8").partition("gitdir:")[2].strip()).resolve()
@@ -204,19 +204,19 @@ class Registration(NamedTuple):
 def register(
     connection: sqlite3.Connection, identity: Identity, session_uuid: str, actions: str
 ) -> Registration:
-    """Enter a session; processes that start at once each get their own, with different names.
+    """Enter a session; processes that start at the same time get sessions of different names.
 
-    Everything that depends on each other is in one transaction, which takes the write lock first:
-    sessions of dead processes are ended, an unfinished session of the same robot is ended as
-    `superseded`, and where a live process already has the name, `#2` (and so on) is appended.
+    One transaction takes the write lock, ends the sessions of dead processes, and ends an
+    unfinished session of the same robot as `superseded`. If a live process already has the name,
+    `#2` (and so on) is appended.
     """
     now_s = time.time()
     # Before the transaction too: most of the work is then done without blocking other writers.
-    liveness.reap(connection, now_s)
+    dead_sessions.reap(connection, now_s)
     with transaction(connection):
-        liveness.reap(connection, now_s)
+        dead_sessions.reap(connection, now_s)
         makes_way = partial(_makes_way, identity=identity)
-        name = liveness.free_name(connection, identity.robot_name, makes_way)
+        name = dead_sessions.free_name(connection, identity.robot_name, makes_way)
         before = connection.execute(_KIND, (name,)).fetchone()
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         # A bridge is not the reloaded successor of an observer's reading of customData.
@@ -236,7 +236,7 @@ def register(
 
 
 def deregister(session_id: int) -> None:
-    """This process no longer records under that session."""
+    """Note that this process no longer records under that session."""
     _own_sessions.discard(session_id)
 
 
@@ -257,14 +257,14 @@ def _is_started_by_webots(identity: Identity) -> bool:
 
 
 def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: int) -> str | None:
-    """The mode before the pause that the robot's last session left, if in this same Webots."""
+    """Return the mode before the pause that the robot's last session left in this Webots."""
     values = (robot_id, identity.instance, PAUSED)
     row = connection.execute(_PAUSED_MODE, values).fetchone()
     return row[0] if row else None
 
 
-def _makes_way(session: liveness.OpenSession, identity: Identity) -> bool:
-    """Whether a session leaves its name: one of this process that is over, an observer's."""
+def _makes_way(session: dead_sessions.OpenSession, identity: Identity) -> bool:
+    """Return whether a session gives up its name: an observer's, or an old one of this process."""
     if session.kind == CUSTOM_DATA != identity.kind:
         return same_simulation(session.instance, identity.instance)
     is_here = (session.host, session.pid) == (identity.host, identity.pid)
@@ -272,13 +272,13 @@ def _makes_way(session: liveness.OpenSession, identity: Identity) -> bool:
 
 
 def describe_robot(identity: Identity, name: str) -> dict[str, Any]:
-    """The values of the robot's row."""
+    """Return the values of the robot's row."""
     devices = json.dumps(identity.devices, ensure_ascii=False)
     return {"name": name, "kind": identity.kind, "devices": devices}
 
 
 def describe_session(identity: Identity, uuid: str, actions: str) -> dict[str, Any]:
-    """The values of the session's row at its start."""
+    """Return the values of the session's row at its start."""
     now_s = time.time()
     return {
         "uuid": uuid,

@@ -9,17 +9,18 @@ import time
 from collections.abc import Callable, Generator
 from typing import Final
 
-from webots_mcp.bridge.breakpoints import Breakpoints, Goal, Watch, read_goal
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.parameters import Parameters, setter_of
 from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.run_goal import Goal, Watch, read_goal
 from webots_mcp.bridge.simulation import Clock, Simulation, mode_now
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import MAX_STEPS, Then
 from webots_mcp.database.pauses import Cause
 from webots_mcp.errors import CommandRefusedError, ControllerEndedError, InterruptedCommandError
 
-_ROUND_S: Final = 0.05  # of wall time in which a loop makes steps before it looks around
+_ROUND_S: Final = 0.05  # wall time of steps that a command makes before it serves the loop again
 
 
 class RunningActions:
@@ -238,7 +239,7 @@ class RunningActions:
             )
 
     def _finish_of(self, command: ClaimedCommand, then: Then) -> Callable[[], None]:
-        """The function that is called at the step that ends a run."""
+        """Return the function that is called at the step that ends a run."""
         pause = self._pause
         was_paused = pause.active
 
@@ -257,7 +258,7 @@ class RunningActions:
 
 
 def _miscounted(made: int, steps: int) -> dict[str, object]:
-    """A warning where another number of steps was made than was asked for."""
+    """Return a warning where another number of steps was made than was asked for."""
     if made <= steps:
         return {}
     return {"warning": f"{made} steps were made, not {steps}: the loop could not stop in time"}

@@ -1,4 +1,4 @@
-"""The built-in actions on the scene tree, above all those that change it.
+"""The built-in actions that change the scene tree: set_field, add_node, remove_node.
 
 Webots sets a field with the next step, so the answer has the field's value after that step. Each
 change is an event, and is remembered, so that a reset undoes it.
@@ -13,7 +13,7 @@ import time
 from collections.abc import Generator
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.field_values import (
     MOST_ENTRIES,
@@ -34,24 +34,22 @@ from webots_mcp.bridge.scene_edits import (
 )
 from webots_mcp.bridge.scene_nodes import children, label
 from webots_mcp.bridge.scene_paths import PathTarget, find, find_node
-from webots_mcp.bridge.scene_reading import get_field, get_scene
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
 _LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
 _LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
-_STAY: Final = ("WorldInfo", "Viewpoint")
+_REQUIRED: Final = ("WorldInfo", "Viewpoint")  # nodes without which Webots has no world
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
 _WORD: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
-_ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
-_SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
+_SEE_CONSOLE: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
 
 
-class SceneActions:
-    """The built-in actions on the scene tree: read it, set fields, add and remove nodes.
+class SceneChanges:
+    """Sets fields, and adds and removes nodes.
 
-    They ask Webots from within the controller's loop, for a few milliseconds per round.
+    Each change asks Webots from within the controller's loop, for a few milliseconds per round.
     """
 
     def __init__(
@@ -62,23 +60,9 @@ class SceneActions:
         self._journal = journal
         self._edits = edits
 
-    def by_name(self) -> dict[str, Action]:
-        """Return the functions by the name of their action."""
-        return {
-            "get_scene": self.get_scene,
-            "get_field": self.get_field,
-            "set_field": self.set_field,
-            "add_node": self.add_node,
-            "remove_node": self.remove_node,
-        }
-
-    def get_scene(self, command: ClaimedCommand) -> Progress:
-        """Find nodes of the tree, see `scene_reading.get_scene`."""
-        return get_scene(self._simulation.robot, command.params)
-
-    def get_field(self, command: ClaimedCommand) -> Progress:
-        """Read a field or the fields of a node, see `scene_reading.get_field`."""
-        return get_field(self._simulation.robot, command.params)
+    def begin_run(self) -> None:
+        """Undo after a reset the changes that Webots has not undone."""
+        self._edits.begin_run()
 
     def set_field(self, command: ClaimedCommand) -> Progress:
         """Set the field, or the entry of a field, at a `path` to a `value`."""
@@ -106,7 +90,8 @@ class SceneActions:
         ):
             raise CommandRefusedError(
                 f"{target.path} is {now!r:.200} after it was set: a controller set it again, or "
-                f"Webots refused the value; {_SAYS}. Fields inside a PROTO cannot be set"
+                f"Webots refused the value; {_SEE_CONSOLE}. "
+                "Fields inside a PROTO cannot be set"
             )
         elif not is_same(target.type_name, now, value):
             facts["now"] = _shown(now)  # the simulation has changed it since
@@ -125,8 +110,8 @@ class SceneActions:
             node = _newest(robot, target, before)
         if node is None:
             raise CommandRefusedError(
-                f"Webots added nothing to {target.path}; {_SAYS}. A PROTO has to be declared in "
-                "the world file first: IMPORTABLE EXTERNPROTO"
+                f"Webots added nothing to {target.path}; {_SEE_CONSOLE}. A PROTO has "
+                "to be declared in the world file first: IMPORTABLE EXTERNPROTO"
             )
         path = _path_of(robot, node)
         self._edits.added.add(int(node.getId()))
@@ -161,10 +146,10 @@ class SceneActions:
         if robot.getFromId(node_id) is not None:
             yield from self._until_stepped()
         if robot.getFromId(node_id) is not None:
-            raise CommandRefusedError(f"Webots did not remove {target.path}; {_SAYS}")
+            raise CommandRefusedError(f"Webots did not remove {target.path}; {_SEE_CONSOLE}")
         reset = "puts it back"
         if is_added:
-            reset = _ADDED_BEFORE
+            reset = "does not bring it back: it was added in this run"
         elif not is_known:
             reset = self._edits.remember_removed(removal, is_proto=is_proto)
         self._journal.event("remove_node", facts | _asked_by(command), target.path)
@@ -309,7 +294,7 @@ def _require_removable(robot: Any, target: PathTarget) -> None:
     node = target.node
     if target.is_hidden:
         raise InvalidInputError(f"{target.path} is inside a PROTO, where nothing can be removed")
-    if node.getTypeName() in _STAY or node.getId() == robot.getRoot().getId():
+    if node.getTypeName() in _REQUIRED or node.getId() == robot.getRoot().getId():
         raise InvalidInputError(f"{target.path} ({label(node)}) cannot be removed from a world")
     each = robot.getSelf()
     while each is not None:

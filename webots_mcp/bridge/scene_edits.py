@@ -16,13 +16,13 @@ from webots_mcp.bridge.scene_nodes import entries, node_fields
 from webots_mcp.bridge.scene_paths import Pace, PathTarget
 from webots_mcp.bridge.simulation import Simulation
 
-MOST_EDITS: Final = 200  # that are put back
+MOST_EDITS: Final = 200  # changes of a run that a reset undoes
 _LONGEST_REMOVED: Final = 200_000  # characters of a node that is remembered
 _ONLY_RELOADED: Final = "does not bring it back; a reload does"
 _PUT_BACK_PROTO: Final = (
     "puts it back if the world declares its PROTO as IMPORTABLE EXTERNPROTO; else a reload does"
 )
-# Physics has changed these since a command set them, and Webots' own reset restores them.
+# A reset by Webots restores these fields, and physics changes them after a command has set them.
 _MOVED_BY_PHYSICS: Final = ("translation", "rotation", "battery")
 _TOO_MANY: Final = f"does not undo it: at most {MOST_EDITS} changes are remembered"
 
@@ -50,11 +50,11 @@ class FieldEdit(NamedTuple):
 
 
 class Removal(NamedTuple):
-    """A node that was removed, as text, and its former position.
+    """A removed node, as text, and where it was.
 
     Attributes:
         path: The path of the command.
-        node_id: The number of the node, or of the one that a reset has put in its place.
+        node_id: The number of the node, or of the node that a reset added in its place.
         parent_id: The number of its parent; None for the root.
         field: The name of the field that contained it.
         entry: Its index in the field; None in a field for a single node.
@@ -103,7 +103,7 @@ class SceneEdits:
         return _is_within(node, self.added)
 
     def is_put_back(self, node: Any) -> bool:
-        """Return whether a reset put back a node, or one that contains it, and will do so again."""
+        """Return whether a reset put back this node, or one around it, and will do so again."""
         return _is_within(node, {removal.node_id for removal in self.removed})
 
     def remember_removed(self, removal: Removal | None, *, is_proto: bool) -> str:
@@ -120,7 +120,7 @@ class SceneEdits:
         return len(self.fields) + len(self.removed) >= MOST_EDITS
 
     def begin_run(self) -> None:
-        """After a reset, undo what Webots has not undone and nothing else has changed."""
+        """Undo after a reset what Webots has not undone, unless other code has changed it since."""
         edits, self.fields, self.added = reversed(self.fields.values()), {}, set()
         outcomes = {edit.path: self._set_back(edit) for edit in edits}
         put_back = {"paths": [path for path, is_set in outcomes.items() if is_set]}
@@ -129,9 +129,9 @@ class SceneEdits:
             self._journal.event("put_back", dict[str, object](facts))
 
     def _bring_back(self) -> dict[str, list[str]]:
-        """Add the removed nodes again, the last one first, so that each index is right.
+        """Add the removed nodes again, the last removed one first, so that each index is right.
 
-        To Webots they are added nodes then, which the next reset removes.
+        For Webots these are new nodes, which its next reset removes; so they are remembered again.
         """
         put_back: dict[str, list[str]] = {"nodes": [], "not": []}
         numbers: dict[int | None, int] = {}  # new ones, by those before
@@ -199,8 +199,8 @@ def find_again(robot: Any, node_id: int, name: str) -> Any | None:
 def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
     """Add a node to a field of nodes, at an index or at its end.
 
-    Webots reports errors in its console only, and the package raises nothing, so the field is
-    compared with before.
+    Webots reports an error in its console only, and its package raises nothing. So a node counts
+    as added only if the field has one more node than before.
 
     Returns:
         The new node; None if none was added.
@@ -217,7 +217,12 @@ def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
 def _position(
     robot: Any, node: Any
 ) -> Generator[None, None, tuple[int | None, str, int | None] | None]:
-    """Return the parent's number (None: the root), field and index; None if not found."""
+    """Find where a node is in the tree.
+
+    Returns:
+        The parent's number (None for the root), the field, and the index in it (None in a field
+        for a single node). None if the node was not found.
+    """
     root, pace, node_id = robot.getRoot(), Pace(), node.getId()
     parent = node.getParentNode() or root
     for name, field, _ in node_fields(parent, inside=False, everything=True):

@@ -34,7 +34,7 @@ _HEAD: Final = re.compile(
 _STEP: Final = re.compile(
     r"\s*(?:\[\s*(?P<index>-?\d+)\s*\]|[./]\s*(?P<target>\d+)(?=[./\[]|$)|[./]\s*(?P<name>[^.\[\]/]+))"
 )
-_HOW: Final = "write a path such as ROVER.translation, BALL.children[0].appearance or #12.name"
+_EXAMPLES: Final = "write a path such as ROVER.translation, BALL.children[0].appearance or #12.name"
 
 
 class Pace:
@@ -115,7 +115,7 @@ def parse(path: object) -> tuple[str, list[str | int]]:
         InvalidInputError: If it is not a path.
     """
     if not isinstance(path, str) or not path.strip() or len(path) > _LONGEST_PATH:
-        raise InvalidInputError(f"{path!r:.80} is not a path of the scene tree: {_HOW}")
+        raise InvalidInputError(f"{path!r:.80} is not a path of the scene tree: {_EXAMPLES}")
     head = _HEAD.match(path)
     position, steps = (head.end() if head else 0), list[str | int]()
     while head and position < len(path.rstrip()):
@@ -126,7 +126,7 @@ def parse(path: object) -> tuple[str, list[str | int]]:
         position = step.end()
     if head is None or position < len(path.rstrip()):
         raise InvalidInputError(
-            f"{path!r} is not a path of the scene tree: {path[position:]!r} is invalid; {_HOW}"
+            f"{path!r} is not a path of the scene tree: {path[position:]!r} is invalid; {_EXAMPLES}"
         )
     return (head["quoted"] or head["plain"]).strip(), steps
 

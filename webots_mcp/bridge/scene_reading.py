@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Generator, Iterable
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Final, cast
 
@@ -28,14 +29,33 @@ from webots_mcp.bridge.scene_paths import Pace, PathTarget, find, find_node
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.naming import nearest_first
 
-_MOST_CHARACTERS: Final = 2_600  # of an answer's rows; the server would shorten more
-_MOST_SHOWN: Final = 50  # entries of a field
-_FIRST_ENTRIES: Final = 3  # of a field among others
-_LONGEST_TEXT: Final = 80  # of a field among others
-_USUAL_DEPTH: Final = 2
-_MOST_AT_THE_TOP: Final = 200
-_MOST_PATTERNS: Final = 20
-_MOST_NEAR: Final = 10  # types or names that are listed where none matches
+
+@dataclass(frozen=True)
+class SceneAnswerLimits:
+    """How much of the scene an answer shows.
+
+    Attributes:
+        characters: Characters of an answer's rows; the server would shorten more.
+        entries: Entries of a field that is read alone.
+        first_entries: Entries of a field in a table.
+        text_characters: Characters of a text in a table.
+        usual_depth: Levels of the tree without a search.
+        top_nodes: Nodes at the top of the tree.
+        patterns: Patterns of one kind in a search.
+        nearest: Types or names that are listed if none matches.
+    """
+
+    characters: int = 2_600
+    entries: int = 50
+    first_entries: int = 3
+    text_characters: int = 80
+    usual_depth: int = 2
+    top_nodes: int = 200
+    patterns: int = 20
+    nearest: int = 10
+
+
+_LIMITS: Final = SceneAnswerLimits()
 
 
 def get_scene(robot: Any, params: dict[str, Any]) -> Progress:
@@ -44,7 +64,7 @@ def get_scene(robot: Any, params: dict[str, Any]) -> Progress:
     seen: dict[str, None] = {}
     wanted = [each for each in _patterns(params, "fields") if each != "name"]  # shown anyway
     after = whole_number(params, "cursor", 0, 10**9, default=0)
-    usual = DEEPEST if types or names else _USUAL_DEPTH
+    usual = DEEPEST if types or names else _LIMITS.usual_depth
     depth = whole_number(params, "depth", 1, DEEPEST, default=usual)
     path = params.get("path")
     target = (yield from find_node(robot, path)) if path else None
@@ -53,23 +73,25 @@ def get_scene(robot: Any, params: dict[str, Any]) -> Progress:
     everything = not WALKED.issuperset(types)
     tree = walk(around, deepest=depth, inside=inside, everything=everything)
     rows, pace = _Rows(["depth", "path", "type", "name", *wanted]), Pace()
-    shown, looked, definitions = list[tuple[tuple[int, ...], list[Any]]](), 0, set[str]()
+    shown, visited, definitions = list[tuple[tuple[int, ...], list[Any]]](), 0, set[str]()
     keys: dict[int, tuple[int, ...]] = {}
-    for looked, found in enumerate(tree, 1):
+    for visited, found in enumerate(tree, 1):
         yield from pace.rest()
         # The walk is breadth first; these keys sort the answer's rows depth first, as a tree reads.
         before = keys.get(found.parent.id, ()) if found.parent else ()
-        keys[found.id] = (*before, looked)
+        keys[found.id] = (*before, visited)
         row = _row(found, definitions, wanted)
         seen |= dict.fromkeys(_called(found) if names else _kinds(found))
-        if looked <= after or not _matches(found, types, names):
+        if visited <= after or not _matches(found, types, names):
             continue
         if not rows.fits(row):
-            return rows.as_table([row for _, row in sorted(shown)]) | {"cursor": looked - 1}
+            return rows.as_table([row for _, row in sorted(shown)]) | {"cursor": visited - 1}
         shown.append((keys[found.id], row))
-    answer = rows.as_table([row for _, row in sorted(shown)]) | {"looked_at": looked}
+    answer = rows.as_table([row for _, row in sorted(shown)]) | {"looked_at": visited}
     if (types or names) and not shown and not after:
-        answer["nearest"] = nearest_first((names or types)[0], filter(None, seen))[:_MOST_NEAR]
+        answer["nearest"] = nearest_first((names or types)[0], filter(None, seen))[
+            : _LIMITS.nearest
+        ]
     if target is not None:
         return answer | {"below": target.path}
     if types or names:
@@ -95,7 +117,7 @@ def get_field(robot: Any, params: dict[str, Any]) -> Progress:
 def _others_at_the_top(root: Any, pace: Pace) -> Generator[None, None, list[str]]:
     """List the types of the top nodes that are neither solids nor groups: WorldInfo, lights."""
     field, others = children(root), dict[str, None]()
-    for index in range(min(field.getCount(), _MOST_AT_THE_TOP)):
+    for index in range(min(field.getCount(), _LIMITS.top_nodes)):
         yield from pace.rest()
         node = field.getMFNode(index)
         if node is not None and not holds_solids(node):
@@ -112,7 +134,7 @@ class _Rows:
 
     def fits(self, row: list[Any]) -> bool:
         self._characters += len(json.dumps(row, default=str)) + 1
-        return self._characters <= _MOST_CHARACTERS
+        return self._characters <= _LIMITS.characters
 
     def as_table(self, rows: list[list[Any]]) -> dict[str, Any]:
         return {"columns": self._columns, "rows": rows}
@@ -170,10 +192,10 @@ def _describe_entries(target: PathTarget, start: int) -> dict[str, Any]:
     field = target.field
     assert field is not None
     count, size, shown = int(field.getCount()), 0, list[Any]()
-    for index in range(start, min(start + _MOST_SHOWN, count)):
+    for index in range(start, min(start + _LIMITS.entries, count)):
         value = _value(field, index)
         size += len(json.dumps(value)) + 1
-        if size > _MOST_CHARACTERS:
+        if size > _LIMITS.characters:
             break
         shown.append(value)
     more = start + len(shown)
@@ -184,7 +206,7 @@ def _value(field: Any, index: int | None) -> Any:
     """Read a single value or an entry; a node is its number and label."""
     if not str(field.getTypeName()).endswith("Node"):
         value = read(field, index)
-        return cut(value, _MOST_CHARACTERS // 2) if isinstance(value, str) else value
+        return cut(value, _LIMITS.characters // 2) if isinstance(value, str) else value
     node = field.getSFNode() if index is None else field.getMFNode(index)
     return None if node is None else f"#{node.getId()} {label(node)}"
 
@@ -195,12 +217,14 @@ def _brief(field: Any) -> Any:
         return None
     if field.getCount() < 0:
         value = _value(field, None)
-        return cut(value, _LONGEST_TEXT) if isinstance(value, str) else value
+        return cut(value, _LIMITS.text_characters) if isinstance(value, str) else value
     count = int(field.getCount())
     if str(field.getTypeName()) == "MFNode":
         return f"{count} nodes"
-    first = read_entries(field, 0, _FIRST_ENTRIES)
-    first = [cut(each, _LONGEST_TEXT) if isinstance(each, str) else each for each in first]
+    first = read_entries(field, 0, _LIMITS.first_entries)
+    first = [
+        cut(each, _LIMITS.text_characters) if isinstance(each, str) else each for each in first
+    ]
     return first if count <= len(first) else [*first, f"... {count} in all"]
 
 
@@ -213,8 +237,8 @@ def _patterns(params: dict[str, Any], name: str) -> list[str]:
             f'{name} must be a list of texts, such as ["Robot"], not {given!r:.80}'
         )
     texts = cast("list[str]", given)
-    if len(texts) > _MOST_PATTERNS:
+    if len(texts) > _LIMITS.patterns:
         raise InvalidInputError(
-            f"{name} has {len(texts)} texts; at most {_MOST_PATTERNS} may be given"
+            f"{name} has {len(texts)} texts; at most {_LIMITS.patterns} may be given"
         )
     return texts

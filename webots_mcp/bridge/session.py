@@ -1,4 +1,4 @@
-"""The session of one controller process: it builds the bridge's parts and connects them."""
+"""Builds the parts of a bridge for one controller process and connects them."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.bridge.attachment import Attachment, UnseenSteps
-from webots_mcp.bridge.breakpoints import Breakpoints, Watch
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.controller_actions import ControllerActions
-from webots_mcp.bridge.device_meanings import describe_devices
 from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.meanings import SignalMeanings
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.picture_actions import PictureActions
-from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.picture_files import PictureFiles
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
+from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.running_actions import RunningActions
-from webots_mcp.bridge.scene_changes import SceneActions
-from webots_mcp.bridge.scene_edits import SceneEdits
+from webots_mcp.bridge.scene_actions import SceneActions
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog
@@ -36,14 +35,14 @@ from webots_mcp.contract import UNMOVED, VERSION
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
 
-_IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or waiting
-_UNMOVED_S: Final = 10.0  # of wall time
+_IDLE_S: Final = 0.5  # a loop that recorded nothing for this time is blocked or waiting
+_UNMOVED_S: Final = 10.0  # wall time after which a loop must have called the bridge
 
 
 class BridgeSession:
     """All parts of a bridge, from its construction to its end, and the runs in it.
 
-    It is the one place that knows how the parts are connected: no part knows the session.
+    Only this class knows how the parts are connected: no part knows the session.
     """
 
     def __init__(
@@ -67,10 +66,16 @@ class BridgeSession:
         self.journal = journal = Journal(recorder, clock)
         self.heartbeat = Heartbeat(recorder, clock)
         self.reloads = Reloads(errors.failed)
-        self.album = Album(recorder, clock, data_dir)
-        self.keeper = Keeper(clock, recorder, journal, self.album, throttle, keep_last_s)
+        self.picture_files = PictureFiles(recorder, clock, data_dir)
+        self.full_rate = FullRateRecorder(
+            clock, recorder, journal, self.picture_files, throttle, keep_last_s
+        )
         self.pause = Pause(
-            simulation, journal, self.heartbeat, self.keeper.write_all, self.check_clock_after_step
+            simulation,
+            journal,
+            self.heartbeat,
+            self.full_rate.write_all,
+            self.check_clock_after_step,
         )
         self.handlers = Handlers(recorder, journal, self.pause)
         self.parameters = Parameters(
@@ -78,7 +83,7 @@ class BridgeSession:
         )
         self.meanings = SignalMeanings(recorder)
         self.breakpoints = Breakpoints(
-            simulation, clock, recorder, journal, self.pause, self.keeper
+            simulation, clock, recorder, journal, self.pause, self.full_rate
         )
         self.watch = Watch(clock, simulation.basic_time_step_s / 100)
         self.publisher = Publisher(
@@ -89,16 +94,16 @@ class BridgeSession:
             throttle,
             self.breakpoints,
             self.watch,
-            self.keeper,
+            self.full_rate,
             DeviceReader(simulation, journal, errors, self._describe_devices),
             self.reloads,
             self.begin_run,
         )
         self.unseen = UnseenSteps(simulation, journal, errors)
-        self._scene_edits = SceneEdits(simulation, journal, errors)
+        self._scene = SceneActions(simulation, clock, journal, errors)
         self.control = self._build_control()
         self._watchdog = Watchdog(simulation, clock, recorder, journal, database, hang_after_s)
-        self._began_s: float | None = time.monotonic()  # None once `_on_tick` has judged it
+        self._began_s: float | None = time.monotonic()  # None once `_on_tick` has checked the loop
         self._maintainer = _start_maintainer(database, self._on_tick)
 
     def _build_control(self) -> Control:
@@ -120,10 +125,10 @@ class BridgeSession:
         actions = (
             running,
             world,
-            PictureActions(simulation, clock, self.album),
-            SceneActions(simulation, clock, self.journal, self._scene_edits),
+            PictureActions(simulation, clock, self.picture_files),
+            self._scene,
             ControllerActions(
-                clock, pause, self.reloads, self.parameters, self.breakpoints, self.keeper
+                clock, pause, self.reloads, self.parameters, self.breakpoints, self.full_rate
             ),
         )
         by_name = {name: action for part in actions for name, action in part.by_name().items()}
@@ -131,13 +136,17 @@ class BridgeSession:
         return Control(*parts, self.reloads, self.handlers, by_name)
 
     def _describe_devices(self) -> None:
-        """Record what the devices say of the signals that are made of them."""
+        """Record the meaning of the signals that `auto_publish` makes of devices."""
+        from webots_mcp.bridge.device_meanings import (
+            describe_devices,  # only where devices are read
+        )
+
         simulation = self.simulation
         known = describe_devices(simulation.robot, is_supervisor=simulation.supervisor)
         self.meanings.record_devices(known)
 
     def attach(self, serve: Callable[[], ClaimedCommand | None]) -> Attachment:
-        """Listen to each step of the robot from now on.
+        """Publish and serve commands with each step of the robot from now on.
 
         Args:
             serve: Serves the pending commands, as `get_command()` does.
@@ -164,7 +173,7 @@ class BridgeSession:
         return registration.robot_name if registration else self.identity.robot_name
 
     def begin(self) -> None:
-        """Begin the first run, and continue the previous session's reload or pause."""
+        """Begin the first run, and continue a reload or a pause of the previous session."""
         registration = self.recorder.registration
         run, reloaded = self.clock.run, registration is not None and registration.reloaded
         run.start_reason = "reload" if reloaded else "start"
@@ -172,11 +181,12 @@ class BridgeSession:
         if reloaded:
             self.reloads.happened()
         if registration is not None:
-            self._succeed_to(registration)
+            self._continue_previous(registration)
         self.breakpoints.begin()
         self._watchdog.begin()
 
-    def _succeed_to(self, registration: Registration) -> None:
+    def _continue_previous(self, registration: Registration) -> None:
+        """Confirm a reload that the previous session requested, and continue its pause."""
         simulation, clock = self.simulation, self.clock
         mode = simulation.mode_name if simulation.supervisor else None
         values = {"now": time.time(), "sim_time": clock.sim_time_s, "mode": mode}
@@ -187,14 +197,14 @@ class BridgeSession:
             self.pause.take_over(registration.paused_mode)
 
     def serve(self) -> ClaimedCommand | None:
-        """One round of the loop: the pending commands, and the heartbeat."""
+        """Serve the pending commands and write the heartbeat, once in each round of the loop."""
         simulation = self.simulation
         self.check_clock()
         if simulation.over:
             return None
         self.parameters.take_wanted()
-        if self.keeper.busy:
-            self.keeper.go_on()
+        if self.full_rate.busy:
+            self.full_rate.go_on()
         command = self.control.serve()
         self.heartbeat.poll()
         if simulation.over:
@@ -202,39 +212,43 @@ class BridgeSession:
         return command
 
     def check_clock(self, *, after_step: bool = False) -> None:
-        """Begin a run if simulation time went back since the last call.
+        """Begin a run if simulation time has gone back since the last call.
 
         Args:
-            after_step: A step has just ended.
+            after_step: Whether a step has just ended.
         """
         if self.clock.update(after_step=after_step):
             self.begin_run()
 
     def check_clock_after_step(self) -> None:
-        """Look right after a step, before the loop's own code runs."""
+        """Begin a run if simulation time went back in the step that has just ended."""
         self.check_clock(after_step=True)
         self.heartbeat.beat_if_due()
 
     def begin_run(self) -> None:
-        """Simulation time went back: end the old run at its newest known time, begin a new one."""
+        """End the run at its newest known time and begin the next: simulation time went back."""
         self.recorder.end_run("reset", self.clock.ended_sim_time_s)
         self.clock.meter.begin_run()
         self.recorder.run = self.clock.run
         self.throttle.begin_run()
         self.reloads.happened()
         self.journal.event("reset")
-        # Before the callbacks, which may read values that waited for the reset, and set others.
+        # Before the callbacks of `on_reload`, which may read parameters or set them.
         self.parameters.begin_run()
-        self._scene_edits.begin_run()
+        self._scene.begin_run()
         restart_motors(self.simulation.robot, self.journal, self.errors.failed)
         self.reloads.fire()
         self.heartbeat.beat()
 
     def close(self, reason: str | None) -> None:
-        """Write the waiting rows and end, for the given or the known reason."""
+        """Write the waiting rows and end the session.
+
+        Args:
+            reason: How it ended; None for `reload` after a reload command, else `finished`.
+        """
         # The maintainer first: its thread uses the recorder too.
         stop = () if self._maintainer is None else (self._maintainer.stop,)
-        for close in (*stop, self._watchdog.close, self.keeper.close):
+        for close in (*stop, self._watchdog.close, self.full_rate.close):
             try:
                 close()
             except Exception as error:  # noqa: BLE001, PERF203  (the session ends whatever fails)
@@ -242,36 +256,37 @@ class BridgeSession:
         reason = reason or self._end_reason
         self.recorder.close(reason, self.clock.sim_time_s)
 
-    def let_go(self) -> None:
-        """Resume a paused simulation, which no command could resume later, and answer commands."""
+    def release_loop(self) -> None:
+        """Resume a paused simulation, and answer commands, which no later call would do."""
         self.pause.close()
         self.control.report_end(extern=self.identity.extern)
 
     def abandon(self) -> None:
-        """In a forked child: leave the recording to the parent."""
+        """Leave the recording to the parent in a forked child."""
         self._watchdog.abandon()
         self.recorder.abandon()
-        self.keeper.abandon()
+        self.full_rate.abandon()
 
     @property
     def _end_reason(self) -> str:
         return "reload" if self.reloads.requested_by else "finished"
 
     def end(self) -> None:
-        """Write everything when Webots says quit: it may kill the process from here on.
+        """Write everything when Webots ends the controller, since it may kill the process next.
 
-        The session stays usable, since the loop may also continue for a last few statements.
+        The session stays usable: the controller may run a few more statements and publish again.
         """
         self.control.report_end(extern=self.identity.extern)
-        self.keeper.write_all()
+        self.full_rate.write_all()
         self._watchdog.close()
         self.recorder.end(self._end_reason, self.clock.sim_time_s)
 
     def _on_tick(self) -> None:
-        """Called in the maintainer's thread, for a loop that is blocked or never calls the bridge.
+        """Do once a second, in the maintainer's thread, what a silent loop does not do.
 
-        Waiting rows are written. Webots' API must not be called in this thread, so it is not known
-        here whether simulation time advances without the bridge.
+        Write waiting rows, check whether the loop hangs, and warn once if it never calls the
+        bridge. Webots' API must not be called in this thread, so whether simulation time advances
+        is only known from the bridge's own calls.
         """
         recorder, began_s = self.recorder, self._began_s
         if recorder.rows_waiting and time.monotonic() - recorder.last_use_s > _IDLE_S:

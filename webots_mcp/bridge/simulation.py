@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.liveness import LoopTimes
+from webots_mcp.database.heartbeat import LoopTimes
 from webots_mcp.database.stacks import STEPPING
 from webots_mcp.errors import CommandRefusedError
 
@@ -45,7 +45,7 @@ class Simulation:
     def __init__(self, robot: Any) -> None:
         _require_robot(robot)
         self.robot = robot
-        self.over = False
+        self.over = False  # Webots has ended the controller
         self.supervisor: bool = _may_supervise(robot)
         self.meter = LoopMeter()
         self._gate = StepGate(robot, self.meter)
@@ -108,7 +108,7 @@ class Simulation:
         return names.get(self.mode, "real_time")
 
     def pump(self) -> bool:
-        """Exchange messages with Webots without advancing time; False if it says quit."""
+        """Exchange messages with Webots without advancing time; False if it ends the controller."""
         self._mode_set = None
         if self._gate.exchange() != QUIT:
             return True
@@ -181,10 +181,10 @@ class Simulation:
         return self._gate.files
 
     def end(self) -> None:
-        """Webots wants the controller to end: its API must not be called any more.
+        """Stop calling Webots' API, since Webots wants the controller to end.
 
         Webots' library would end the process in the next `step` of the user's loop, without any
-        cleanup. So that step is answered here, with -1, on which the loop ends by itself.
+        cleanup. So the bridge answers that step with -1, and the loop ends by itself.
         """
         self._gate.close(lambda _: QUIT)
         self.over = True
@@ -223,12 +223,12 @@ def _is_robot(value: object) -> bool:
 
 
 def _has_method(robot: object, name: str) -> bool:
-    """Whether its class has the method: a wrapper that forwards all attributes is not a robot."""
+    """Return whether a robot's class has the method; wrappers only forward to a robot that has."""
     return callable(getattr(type(robot), name, None))
 
 
 def _may_supervise(robot: Any) -> bool:
-    """Whether it is a Supervisor: by its class, and by the permission in the world file."""
+    """Return whether it is a Supervisor: by its class, and by the permission in the world file."""
     return hasattr(robot, "simulationSetMode") and bool(robot.getSupervisor())
 
 
@@ -306,9 +306,9 @@ class StepGate:
 
 
 class _OfSlotted:
-    """A class's attribute for robots with `__slots__`, which have no place for it; None of others.
+    """An attribute of a class for robots with `__slots__`, which cannot store it themselves.
 
-    They are held for ever, so that no later robot has the number of one that is gone.
+    They are never released, so that no later robot gets the id of a former one.
     """
 
     def __init__(self) -> None:
@@ -360,12 +360,12 @@ def _guarded(name: str, method: Method) -> Method:
 
 
 def _vehicles(robot: Any) -> list[Any]:
-    """Webots' classes whose `step` calls the C library and not `Robot.step`: `vehicle.Driver`."""
+    """Return Webots' classes whose `step` bypasses `Robot.step`, such as `vehicle.Driver`."""
     return [cls for cls in type(robot).__mro__ if cls.__module__.partition(".")[0] == _VEHICLE]
 
 
 def _owner_of_step(robot: Any) -> Any:
-    """The last class that defines both `step` and `getTime`.
+    """Return the last class that defines both `step` and `getTime`.
 
     A subclass that overrides `step` (an environment, say) hardly ever redefines `getTime` too.
     """
@@ -373,7 +373,7 @@ def _owner_of_step(robot: Any) -> Any:
     return owners[-1] if owners else type(robot)
 
 
-# -- whose time a round of the loop takes ----------------------------------------------------------
+# -- how long the controller, Webots and the bridge take in a round of the loop --------------------
 
 
 class LoopMeter:
@@ -396,13 +396,13 @@ class LoopMeter:
         self._steps = -1  # until the first step has ended: what a controller does before is no loop
 
     def leave_own(self) -> None:
-        """The controller's own code calls a step or the bridge."""
+        """Note that the controller's own code calls a step or the bridge."""
         now_s = time.perf_counter()
         self._own_s += now_s - self.at_s
         self.at_s = now_s
 
     def leave_step(self, answer: int, has_advanced: bool) -> int:
-        """Webots has answered; returns its answer."""
+        """Note that Webots has answered a step; return its answer."""
         now_s = time.perf_counter()
         self.thread = threading.get_ident()
         self._step_s += now_s - self.at_s
@@ -414,7 +414,7 @@ class LoopMeter:
         return answer
 
     def leave_bridge(self) -> None:
-        """A call of the bridge ends, or it lets a step be made."""
+        """Note that a call of the bridge ends, or that it lets a step be made."""
         self.at_s = time.perf_counter()
 
     def begin_run(self) -> None:
@@ -489,20 +489,20 @@ class Clock:
         self.moved_s = time.monotonic()
 
     def newest_s(self, run: CurrentRun) -> float:
-        """The newest simulation time of the current run, or of the one before it."""
+        """Return the newest simulation time of the current run, or of the one before it."""
         return self.sim_time_s if run is self.run else self.ended_sim_time_s
 
     def await_reset(self) -> None:
-        """A reset was asked for. It happens at the end of the next physics step.
+        """Expect the reset that was requested, which happens at the end of the next physics step.
 
-        Close to the start of a run, the first time after the reset is not below the last one before
-        it. So where the last time was 0, any later time is taken for the new run's; else the same
-        time again after a step is.
+        Close to the start of a run, the first time after a reset is not below the last one before
+        it. So if the last time was 0, any later time counts as the new run's; else the same time
+        again after a step does.
         """
         self._reset_from_s = self.sim_time_s
 
     def forget_reset(self) -> None:
-        """No reset happened in time: do not wait for it any more."""
+        """Stop expecting a reset, since none happened in time."""
         self._reset_from_s = None
 
     def _is_awaited_reset(self, now_s: float, after_step: bool) -> bool:
@@ -517,7 +517,7 @@ class Clock:
 
 
 class CurrentRun:
-    """A stretch of rising simulation time; its id is None until its row is written.
+    """A segment of rising simulation time; its id is None until its row is written.
 
     Attributes:
         rows: The number of its states in the database.

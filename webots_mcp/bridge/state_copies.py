@@ -21,10 +21,10 @@ _LEAVES: Final = frozenset((float, int, str, bool, type(None)))
 
 
 class StateCopy:
-    """The values of a state, and where in it they stand.
+    """A copied state: its values, and the shape into which they belong.
 
     Attributes:
-        values: Them, packed.
+        values: The values, packed by `marshal`.
     """
 
     __slots__ = ("_shape", "values")
@@ -126,7 +126,7 @@ class _ShapeWriter:
         """
         kind = type(value)
         if kind in _LEAVES:
-            self._take_room(1)
+            self._count_values(1)
             self.values.append(name)
             return next
         if depth > _MOST_DEPTH:
@@ -140,35 +140,37 @@ class _ShapeWriter:
     def _add_dict(
         self, value: dict[Any, Any], name: str, depth: int
     ) -> Callable[[Iterator[Any]], Any]:
-        here = self._test(name, "dict", len(value))
+        container = self._test(name, "dict", len(value))
         parts: list[tuple[str, Callable[[Iterator[Any]], Any]]] = []
         for key, item in value.items():
             if type(key) is not str:
                 raise _UnlikeError
-            parts.append((key, self.add(item, f"{here}[{key!r}]", depth + 1)))
+            parts.append((key, self.add(item, f"{container}[{key!r}]", depth + 1)))
         return lambda values: {key: restore(values) for key, restore in parts}
 
     def _add_items(
         self, value: list[Any] | tuple[Any, ...], name: str, depth: int
     ) -> Callable[[Iterator[Any]], Any]:
         kind, count = type(value), len(value)
-        here = self._test(name, kind.__name__, count)
+        container = self._test(name, kind.__name__, count)
         if _LEAVES.issuperset(map(type, value)):
-            self._take_room(count)
-            self.values.append(f"*{here}")
+            self._count_values(count)
+            self.values.append(f"*{container}")
             return lambda values: kind(next(values) for _ in range(count))
-        parts = [self.add(item, f"{here}[{i}]", depth + 1) for i, item in enumerate(value)]
+        parts = [self.add(item, f"{container}[{i}]", depth + 1) for i, item in enumerate(value)]
         return lambda values: kind(restore(values) for restore in parts)
 
     def _test(self, name: str, kind: str, count: int) -> str:
-        """Assign a container to a name of its own, and test it."""
-        self._take_room(1)
-        here = f"c{len(self.lines)}"
-        self.lines.append(f"{here} = {name}")
-        self.lines.append(f"if type({here}) is not {kind} or len({here}) != {count}: raise unlike")
-        return here
+        """Write lines that assign a container to a name of its own and check type and length."""
+        self._count_values(1)
+        own_name = f"c{len(self.lines)}"
+        self.lines.append(f"{own_name} = {name}")
+        self.lines.append(
+            f"if type({own_name}) is not {kind} or len({own_name}) != {count}: raise unlike"
+        )
+        return own_name
 
-    def _take_room(self, count: int) -> None:
+    def _count_values(self, count: int) -> None:
         self._count += count
         if self._count > _MOST_VALUES:
             raise _UnlikeError

@@ -1,11 +1,12 @@
-"""Writes down where the loop is when it gives no sign of life.
+"""Records where the loop is if it gives no sign of life.
 
-Once a second the maintainer's thread looks, and where the loop is silent for longer than the limit
-it writes the stacks of all threads: with the interpreter's lock, so that no thread changes them
-meanwhile. The timer of `faulthandler` does without that lock, and ended one process in 15 to 100
-whose code was running then (Python 3.10 to 3.13, measured); it is not used. Where C code keeps the
-lock, no thread of Python runs. The file's time stops then, and who asks for the status sends a
-signal on which `faulthandler` writes the stacks (`store.robots`); those stand still as well.
+Once a second the maintainer's thread checks the loop. If the loop is silent for longer than the
+limit, the thread writes the stacks of all threads, while it holds the interpreter's lock, so that
+no other thread runs meanwhile. The timer of `faulthandler` is not used: it works without that lock,
+and ended one process in 15 to 100 whose code was running then (measured, Python 3.10 to 3.13).
+
+While C code holds the lock, no Python thread runs, and the file's time stops. Then a process that
+reads the status sends a signal, on which `faulthandler` writes the stacks (`store.robots`).
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ _WEBOTS: Final = ("controller", "vehicle")  # its packages
 
 
 class Watchdog:
-    """Of the loop of one session; it is off for a database in memory, and with a limit of 0.
+    """Watches the loop of one session; off for a database in memory, and with a limit of 0.
 
     Args:
-        database: Next to which the file is.
-        limit_s: So long may the loop be silent, in seconds of wall time.
+        database: The database; the file with the stacks is written next to it.
+        limit_s: How long the loop may be silent, in seconds of wall time.
     """
 
     def __init__(
@@ -65,12 +66,12 @@ class Watchdog:
         self._about |= {"step_files": files, "libraries": libraries}
         self._file = -1
         self._head = b""
-        self._began_s = self._silent_since_s = 0.0  # signs of life
-        self._judged_s = 0.0  # when the stacks were written that were judged last
+        self._began_s = self._silent_since_s = 0.0  # times of signs of life
+        self._judged_s = 0.0  # wall time of the stacks that were judged last
         self._logged = 0
 
     def begin(self) -> None:
-        """What the loop's thread does from now on counts."""
+        """Begin to watch the loop."""
         self._began_s = self._meter.at_s = time.perf_counter()
         self.check()
 
@@ -83,18 +84,18 @@ class Watchdog:
                 self._write_if_silent()
             except (OSError, RuntimeError) as error:
                 self._end()
-                text = f"hangs of the loop are not looked for: {error}"
+                text = f"hangs of the loop are not detected: {error}"
                 self._journal.log("warning", "bridge", text)
 
     def close(self) -> None:
-        """Log what was written last, and remove the file."""
+        """Log the stacks that were written last, and remove the file."""
         is_locked = self._lock.acquire(timeout=1.0)  # an interrupt may have left it locked
         self._end()
         if is_locked:
             self._lock.release()
 
     def abandon(self) -> None:
-        """In a forked child: the file is the parent's."""
+        """Stop in a forked child: the file belongs to the parent."""
         self._is_on = False
 
     def _end(self) -> None:
@@ -109,7 +110,7 @@ class Watchdog:
     def _write_if_silent(self) -> None:
         if self._file < 0 or not os.fstat(self._file).st_nlink:
             self._open()
-        if self._judge():  # what came of a signal, which may have woken the loop: who sent it looks
+        if self._judge():  # a signal has written them, and may have woken the loop: keep them
             return
         alive_s = self._meter.at_s
         if time.perf_counter() - alive_s < self._limit_s:
@@ -121,32 +122,32 @@ class Watchdog:
             self._judge()
 
     def _open(self) -> None:
-        """Make the file; a former one was deleted."""
+        """Create the file, also after it was deleted."""
         if self._file >= 0:
             self._leave_file()
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
         self._file = os.open(self._path, flags, PRIVATE_FILE)
         lock(self._file)
         if SIGNAL and signal.getsignal(SIGNAL) is signal.SIG_DFL:
-            _nowhere()  # now: at the end there may be no file descriptor left for it
+            _null_device()  # opened now: at the end there may be no file descriptor left for it
             faulthandler.register(SIGNAL, self._file, all_threads=True)
             self._about["signal"] = SIGNAL
 
     def _leave_file(self) -> None:
-        """Close it; a signal that was sent meanwhile must neither end the process nor find it."""
+        """Close the file; a signal that arrives later must neither end the process nor write."""
         self._check_signal()
         if "signal" in self._about:
-            faulthandler.register(SIGNAL, _nowhere(), all_threads=False)
+            faulthandler.register(SIGNAL, _null_device(), all_threads=False)
         file, self._file = self._file, -1  # first: the number may be another file's at once
         os.close(file)
 
     def _check_signal(self) -> None:
-        """Leave it to a controller that has taken it for itself."""
+        """Give the signal up if the controller has installed a handler of its own."""
         if "signal" in self._about and signal.getsignal(SIGNAL) is not signal.SIG_DFL:
             del self._about["signal"]
 
     def _begin_anew(self) -> None:
-        """Whose stacks will follow; the time of the file shows that Python runs."""
+        """Write the first line, which names run and thread, or touch the file: Python runs."""
         self._check_signal()
         now = {"run": self._clock.run.uuid, "thread": self._meter.thread}
         head = json.dumps(self._about | now).encode() + b"\n"
@@ -158,7 +159,7 @@ class Watchdog:
         self._head = head
 
     def _judge(self) -> bool:
-        """Log where the loop was, unless it waited for Webots or had not begun; True if new."""
+        """Log where the loop was, unless it waited for Webots; return whether stacks are new."""
         with open(self._file, "rb", closefd=False) as file:
             stacks = read_stacks(file)
         if stacks is None or stacks.wall_time_s == self._judged_s or not stacks.is_hang:
@@ -172,5 +173,5 @@ class Watchdog:
 
 
 @functools.cache
-def _nowhere() -> int:
+def _null_device() -> int:
     return os.open(os.devnull, os.O_WRONLY)

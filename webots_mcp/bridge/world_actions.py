@@ -24,10 +24,8 @@ from webots_mcp.database.files import full_path
 from webots_mcp.database.location import require_world_of
 from webots_mcp.errors import CommandRefusedError, ControllerEndedError, InvalidInputError
 
-_RESET_TIMEOUT_S: Final = 10.0
 _RELOAD_TIMEOUT_S: Final = 30.0
 _DIALOG: Final = "a dialog may be open in Webots (start it with --batch)"
-_HIGHEST_STATUS: Final = 255  # of a process
 
 
 class WorldActions:
@@ -78,14 +76,15 @@ class WorldActions:
         clock, run = self._clock, self._clock.run
         clock.await_reset()
         self._simulation.robot.simulationReset()
-        deadline_s = time.monotonic() + _RESET_TIMEOUT_S
+        timeout_s = 10.0
+        deadline_s = time.monotonic() + timeout_s
         with self._pause.awaiting_step():  # the state published in the first step is of the new run
             while clock.run is run:
                 if time.monotonic() > deadline_s:
                     clock.forget_reset()
                     raise CommandRefusedError(
                         "simulationReset() was called, but simulation time did not go back within "
-                        f"{_RESET_TIMEOUT_S:.0f} s; check that the loop still calls step()"
+                        f"{timeout_s:.0f} s; check that the loop still calls step()"
                     )
                 yield
 
@@ -114,10 +113,13 @@ class WorldActions:
         return (yield from _until_ended("worldLoad"))
 
     def _world_of_project(self, world: object) -> Path:
-        """A world of the current one's project.
+        """Return the file of a world, which must be in the project of the current one.
 
-        This is checked here, so that every client is bound by it: loading a world starts its
-        controllers, and so runs their code.
+        Loading a world runs the code of its controllers. The bridge checks this, not the server,
+        so that every client is bound by it.
+
+        Raises:
+            InvalidInputError: If it is no world, or a world of another project.
         """
         try:
             file = full_path(world) if isinstance(world, str) else Path()
@@ -134,7 +136,7 @@ class WorldActions:
 
     def quit(self, command: ClaimedCommand) -> Progress:
         """Ask Webots to end; this process ends with it."""
-        status = whole_number(command.params, "status", 0, _HIGHEST_STATUS, default=0)
+        status = whole_number(command.params, "status", 0, 255, default=0)
         return self._quit(command, status)
 
     def _quit(self, command: ClaimedCommand, status: int) -> Progress:
@@ -149,7 +151,7 @@ class WorldActions:
 
 
 def _until_ended(asked: str) -> Progress:
-    """Done when the controller ends, which Webots does before anything else."""
+    """Wait until Webots ends the controller, which it does first of all."""
     deadline_s = time.monotonic() + _RELOAD_TIMEOUT_S
     try:
         while time.monotonic() < deadline_s:

@@ -470,7 +470,7 @@ def _follow(
         time.sleep(_LOOK_EVERY_S)
     webots.wait_for_output()
     if first is None and _announce_first(launched) is None:
-        launched.record_last_words()
+        launched.record_unfollowed_output()
         _say(launched.silence())
     return code
 

@@ -38,7 +38,7 @@ from webots_mcp.errors import (
 Result = TypeVar("Result")
 
 _UNINTERRUPTED_MS: Final = 100
-LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits so long
+LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits this long
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _CALLED_OFF: Final = "called off"
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
@@ -51,28 +51,28 @@ _ABOUT_A_VALUE: Final = (
 # All that a statement may raise because of the database.
 FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemError)
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
-_MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
-_TOKENS: Final = re.compile(
-    r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
+# Patterns are texts, which `re` compiles when they are needed: most are for foreign objects only.
+_MADE: Final = r'(?i)CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)'
+_TOKENS: Final = (
+    r"(?s)('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])"
 )
-_OF_COLUMNS: Final = re.compile(
-    r'CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
-    r'(, ?"?\w+"?( (ASC|DESC))?)*\)',
-    re.IGNORECASE,
+_OF_COLUMNS: Final = (
+    r'(?i)CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
+    r'(, ?"?\w+"?( (ASC|DESC))?)*\)'
 )
-_INDEX: Final = re.compile(r"CREATE (UNIQUE )?INDEX")
+_INDEX: Final = r"CREATE (UNIQUE )?INDEX"
 _OBJECTS: Final = (
     "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
     "FROM {}.sqlite_master WHERE sql IS NOT NULL"
 )
-# SQLite's own, which our questions use: a table or view of that name would be read in their place.
-_OF_SQLITE: Final = re.compile(r"pragma_|json_(each|tree)$|sqlite_")
+# Names of SQLite's own functions: a table or view of such a name would be read in their place.
+_OF_SQLITE: Final = r"pragma_|json_(each|tree)$|sqlite_"
 _OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
 _NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
 LONGEST_READ_S: Final = 60.0  # of a statement of a reader
-_STEPS_PER_LOOK: Final = 1_000_000  # of SQLite's virtual machine: some 20 ms
+_STEPS_PER_CHECK: Final = 1_000_000  # of SQLite's virtual machine: some 20 ms
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
 _MOST_DESCRIPTORS: Final = 1024
 # Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
@@ -85,19 +85,20 @@ _PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
 
 
 def never_wait(connection: sqlite3.Connection) -> None:
-    """From now on a lock that is held by another is an error at once, not a wait."""
+    """Make a lock that another connection holds an error at once from now on, not a wait."""
     connection.execute("PRAGMA busy_timeout=0")
 
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Generator[None]:
-    """All that is written inside is stored, or nothing; the write lock is taken before the first.
+    """Open a transaction that takes the write lock first: all writes in it are stored, or none.
 
     Args:
-        connection: In autocommit mode and in no transaction, as `connect` gives it.
+        connection: A connection in autocommit mode and in no transaction, as `connect` opens it.
 
     Raises:
-        sqlite3.Error: Also where the lock is not to be had (`is_busy`); then nothing ran inside.
+        sqlite3.Error: If a write fails, or the lock cannot be acquired (`is_busy`); in that case
+            nothing inside has run.
     """
     try:
         _begin(connection)
@@ -124,7 +125,15 @@ def _begin(connection: sqlite3.Connection) -> None:
 
 
 def _begun(connection: sqlite3.Connection, *, last: bool) -> bool:
-    """Whether the write lock is had; the last attempt raises where it is not."""
+    """Try once to take the write lock.
+
+    Args:
+        connection: A connection that is in no transaction.
+        last: Raise if the lock is held by another connection.
+
+    Returns:
+        Whether the lock was acquired.
+    """
     try:
         connection.execute("BEGIN IMMEDIATE")
     except sqlite3.OperationalError as error:
@@ -135,9 +144,10 @@ def _begun(connection: sqlite3.Connection, *, last: bool) -> bool:
 
 
 def in_transaction(connection: sqlite3.Connection, act: Callable[[], Result]) -> Result:
-    """As `transaction`, also where a KeyboardInterrupt comes between any two lines.
+    """Call `act` in a transaction that no KeyboardInterrupt can leave open.
 
-    A `with` statement has a moment after BEGIN and one before COMMIT that are outside of it.
+    A `with` statement cannot promise that: an interrupt may come right after BEGIN, before its
+    block has begun, or right before COMMIT, after its block has ended.
     """
     try:
         connection.execute("BEGIN IMMEDIATE")
@@ -156,21 +166,22 @@ def roll_back(connection: sqlite3.Connection) -> None:
 
 
 class AtomicStatements:
-    """Statements that SQLite runs as one: one short transaction in one call.
+    """Statements that SQLite runs as one short transaction in one call.
 
-    Work done while control loops run holds the write lock for a millisecond at most. In a
-    process with several threads a `transaction` cannot promise that: between any two of its
-    statements another thread may run for 5 ms and more, while every robot waits for the lock.
-    Statements in the body of a trigger run without Python in between.
+    Maintenance holds the write lock for a millisecond at most while control loops run. In a process
+    with several threads a `transaction` cannot promise that: between two of its statements another
+    thread may run for 5 ms and more, while every robot waits for the lock. The statements in the
+    body of a trigger run without Python in between.
 
-    What a step writes is prepared before it, in temporary tables, which lock no other process out.
+    The rows to write are prepared in temporary tables, which lock out no other process.
 
     Args:
-        name: Of the step, unlike that of any table.
-        parameters: Names of the values that it is run with: `NEW.name` in the statements.
-        statements: Tables without the name of a database, no LIMIT on a DELETE or an UPDATE (so
-            SQLite wants it in triggers).
-        unless: A condition in SQL under which nothing is done: what was prepared is out of date.
+        name: The name of the trigger's view; no table may have it.
+        parameters: Names of the values of a call, which the statements use as `NEW.name`.
+        statements: The statements. As in any trigger, tables have no schema name, and a DELETE or
+            UPDATE has no LIMIT.
+        unless: A condition in SQL; if it holds, the prepared rows are out of date, and nothing is
+            done.
     """
 
     def __init__(
@@ -187,14 +198,17 @@ class AtomicStatements:
         self._run = f"INSERT INTO {name} VALUES ({marks})"
 
     def run(self, connection: sqlite3.Connection, *values: object) -> bool:
-        """Do all of it and return True, or nothing.
+        """Run all statements, or none of them.
 
         Args:
-            connection: In autocommit mode; it has the temporary tables that the statements name.
-            values: One for each parameter.
+            connection: A connection in autocommit mode, with the temporary tables.
+            values: One value for each parameter.
+
+        Returns:
+            False if the condition `unless` held, and nothing was done.
 
         Raises:
-            sqlite3.Error: Also where the write lock is not to be had (`is_busy`).
+            sqlite3.Error: If a statement fails, or the write lock cannot be acquired (`is_busy`).
         """
         for statement in self._prepare:
             connection.execute(statement)
@@ -208,30 +222,30 @@ class AtomicStatements:
 
 
 def is_busy(error: Exception) -> bool:
-    """Whether another connection held the lock at that instant: trying again helps.
+    """Return whether another connection held the lock at that instant, so that a retry helps.
 
-    `sqlite3` raises more than its own errors: a damaged file makes it quote bytes in a message,
-    which are no UTF-8. So who writes catches any Exception, and asks here what it means.
+    `sqlite3` raises more than its own errors: for a damaged file it may quote bytes in a message
+    that are not UTF-8. So code that writes catches any Exception, and checks its meaning here.
     """
     return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)
 
 
 def is_about_a_value(error: Exception) -> bool:
-    """Whether a single value cannot be read, by SQLite or as text; the file is whole."""
+    """Return whether a single value cannot be read, while the file itself is intact."""
     if isinstance(error, UnicodeDecodeError):  # else it is SQLite's own message that is no text
         return not any(words in text_of(error) for words in _DAMAGE)
     return isinstance(error, sqlite3.Error) and any(s in str(error) for s in _ABOUT_A_VALUE)
 
 
 def is_damage(error: Exception) -> bool:
-    """Whether SQLite says that the file itself is broken, or never was a database."""
+    """Return whether SQLite says that the file itself is broken, or never was a database."""
     if not isinstance(error, FAILURES) or is_about_a_value(error):
         return False
     return any(words in text_of(error) for words in _DAMAGE)
 
 
 def text_of(error: Exception) -> str:
-    """What went wrong, also where SQLite's own message is no text."""
+    """Return the message of an error, even if SQLite's own message is not valid text."""
     if isinstance(error, UnicodeDecodeError):
         return error.object.decode("utf-8", "replace")
     # Python 3.10 leaves such a message out; of this class itself, it was about the file.
@@ -239,7 +253,7 @@ def text_of(error: Exception) -> str:
 
 
 def is_unwritable(error: Exception) -> bool:
-    """Whether the file, or the folder that it needs for its log, cannot be written."""
+    """Return whether the file, or the folder that it needs for its log, cannot be written."""
     return isinstance(error, sqlite3.OperationalError) and any(
         text in str(error) for text in _UNWRITABLE
     )
@@ -258,11 +272,11 @@ def is_unwritable(error: Exception) -> bool:
 
 
 def schema_version(connection: sqlite3.Connection) -> int:
-    """The schema version of a database of ours; 0 for an empty file.
+    """Return the schema version of a database of ours; 0 for an empty file.
 
     Raises:
-        ForeignDatabaseError: The file holds tables of another application.
-        sqlite3.DatabaseError: The file is no database, or is damaged.
+        ForeignDatabaseError: If the file holds tables of another application.
+        sqlite3.DatabaseError: If the file is not a database, or is damaged.
     """
     # In this order: another starter may be making the tables now, in one transaction. By PRAGMAs:
     # in the place of SQLite's own `pragma_user_version` a view of that name would be read.
@@ -289,7 +303,9 @@ def require_current(connection: sqlite3.Connection) -> None:
     """Raise unless the database has exactly the schema of this version.
 
     Raises:
-        SchemaTooNewError, SchemaTooOldError, ForeignDatabaseError: As they say.
+        SchemaTooNewError: If a newer version of webots-mcp made the database.
+        SchemaTooOldError: If an older version made it.
+        ForeignDatabaseError: If another application made it.
     """
     version = schema_version(connection)
     if version > SCHEMA_VERSION:
@@ -308,10 +324,10 @@ def require_current(connection: sqlite3.Connection) -> None:
 
 
 def create_schema(connection: sqlite3.Connection) -> None:
-    """Make the tables in an empty database; of several starters at once, one does it.
+    """Create the tables in an empty database, and its UUID, the only row of `recording`.
 
-    The database gets its UUID, the one row of `recording`. The check, the tables and that row
-    stand in one transaction that takes the write lock first.
+    Several processes may call this at the same time: one transaction, which takes the write lock
+    first, checks that the database is still empty.
     """
     with transaction(connection):
         if schema_version(connection) == 0:
@@ -332,14 +348,14 @@ def statements_of(file: Path) -> tuple[str, ...]:
 
 
 def shipped_objects() -> dict[str, str]:
-    """Return by their names the statements that make what each recording has."""
+    """Return the statements that create what each recording has, by name."""
     return _objects_of(shipped_statements())
 
 
 @cache
 def _objects_of(statements: tuple[str, ...]) -> dict[str, str]:
-    """Return by their names the statements that make tables, views, indexes and triggers."""
-    made = ((_MADE.match(each), each.rstrip()) for each in statements)
+    """Return the statements that create tables, views, indexes and triggers, by name."""
+    made = ((re.match(_MADE, each), each.rstrip()) for each in statements)
     return {match[1].lower(): each for match, each in made if match}
 
 
@@ -349,24 +365,24 @@ def require_shipped(
     schema: str = "main",
     statements: tuple[str, ...] | None = None,
 ) -> None:
-    """Raise where a table, view or index of ours is not what we ship, or something runs on one.
+    """Refuse a database whose objects differ from those that we ship, or run code on our tables.
 
-    A table or view that is missing is as wrong; an index is not.
+    A missing table or view is refused too; a missing index is not.
 
     Args:
-        connection: Nothing but PRAGMAs was asked of that database yet.
-        schema: The name that the database was attached under.
-        statements: Those that made the tables; None for those of this version.
+        connection: A connection on which only PRAGMAs have run so far.
+        schema: The name under which the database is attached.
+        statements: The statements that created the tables; None for those of this version.
 
     Raises:
-        ForeignDatabaseError: The text names what it is, and what to do.
+        ForeignDatabaseError: If an object differs; the text names it and says what to do.
     """
     shipped = _objects_of(statements or shipped_statements())
     texts = set(shipped.values())
     found = connection.execute(_OBJECTS.format(schema)).fetchall()
     names = {name.lower() for _, name, _, _ in found}
     for name, sql in shipped.items():
-        if name not in names and not _INDEX.match(sql):  # without one, all is slower, and true
+        if name not in names and not re.match(_INDEX, sql):  # without one, all is slower, and true
             raise ForeignDatabaseError(
                 f"{_file(connection, schema)} has no {name!r}, which webots-mcp makes in each "
                 "recording: use a copy from before it was removed"
@@ -379,7 +395,7 @@ def require_shipped(
         if (why := _why_refused(kind, name, table, sql, shipped, referring)) is not None:
             raise ForeignDatabaseError(
                 f"the {kind} {name[:60]!r} in {_file(connection, schema)} {why}, and webots-mcp "
-                "has not made it, so nothing of the file is used: if it is your own, remove it "
+                "did not create it, so nothing of the file is used: if it is your own, remove it "
                 f"(sqlite3 FILE 'DROP {kind.upper()} ...'), else do not trust the file"
             )
 
@@ -392,28 +408,32 @@ def _file(connection: sqlite3.Connection, schema: str) -> str:
 def _why_refused(
     kind: str, name: str, table: str, sql: str, shipped: dict[str, str], referring: set[str]
 ) -> str | None:
-    """Why an object is refused; None where it is harmless, or ours in another spelling."""
+    """Return why an object is refused; None if it is harmless, or ours in another spelling."""
     if (ours := shipped.get(name.lower())) is not None:
-        return None if _spelled(sql) == _spelled(ours) else "stands where another is in recordings"
-    if _OF_SQLITE.match(name.lower()) and not sql.startswith(_OF_SQLITE_MADE):
+        return (
+            None
+            if _spelled(sql) == _spelled(ours)
+            else "differs from the object of that name in recordings"
+        )
+    if re.match(_OF_SQLITE, name.lower()) and not sql.startswith(_OF_SQLITE_MADE):
         return "has a name of SQLite's own"
     if kind == "trigger" and (table.lower() in shipped or table.lower() in referring):
         return f"runs when {table[:60]!r} is written to"
-    if kind == "index" and table.lower() in shipped and not _OF_COLUMNS.fullmatch(sql.strip()):
+    if kind == "index" and table.lower() in shipped and not re.fullmatch(_OF_COLUMNS, sql.strip()):
         return f"computes when {table[:60]!r} is written to"
     return None
 
 
 def _refers(sql: str) -> bool:
-    """Whether a table may have foreign keys, by which a deleted row of ours deletes rows there."""
+    """Return whether a table may have foreign keys: deleting a row of ours may delete its rows."""
     return "references" in sql.lower()
 
 
 def _spelled(sql: str) -> list[str]:
-    """The words of a statement: versions of SQLite and ours differ in spaces and comments."""
+    """Split a statement into words, since SQLite may store other spaces and comments."""
     return [
         each if each.startswith("'") else each.strip('"').lower()
-        for each in _TOKENS.findall(sql)
+        for each in re.findall(_TOKENS, sql)
         if not each.startswith(("/*", "--"))
     ]
 
@@ -424,12 +444,12 @@ Role = Literal["loop", "writer", "reader"]
 # SQLite remembers in the process' own memory which files it has open and locked. A fork copies that
 # memory, but not the locks: a connection that the child opens to the same file believes to hold
 # locks that it does not have, and destroys the database under its parent.
-# Device and inode; None where this process was forked and has not looked yet.
+# Device and inode of each such file; None if this process was forked and has not listed them yet.
 _inherited: set[tuple[int, int]] | None = set()
 
 
 class ReadingConnection(sqlite3.Connection):
-    """Each statement is interrupted after a minute: what others wrote may take for ever to read."""
+    """Interrupts each statement after a minute, since views of others may never end."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -437,12 +457,12 @@ class ReadingConnection(sqlite3.Connection):
         keep_deadline(self)
 
     def execute(self, *statement: Any) -> sqlite3.Cursor:
-        """Execute like any connection, with a deadline of its own."""
+        """Execute a statement, with a deadline of its own."""
         self._until_s[0] = time.monotonic() + LONGEST_READ_S
         return super().execute(*statement)
 
     def is_late(self) -> Callable[[], bool]:
-        """A function that returns whether the newest statement has exceeded its time."""
+        """Return a function that returns whether the newest statement exceeds its time."""
         until_s = self._until_s
         return lambda: time.monotonic() > until_s[0]
 
@@ -450,14 +470,14 @@ class ReadingConnection(sqlite3.Connection):
 def keep_deadline(connection: sqlite3.Connection) -> None:
     """Restore a connection's own deadline, if it has one, after another one was set."""
     is_late = connection.is_late() if isinstance(connection, ReadingConnection) else None
-    connection.set_progress_handler(is_late, _STEPS_PER_LOOK)
+    connection.set_progress_handler(is_late, _STEPS_PER_CHECK)
 
 
 class FrozenConnection(ReadingConnection):
-    """To a file in a place that cannot be written, read as it lies on the disk.
+    """A connection to a file in a folder that cannot be written.
 
-    Reading a database in WAL mode needs two files next to it. Where they cannot be created and do
-    not exist, only the file itself counts, and SQLite reads it as one that never changes.
+    Reading a database in WAL mode needs two files next to it. If these do not exist and cannot be
+    created, SQLite reads the database file alone, as one that never changes.
     """
 
 
@@ -466,22 +486,22 @@ def connect(
 ) -> sqlite3.Connection:
     """Open the database in autocommit mode: transactions begin only where the code says so.
 
-    For a "reader" a file that cannot be written is opened as well, see `FrozenConnection`.
+    A "reader" can also open a file that cannot be written, see `FrozenConnection`.
 
     Args:
         database: A file or a database in memory.
-        role: "loop" for a controller, "writer" for the server, "reader" cannot write.
-        create: Make the file (empty, in WAL mode) and its folder where they are missing.
-        patient: Wait up to 5 s for locks, here and later; a control loop does not.
+        role: "loop" for a controller, "writer" for the server, "reader" for read access.
+        create: Create the file (empty, in WAL mode) and its folder if they are missing.
+        patient: Wait up to 5 s for locks, now and later; a control loop does not.
 
     Raises:
-        NoDatabaseError: The file is missing and `create` is false.
-        DatabaseError: The folder cannot be made, the file cannot be opened, its log cannot be
-            read where nothing can be written, or SQLite is too old.
-        ForeignDatabaseError: The file belongs to another application, or holds under our names,
-            or on our tables, what we did not make.
-        ForkedProcessError: The process that this one was forked from has the file open.
-        sqlite3.Error: The file is no database, or is locked for longer than 5 s.
+        NoDatabaseError: If the file is missing and `create` is false.
+        DatabaseError: If the folder cannot be created, the file cannot be opened, its log cannot
+            be read in a folder without write access, or SQLite is too old.
+        ForeignDatabaseError: If the file belongs to another application, or has objects under our
+            names, or on our tables, that we did not create.
+        ForkedProcessError: If the process from which this one was forked has the file open.
+        sqlite3.Error: If the file is not a database, or is locked for longer than 5 s.
     """
     _require_usable(database)
     address = database.uri if isinstance(database, MemoryDatabase) else _file_uri(database, create)
@@ -505,7 +525,7 @@ def connect(
 
 
 def _prepare(connection: sqlite3.Connection, role: Role) -> None:
-    """Set what the role needs, and look whether all is ours; another version's is not used."""
+    """Set the PRAGMAs of the role, and refuse foreign objects in a database of this version."""
     for pragma in _PRAGMAS[role]:
         connection.execute(f"PRAGMA {pragma}")
     if _can_distrust():
@@ -516,9 +536,9 @@ def _prepare(connection: sqlite3.Connection, role: Role) -> None:
 
 @cache
 def _can_distrust() -> bool:
-    """Whether views may be kept from functions with side effects, and ours work nevertheless.
+    """Return whether `trusted_schema` can be off without breaking our own views.
 
-    SQLite 3.40 counts those of JSON, which our views call, among them.
+    SQLite 3.40 counts the JSON functions, which our views call, among those with side effects.
     """
     with closing(sqlite3.connect(":memory:")) as probe:
         probe.execute("PRAGMA trusted_schema=OFF")
@@ -545,7 +565,7 @@ def _require_usable(database: Database) -> None:
 
 
 def is_inherited(file: Path) -> bool:
-    """Whether a process that this one was forked from had the file open at that moment."""
+    """Return whether a process that this one was forked from had the file open at that moment."""
     global _inherited
     if _inherited is None:
         _inherited = _open_files()
@@ -590,7 +610,11 @@ def _open(address: str, timeout_s: float, kind: type[sqlite3.Connection]) -> sql
 
 
 def _open_frozen(file: Path) -> sqlite3.Connection:
-    """Only without a write-ahead log, which may have the newest rows, or be written right now."""
+    """Open a file that cannot be written, as one that never changes.
+
+    Raises:
+        DatabaseError: If it has a write-ahead log, which may have the newest rows.
+    """
     log = file.with_name(f"{file.name}-wal")
     if log.exists():
         raise DatabaseError(
@@ -608,9 +632,9 @@ def _open_frozen(file: Path) -> sqlite3.Connection:
 
 
 def identify_files(database: Database) -> tuple[int, ...]:
-    """Which files a database consists of at this moment.
+    """Identify the files of a database, to notice later that they were deleted or replaced.
 
-    A connection to files that were deleted or replaced still works, on data that no other sees.
+    A connection to such files still works, on data that no other process sees.
     """
     if isinstance(database, MemoryDatabase):
         return ()
@@ -656,21 +680,21 @@ def _make(file: Path) -> None:
 
 
 def is_there(file: Path) -> bool:
-    """Whether the file exists.
+    """Return whether the file exists.
 
     Raises:
-        DatabaseError: Its folder cannot be looked into.
+        DatabaseError: If its folder cannot be read.
     """
     try:
         return file.exists()
     except OSError as error:
-        raise DatabaseError(f"{file} cannot be looked at: {error}") from error
+        raise DatabaseError(f"{file} cannot be checked: {error}") from error
 
 
 def _make_wal(connection: sqlite3.Connection) -> None:
-    """Set what can only be set while the file is empty; harmless on one that is not.
+    """Set the journal mode and vacuum mode, which is only possible while the file is empty.
 
-    Asking first matters: setting the mode needs a lock even where it changes nothing.
+    The mode is read first, since setting it takes a lock even if nothing changes.
     """
     if journal_mode(connection) in ("wal", "memory"):
         return
@@ -679,9 +703,9 @@ def _make_wal(connection: sqlite3.Connection) -> None:
 
 
 def journal_mode(connection: sqlite3.Connection) -> str:
-    """The journal mode in force; anything but "wal" on a file means: no shared memory there.
+    """Return the journal mode; for a file, any mode but "wal" means that memory cannot be shared.
 
-    Network file systems and the border between Windows and WSL cannot share memory, and without
-    it readers and writers block each other.
+    Network file systems cannot share memory, nor can Windows and WSL with each other. Without
+    shared memory, readers and writers block each other.
     """
     return str(connection.execute("PRAGMA journal_mode").fetchone()[0])

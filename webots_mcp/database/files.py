@@ -1,4 +1,4 @@
-"""Files and folders that are their owner's alone, and files that are replaced whole.
+"""Creates private files and folders, and replaces files as a whole.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -9,33 +9,29 @@ import os
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from webots_mcp.errors import InvalidInputError
-
-if TYPE_CHECKING:
-    pass
-
 
 PRIVATE_FOLDER: Final = 0o700  # recordings hold pictures and logs: they are their owner's alone
 PRIVATE_FILE: Final = 0o600
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder that is its owner's alone; one that is there already keeps its mode.
+    """Create a folder that only its owner can read; an existing folder keeps its mode.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: If it cannot be created.
     """
     folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
 
 
 @contextmanager
 def whole_file(file: Path) -> Generator[Path]:
-    """A file next to it to write to, private to its owner, which replaces it when it is complete.
+    """Open a private temporary file next to a file, and replace that file once it is complete.
 
     Raises:
-        OSError: It cannot be written; no part of it is left.
+        OSError: If it cannot be written; no part of it is left.
     """
     aside = file.with_name(f"{file.name}.part")
     aside.touch(PRIVATE_FILE)
@@ -49,10 +45,10 @@ def whole_file(file: Path) -> Generator[Path]:
 
 @contextmanager
 def placed(file: Path) -> Generator[Path]:
-    """As `whole_file`, for a file that somebody has named.
+    """Open a temporary file like `whole_file`, for a file that a user has named.
 
     Raises:
-        InvalidInputError: It cannot be written.
+        InvalidInputError: If it cannot be written.
     """
     try:
         with whole_file(file) as aside:
@@ -62,10 +58,10 @@ def placed(file: Path) -> Generator[Path]:
 
 
 def full_path(path: str | os.PathLike[str]) -> Path:
-    """The path with `~` and links followed.
+    """Return the path with `~` and links followed.
 
     Raises:
-        OSError: `~` is no user's home, links form a circle, or the name is not valid.
+        OSError: If `~` is not a user's home, links form a circle, or the name is not valid.
     """
     try:
         return Path(path).expanduser().resolve()

@@ -70,7 +70,7 @@ class DataFolder(NamedTuple):
 
 
 def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
-    """Where the database and the pictures live; the same answer for bridge and server.
+    """Return the folder of the database and the pictures; the same for bridge and server.
 
     In rising order of precedence: `~/.webots-mcp/data`; `mcp_data/` in the nearest folder at or
     above the current one that is a Webots project (see `find_project`); the environment variable
@@ -80,7 +80,7 @@ def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
 
 
 def choose_data_dir(data_dir: str | os.PathLike[str] | None = None) -> DataFolder:
-    """As `resolve_data_dir`, with the rule."""
+    """Return the same folder as `resolve_data_dir`, and the rule that chose it."""
     if data_dir is not None:
         return DataFolder(full_path(data_dir), "it was named")
     if named := os.environ.get(DATA_DIR_VARIABLE):
@@ -114,14 +114,14 @@ def _is_project(folder: Path) -> bool:
 
 
 def require_world_of(project: Path | None, world: Path) -> Path:
-    """The project of a world that may be opened: a world starts the controllers of its project.
+    """Return the project of a world; refuse one of another project, whose controllers it starts.
 
     Args:
-        project: It has to lie in this one; None for any.
-        world: Its file, with links followed.
+        project: The project that it must lie in; None for any.
+        world: The world file, with links followed.
 
     Raises:
-        InvalidInputError: It is no world, or lies in no project, or in another one.
+        InvalidInputError: If it is not a world, or lies in no project, or in another one.
     """
     if world.suffix != WORLD_ENDING:
         raise InvalidInputError(f"{world} is no world: its name does not end with {WORLD_ENDING}")
@@ -139,7 +139,7 @@ def resolve_database(
     database: str | os.PathLike[str] | MemoryDatabase | None = None,
     data_dir: str | os.PathLike[str] | None = None,
 ) -> tuple[Database, Path]:
-    """The database and the folder of its pictures, from what a user gave.
+    """Return the database and the folder of its pictures, from what a user gave.
 
     Args:
         database: A file, `":memory:"` for a new one in memory, an open `MemoryDatabase`, or None
@@ -147,8 +147,8 @@ def resolve_database(
         data_dir: The data folder; None for the database's own folder, else `resolve_data_dir`.
 
     Raises:
-        TypeError: `database` is of another type.
-        OSError: A path cannot be followed.
+        TypeError: If `database` is of another type.
+        OSError: If a path cannot be followed.
     """
     if isinstance(database, str) and database == ":memory:":
         database = MemoryDatabase()

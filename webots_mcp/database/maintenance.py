@@ -33,7 +33,7 @@ from webots_mcp.database.connection import (
     require_current,
     text_of,
 )
-from webots_mcp.database.liveness import JobLease, give_back, take
+from webots_mcp.database.leases import JobLease, give_back, take
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn
@@ -47,8 +47,8 @@ WAL_LIMIT_BYTES: Final = 1_000_000  # a shorter log is left alone
 LONG_LOG_BYTES: Final = 12_000_000  # it begins anew, for which rows wait a few milliseconds
 LONGEST_LOG_BYTES: Final = 32_000_000  # its file is cut
 FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
-# A log that a reader holds cannot begin anew. People are told of one that is longer than this, or,
-# where little space is left, than a share of it.
+# A log that a reader holds cannot begin anew. A warning is printed if it is longer than this or, on
+# a disk with little space, than a share of the free space.
 HELD_LOG_BYTES: Final = 100_000_000
 SHARE_OF_FREE_SPACE: Final = 0.1
 _SHORTEST_HELD_LOG_BYTES: Final = 40_000_000  # a log that nobody holds may be nearly as long
@@ -102,7 +102,7 @@ class Maintainer(threading.Thread):
         self._log_bytes = 0  # after the last checkpoint
         self._is_held = False  # a reader keeps the log from beginning anew
         self._retry_s = 0.0
-        self._has_told_of_reader = False
+        self._has_warned_of_reader = False
         self._warned_of = ""
         self.failures = 0  # rounds that were not finished
 
@@ -131,7 +131,7 @@ class Maintainer(threading.Thread):
             self._give_back()
 
     def tick(self) -> bool:
-        """One round of work; True if this maintainer holds the lease."""
+        """Do one round of work; return whether this maintainer holds the lease."""
         self._interval_s = INTERVAL_S
         if self._on_tick is not None:
             self._on_tick()
@@ -163,7 +163,7 @@ class Maintainer(threading.Thread):
         return connection
 
     def _hold_lease(self, connection: sqlite3.Connection) -> bool:
-        """Renew at half time only, so that most ticks write nothing."""
+        """Take or renew the lease; it is renewed at half time, so that most ticks write nothing."""
         now = time.time()
         lease = connection.execute(_LEASE, {"holder": self._lease.holder}).fetchone()
         is_ours, is_bridges, until_s = lease or (False, False, 0.0)
@@ -177,7 +177,7 @@ class Maintainer(threading.Thread):
         return self._take_lease(connection)
 
     def _take_lease(self, connection: sqlite3.Connection) -> bool:
-        """Also renew it, or take it from a bridge where this is a server."""
+        """Take or renew the lease; a server takes it from a bridge."""
         return take(connection, self._lease, outranked=self._outranked)
 
     def _checkpoint(self, connection: sqlite3.Connection) -> None:
@@ -204,18 +204,19 @@ class Maintainer(threading.Thread):
         self._log_bytes = log_bytes
 
     def _note_held(self, *, is_held: bool) -> None:
-        """Warn of a reader that holds a long log, once until it lets go."""
+        """Warn of a reader that holds a long log, once until it releases it."""
         self._is_held, self._retry_s = is_held, time.monotonic() + _HELD_RETRY_S
-        told = held_log(self._database) if is_held else None
-        if told is not None and not self._has_told_of_reader:
-            warn(f"{told}: {FREE_THE_LOG}")
-        self._has_told_of_reader = is_held and (self._has_told_of_reader or told is not None)
+        description = held_log(self._database) if is_held else None
+        if description is not None and not self._has_warned_of_reader:
+            warn(f"{description}: {FREE_THE_LOG}")
+        has_warned = self._has_warned_of_reader or description is not None
+        self._has_warned_of_reader = is_held and has_warned
 
     def _copy_log(self, connection: sqlite3.Connection, how: str) -> int:
-        """Checkpoint after a commit of one's own, without which the log might begin anew meanwhile.
+        """Checkpoint right after a commit of our own, so that no other commit restarts the log.
 
         Returns:
-            How long the log is; 0 once it begins anew.
+            The length of the log in bytes; 0 once it begins anew.
         """
         if not self._take_lease(connection):
             return 0
@@ -245,7 +246,7 @@ class Maintainer(threading.Thread):
 
 
 def held_log(database: Database) -> str | None:
-    """What is to be told of a log that is so long that a reader must hold it, else None."""
+    """Describe a log that is so long that a reader must hold it; None for a shorter one."""
     if isinstance(database, MemoryDatabase):
         return None
     import shutil  # which a controller loads only here, in the maintainer's thread
@@ -265,7 +266,7 @@ def held_log(database: Database) -> str | None:
 
 
 def _described(error: Exception) -> str:
-    """An error of the database or of ours speaks for itself; any other needs its kind."""
+    """Return an error of the database or of ours speaks for itself; any other needs its kind."""
     if isinstance(error, (sqlite3.Error, WebotsMCPError, OSError)):
         return text_of(error)
     return repr(error)

@@ -23,19 +23,13 @@ from __future__ import annotations
 
 import math
 import sqlite3
-import time
 from typing import Final, NamedTuple
-
-from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, BreakpointAction
-from webots_mcp.database.connection import transaction
-from webots_mcp.errors import InvalidInputError
 
 PAUSED: Final = "paused"  # how a command controls the loop: the column session.pause_state
 STEPPING: Final = "stepping"
 STEPPING_WORLD: Final = "stepping the world"  # which waits for this robot meanwhile
 PAUSE: Final = "pause"  # the kinds of the events
 RESUME: Final = "resume"
-VIOLATION: Final = "violation"  # what was expected did not hold
 
 IN_WEBOTS: Final = "a person or another controller, in Webots"
 SESSION_BEFORE: Final = "the controller's session before this one"
@@ -75,61 +69,15 @@ _OF_RUN: Final = (
     "SELECT kind, wall_time_s FROM event WHERE run_id = ? "
     f"AND kind IN ('{PAUSE}', '{RESUME}') ORDER BY id"
 )
-OF_CONTROLLER: Final = "controller"  # `created_by` of those that the controller's own code has set
-# Those end with their session.
-OF_PROJECT: Final = "project"  # of those of its file
-_MEANT: Final = "(b.robot_id = r.id OR b.robot_name IN ('*', r.name))"
-_OF_ROBOT: Final = (
-    f"FROM robot r JOIN breakpoint b ON {_MEANT} LEFT JOIN session s ON s.id = b.session_id "
-    f"WHERE r.id = ? AND (b.created_by IS NOT '{OF_CONTROLLER}' "
-    "OR (s.id IS NOT NULL AND s.ended_wall_time_s IS NULL))"
-)
-# What a bridge arms; texts come as bytes, because one that is no UTF-8 would fail the statement.
-ARMED: Final = (
-    "SELECT b.id, CAST(b.condition AS BLOB), CAST(b.action AS BLOB), b.after_hits, "
-    "CAST(b.name AS BLOB), CAST(b.expects AS BLOB), CAST(b.during AS BLOB) "
-    f"FROM robot r JOIN breakpoint b ON {_MEANT} "
-    "WHERE r.id = :robot AND b.enabled AND typeof(b.after_hits) = 'integer' "
-    f"AND (b.created_by IS NOT '{OF_CONTROLLER}' OR b.session_id = :session) "
-    "ORDER BY b.id LIMIT :most"
-)
-# What was expected of a run: by its controller's code, and by the project.
-EXPECTED: Final = (
-    "SELECT b.expects, b.during, b.name, b.created_by FROM run u JOIN robot r ON r.id = u.robot_id "
-    f"JOIN breakpoint b ON {_MEANT} WHERE u.id = ? AND b.expects IS NOT NULL "
-    f"AND (b.created_by IS NOT '{OF_CONTROLLER}' OR b.session_id = u.session_id) ORDER BY b.id"
-)
-_LISTED: Final = (
-    "SELECT b.id, r.id, b.condition, b.action, b.after_hits, b.enabled, b.hit_count, "
-    f"b.created_wall_time_s, b.created_by, b.error {_OF_ROBOT} ORDER BY b.id"
-)
-_IDS: Final = f"SELECT b.id {_OF_ROBOT} ORDER BY b.id"
-_COUNT: Final = f"SELECT count(*) {_OF_ROBOT} AND b.enabled"
-_LIKE: Final = (
-    f"SELECT b.id {_OF_ROBOT} AND b.enabled AND b.condition = ? AND b.action = ? "
-    "AND b.after_hits = ? AND b.expects IS NULL"
-)
-# Of a controller's own code with its session, else without one.
-SET: Final = (
-    "INSERT INTO breakpoint (robot_id, session_id, condition, action, after_hits, "
-    "created_wall_time_s, created_by, name, expects, during) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id"
-)
-_REMOVE: Final = "DELETE FROM breakpoint WHERE id = ? AND robot_id = ? RETURNING id"
-_NEWEST_HIT: Final = (
-    "SELECT e.run_id, e.sim_time_s FROM event e JOIN run u ON u.id = e.run_id "
-    "WHERE u.robot_id = ? AND e.kind IN ('breakpoint', 'violation') "
-    "AND json_extract(e.data, '$.breakpoint_id') = ? ORDER BY e.id DESC LIMIT 1"
-)
 
 
 class Cause(NamedTuple):
-    """For what a pause began, or ended; of most fields nothing is known.
+    """Why a pause began or ended; fields that do not apply are None.
 
     Attributes:
-        command_id: Of the command that did it.
-        breakpoint_id: Of the breakpoint that was hit; None also where it is not stored.
-        condition: Of that breakpoint.
+        command_id: The command that did it.
+        breakpoint_id: The breakpoint that was hit; None also if it is not stored.
+        condition: The condition of that breakpoint.
         by: Who else did it, in words.
     """
 
@@ -155,13 +103,13 @@ class Cause(NamedTuple):
 def change_since(
     connection: sqlite3.Connection, session_id: int, sim_time_s: float, wall_time_s: float
 ) -> str | None:
-    """`PAUSE` or `RESUME`, whichever happened last since a heartbeat; None for neither.
+    """Return `PAUSE` or `RESUME`, whichever happened last since a heartbeat; None for neither.
 
     Args:
-        connection: To the recording.
+        connection: A connection to the recording.
         session_id: The session.
         sim_time_s: The simulation time of its heartbeat.
-        wall_time_s: When that was.
+        wall_time_s: The wall time of its heartbeat.
     """
     values = {"session_id": session_id, "sim_time_s": sim_time_s, "wall_time_s": wall_time_s}
     row = connection.execute(_CHANGE_SINCE, values).fetchone()
@@ -169,7 +117,7 @@ def change_since(
 
 
 def breakpoint_at(connection: sqlite3.Connection, session_id: int) -> str | None:
-    """Which breakpoint began the newest pause of a session, and when; None where a command did."""
+    """Describe the breakpoint that began the newest pause of a session; None if a command did."""
     found = connection.execute(_CONDITION, (session_id,)).fetchone()
     if found is None or found[0] is None:
         return None
@@ -177,7 +125,7 @@ def breakpoint_at(connection: sqlite3.Connection, session_id: int) -> str | None
 
 
 def paused_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> float:
-    """For how much of the wall time of a run, up to its end, its bridge kept it paused."""
+    """Return for how many seconds of wall time its bridge kept a run paused, up to its end."""
     total_s, since_s = 0.0, math.inf
     for kind, wall_s in (*connection.execute(_OF_RUN, (run_id,)), (RESUME, end_wall_s)):
         if kind == PAUSE:
@@ -186,83 +134,3 @@ def paused_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> 
             total_s += max(0.0, wall_s - since_s)
             since_s = math.inf
     return total_s
-
-
-# The stored breakpoints: conditions that a robot's bridge asks of each published state.
-
-
-class StoredBreakpoint(NamedTuple):
-    """A breakpoint as the database has it.
-
-    Attributes:
-        enabled: False once its condition failed; `error` says why.
-        hit_count: How often the condition began to hold, in all runs.
-    """
-
-    id: int
-    robot_id: int
-    condition: str
-    action: str
-    after_hits: int
-    enabled: bool
-    hit_count: int
-    created_wall_time_s: float
-    created_by: str | None
-    error: str | None
-
-
-def list_breakpoints(connection: sqlite3.Connection, robot_id: int) -> list[StoredBreakpoint]:
-    """Those of a robot, the oldest first."""
-    return [StoredBreakpoint(*row) for row in connection.execute(_LISTED, (robot_id,)).fetchall()]
-
-
-def set_breakpoint(
-    connection: sqlite3.Connection,
-    robot_id: int,
-    condition: str,
-    action: BreakpointAction,
-    after_hits: int,
-    created_by: str,
-) -> int:
-    """Store one; the one that is there already is the answer to its like. Returns its id.
-
-    Raises:
-        InvalidInputError: The robot has as many as there may be.
-    """
-    with transaction(connection):
-        asked = (condition, action, after_hits)
-        if (like := connection.execute(_LIKE, (robot_id, *asked)).fetchone()) is not None:
-            return int(like[0])
-        if connection.execute(_COUNT, (robot_id,)).fetchone()[0] >= MAX_BREAKPOINTS:
-            raise InvalidInputError(
-                f"this robot has {MAX_BREAKPOINTS} breakpoints: remove one first"
-            )
-        values = (robot_id, None, *asked, time.time(), created_by, None, None, None)
-        return int(connection.execute(SET, values).fetchall()[0][0])
-
-
-def remove_breakpoint(connection: sqlite3.Connection, robot_id: int, breakpoint_id: int) -> None:
-    """Delete one; the events of its hits stay.
-
-    Raises:
-        InvalidInputError: The robot has none of that id.
-    """
-    with transaction(connection):
-        removed = connection.execute(_REMOVE, (breakpoint_id, robot_id)).fetchall()
-    if removed:
-        return
-    there = [str(number) for (number,) in connection.execute(_IDS, (robot_id,)).fetchall()]
-    if str(breakpoint_id) in there:
-        raise InvalidInputError(
-            f"breakpoint {breakpoint_id} is an expectation of {PROJECT_FILE}: change it there"
-        )
-    known = f"there are {', '.join(there)}" if there else "it has none"
-    raise InvalidInputError(f"this robot has no breakpoint {breakpoint_id}; {known}")
-
-
-def newest_hit(
-    connection: sqlite3.Connection, robot_id: int, breakpoint_id: int
-) -> tuple[int, float] | None:
-    """Run and simulation time of the newest hit whose action was taken; None without any."""
-    row = connection.execute(_NEWEST_HIT, (robot_id, breakpoint_id)).fetchone()
-    return None if row is None else (row[0], row[1])

@@ -1,10 +1,10 @@
-"""The command queue: the rows of `command`, and every statement that changes one.
+"""The command queue as a client uses it: adds commands, cancels them, and reads their outcome.
 
-A client adds a command as `pending`. The controller that it is for makes it `claimed`, in one
-statement and before anything runs, and then `done` or `failed`. A command that is not claimed in
-time is `expired`, one that its client cancels before that is `cancelled`, and one whose claimer's
-process ended without an answer is `lost`. So a command runs at most once, and its outcome is final:
-each statement names the status that it expects, which holds for any number of processes.
+A client adds a command as `pending`. The robot's controller makes it `claimed`, in one statement
+and before anything runs, and then `done` or `failed`. A command that is not claimed in time becomes
+`expired`, one that its client cancels before that `cancelled`, and one whose controller ended
+without an answer `lost`. So a command runs at most once, and its outcome is final: each statement
+names the status that it expects (`queue_statements`), whatever other processes do.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -40,57 +40,6 @@ _CANCEL: Final = (
     "WHERE id = :id AND status = 'pending'"
 )
 _NOTE: Final = "UPDATE command SET error = :note WHERE id = :id AND status = 'claimed'"
-# An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
-# it is made only after this has found a command. The texts are read as bytes: one that is not
-# UTF-8 would fail the statement after it claimed the command.
-PEEK: Final = (
-    "SELECT 1 FROM command WHERE robot_id = ? AND status = 'pending' "
-    "AND expires_wall_time_s > ? LIMIT 1"
-)
-# A session that was judged dead although it lives may have a successor: commands are for that one.
-_SUCCESSOR: Final = (
-    "FROM session s WHERE s.robot_id = :robot AND s.id > :session AND s.ended_wall_time_s IS NULL"
-)
-CLAIM: Final = (
-    "UPDATE command SET status = 'claimed', session_id = :session, claimed_wall_time_s = :now, "
-    "claimed_sim_time_s = :sim_time WHERE status = 'pending' AND id = (SELECT id FROM command "
-    "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
-    f"ORDER BY id LIMIT 1) AND NOT EXISTS (SELECT 1 {_SUCCESSOR}) "
-    "RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB), CAST(requested_by AS BLOB)"
-)
-SUCCESSOR_PID: Final = f"SELECT s.pid {_SUCCESSOR} LIMIT 1"
-# Commands are claimed in the order of their ids. One row always.
-CLAIMED_SINCE: Final = (
-    "SELECT (SELECT max(id) FROM command WHERE session_id = ? AND status = 'claimed' AND id > ?)"
-)
-_OF_CLAIMER: Final = "WHERE id = :command AND status = 'claimed' AND session_id = :session"
-ISSUE: Final = f"UPDATE command SET issued_wall_time_s = :now {_OF_CLAIMER}"
-FINISH: Final = (
-    "UPDATE command SET status = :status, finished_wall_time_s = :now, "
-    f"finished_sim_time_s = :sim_time, result = :result, error = :error {_OF_CLAIMER}"
-)
-# The process that asked for the reload is gone; that this one runs is the proof that it worked.
-CONFIRM_RELOAD: Final = (
-    "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
-    "finished_sim_time_s = :sim_time, result = json_object('run_id', :run, 'mode', :mode, "
-    "'why', 'a reload keeps the mode') "
-    "WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND action = 'reload' "
-    "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
-)
-EXPIRE: Final = (
-    "UPDATE command SET status = 'expired', finished_wall_time_s = :now, "
-    "error = 'no controller claimed it in time; it will never run' "
-    "WHERE status = 'pending' AND expires_wall_time_s <= :now"
-)
-CLAIMED_BY_ENDED: Final = (
-    "SELECT c.id, c.issued_wall_time_s, s.extern, s.uuid FROM command c "
-    "LEFT JOIN session s ON s.id = c.session_id "
-    "WHERE c.status = 'claimed' AND (s.id IS NULL OR s.ended_wall_time_s IS NOT NULL)"
-)
-LOSE: Final = (
-    "UPDATE command SET status = 'lost', finished_wall_time_s = :now, error = :why "
-    "WHERE id = :id AND status = 'claimed'"
-)
 
 
 class QueuedCommand(NamedTuple):
@@ -119,7 +68,7 @@ class QueuedCommand(NamedTuple):
         return self.status in FINAL_STATUSES
 
     def decoded_result(self) -> Any:
-        """What the controller answered; None where it did not, or where it is no JSON."""
+        """Return the controller's answer; None if there is none, or it is not JSON."""
         try:
             return json.loads(self.result) if self.result is not None else None
         except ValueError:
@@ -134,14 +83,6 @@ _NEWEST: Final = (
     "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
     "ORDER BY id DESC LIMIT :limit"
 )
-
-# -- who asks ----------------------------------------------------------------------------------
-
-
-# -- the controller that it is for -------------------------------------------------------------
-
-
-# -- processes that see that none will finish it (`liveness.reap`) ----------------------------
 
 
 class CommandQueue:
@@ -169,24 +110,24 @@ class CommandQueue:
         idempotency_key: str | None = None,
         request_id: int | None = None,
     ) -> QueuedCommand:
-        """Ask for an action; sending it again with the same key makes no second command.
+        """Queue a command; sending it again with the same key makes no second command.
 
         The insert is repeated while the database is busy. That is safe: every repetition carries
         the same unique key, so that an insert whose answer was lost is found instead of doubled.
 
         Args:
-            robot_id: Whose controller is to run it.
+            robot_id: The robot whose controller is to run it.
             action: A built-in or registered action.
             params: Its parameters, plain JSON.
-            time_to_live_s: Unclaimed after this time, it expires and never runs.
-            requested_by: Who asks, for the record.
-            idempotency_key: A key of the caller's; one is made up if it is None.
-            request_id: The row of the request that it is sent for.
+            time_to_live_s: Time after which an unclaimed command expires and never runs.
+            requested_by: The caller, for the record.
+            idempotency_key: A key of the caller's; None for a new one.
+            request_id: The row of the request for which it is sent.
 
         Raises:
-            InvalidInputError: The parameters are not plain JSON or too long, or the key already
-                belongs to another request.
-            sqlite3.OperationalError: The database stayed locked.
+            InvalidInputError: If the parameters are not plain JSON or too long, or the key already
+                belongs to another command.
+            sqlite3.OperationalError: If the database stayed locked.
         """
         key = idempotency_key or new_uuid()
         now_s = self._clock()
@@ -210,7 +151,7 @@ class CommandQueue:
         return command
 
     def leave(self, command_id: int, why: str) -> bool:
-        """The caller has stopped waiting: cancel it, or note that where it is already running.
+        """Cancel a command whose caller has stopped waiting, or note that if it is already running.
 
         Returns:
             Whether it is running.
@@ -227,16 +168,16 @@ class CommandQueue:
 
 
 def find_command(connection: sqlite3.Connection, idempotency_key: str) -> QueuedCommand | None:
-    """The command that was sent with that key; None where none was."""
+    """Return the command that was sent with that key; None where none was."""
     row = connection.execute(_BY_KEY, (idempotency_key,)).fetchone()
     return QueuedCommand(*row) if row else None
 
 
 def fetch_command(connection: sqlite3.Connection, command_id: int) -> QueuedCommand:
-    """The command of that id.
+    """Return the command of that id.
 
     Raises:
-        InvalidInputError: There is none.
+        InvalidInputError: If there is none.
     """
     row = connection.execute(_BY_ID, (command_id,)).fetchone()
     if row is None:
@@ -252,7 +193,7 @@ def list_commands(
     status: str | None = None,
     before_id: int | None = None,
 ) -> list[QueuedCommand]:
-    """The robot's newest commands, newest first; with a limit of -1 all of them.
+    """Return the robot's newest commands, newest first; with a limit of -1 all of them.
 
     `before_id` pages towards older ones.
     """
@@ -261,7 +202,7 @@ def list_commands(
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:
-    """Whether `liveness.reap` could have anything to say about commands."""
+    """Return whether `dead_sessions.reap` could have anything to say about commands."""
     return bool(connection.execute(_UNFINISHED).fetchone()[0])
 
 

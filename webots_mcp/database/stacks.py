@@ -1,9 +1,9 @@
-"""Where a silent loop is: the stacks of a controller's threads, in a file next to the database.
+"""Shows where a silent loop is: stacks of a controller's threads, in a file next to the database.
 
-The bridge lets `faulthandler` write them where the loop gives no sign of life for longer than a
-limit. The first line of the file is a JSON object: whose stacks they are, and which files are not
-the controller's own. What follows is empty, or what `faulthandler` wrote; its time is that of the
-file. The file stays locked while its process lives.
+The bridge lets `faulthandler` write them if the loop gives no sign of life for longer than a limit.
+The first line of the file is a JSON object: the run, the thread, and which files are libraries. The
+rest is what `faulthandler` wrote, if anything; the time of the file is when. The file stays locked
+while its process lives.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -24,26 +24,26 @@ FORMAT: Final = 1
 LOGGER: Final = "stacks"  # of the log rows
 SIGNAL: Final = getattr(signal, "SIGRTMAX", 5) - 5  # 0, none, but on Linux
 STEPPING: Final = ("step", "stepBegin", "stepEnd")  # methods in which a controller waits for Webots
-_THREAD: Final = re.compile(
-    r"^(?:Current thread|Thread) 0x([0-9a-f]+)[^\n]*\(most recent call first\):\n((?:  .*\n?)*)",
-    re.MULTILINE,
+# Patterns are texts, which `re` compiles when they are needed: rarely in a controller.
+_THREAD: Final = (
+    r"(?m)^(?:Current thread|Thread) 0x([0-9a-f]+)[^\n]*\(most recent call first\):"
+    r"\n((?:  .*\n?)*)"
 )
-_CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
-_FOLDERS: Final = re.compile(r".*[/\\]")
+_CALL: Final = r'(?m)^  File "(.*)", line (\S+) in (.*)$'
 # Folders whose files are no controller's own: this package's, and Python's.
 LIBRARIES: Final = (f"{Path(__file__).parents[1]}{os.sep}", f"{Path(os.__file__).parent}{os.sep}")
-INSTALLED: Final = re.compile(
+INSTALLED: Final = (
     r"[/\\](?:site|dist)-packages[/\\]|[/\\]lib[/\\]controller[/\\]python[/\\]|^<frozen "
 )
-_DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
-_BY_PERSON: Final = "waitForUserInputEvent"  # of Webots' Robot: a key or a click is waited for
+_DEBUGGER: Final = r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)"
+_BY_PERSON: Final = "waitForUserInputEvent"  # of Webots' Robot: it waits for a key or a click
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
-_UNTOUCHED_S: Final = 3.0  # the maintainer's thread touches the file each second
+_UNTOUCHED_S: Final = 3.0  # the maintainer's thread normally touches the file once a second
 _MOST_BYTES: Final = 200_000
 _MOST_TEXT: Final = 4000
 _MOST_CALLERS: Final = 3
 _LONGEST_NAME: Final = 60
-# What a file that was made by others raises.
+# The errors that a file of unknown origin may raise.
 _STRANGE: Final = (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError)
 
 
@@ -55,28 +55,29 @@ class Call(NamedTuple):
     function: str
 
     def __str__(self) -> str:
-        place = f"{_cut(_FOLDERS.sub('', self.file))}:{self.line}"
+        name = re.split(r"[/\\]", self.file)[-1]
+        place = f"{_cut(name)}:{self.line}"
         return place if self.function == "<module>" else f"{place}, {_cut(self.function)}()"
 
     @property
     def as_caller(self) -> str:
-        """In a list of callers, where its name is enough."""
+        """Its name in a list of callers."""
         return str(self) if self.function == "<module>" else f"{_cut(self.function)}()"
 
 
 class Stacks(NamedTuple):
-    """What was written of a silent controller.
+    """The stacks of a silent controller.
 
     Attributes:
-        wall_time_s: When, Unix time.
+        wall_time_s: When they were written, in Unix time.
         run: UUID of the run.
         limit_s: How long the loop may be silent.
-        calls: Of the loop's thread, the innermost first; never empty.
-        own: Of them, those of the controller's own code: neither the bridge's nor a library's.
-        is_hang: That code, or what it called, keeps the loop from its step; else it waits for
-            Webots in a step, or for a person: in a debugger of Python, for a key or a click.
-        is_in_step: It waits for Webots.
-        text: All threads, as `faulthandler` wrote them.
+        calls: The calls of the loop's thread, the innermost first; never empty.
+        own: Those calls that are the controller's own code, neither the bridge's nor a library's.
+        is_hang: Whether that code, or what it called, keeps the loop from its step. Otherwise the
+            loop waits for Webots in a step, or for a person: in a debugger, for a key or a click.
+        is_in_step: Whether the loop waits for Webots.
+        text: The stacks of all threads, as `faulthandler` wrote them.
     """
 
     wall_time_s: float
@@ -89,7 +90,7 @@ class Stacks(NamedTuple):
     text: str
 
     def began_after(self, last_seen_wall_time_s: float) -> bool:
-        """Whether the loop had been silent for the limit since that sign of life."""
+        """Return whether the loop had been silent for the limit since that sign of life."""
         return self.wall_time_s - last_seen_wall_time_s >= _EARLY * self.limit_s
 
     @property
@@ -101,26 +102,26 @@ class Stacks(NamedTuple):
         return text if place is self.calls[0] else f"{text}; there in {self.calls[0]}"
 
     def log_values(self, sim_time_s: float | None) -> dict[str, float | str | None]:
-        """Of the log row, which is known by its time."""
+        """Return the values of the log row, which its time identifies."""
         text = f"silent for more than {self.limit_s:g} s in {self.place}\n{self.text[:_MOST_TEXT]}"
         return {"sim_time": sim_time_s, "wall_time": self.wall_time_s, "message": text}
 
 
 def stacks_path(database: Path, session_uuid: str) -> Path:
-    """Where the stacks of a session's process are written."""
+    """Return the file in which the stacks of a session's process are written."""
     return Path(f"{database}-stacks-{session_uuid}.txt")
 
 
 def read_stacks(file: BinaryIO) -> Stacks | None:
-    """What a file holds; None where nothing was written, or it cannot be read."""
+    """Read the stacks in a file; None if there are none, or it cannot be read."""
     file.seek(0)
     head, _, rest = file.read(_MOST_BYTES).partition(b"\n")
     text = rest.decode("utf-8", "replace")
     try:
         about = json.loads(head)
         run, limit_s = str(about["run"]), float(about["limit_s"])
-        threads = {int(thread, 16): calls for thread, calls in _THREAD.findall(text)}
-        calls = [Call(*call) for call in _CALL.findall(threads[about["thread"]])]
+        threads = {int(thread, 16): calls for thread, calls in re.findall(_THREAD, text)}
+        calls = [Call(*call) for call in re.findall(_CALL, threads[about["thread"]])]
         steps, libraries = (tuple(map(str, about[name])) for name in ("step_files", "libraries"))
         run.encode()
     except _STRANGE:
@@ -131,30 +132,30 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     own = [call for call in calls if call not in waits and not is_library(call.file, libraries)]
     inner = calls[: calls.index(own[0])] if own else calls
     is_in_step = any(call in waits for call in inner)
-    is_held = any(_DEBUGGER.search(call.file) or call.function == _BY_PERSON for call in calls)
+    is_held = any(re.search(_DEBUGGER, call.file) or call.function == _BY_PERSON for call in calls)
     hangs = not (is_in_step or is_held)
     written_s = os.fstat(file.fileno()).st_mtime
     return Stacks(written_s, run, limit_s, calls, own, hangs, is_in_step, text)
 
 
 def is_library(file: str, libraries: tuple[str, ...] = LIBRARIES) -> bool:
-    """Whether a file is no controller's own, but Python's, Webots', this package's or installed."""
-    return file.startswith(libraries) or INSTALLED.search(file) is not None
+    """Return whether a file belongs to Python, Webots, this package or an installed one."""
+    return file.startswith(libraries) or re.search(INSTALLED, file) is not None
 
 
 def stacks_at(path: Path) -> Stacks | None:
-    """What the file of a process holds; None where nothing was written."""
+    """Read the stacks of a process; None if there are none."""
     with suppress(*_STRANGE), path.open("rb") as file:
         return read_stacks(file)
     return None
 
 
 def needs_signal(path: Path, silent_s: float) -> bool:
-    """Whether only `SIGNAL` makes a process write the stacks of its silent loop.
+    """Return whether only `SIGNAL` makes a process write the stacks of its silent loop.
 
-    So it is where the loop is silent for the limit, nothing is written, and no thread could touch
-    the file either: C code keeps the interpreter's lock. The signal ends what that code waits for
-    in the system, such as a `sleep`, early; so nothing less is a reason to send it.
+    That is the case if the loop is silent for the limit, nothing is written, and no thread has
+    touched the file: C code holds the interpreter's lock. The signal may end a system call of that
+    code early, such as a `sleep`, so there must be no other way.
 
     Args:
         path: The file of the process.

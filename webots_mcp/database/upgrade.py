@@ -45,7 +45,7 @@ def in_current_schema(database: Path) -> Generator[Path]:
         with closing(connect(database, "reader")) as connection:
             version = schema_version(connection)
             is_frozen = isinstance(connection, FrozenConnection)
-    except sqlite3.Error:  # whoever reads it says what is wrong with it
+    except sqlite3.Error:  # reading it reports what is wrong with it
         version, is_frozen = 0, False
     if version != PREVIOUS_SCHEMA_VERSION:
         yield database

@@ -1,16 +1,15 @@
-"""The file in which writes of a controller wait for the database, and how they come into it.
+"""The file in which writes of a controller wait for the database, and how they are ingested.
 
-A row that meets a lock for longer than a control loop may wait is appended, as one line with one
-`write()`, to a file of its session next to the database (`webots.db-waiting-<session uuid>.jsonl`).
-It survives a killed process; the next process that opens the database adopts it: exactly once, in
-order, in short transactions. The progress is in `session.last_adopted_entry`, which is written in
-the same transaction as the rows. So it does not matter what happens to the file afterwards: a
-process that finds it again, after a kill or an interrupt at any place, skips the entries that are
-already in the database.
+If the database is locked for longer than a control loop may wait, a row is appended to a file of
+its session next to the database (`webots.db-waiting-<session uuid>.jsonl`), as one line with one
+`write()`. It survives a killed process. The next process that opens the database ingests it:
+exactly once, in order, in short transactions. The progress is in `session.last_adopted_entry`,
+which is written in the same transaction as the rows. So nothing that happens to the file afterwards
+matters: a process that finds it again skips the entries that are already in the database.
 
-The first line says who records. Each further one is a `WaitingEntry` as a JSON array: its number,
-its kind, the UUID of its run and its values. A line that was cut off by a kill in the middle of its
-`write()` is no JSON array, and its caller never had an answer.
+The first line has the robot and the session. Each further line is a `WaitingEntry` as a JSON array:
+its number, its kind, the UUID of its run and its values. A line that a kill cut off in the middle
+of its `write()` is not a JSON array, and its caller never received an answer.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -31,14 +30,12 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 
-from webots_mcp.database import queue
+from webots_mcp.database import queue_statements
 from webots_mcp.database.connection import in_transaction
 from webots_mcp.database.stacks import LOGGER, read_stacks, stacks_path
 from webots_mcp.errors import SessionGoneError, warn
 
-# What a controller writes while it runs: each kind of write by its name, with its statement.
-
-
+# The kinds of writes of a running controller; `STATEMENTS` has the statement of each.
 Kind = Literal[
     "run",
     "state",
@@ -77,8 +74,8 @@ _SAME_MEANING: Final = (
     "why = excluded.why, set_wall_time_s = excluded.set_wall_time_s"
 )
 
-# Values in order follow on the run's id, where there is a run; named ones may use the ids of
-# `run` and `session` too. Ids are those of the database at hand, so they never wait in a file.
+# Values in a tuple come after the run's id, if there is a run; named values may also use `:run` and
+# `:session`. These ids differ between databases, so they never wait in a file.
 STATEMENTS: Final[dict[Kind, str]] = {
     "run": (
         "INSERT INTO run (uuid, session_id, robot_id, world, basic_time_step_ms, start_reason, "
@@ -168,9 +165,9 @@ STATEMENTS: Final[dict[Kind, str]] = {
         f"SELECT s.robot_id, {_OF_ITEMS}, 'device', :now, 'bridge' "
         f"FROM session s, json_each(:rows) r WHERE s.id = :session {_SAME_MEANING}"
     ),
-    "command issued": queue.ISSUE,
-    "command finished": queue.FINISH,
-    "reload confirmed": queue.CONFIRM_RELOAD,
+    "command issued": queue_statements.ISSUE,
+    "command finished": queue_statements.FINISH,
+    "reload confirmed": queue_statements.CONFIRM_RELOAD,
     "breakpoint hit": "UPDATE breakpoint SET hit_count = hit_count + 1 WHERE id = ?",
     "breakpoint failed": "UPDATE breakpoint SET enabled = 0, error = ? WHERE id = ?",
     # What a controller's code has set ends with its session.
@@ -238,26 +235,24 @@ _NEW_SESSION: Final = (
     f"VALUES (:robot_id, :{', :'.join(SESSION_COLUMNS)}) ON CONFLICT (uuid) "
     "DO UPDATE SET ended_wall_time_s = NULL, end_reason = NULL"
 )
-# What refuses a row whatever state the database is in: its own content.
+# Errors that mean that a row's own content is refused, whatever state the database is in.
 _UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeEncodeError, OverflowError)
-# What a file that was damaged, or made by others, raises while it is read.
+# Errors that reading a damaged file, or one of unknown origin, may raise.
 _OF_THE_FILE: Final = (
     OSError, ValueError, TypeError, LookupError, RecursionError, SessionGoneError,
 )  # fmt: skip
 # At the end of the name of a journal's part: the session's UUID and the number of the part.
-_PART: Final = re.compile(
-    r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
-)
+_PART: Final = r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
 
 
 class WaitingEntry(NamedTuple):
     """One write of a session.
 
     Attributes:
-        number: Rising within the session; what was taken in once is known by it.
-        kind: Which of `STATEMENTS`.
+        number: It rises within the session and shows which entries are already in the database.
+        kind: The key of its statement in `STATEMENTS`.
         run: UUID of the run that it belongs to.
-        values: Of the statement.
+        values: The values of the statement.
     """
 
     number: int
@@ -267,7 +262,7 @@ class WaitingEntry(NamedTuple):
 
 
 def bind(run_id: int | None, session_id: int | None, values: Values) -> Values:
-    """The values of a statement, with the ids of its run and session."""
+    """Return the values of a statement, with the ids of its run and session."""
     if isinstance(values, dict):
         return {"run": run_id, "session": session_id, **values}
     return values if run_id is None else (run_id, *values)
@@ -277,18 +272,18 @@ _strange: set[Path] = set()
 
 
 def waiting_path(database: Path, session_uuid: str) -> Path:
-    """Where the entries of a session wait."""
+    """Return the file in which the entries of a session wait."""
     return Path(f"{database}-waiting-{session_uuid}.jsonl")
 
 
 def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_path) -> list[Path]:
-    """The files in which entries of bridges wait, of living sessions too; or those of a kind."""
+    """Return the files of a kind; by default those in which entries of bridges wait."""
     names = _names(database, kind)
-    return [database.with_name(name) for name in sorted(names) if not _PART.search(name)]
+    return [database.with_name(name) for name in sorted(names) if not re.search(_PART, name)]
 
 
 def left_waiting(database: Path) -> list[Path]:
-    """Those files of bridges that no living process writes."""
+    """Return the files of bridges that no living process writes."""
     left: list[Path] = []
     for path in waiting_paths(database):
         with contextlib.suppress(OSError), path.open("r+b") as file:
@@ -298,7 +293,7 @@ def left_waiting(database: Path) -> list[Path]:
 
 
 def journal_parts(database: Path) -> dict[str, list[Path]]:
-    """The journals of controllers that open no database (docs/journal.md), by session.
+    """Return the journals of controllers that open no database (docs/journal.md), by session.
 
     Returns:
         Of each UUID the parts in order; those that were written last come last. Where a part is
@@ -306,7 +301,7 @@ def journal_parts(database: Path) -> dict[str, list[Path]]:
     """
     found: dict[str, list[tuple[int, Path]]] = {}
     for name in _names(database, waiting_path):
-        if part := _PART.search(name):
+        if part := re.search(_PART, name):
             found.setdefault(part[1], []).append((int(part[2]), database.with_name(name)))
     return {
         uuid: [path for _, path in sorted(parts)]
@@ -351,7 +346,7 @@ class WaitingFile:
         """Add entries with one `write()`, all or none of them.
 
         Raises:
-            OSError: They could not be written; what was written of them is no whole line.
+            OSError: If they could not be written; a part that was written is not a whole line.
         """
         file = former = self._file
         if file is None or os.fstat(file.fileno()).st_nlink == 0:
@@ -361,7 +356,7 @@ class WaitingFile:
         self._write(file, b"".join(encoded(entry) for entry in entries))
 
     def read(self, offset: int) -> list[tuple[int, WaitingEntry]]:
-        """The next entries from that byte on; see `next_entries`."""
+        """Return the next entries from that byte on; see `next_entries`."""
         if self._file is None:
             return []
         with open(self._file.fileno(), "rb", closefd=False) as file:
@@ -386,7 +381,7 @@ class WaitingFile:
                 self.path.unlink()
 
     def _made(self) -> FileIO:
-        """A new file that says who records, with all that a deleted one still holds."""
+        """Create a file with robot and session, and with the entries of a deleted one."""
         file = open(self.path, "a+b", buffering=0, opener=_open_privately)  # noqa: SIM115
         try:
             if not lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
@@ -425,9 +420,9 @@ _open_privately: Final = partial(os.open, mode=0o600)
 
 
 def next_entries(file: BinaryIO, offset: int) -> list[tuple[int, WaitingEntry]]:
-    """Some entries from that byte on, each with the byte that follows; none at the end.
+    """Read some entries from that byte on, each with the offset after it; none at the end.
 
-    Lines that were cut off are passed over.
+    Lines that were cut off are skipped.
     """
     entries: list[tuple[int, WaitingEntry]] = []
     file.seek(offset)
@@ -441,7 +436,7 @@ def next_entries(file: BinaryIO, offset: int) -> list[tuple[int, WaitingEntry]]:
 
 
 def count_rows(path: Path) -> int:
-    """How many rows wait in a file; 0 where there is none."""
+    """Count the rows that wait in a file; 0 if there is no file."""
     offset, rows = 0, 0
     with contextlib.suppress(OSError), path.open("rb") as file:
         while entries := next_entries(file, offset):
@@ -451,10 +446,10 @@ def count_rows(path: Path) -> int:
 
 
 def read_header(file: BinaryIO) -> dict[str, Any] | None:
-    """Who recorded; None where the first line was cut off.
+    """Read robot and session of a file; None if its first line was cut off.
 
     Raises:
-        ValueError: Another version wrote the file, or it is no JSON object.
+        ValueError: If another version wrote the file, or the line is not a JSON object.
     """
     file.seek(0)
     line = file.readline(_LONGEST_HEADER_BYTES)
@@ -470,12 +465,12 @@ def read_header(file: BinaryIO) -> dict[str, Any] | None:
 
 
 def encoded(value: object) -> bytes:
-    """A line; ASCII, so that any text can be written."""
+    """Return a line; ASCII, so that any text can be written."""
     return json.dumps(value).encode() + b"\n"
 
 
 def _decoded(line: bytes) -> WaitingEntry | None:
-    """None for what is no entry: cut off by a kill, or damaged since."""
+    """Decode an entry; None for a line that was cut off by a kill, or damaged since."""
     try:
         number, kind, run, values = json.loads(line)
         entry = WaitingEntry(
@@ -506,21 +501,21 @@ def lock(fd: int) -> bool:
 
 
 def is_unfit(error: Exception) -> bool:
-    """Whether the row itself is refused; a session that is gone is the database's fault."""
+    """Return whether the row itself is refused; a missing session is not the row's fault."""
     text = str(error)
     if isinstance(error, (sqlite3.InterfaceError, sqlite3.ProgrammingError)):
         return "bind" in text  # a value of a type that SQLite does not know
     return isinstance(error, _UNFIT) and "FOREIGN KEY" not in text
 
 
-class Taken(NamedTuple):
-    """What one transaction took in.
+class Ingested(NamedTuple):
+    """The outcome of one transaction that ingested entries.
 
     Attributes:
-        since: Number of the last entry that was in before.
-        number: Of the last entry that is in.
-        written: The entries of this call; those passed over are not among them.
-        unfit: Why the database will never take an entry, for each such.
+        since: Number of the last entry that was in the database before.
+        number: Number of the last entry that is in the database now.
+        written: The entries that this call wrote; skipped ones are not among them.
+        unfit: The reason for each entry that the database will never accept.
     """
 
     since: int
@@ -529,34 +524,34 @@ class Taken(NamedTuple):
     unfit: list[str]
 
 
-def take_in(
+def ingest(
     connection: sqlite3.Connection,
     session_id: int,
     piece: Sequence[WaitingEntry],
-    finish: Callable[[Taken], object] | None = None,
+    finish: Callable[[Ingested], object] | None = None,
     begin: Callable[[WaitingEntry], dict[str, Any] | None] | None = None,
-) -> Taken:
-    """Write the entries of a session in one transaction, as many as there is time for.
+) -> Ingested:
+    """Write entries of a session in one transaction, as many as fit into a millisecond.
 
     Args:
         connection: A writer in autocommit mode and in no transaction.
-        session_id: Of the session.
+        session_id: The session.
         piece: Its next entries, in order.
-        finish: Called last of all in that transaction.
-        begin: Gives the values of an entry's run that the database does not know, if it shall be
-            made.
+        finish: Called at the end of that transaction.
+        begin: Returns the values of an entry's run that the database does not have, or None if
+            that run is not to be created.
 
     Raises:
-        sqlite3.Error: Nothing was written.
-        SessionGoneError: The session was deleted.
+        sqlite3.Error: If the transaction fails; nothing was written.
+        SessionGoneError: If the session was deleted.
     """
 
-    def act() -> Taken:
+    def act() -> Ingested:
         until_s = time.monotonic() + _PIECE_S
         session = connection.execute(_ADOPTED, (session_id,)).fetchone()
         if session is None:
             raise SessionGoneError(f"the session {session_id} was deleted from the database")
-        taken = Taken(session[0], session[0], [], [])
+        taken = Ingested(session[0], session[0], [], [])
         for entry in piece:
             if entry.number > taken.number:
                 taken = taken._replace(number=entry.number)
@@ -578,7 +573,7 @@ def _write(
     entry: WaitingEntry,
     begin: Callable[[WaitingEntry], dict[str, Any] | None] | None,
 ) -> str | None:
-    """Write an entry; or why the database will never take it, which stops no other."""
+    """Write an entry; return why the database will never accept it, or None if it was written."""
     run_id = None
     try:
         if entry.run is not None:
@@ -598,19 +593,19 @@ def _write(
 
 
 def adopt(connection: sqlite3.Connection, database: Path, until_s: float = math.inf) -> int:
-    """Take in what sessions of dead processes left behind; files of live sessions are left alone.
+    """Ingest what sessions of dead processes left behind; files of live sessions stay as they are.
 
     Args:
         connection: A writer in autocommit mode and in no transaction.
         database: Its file.
-        until_s: The monotonic time at which it ends; what is left waits.
+        until_s: The monotonic time at which to stop; the rest waits.
 
     Returns:
-        How many rows and other writes that was. A file that cannot be taken in is left in place and
+        The number of rows and other writes. A file that cannot be ingested is left in place and
         reported once; recording continues without it.
 
     Raises:
-        sqlite3.Error: The database is locked; what is in is in, the rest waits.
+        sqlite3.Error: If the database is locked; what was ingested stays, the rest waits.
     """
     count = sum(_adopt_file(connection, path, until_s) for path in waiting_paths(database))
     found = waiting_paths(database, stacks_path)
@@ -618,7 +613,7 @@ def adopt(connection: sqlite3.Connection, database: Path, until_s: float = math.
 
 
 def _adopt_stacks(connection: sqlite3.Connection, path: Path) -> int:
-    """Log where the loop of a dead process was silent, and delete the file."""
+    """Log where the loop of a dead process hung, and delete the file."""
     logged = 0
     with contextlib.suppress(OSError):  # another took it in meanwhile, or it cannot be read
         with path.open("r+b") as file:
@@ -654,10 +649,10 @@ def _adopt_file(connection: sqlite3.Connection, path: Path, until_s: float) -> i
 
 
 def report_strange(path: Path, error: Exception) -> None:
-    """Warn once of a file that cannot be taken in: it stays, and is met again each second.
+    """Warn once of a file that cannot be ingested: it stays, and is found again each second.
 
     Raises:
-        Exception: The error, where it is not the file's fault.
+        Exception: The error, if it is not the file's fault.
     """
     if not (isinstance(error, _OF_THE_FILE) or is_unfit(error)):
         raise error
@@ -669,14 +664,14 @@ def report_strange(path: Path, error: Exception) -> None:
 
 
 def _adopt_open(connection: sqlite3.Connection, file: BinaryIO, until_s: float) -> tuple[int, bool]:
-    """How many entries were written, and whether none is left."""
+    """Ingest an open file; return how many entries were written, and whether none is left."""
     header = read_header(file)
     if header is None:
         return 0, True
     session_id = _session(connection, header)
     offset, count, unfit = file.tell(), 0, list[str]()
     while piece := next_entries(file, offset):
-        taken = take_in(connection, session_id, [entry for _, entry in piece])
+        taken = ingest(connection, session_id, [entry for _, entry in piece])
         offset = max(end for end, entry in piece if entry.number <= taken.number)
         count += sum(entry.kind != "run" for entry in taken.written)
         unfit += taken.unfit
@@ -691,7 +686,7 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO, until_s: float) 
 
 
 def _session(connection: sqlite3.Connection, header: dict[str, Any]) -> int:
-    """The session's id; it is entered where the database does not know it."""
+    """Return the session's id; enter the session if the database does not have it."""
     known = connection.execute(_SESSION_OF, (header["session"]["uuid"],)).fetchone()
     if known is not None:
         return int(known[0])
@@ -706,14 +701,14 @@ def _session(connection: sqlite3.Connection, header: dict[str, Any]) -> int:
 
 
 def enter_robot(connection: sqlite3.Connection, robot: dict[str, Any], now_s: float) -> int:
-    """The robot's id; its row is made or brought up to date."""
+    """Insert or update a robot's row; return its id."""
     connection.execute(_KNOWN_ROBOT, {**robot, "now": now_s})
     found = connection.execute("SELECT id FROM robot WHERE name = ?", (robot["name"],)).fetchone()
     return int(found[0])
 
 
 def enter_session(connection: sqlite3.Connection, robot_id: int, session: dict[str, Any]) -> int:
-    """Make a session's row, of columns and their values; one of that UUID is gone on with."""
+    """Insert a session's row, or reopen the one of that UUID; return its id."""
     values = dict.fromkeys(SESSION_COLUMNS) | session
     connection.execute(_NEW_SESSION, {**values, "robot_id": robot_id})
     return int(connection.execute(_SESSION_OF, (session["uuid"],)).fetchone()[0])

@@ -21,7 +21,7 @@ from webots_mcp.answers.models import (
 )
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import BreakpointAction
-from webots_mcp.database import pauses as stored
+from webots_mcp.database import stored_breakpoints as stored
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Id, RobotName
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question

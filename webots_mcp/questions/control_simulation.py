@@ -240,7 +240,7 @@ async def _wait(launched: WebotsLaunch, caller: Caller, until_s: float) -> Sessi
             return first
         if is_over:
             await to_thread.run_sync(launched.webots.end)
-            await to_thread.run_sync(launched.record_last_words)
+            await to_thread.run_sync(launched.record_unfollowed_output)
             raise CommandRefusedError(await to_thread.run_sync(launched.silence))
         lines = launched.webots.lines
         said = cut_text(lines[-1].text, 200) if lines else "Webots starts"

@@ -28,7 +28,7 @@ from webots_mcp.answers.shortening import (
     shorten,
 )
 from webots_mcp.contract import CUSTOM_DATA
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
 from webots_mcp.questions.declaring import READS, question
@@ -267,7 +267,7 @@ def _pace(view: RobotView, run: RunRecord) -> float | None:
 
 def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
     """Return what the run is; `rows` is as of its last heartbeat."""
-    end_reason = run.end_reason or dict(dead_sessions(view.connection)).get(run.session_id)
+    end_reason = run.end_reason or dict(find_dead_sessions(view.connection)).get(run.session_id)
     ended = {"ended_by": end_reason} if end_reason is not None else {}
     return {
         "id": run.id,

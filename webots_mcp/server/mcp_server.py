@@ -29,7 +29,7 @@ from pydantic import ValidationError
 
 from webots_mcp.contract import VERSION
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.database.liveness import reap_if_dead
+from webots_mcp.database.dead_sessions import reap_if_dead
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, WebotsMCPError, warn

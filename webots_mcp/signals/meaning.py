@@ -33,6 +33,12 @@ _OF_OTHERS: Final = (f"{WORLD}.", f"{SOLIDS}.")
 SIDES: Final = (
     "left", "right", "front", "rear", "front left", "front right", "rear left", "rear right",
 )  # fmt: skip
+_UNITS: Final = {  # as people write them, and as names are understood
+    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "degree": "deg", "degrees": "deg",
+    "°": "deg", "radian": "rad", "radians": "rad", "°/s": "deg/s", "rev/min": "rpm", "1/min": "rpm",
+    "r/min": "rpm", "kph": "km/h", "kmh": "km/h", "mps": "m/s", "rad/sec": "rad/s",
+    "deg/sec": "deg/s",
+}  # fmt: skip
 LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is declared for
 _LONGEST_UNIT: Final = 20  # characters
 _REMEMBERED: Final = 4096  # names whose words are kept
@@ -78,6 +84,10 @@ HOLDING: Final = frozenset(("gripper", "finger", "claw", "jaw", "hand"))  # they
 _FREE_MOTORS: Final = frozenset((  # motors that move no robot over the ground by wheels
     "fan", "propeller", "prop", "rotor", "engine", "brush", "pump", "spindle", "conveyor", "belt",
     "thruster", "vacuum", "drum", "blade", "turbine",
+))  # fmt: skip
+INPUTS: Final = frozenset((  # what a person moves by hand
+    "joystick", "stick", "gamepad", "joypad", "pad", "axis", "axe", "mouse", "touch", "cursor",
+    "keyboard", "key", "button", "input",
 ))  # fmt: skip
 _TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
 _GYROS: Final = frozenset(("gyro", "imu", "gyroscope"))
@@ -151,6 +161,7 @@ def understood_words() -> dict[str, list[str]]:
         "motor speed, not of a wheel": _FREE_MOTORS,
         "angular velocity": said.get("angular velocity", set()) | _GYROS,
         "count": _COUNTS,
+        "moved by hand, no position": INPUTS,
     }
     return {meaning: sorted(words) for meaning, words in groups.items()}
 
@@ -360,7 +371,7 @@ def _checked(name: str, field: str, value: object) -> Any:
                 f"signal {name!r}: unit must be a text of up to {_LONGEST_UNIT} characters, such "
                 f"as 'm/s', not {value!r:.80}"
             )
-        return value
+        return _UNITS.get(value.lower(), value)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
         raise ValueError(f"signal {name!r}: {field} must be a finite number, not {value!r:.80}")
     return float(value)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.contract import host_name
-from webots_mcp.database.liveness import give_back, held_jobs, holder_of, lease_of, take
+from webots_mcp.database.leases import give_back, held_jobs, holder_of, lease_of, take
 from webots_mcp.errors import (
     CommandRefusedError,
     DatabaseError,
@@ -82,9 +82,10 @@ def job_of(instance: Instance) -> str:
 
 @contextmanager
 def follow_console(instance: Instance, recording: RecordingAccess) -> Generator[ConsoleFollower]:
-    """While this lasts, what that Webots says in its console is recorded, by one process of many.
+    """Record the console of a Webots inside the block; of several processes, one does so.
 
-    It begins as soon as there is a database. Where Webots cannot be reached, `problem` says why.
+    Recording begins as soon as there is a database. If Webots cannot be reached, `problem` of the
+    follower says why.
     """
     follower = ConsoleFollower(instance, recording)
     follower.start()
@@ -95,10 +96,10 @@ def follow_console(instance: Instance, recording: RecordingAccess) -> Generator[
 
 
 class _RecordingThread(threading.Thread):
-    """A daemon thread that records the lines of a console, each a moment after it came.
+    """A daemon thread that records the lines of a console, each a moment after it arrived.
 
     Attributes:
-        problem: Why it does not at the moment; None where it does.
+        problem: Why nothing is recorded at the moment; None while lines are recorded.
     """
 
     def __init__(self, name: str, recording: RecordingAccess) -> None:
@@ -110,7 +111,7 @@ class _RecordingThread(threading.Thread):
         self._lost = 0
 
     def _hold(self, lines: Iterable[Said]) -> None:
-        """Keep lines until their time comes, and no more of them than is wise."""
+        """Hold lines until they are due; beyond 5,000 the oldest are dropped."""
         now_s = time.monotonic()
         self._held.extend((now_s, line) for line in lines)
         while len(self._held) > 5_000:  # while the database is locked
@@ -119,14 +120,14 @@ class _RecordingThread(threading.Thread):
 
     @contextmanager
     def _keeping_on(self) -> Generator[None]:
-        """A database that is locked may be written later; the lease that was lost never is."""
+        """Note a locked database and continue: it may be written later. A lost lease is raised."""
         try:
             yield
         except DatabaseError as error:
             self.problem = str(error)
 
     def _write_held(self, job: Job, rows: ConsoleRows, came_by_s: float) -> None:
-        """Record the lines that came until then."""
+        """Record the lines that arrived until a monotonic time."""
         held = [(came_s, line) for came_s, line in list(self._held) if came_s <= came_by_s]
         lines = [line for _, line in held]
         lost = self._lost
@@ -142,7 +143,7 @@ class _RecordingThread(threading.Thread):
             self._held.popleft()
 
     def _write_waiting(self, job: Job, rows: ConsoleRows) -> None:
-        """Record the lines that have waited for a run, once it is there."""
+        """Record the lines that have waited for a run, once it has begun."""
         with self._recording.reader() as connection:
             goes_on = rows.may_go_on(connection)
         if goes_on:
@@ -160,7 +161,7 @@ class ConsoleFollower(_RecordingThread):
         self._was_connected = False
 
     def run(self) -> None:
-        """Follow, and after a failure try again, ever more seldom."""
+        """Follow the console; after a failure try again, with pauses that grow."""
         pause_s = 0.0
         while not self._ending.wait(pause_s):
             began_s = time.monotonic()
@@ -174,13 +175,13 @@ class ConsoleFollower(_RecordingThread):
             longer_s = _TIMES.min_pause_s if lasted else 2 * pause_s
             pause_s = min(max(longer_s, _TIMES.min_pause_s), _TIMES.max_pause_s)
 
-    def let_go(self) -> None:
-        """Have it end soon."""
+    def ask_to_end(self) -> None:
+        """Ask the thread to end, without waiting for it."""
         self._ending.set()
 
     def stop(self) -> None:
-        """End it: what has come is recorded, and others may follow at once."""
-        self.let_go()
+        """End the thread: lines that have arrived are recorded, and others may follow at once."""
+        self.ask_to_end()
         self.join(timeout=3)
 
     def _follow_if_free(self) -> None:
@@ -199,7 +200,7 @@ class ConsoleFollower(_RecordingThread):
                 give_back(connection, lease)
 
     def _follow(self, job: Job) -> None:
-        """Until it is to end, or Webots hangs up; what has come is recorded in any case."""
+        """Record until the thread is to end or Webots closes the connection."""
         age_s = time.time() - self.instance.started_wall_time_s
         lines = ConsoleLines(old=self._was_connected or age_s > _TIMES.young_s)
         try:
@@ -213,7 +214,7 @@ class ConsoleFollower(_RecordingThread):
                 self._write_held(job, self._rows, came_by_s=math.inf)
 
     def _listen(self, job: Job, stream: Stream, lines: ConsoleLines) -> None:
-        renew_s = look_s = 0.0
+        renew_s = check_s = 0.0
         while not self._ending.is_set():
             message = stream.receive(time.monotonic() + _TIMES.receive_s)
             self._hold(lines.idle())
@@ -224,8 +225,8 @@ class ConsoleFollower(_RecordingThread):
                 if now_s > renew_s:
                     renew_s = now_s + _TIMES.renew_s
                     job.require_held()
-                if self._rows.waits and now_s > look_s:
-                    look_s = now_s + _TIMES.waiting_s
+                if self._rows.waits and now_s > check_s:
+                    check_s = now_s + _TIMES.waiting_s
                     self._write_waiting(job, self._rows)
                 if self._held and self._held[0][0] < now_s - _TIMES.hold_s:
                     self._write_held(job, self._rows, now_s - _TIMES.hold_s)
@@ -266,14 +267,14 @@ class StandInConsole(_RecordingThread):
             self._hold(self._lines.take_line(WebotsLine(stream, line)))
 
     def run(self) -> None:
-        """Record until the context is left, and then what is left."""
+        """Record until the context is left, and then the remaining lines."""
         rows, lease = ConsoleRows(self._name, self._began_s), lease_of(_JOB + self._name)
         job = Job(self._recording, lease)
         try:
             self._recording.create()
             with self._recording.writer() as connection:
                 take(connection, lease)
-            renew_s = look_s = time.monotonic()
+            renew_s = check_s = time.monotonic()
             while not self._ending.wait(_TIMES.receive_s):
                 now_s = time.monotonic()
                 self._note_idle()
@@ -281,8 +282,8 @@ class StandInConsole(_RecordingThread):
                     if now_s > renew_s + _TIMES.renew_s:
                         renew_s = now_s
                         job.require_held()
-                    if rows.waits and now_s > look_s + _TIMES.waiting_s:
-                        look_s = now_s
+                    if rows.waits and now_s > check_s + _TIMES.waiting_s:
+                        check_s = now_s
                         self._write_waiting(job, rows)
                     self._write_held(job, rows, now_s - _TIMES.hold_s)
             self._note_idle(at_the_end=True)
@@ -298,7 +299,7 @@ class StandInConsole(_RecordingThread):
 
 
 class ConsoleWatch(threading.Thread):
-    """A daemon thread that looks for Webots of the recording, and follows each of them.
+    """A daemon thread that searches for Webots of the recording, and follows each of them.
 
     Args:
         recording: Where the lines are to be recorded.
@@ -344,20 +345,20 @@ class ConsoleWatch(threading.Thread):
         if self.is_alive():
             self.join(timeout=2)
         for follower in self._followers.values():
-            follower.let_go()
+            follower.ask_to_end()
         for follower in self._followers.values():
             follower.stop()
 
 
-# -- whether it is followed ---------------------------------------------------------------------
+# -- whether a console is followed --------------------------------------------------------------
 
 
 def console_state(recording: RecordingAccess, connection: sqlite3.Connection) -> str:
-    """In a sentence, of all Webots of a recording.
+    """Say in a sentence whether the console of each Webots of a recording is followed.
 
     Args:
-        recording: Which is asked about.
-        connection: To it.
+        recording: The recording.
+        connection: A connection to it.
     """
     running = own_webots(recording)
     states = [_state(each, recording, connection) for each in running]
@@ -389,4 +390,4 @@ def _state(instance: Instance, recording: RecordingAccess, connection: sqlite3.C
         return f"{console} is not followed: {error}"
     if recording.read_only:
         return f"{console} is not followed: a server with --read-only does not, one without does"
-    return f"{console} is not followed yet: a server looks for it every few seconds"
+    return f"{console} is not followed yet: a server searches for it every few seconds"

@@ -1,6 +1,6 @@
-"""Lines of Webots' console as rows of a recording.
+"""Turns lines of Webots' console into rows of a recording.
 
-At most 500 lines a second are recorded; the rest are counted.
+At most 500 lines a second become rows. If more arrive, one row says how many were left out.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _OWN: Final[dict[str, dict[str, LogLevel]]] = {
 
 
 class ConsoleLines:
-    """Takes Webots' messages as they come, gives its lines.
+    """Turns Webots' messages into rows, in the order in which they arrive.
 
     Args:
         old: Whether the first lines may have been printed long before they were read.
@@ -44,18 +44,18 @@ class ConsoleLines:
         self._left_out = 0
 
     def take(self, message: Message) -> Iterator[Said]:
-        """The lines of a message; none of one that is about something else."""
+        """Return the rows of a message; none if it is not about the console."""
         lines = list(console_lines(message.text))
         if lines and self._is_first:
             self._is_first = False
-            yield from self._that_waited(lines)
+            yield from self._first_lines(lines)
         else:
             for line in lines:
                 yield from self.take_line(line)
         if lines and message.dropped_bytes:
             yield note(f"{message.dropped_bytes} bytes of the console in one burst")
 
-    def _that_waited(self, lines: list[WebotsLine]) -> Iterator[Said]:
+    def _first_lines(self, lines: list[WebotsLine]) -> Iterator[Said]:
         newest = lines[-MOST_OLD_LINES:]
         text = f"the next {len(newest)} lines were printed before the console was followed"
         if len(newest) < len(lines):
@@ -66,16 +66,16 @@ class ConsoleLines:
             yield as_row(line)._replace(is_old=True)
 
     def idle(self) -> Iterator[Said]:
-        """Notes that are due although no line came."""
+        """Return the notes that are due although no line has arrived."""
         if int(time.monotonic()) != self._second:
             yield from self._note_left_out()
 
     def rest(self) -> Iterator[Said]:
-        """Notes of what has been left out until now."""
+        """Return a note of the lines left out so far, at the end."""
         yield from self._note_left_out()
 
     def take_line(self, line: WebotsLine) -> Iterator[Said]:
-        """A line that has just been printed, unless it is one of too many."""
+        """Return the row of a line that has just been printed, unless there were too many."""
         second = int(time.monotonic())
         if second != self._second:
             yield from self._note_left_out()
@@ -109,10 +109,10 @@ def _judged(stream: str, text: str) -> tuple[LogLevel, LogSource]:
 
 
 def note(lost: str) -> Said:
-    """Return a line about what was left out."""
+    """Return a row that says what was left out."""
     return _about(f"(not recorded: {lost})")
 
 
 def _about(text: str) -> Said:
-    """Return a line about the lines."""
+    """Return a row with a note about the console."""
     return Said(time.time(), "warning", "console", text, None)

@@ -13,13 +13,9 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from webots_mcp.errors import CommandRefusedError
-
-if TYPE_CHECKING:
-    pass
-
 
 HOME_VARIABLE: Final = "WEBOTS_HOME"
 _DEFAULT_HOMES: Final[dict[str, tuple[str, ...]]] = {
@@ -47,7 +43,7 @@ class Installation:
         program: `webots` itself.
         launcher: `webots-controller`, which starts extern controllers; None where it is missing.
         python_api: The folder of the Python package `controller`; None where it is missing.
-        version: `R2023b`, say; None where its version file is missing or says nothing.
+        version: For example `R2023b`; None if its version file is missing or empty.
     """
 
     home: Path | None
@@ -74,10 +70,10 @@ def find_webots() -> Installation:
     """
     if found := installations():
         return found[0]
-    looked = ", ".join(str(home) for home in _default_homes(sys.platform))
+    searched = ", ".join(str(home) for home in _default_homes(sys.platform))
     raise CommandRefusedError(
         f"there is no program 'webots' in WEBOTS_HOME "
-        f"({os.environ.get(HOME_VARIABLE) or 'not set'}), on the PATH or in {looked}: install "
+        f"({os.environ.get(HOME_VARIABLE) or 'not set'}), on the PATH or in {searched}: install "
         "Webots, or set WEBOTS_HOME to its folder"
     )
 
@@ -97,7 +93,7 @@ def _default_homes(platform: str) -> list[Path]:
 
 
 def _at(home: Path, found_by: str, platform: str) -> Iterator[Installation]:
-    """The installation in a folder; nothing where no program is there."""
+    """Return the installation in a folder; nothing if the folder has no program."""
     program = _program(home, "webots", platform)
     if program is not None:
         libraries = _LIBRARIES.get(platform, ("lib",))
@@ -113,7 +109,7 @@ def _at(home: Path, found_by: str, platform: str) -> Iterator[Installation]:
 
 
 def _of_program(program: Path, platform: str) -> Installation:
-    """Of a program on the PATH: a link into the home folder, or something that starts Webots."""
+    """Return the installation of a program on the PATH, which may be a link or a starter script."""
     homes = [*program.resolve().parents[:4], *_snap_home(program, platform)]
     for home in homes:
         if _version(home, platform) is not None:
@@ -124,7 +120,7 @@ def _of_program(program: Path, platform: str) -> Installation:
 
 
 def _snap_home(program: Path, platform: str) -> list[Path]:
-    """Return a snap's program is a link to `snap` itself, which does not show where Webots is."""
+    """Return the home folders of a snap, whose program links to `snap` itself, not to Webots."""
     is_snap = program.resolve().name == "snap" or "snap" in program.parts
     return [home for home in _default_homes(platform) if is_snap and "snap" in home.parts]
 

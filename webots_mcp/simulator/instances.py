@@ -25,7 +25,7 @@ _PROGRAMS: Final = ("webots", "webots-bin", "webotsw")
 
 @dataclass(frozen=True)
 class Instance:
-    """A Webots that runs.
+    """A running Webots.
 
     Attributes:
         pid: Its process.
@@ -47,19 +47,19 @@ class Instance:
 
     @property
     def name(self) -> str:
-        """As the sessions of its controllers name it."""
+        """The name by which the sessions of its controllers refer to it."""
         return f"{host_name()}:{self.port}"
 
     @property
     def data_dir(self) -> Path | None:
-        """Where its controllers record if its environment says so; None where it does not."""
+        """The data folder of its controllers, if its environment names one; else None."""
         environment = shown_of(self.pid, lambda process: process.environ(), dict[str, str]())
         named = environment.get(DATA_DIR_VARIABLE)
         return Path(named) if named else None
 
     @property
     def runs(self) -> bool:
-        """Whether it still does."""
+        """Whether it is still running."""
         import psutil
 
         try:
@@ -73,7 +73,7 @@ class Instance:
 
     @property
     def address(self) -> WebotsAddress:
-        """Where to speak to it."""
+        """The address at which it receives orders."""
         return WebotsAddress("127.0.0.1", self.port)
 
 

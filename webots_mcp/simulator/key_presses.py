@@ -10,26 +10,23 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from webots_mcp.errors import CommandRefusedError
-
-if TYPE_CHECKING:
-    pass
 from webots_mcp.simulator.orders import Order
 
 _TITLE: Final = "Webots R20"  # "<world> (<project>) - Webots R2023b"
 
 
 class Key(NamedTuple):
-    """What is pressed together with Ctrl, or Command."""
+    """A key that is pressed together with Ctrl, or with Command on macOS."""
 
     name: str
     shift: bool = False
 
     @property
     def spoken(self) -> str:
-        """As a person reads it."""
+        """The keys in words, such as `Ctrl+Shift+T`."""
         return f"Ctrl+{'Shift+' * self.shift}{self.name.upper()}"
 
 
@@ -52,8 +49,8 @@ def press(order: Order, pid: int | None, platform: str = sys.platform) -> None:
         platform: As `sys.platform` names it.
 
     Raises:
-        CommandRefusedError: The window was not found, the keys could not be sent, or how that
-                is done on this platform is not known.
+        CommandRefusedError: If the window was not found, the keys could not be sent, or it is not
+                known how to press keys on this platform.
     """
     key = KEYS[order]
     try:

@@ -85,10 +85,10 @@ class SessionStart(NamedTuple):
 
 
 class WebotsLaunch:
-    """A Webots that we have started, and what is recorded in it.
+    """A Webots that this process has started, and what is recorded in it.
 
     Args:
-        recording: Where its controllers record.
+        recording: The recording into which its controllers write.
         start: How it is started.
         environment: Variables for its controllers, in addition to those of this process.
         show: Called with each line of its console, in a thread of its own.
@@ -127,7 +127,7 @@ class WebotsLaunch:
         reasons = [*self._of_webots(), *why_silent(self._begun(), self.world)]
         return "; ".join(reasons) or "no controller has recorded yet"
 
-    def record_last_words(self) -> None:
+    def record_unfollowed_output(self) -> None:
         """Record the output of a Webots that ended before its console was followed.
 
         Raises:
@@ -160,7 +160,7 @@ class WebotsLaunch:
 
 
 def _is_problem(line: WebotsLine) -> bool:
-    """Return whether a line is from stderr, or looks so: `xvfb-run` may mix both streams."""
+    """Return whether a line reports a problem; `xvfb-run` may mix stdout and stderr."""
     if line.stream == "stderr":
         return bool(line.text.strip()) and not line.text.startswith(("INFO:", "DEBUG:"))
     return bool(re.search(r"^(WARNING|ERROR):|\b\w*(Error|Exception)\b", line.text))
@@ -174,7 +174,7 @@ def why_silent(
     Args:
         begun: The sessions of its controllers.
         world: The file.
-        extern: What is to be done about an extern controller.
+        extern: The advice for an extern controller.
     """
     if begun:
         names = ", ".join(each.robot for each in begun)
@@ -212,7 +212,7 @@ def starts_since(recording: RecordingAccess, session: int) -> list[SessionStart]
 
 
 def _read(recording: RecordingAccess, query: str, *values: object) -> list[tuple[Any, ...]]:
-    """Nothing where there is no recording yet."""
+    """Return the rows of a query; nothing if there is no recording yet."""
     try:
         with recording.reader() as connection:
             return connection.execute(query, values).fetchall()

@@ -26,7 +26,7 @@ from webots_mcp.bridge.custom_data import CustomDataReader, ObserverParts
 from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.simulator.observed_world import DIGITS, ObservedBody, ObservedWorld
+from webots_mcp.simulator.observed_bodies import DIGITS, ObservedBodies, ObservedBody
 
 PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
 LONGEST_PERIOD_MS: Final = 60_000
@@ -34,10 +34,10 @@ _GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to 
 
 
 def checked_period(period_ms: int) -> int:
-    """Return a period that can be kept to.
+    """Return a period that is within the limits.
 
     Raises:
-        InvalidInputError: It cannot.
+        InvalidInputError: If it is not.
     """
     if not 1 <= period_ms <= LONGEST_PERIOD_MS:
         raise InvalidInputError(f"the period is from 1 to {LONGEST_PERIOD_MS} ms, not {period_ms}")
@@ -62,7 +62,7 @@ class StepPace:
         self._stood_since_s = time.monotonic()
 
     def go_on(self, *, may_step: bool = True) -> bool:
-        """One round; False where Webots wants the controller to end.
+        """Make one round; return False if Webots wants the controller to end.
 
         Args:
             may_step: Whether it may make a step, which a command that counts steps forbids.
@@ -98,12 +98,12 @@ class StepPace:
 
 
 class ObserverBridge(MCPBridge):
-    """The bridge of a robot that only looks."""
+    """The bridge of a robot that only observes others."""
 
     _kind = OBSERVER
 
     def record_event(self, kind: str, data: dict[str, object]) -> None:
-        """Record what changes seldom: what there is, and the mode."""
+        """Record what seldom changes: the bodies of the world, and the simulation mode."""
         self._session.journal.event(kind, data)
 
     def count_steps_by_time(self) -> None:
@@ -137,7 +137,7 @@ class ObserverBridge(MCPBridge):
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The whole controller; its first argument may be a period in milliseconds."""
+    """Run the whole controller; its first argument may be a period in milliseconds."""
     from controller import Supervisor  # type: ignore[import-not-found]
 
     given = " ".join(sys.argv[1:] if arguments is None else arguments)
@@ -240,7 +240,7 @@ class Observer:
         self._robot = robot
         self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
         self.bridge.count_steps_by_time()
-        self.world = ObservedWorld(robot, self._period_ms, self._warn)
+        self.world = ObservedBodies(robot, self._period_ms, self._warn)
         self.custom_data = self.bridge.read_custom_data()
         self._pace = StepPace(robot, self._period_ms, world_waits=self.bridge.world_waits)
         self._due_s = -math.inf
@@ -249,7 +249,7 @@ class Observer:
         self.bridge.register_command(LOOK_AT, self.look_at)
 
     def go_on(self) -> bool:
-        """One round; False where Webots wants the controller to end."""
+        """Make one round; return False if Webots wants the controller to end."""
         if not self._pace.go_on(may_step=not self.bridge.steps_world):
             return False
         try:

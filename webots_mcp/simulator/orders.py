@@ -24,7 +24,7 @@ Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 MAX_MESSAGE_BYTES: Final = 4 << 20
 ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
 _CLOSING_S: Final = 0.2
-# What is sent, and how what comes back begins. The time in ms is a limit; negative: none.
+# What is sent, and how the reply begins. The number is a time limit in ms; -1 means no limit.
 _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "pause": ("pause", ("pause",)),  # "paused by client", and "pause: <ms>" to the others
     "resume": ("real-time:-1", ("real-time",)),
@@ -38,7 +38,7 @@ RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much la
 
 
 class WebotsAddress(NamedTuple):
-    """Where a Webots listens."""
+    """The address at which a Webots listens."""
 
     host: str
     port: int
@@ -48,10 +48,11 @@ class WebotsAddress(NamedTuple):
 
 
 class Message(NamedTuple):
-    """What Webots sent: its text as far as it is kept.
+    """A message of Webots.
 
     Attributes:
-        dropped_bytes: How much of the end is not kept.
+        text: The text, up to 4 MB.
+        dropped_bytes: How many bytes at its end were dropped.
     """
 
     text: str
@@ -141,11 +142,11 @@ class Stream:
 
 @contextmanager
 def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
-    """A connection to Webots.
+    """Open a connection to Webots.
 
     Raises:
-        CommandRefusedError: Nothing listens there, it is not Webots, it does not answer, or it
-            hung up.
+        CommandRefusedError: If nothing listens there, it is not Webots, it does not answer, or it
+            closed the connection.
     """
     from websockets.exceptions import WebSocketException
     from websockets.sync.client import connect
@@ -163,10 +164,10 @@ def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
     except TimeoutError as error:
         raise CommandRefusedError(
             f"what listens at {address} did not answer within {timeout_s:g} s: Webots' main thread "
-            "is busy, or it is no Webots"
+            "is busy, or it is not Webots"
         ) from error
     except WebSocketException as error:  # it refuses, or hangs up in the handshake
-        raise CommandRefusedError(f"what listens at {address} is no Webots ({error})") from error
+        raise CommandRefusedError(f"what listens at {address} is not Webots ({error})") from error
     except OSError as error:
         raise CommandRefusedError(f"no Webots listens at {address} ({error})") from error
     with connection:
@@ -177,17 +178,17 @@ def give_order(address: WebotsAddress, order: Order, timeout_s: float = ANSWER_S
     """Send Webots an order, and return its reply.
 
     Raises:
-        CommandRefusedError: There is no Webots to speak to.
+        CommandRefusedError: If no Webots can be reached.
     """
     words, answers = _ORDERS[order]
     return _give(address, words, answers, timeout_s, late=order in RESTARTING)
 
 
 def load_world(address: WebotsAddress, file_name: str, timeout_s: float = ANSWER_S) -> OrderReply:
-    """Have Webots open another world of the folder of the present one.
+    """Order Webots to open another world in the folder of the current one.
 
     Raises:
-        CommandRefusedError: There is no Webots to speak to.
+        CommandRefusedError: If no Webots can be reached.
     """
     return _give(address, f"load:{file_name}", _ORDERS["reload"][1], timeout_s, late=True)
 
@@ -235,16 +236,17 @@ def why_not_obeyed(address: WebotsAddress, reply: OrderReply) -> str:
 
 
 def begin_console(stream: Stream) -> None:
-    """Have Webots send its console to all its clients, from the first line not sent yet."""
+    """Request Webots' console, which is then sent to all clients from the first unsent line on."""
     # A robot of this name need not exist: asking for a window begins the logs for this client.
     request = {"name": "webots-mcp", "message": "init robot window"}
     stream.send(f"robot:{json.dumps(request, separators=(',', ':'))}")
 
 
 def console_lines(text: str) -> Iterator[WebotsLine]:
-    """The lines of a message; each names its stream, those that go on with it do not.
+    """Yield the console lines of a message.
 
-    Empty ones are left out: where a line of a controller ends, there is one.
+    A line names its stream; lines that continue it do not. Empty lines are omitted: Webots sends
+    one after each line of a controller.
     """
     kind = None
     for line in text.split("\n"):

@@ -21,22 +21,22 @@ from webots_mcp.store.robots import list_robots
 
 
 def own_webots(recording: RecordingAccess) -> list[Instance]:
-    """Return those that run on this machine.
+    """Return the Webots of a recording that run on this machine.
 
     Raises:
-        DatabaseError: The recording cannot be read.
+        DatabaseError: If the recording cannot be read.
     """
     running = instances()
     return [each for each in running if belongs(each, recording)] if running else []
 
 
 def belongs(instance: Instance, recording: RecordingAccess) -> bool:
-    """Return whether a Webots is of a recording.
+    """Return whether a Webots belongs to a recording.
 
     Raises:
-        DatabaseError: The recording cannot be read.
+        DatabaseError: If the recording cannot be read.
     """
-    into = instance.data_dir  # that of a trial has one of its own
+    into = instance.data_dir  # the Webots of a trial has a data folder of its own
     is_elsewhere = into is not None and full_path(into) != full_path(recording.data_dir)
     if not is_elsewhere and _is_in_project(instance, recording):
         return True

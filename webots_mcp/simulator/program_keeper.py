@@ -1,9 +1,9 @@
 """Runs a simulator for as long as its starter lives: `python program_keeper.py COMMAND...`.
 
-It starts the command when it reads a byte from its standard input, and ends it when that input
-ends: it is closed by who holds the other end, or with him, however he dies. It runs in a Python of
-its own that loads little else. Where the keeper itself is killed, Linux ends the command; elsewhere
-it takes who started the keeper, and outlives both only where both are killed at once.
+The keeper starts the command when it reads a byte from its standard input, and ends it when that
+input ends. The input ends when the starter closes it or dies, in whatever way. The keeper runs in a
+Python process of its own that loads little else. If the keeper itself is killed, Linux ends the
+command. On other systems the starter ends it, so it survives only if both are killed at once.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ GRACE_S = 5.0  # Webots gives its controllers 1 s, and ends them after another
 
 
 def main(command: list[str]) -> int:
-    """Keep a command; returns its exit code, or 0 where it was never asked to start it."""
+    """Run a command; return its exit code, or 0 if it was never started."""
     signal.signal(signal.SIGTERM, _leave_it_to_the_simulator)
     _lead_a_group()
     if not os.read(_STDIN, 1):
@@ -37,13 +37,13 @@ def main(command: list[str]) -> int:
 
 
 def _lead_a_group() -> None:
-    """Of the simulator and its controllers alone: not of `xvfb-run`, which cleans up after them."""
+    """Begin a process group for the simulator and its controllers, without `xvfb-run`."""
     if os.name == "posix" and os.getpgrp() != os.getpid():
         os.setpgid(0, 0)
 
 
 def _end_with_keeper() -> Callable[[], object] | None:
-    """Return what the command's process asks for first, so that it does not outlive this one."""
+    """Return what the command's process calls first, so that it does not outlive this one."""
     if sys.platform != "linux":
         return None
     import ctypes
@@ -59,7 +59,7 @@ def _end_with_keeper() -> Callable[[], object] | None:
 
 
 def _leave_it_to_the_simulator(number: int, frame: FrameType | None) -> None:
-    """A signal goes to all of the process group."""
+    """Ignore a signal, which the whole process group receives: the simulator ends by it."""
 
 
 def _end_with_input(simulator: "subprocess.Popen[bytes]") -> None:
@@ -73,7 +73,7 @@ def _end_with_input(simulator: "subprocess.Popen[bytes]") -> None:
 
 
 def _ask_to_end(simulator: "subprocess.Popen[bytes]") -> None:
-    """Webots passes it on to its controllers, which get -1 from their step."""
+    """Ask the simulator to end; Webots then answers -1 to the steps of its controllers."""
     if sys.platform == "win32":
         _run(windows_command(simulator.pid, hard=False))
     else:
@@ -81,7 +81,7 @@ def _ask_to_end(simulator: "subprocess.Popen[bytes]") -> None:
 
 
 def _end(simulator: "subprocess.Popen[bytes]") -> None:
-    """With all of its process group, which is ours: Webots is a script that starts the program."""
+    """Kill the simulator with its process group, since Webots is a script that starts a program."""
     if sys.platform == "win32":
         _run(windows_command(simulator.pid, hard=True))
         simulator.kill()
@@ -90,7 +90,7 @@ def _end(simulator: "subprocess.Popen[bytes]") -> None:
 
 
 def windows_command(pid: int, *, hard: bool) -> list[str]:
-    """Ends a program with those that it has started; softly by closing their windows."""
+    """Return the command that ends a process and its children; without `hard` it may refuse."""
     return ["taskkill", "/T", *(["/F"] if hard else []), "/PID", str(pid)]
 
 

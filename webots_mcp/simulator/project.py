@@ -46,9 +46,13 @@ NO_POSITION_OF_ITS_OWN: Final = (
 
 
 class ProjectController(NamedTuple):
-    """A controller's folder, the file of it that Webots starts, and what that is written in.
+    """A controller of a project.
 
-    Where the sources of a program are there, `file` is one of them.
+    Attributes:
+        name: Its name, which is that of its folder.
+        file: The file that Webots starts, or a source file of that program.
+        language: Its language, or what else it is, such as `a program` or `a container`.
+        is_built: Whether Webots can start it now.
     """
 
     name: str
@@ -58,7 +62,7 @@ class ProjectController(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """How it is recorded, where the bridge cannot be used in it."""
+        """How to record a controller in which the bridge cannot be used."""
         header = (
             "include webots_mcp.h ('webots-mcp header' writes it), or "
             if self.language in ("C", "C++")
@@ -101,7 +105,7 @@ def controllers_of(project: Path, platform: str = sys.platform) -> list[ProjectC
 
 
 def _started(folder: Path, platform: str) -> Iterator[ProjectController]:
-    """The file of a controller's folder that Webots starts: the first that is there."""
+    """Return the file of a controller's folder that Webots starts: the first that exists."""
     name = folder.name
     program = f"{name}.exe" if platform == "win32" else name
     kinds = {
@@ -137,7 +141,7 @@ def _source(folder: Path) -> ProjectController | None:
 
 
 def has_bridge(controller: Path) -> bool:
-    """Return whether a file of a controller's folder speaks of the bridge."""
+    """Return whether a Python file in a controller's folder names the bridge."""
     return any(b"MCPBridge" in file.read_bytes() for file in sorted(controller.glob("*.py")))
 
 

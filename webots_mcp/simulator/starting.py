@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final, Literal, NamedTuple
 
-from webots_mcp.database.liveness import process_alive
+from webots_mcp.database.processes import process_alive
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator import program_keeper
 from webots_mcp.simulator.installations import find_webots
@@ -65,7 +65,7 @@ class Start:
 
     @property
     def options(self) -> list[str]:
-        """As Webots takes them: no dialog, and the console where this one is."""
+        """The options of Webots' command line: no dialogs, and its console on stdout and stderr."""
         return [
             "--batch",
             "--stdout",
@@ -77,10 +77,10 @@ class Start:
         ]
 
     def command_line(self) -> CommandLine:
-        """Of the Webots that is found here.
+        """Return the command that starts the Webots of this machine.
 
         Raises:
-            CommandRefusedError: There is none, or nothing to show its window on.
+            CommandRefusedError: If there is none, or no display for its window.
         """
         program = find_webots().program
         return CommandLine([str(program), *self.options, str(self.world)], _virtual_display())
@@ -105,7 +105,7 @@ def any_port() -> int:
 
 
 def _is_free(port: int) -> bool:
-    """Webots listens at all addresses of the machine."""
+    """Return whether a port is free at all addresses of the machine, where Webots listens."""
     try:
         with socket.create_server(("", port)):
             return True
@@ -129,11 +129,11 @@ def _virtual_display() -> list[str]:
 class KeptProgram:
     """A program that ends with this process, however that ends.
 
-    Nothing runs before `start`, but the process exists: a caller that stores its pid in between
-    leaves no unknown program behind.
+    Nothing runs before `start`, but the process exists already: a caller can store its pid first,
+    and leaves no unknown program behind.
 
     Attributes:
-        pid: Of the process around it, whose group it is in where it needs no display.
+        pid: The process around the program. The program is in its group if it needs no display.
     """
 
     def __init__(
@@ -169,11 +169,11 @@ class KeptProgram:
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs; 128 and more: that signal ended it."""
+        """Its exit code; None while it runs, and 128 plus the signal if one ended it."""
         return self._process.poll()
 
     def end(self) -> None:
-        """End it with its controllers, the hard way if need be."""
+        """End it with its controllers, by force if necessary."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -207,7 +207,7 @@ class LaunchedWebots(KeptProgram):
         self._show = show
         self._lines = deque[WebotsLine](maxlen=200)
         self._instance: Instance | None = None
-        self._look_again_s = 0.0
+        self._search_again_s = 0.0
         self._readers = [
             threading.Thread(target=self._read, args=(name, pipe), daemon=True)
             for name, pipe in (("stdout", self._process.stdout), ("stderr", self._process.stderr))
@@ -223,8 +223,8 @@ class LaunchedWebots(KeptProgram):
     @property
     def instance(self) -> Instance | None:
         """The instance as the system shows it; None before it listens, or where it is not shown."""
-        if self._instance is None and time.monotonic() > self._look_again_s:
-            self._look_again_s = time.monotonic() + 0.5
+        if self._instance is None and time.monotonic() > self._search_again_s:
+            self._search_again_s = time.monotonic() + 0.5
             pids = self.pids
             found = (each for each in instances() if each.is_listening and each.pid in pids)
             self._instance = next(found, None)
@@ -237,7 +237,7 @@ class LaunchedWebots(KeptProgram):
 
     def address_now(self) -> WebotsAddress | None:
         """Return the same, searched for at once."""
-        self._look_again_s = 0.0
+        self._search_again_s = 0.0
         return self.address
 
     @property
@@ -269,11 +269,11 @@ class LaunchedWebots(KeptProgram):
                     self._show(line)
 
 
-# -- ending what another left ------------------------------------------------------------------
+# -- ending programs that an earlier process left ----------------------------------------------
 
 
 def end_left_over(pid: int, process: str | None, started_wall_time_s: float) -> None:
-    """End a program that outlived who started it."""
+    """End a program that outlived the process which started it."""
     seen = (pid, process, started_wall_time_s)
     if not process_alive(*seen):
         return
@@ -281,7 +281,7 @@ def end_left_over(pid: int, process: str | None, started_wall_time_s: float) -> 
 
 
 def _end(pid: int, is_there: Callable[[], bool]) -> None:
-    """End a process with its group, the hard way if need be."""
+    """End a process with its group, by force if necessary."""
     if not _signal(pid, signal.SIGTERM):
         return
     until_s = time.monotonic() + program_keeper.GRACE_S
@@ -292,7 +292,7 @@ def _end(pid: int, is_there: Callable[[], bool]) -> None:
 
 
 def _signal(pid: int, number: int) -> bool:
-    """To all of its session, as Webots is a script that starts the program; False if none is."""
+    """Signal a process and its group, since Webots is a script; False if there is no such one."""
     try:
         if sys.platform == "win32":
             os.kill(pid, signal.SIGTERM)

@@ -27,9 +27,9 @@ from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import BlockedLoop, find_block, robot_name
 
-# Called with what is done, how much there is to do (None where unknown), and a text.
+# Receives how much is done, how much there is to do (None if unknown), and a text.
 ProgressReport = Callable[[float, float | None, str], Awaitable[None]]
-# A running loop claims a command at once. After this time the block that keeps it is searched for.
+# A running loop claims a command at once. After this time, it is checked what blocks the loop.
 BLOCK_NOTICED_S: Final = 2.0
 _WITHDRAWN: Final = "the command was withdrawn and will not run"
 
@@ -43,8 +43,8 @@ class WaitingTimes:
             PRAGMA data_version, which would miss commits of the same connection.
         report_s: Between two reports of progress.
         block_search_s: Between two searches for what blocks the loop.
-        outliving_s: How long the command stays valid after the deadline. At the deadline it is
-            cancelled; this only matters if the server dies while it waits.
+        outliving_s: How long an unclaimed command stays valid after the time limit. Usually the
+            server cancels it at that limit; if the server dies first, the command expires then.
     """
 
     poll_s: float = 0.004
@@ -80,23 +80,24 @@ class Dispatcher:
     ) -> CommandAnswer:
         """Send a command, wait until it is final or the time is up, and report its outcome.
 
-        A command that is not claimed soon because its loop is known to be blocked is withdrawn at
-        once. One that is not claimed at the deadline is cancelled, so that it cannot run when its
-        caller has stopped waiting; the same happens when the caller disconnects.
+        A command never runs after its caller has stopped waiting. It is cancelled if no controller
+        has claimed it within `claiming_s`, or if the caller disconnects. If the loop is known to be
+        blocked, the command is withdrawn at once.
 
         Args:
-            robot: Whose controller is asked; None where only one can be meant.
+            robot: The robot whose controller is asked; None if only one is possible.
             action: A built-in or registered action.
             timeout_s: How long to wait for the outcome, in wall seconds.
             params: Its parameters, plain JSON.
-            claiming_s: How long to wait for a controller to claim it, if less, in wall seconds.
-            block_noticed_s: After which time it is asked whether its loop is blocked.
+            claiming_s: How long to wait for a controller to claim it, in wall seconds; at most
+                `timeout_s`.
+            block_noticed_s: Time after which to check whether its loop is blocked, in wall seconds.
 
         Raises:
-            NotAllowedError: A rule of the project forbids it.
-            InvalidInputError: The robot, the action or its parameters are invalid.
-            CommandRefusedError: No live controller could run it.
-            NothingRecordedError: There is no robot to ask.
+            NotAllowedError: If a rule of the project forbids it.
+            InvalidInputError: If the robot, the action or its parameters are invalid.
+            CommandRefusedError: If no live controller could run it.
+            NothingRecordedError: If there is no robot to ask.
         """
         started_s = time.monotonic()
         claiming_s = min(claiming_s, timeout_s)
@@ -107,7 +108,7 @@ class Dispatcher:
         return await to_thread.run_sync(self._answer, command, waited_s)
 
     async def name_mode_afterwards(self, answer: CommandAnswer) -> None:
-        """Correct the mode in an answer that is given some time after its command was done."""
+        """Correct the mode in an answer, since a later command may have changed it."""
 
         def correct(command_id: int) -> None:
             with self._recording.reader() as connection:
@@ -119,10 +120,10 @@ class Dispatcher:
             await to_thread.run_sync(correct, answer.command_id)
 
     async def wait(self, command_id: int, timeout_s: float) -> CommandAnswer:
-        """Continue to wait for a command that was sent before; it is not cancelled at the deadline.
+        """Continue to wait for a command that was sent before, without cancelling it at the end.
 
         Raises:
-            InvalidInputError: There is no such command.
+            InvalidInputError: If there is no such command.
         """
         started_s = time.monotonic()
         await to_thread.run_sync(self._recording.settle)
@@ -136,7 +137,7 @@ class Dispatcher:
         sending = _Sending(partial(self._enqueue, robot, action, params, timeout_s))
         try:
             sent = await to_thread.run_sync(sending.send)
-            assert sent is not None, "stopped below only"
+            assert sent is not None, "only `stop` below prevents sending"
             return sent
         except (anyio.get_cancelled_exc_class(), KeyboardInterrupt):
             with anyio.CancelScope(shield=True):
@@ -149,7 +150,7 @@ class Dispatcher:
     ) -> QueuedCommand:
         try:
             command = await self._watch(command.id, claiming_s, block_noticed_s, withdraws=True)
-            command = await to_thread.run_sync(self._at_the_deadline, command)
+            command = await to_thread.run_sync(self._cancel_unclaimed, command)
             if command.is_final:
                 return command
             return await self._watch(command.id, until_s - time.monotonic())
@@ -210,7 +211,7 @@ class Dispatcher:
                 await anyio.sleep(_TIMES.poll_s)
             return command
 
-    def _at_the_deadline(self, command: QueuedCommand) -> QueuedCommand:
+    def _cancel_unclaimed(self, command: QueuedCommand) -> QueuedCommand:
         if command.is_final:
             return command
         self._recording.settle()
@@ -218,7 +219,7 @@ class Dispatcher:
         return self._cancel(command.id, "no controller claimed it in time; it will not run")
 
     def _leave(self, command: QueuedCommand) -> None:
-        """The caller has left: cancel the command; a begun `run` or `step` ends now."""
+        """Cancel a command whose caller has left; a `run` or `step` that has begun ends now."""
         with self._recording.writer() as connection:
             queue = CommandQueue(connection)
             is_running = queue.leave(command.id, "the client disconnected")

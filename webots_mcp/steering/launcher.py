@@ -98,4 +98,4 @@ def project_of(recording: RecordingAccess) -> Path:
 
 
 def _ignore(line: WebotsLine) -> None:
-    """Ignore a line of Webots' output: `LaunchedWebots` keeps the newest ones."""
+    """Do nothing with a line of Webots' output: `LaunchedWebots` keeps the newest ones."""

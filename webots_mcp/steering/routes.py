@@ -41,7 +41,7 @@ from webots_mcp.store.requests import permit
 
 CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # a loop that has just stopped is detected within it
 UNCLAIMED: Final = ("cancelled", "expired")
-MIN_ROUTE_S: Final = 0.1  # what each route gets, however little time is left
+MIN_ROUTE_S: Final = 0.1  # minimum time for a route, however little is left
 _EVIDENCE_S: Final = 3.0  # a heartbeat shows within half a second that simulation time advances
 _NOT_SHOWN: Final = (
     "the recording does not show it yet: simulation time also stands still while a controller "
@@ -137,7 +137,7 @@ class Attempt(Request):
     port: int | None = None
 
     async def steer(self) -> CommandAnswer:
-        """Steer by the first route that works.
+        """Carry out the order by the first route that works.
 
         Raises:
             InvalidInputError: There is no such robot, or several are possible.
@@ -186,7 +186,7 @@ class Attempt(Request):
         Args:
             situation: What is known of the robot.
             claiming_s: How long to wait for its loop to claim the command, in wall seconds.
-            block_noticed_s: After which time to check whether its loop is blocked.
+            block_noticed_s: Time after which to check whether its loop is blocked, in wall seconds.
         """
         answer = await self._send(self.robot, self.order, self.params, claiming_s, block_noticed_s)
         if situation.robot is not None and situation.robot == situation.observer:

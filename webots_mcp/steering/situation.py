@@ -42,8 +42,8 @@ class Situation:
         address: Webots' address as named by the caller or by the robot's session.
         before: The newest moment of its recording.
         observer: The name of the live observer of its simulation, if there is one.
-        is_address_sure: Whether the wanted Webots is sure to listen at the address: the caller has
-            named it, or a live controller runs there. Else another Webots may listen by now.
+        is_address_sure: Whether the wanted Webots certainly listens at the address: the caller has
+            named it, or a live controller runs there. Otherwise another Webots may listen by now.
     """
 
     robot: str | None

@@ -1,4 +1,4 @@
-"""What a plan file says: which parameters are tried, for how long, and how a run is scored."""
+"""Reads a plan of trials: which parameters to try, for how long, and how to score a run."""
 
 from __future__ import annotations
 
@@ -36,14 +36,15 @@ _HOW_MANY: Final = "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or 
 
 @dataclass(frozen=True)
 class ParameterRange:
-    """What may be tried of one parameter: the numbers of a range, or one of some choices.
+    """The values that may be tried of one parameter: the numbers of a range, or some choices.
 
     Attributes:
-        low: The least number.
-        high: The greatest number.
-        step: Only so many more than `low` are tried; where both are whole, whole numbers.
-        log: Numbers are spread evenly over orders of magnitude.
-        choices: Instead of numbers.
+        low: The minimum.
+        high: The maximum.
+        step: Distance between the numbers to try; if both `low` and `step` are whole, only whole
+            numbers are tried.
+        log: Whether numbers are spread evenly over orders of magnitude.
+        choices: The values, in place of a range.
     """
 
     low: float | None = None
@@ -90,22 +91,22 @@ class ParameterRange:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """What is tried, wherever it runs.
+    """A plan of trials, independent of where they run.
 
     Attributes:
-        score: See docs/trials.md.
-        parameters: The sets that are tried; empty where they are searched for.
-        best: Which scores are the best.
-        for_s: A trial ends after this many simulated seconds ...
-        until: ... or when this condition holds, whichever comes first.
-        prune: A trial in which this condition holds is ended early, without a score.
-        repeats: How often each set is tried.
-        robot: The robot whose signals, events and parameters to use, where a world has several.
-        timeout_s: A trial that takes longer, in wall time, has failed.
-        ranges: What is searched, by parameter.
-        search: Who says which sets are tried: a sampler of Optuna.
-        sets: How many are searched for.
-        seed: Of the sampler: the same one says the same of the same trials.
+        score: The expression that scores a run, see docs/trials.md.
+        parameters: The parameter sets to try; empty if they are searched for.
+        best: Whether the highest or the lowest score is the best.
+        for_s: Simulated seconds after which a trial ends.
+        until: Condition at which a trial ends, if it holds before `for_s` is over.
+        prune: Condition at which a trial ends early, without a score.
+        repeats: How often to try each set.
+        robot: The robot whose signals, events and parameters to use, if a world has several.
+        timeout_s: Wall time after which a trial has failed, in seconds.
+        ranges: The values to search, by parameter.
+        search: The sampler of Optuna that proposes sets.
+        sets: The number of sets to search for.
+        seed: Seed of the sampler: with the same seed and trials it proposes the same set.
     """
 
     score: str
@@ -161,7 +162,7 @@ class TrialPlan:
 
     @property
     def text(self) -> str:
-        """All of it, always written alike: by it a set is found again."""
+        """The plan as JSON, always in the same form: it identifies a trial set."""
         plain = asdict(self) | {"ranges": _as_plain(self.ranges)}
         return json.dumps(plain, sort_keys=True, ensure_ascii=False)
 
@@ -175,7 +176,7 @@ class TrialPlan:
 
     @property
     def trial_count(self) -> int:
-        """How many trials there are in the end."""
+        """The total number of trials."""
         return (self.sets or len(self.parameters)) * self.repeats
 
 
@@ -199,14 +200,14 @@ def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
     """Read a plan, for a search or without one.
 
     Raises:
-        InvalidInputError: It cannot be read, is no TOML, or says something that is not possible;
-            the text names it.
+        InvalidInputError: If it cannot be read, is not TOML, or asks for something impossible; the
+            text names it.
     """
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
         found = cast("dict[str, Any]", toml.loads(file.read_text("utf-8")))
     except ValueError as error:  # also what is not UTF-8
-        raise InvalidInputError(f"{file} is no TOML: {error}") from error
+        raise InvalidInputError(f"{file} is not TOML: {error}") from error
     except OSError as error:
         raise InvalidInputError(f"the plan {file} cannot be read: {error.strerror}") from error
     try:
@@ -237,14 +238,14 @@ def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Worl
 
 
 def combinations(grid: dict[str, Any], where: str = "") -> list[dict[str, Any]]:
-    """Every combination of the values of a grid.
+    """Return every combination of the values of a grid.
 
     Args:
         grid: Lists of values by parameter.
-        where: It stands, for what an error says.
+        where: The place of the grid, as an error names it.
 
     Raises:
-        InvalidInputError: One has no list of values, or there are too many.
+        InvalidInputError: If a parameter has no list of values, or there are too many combinations.
     """
     for name, values in grid.items():
         if not isinstance(values, list) or not values:
@@ -288,10 +289,10 @@ def _range_of(name: str, table: Any) -> ParameterRange:
 
 
 def _require_kinds(table: dict[str, Any], kinds: Mapping[str, Any]) -> None:
-    """See that a table of a plan has only keys that are known, with values of their kinds.
+    """Refuse a table of a plan with an unknown key, or with a value of the wrong type.
 
     Raises:
-        InvalidInputError: It has others.
+        InvalidInputError: If there is one.
     """
     for key, value in table.items():
         if key not in kinds:
@@ -304,7 +305,7 @@ def _require_kinds(table: dict[str, Any], kinds: Mapping[str, Any]) -> None:
 
 
 def _as_plain(ranges: dict[str, ParameterRange]) -> dict[str, Any]:
-    """In JSON's terms, without what is not given."""
+    """Return ranges as JSON values, without those that are not given."""
     return {
         name: {key: value for key, value in asdict(each).items() if value not in (None, False)}
         for name, each in ranges.items()

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, ENDED_BY, PARAMETERS_VARIABLE
 from webots_mcp.errors import (
@@ -34,9 +34,6 @@ from webots_mcp.store.parameters import (
 )
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.runs import run_info
-
-if TYPE_CHECKING:
-    pass
 
 CONSOLE: Final = "simulator.log"
 CommandOfWorld = Callable[[str], CommandLine]
@@ -59,12 +56,12 @@ class TrialAttempt:
     """One trial that is to be run.
 
     Attributes:
-        plan: When it ends, and how it is scored.
+        plan: The plan, which says when the trial ends and how it is scored.
         values: Its parameters.
-        folder: An empty one, in which its recording is left.
+        folder: An empty folder, in which its recording is left.
         stopping: Once it is set, the trial ends soon.
-        begun: Called with the pid of its simulator before that does anything; with None where it
-            was handed to another machine.
+        begun: Called with the pid of its simulator before that does anything; with None if another
+            machine runs the trial.
     """
 
     plan: WorldPlan
@@ -79,34 +76,34 @@ class Simulators(Protocol):
 
     @property
     def count(self) -> int:
-        """How many can run at once, now."""
+        """How many trials can run at the same time now."""
         ...
 
     def run(self, attempt: TrialAttempt) -> TrialResult:
-        """Run a trial; its recording is in its folder then, and the result has its run's id there.
+        """Run a trial; leave its recording in its folder, and return its result with the run's id.
 
         Raises:
-            StoppedError: The caller wanted it to stop.
-            InvalidInputError: No trial of the set can succeed.
-            CommandRefusedError: No trial can be run there any more.
+            StoppedError: If the caller wanted it to stop.
+            InvalidInputError: If no trial of the set can succeed.
+            CommandRefusedError: If no trial can be run there any more.
         """
         ...
 
 
 @dataclass(frozen=True)
 class LocalSimulators:
-    """Processes of this machine.
+    """Simulators on this machine.
 
     Attributes:
-        command: Of a world's simulator.
-        count: How many run at once.
+        command: Returns the command that starts the simulator of a world.
+        count: How many run at the same time.
     """
 
     command: CommandOfWorld
     count: int
 
     def run(self, attempt: TrialAttempt) -> TrialResult:
-        """As `Simulators.run`."""
+        """Run a trial in a simulator of this machine, see `Simulators.run`."""
         return run_attempt(attempt, self.command)
 
 
@@ -177,7 +174,7 @@ def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> Tr
 def _watched(
     attempt: TrialAttempt, watch: TrialWatch, simulator: TrialSimulator
 ) -> tuple[End | None, str]:
-    """Until the trial is over; the end that it reached, or why it reached none."""
+    """Wait until a trial is over; return the end that it reached, or why it reached none."""
     folder, timeout_s = attempt.folder, attempt.plan.timeout_s
     recording = RecordingAccess(folder / DATABASE_NAME, folder, read_only=True)
     until_s = time.monotonic() + timeout_s
@@ -233,7 +230,7 @@ def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: s
 
 
 def _ending_line(connection: sqlite3.Connection, run_id: int | None) -> str | None:
-    """By which exception the controller ended, where it did."""
+    """Return the log line of the exception that ended the controller, if one did."""
     wanted = LogFilter(run_id, LogWindow(-math.inf, math.inf), ENDED_BY, "error")
     found = newest_lines(connection, wanted, 1) if run_id is not None else []
     return found[0].message if found else None

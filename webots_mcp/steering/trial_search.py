@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 def require_optuna() -> None:
-    """See that there is what a search needs, before anything is written.
+    """Check that Optuna is installed, before anything is written.
 
     Raises:
-        InvalidInputError: Optuna is not installed.
+        InvalidInputError: If it is not installed.
     """
     try:
         import_module("optuna")
@@ -38,7 +38,7 @@ def require_optuna() -> None:
 
 
 def next_parameters(plan: TrialPlan, trials: Sequence[TrialRecord]) -> dict[str, Any] | None:
-    """Return the parameters of the trial after these; None where there is none.
+    """Return the parameters of the next trial; None if all trials are done.
 
     Each set is tried `plan.repeats` times in a row.
     """

@@ -15,7 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.files import make_folder
@@ -25,6 +25,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.simulator.starting import end_left_over
 from webots_mcp.steering.trial_plan import WorldPlan
+from webots_mcp.steering.trial_run import Simulators, StoppedError, TrialAttempt, recorded_result
 from webots_mcp.steering.trial_search import next_parameters
 from webots_mcp.store.merging import merge
 from webots_mcp.store.parameters import (
@@ -44,24 +45,20 @@ from webots_mcp.store.policy import LAUNCH
 from webots_mcp.store.recording import Job, RecordingAccess
 from webots_mcp.store.requests import permit
 
-if TYPE_CHECKING:
-    pass
-from webots_mcp.steering.trial_run import Simulators, StoppedError, TrialAttempt, recorded_result
-
 FOLDER: Final = "trials"
 TrialReport = Callable[[TrialRecord, TrialResult], object]
 
 
 @dataclass(frozen=True)
 class SetRun:
-    """The run of a trial set: what is tried, where, and who takes it in.
+    """What is needed to run a trial set.
 
     Attributes:
-        recording: Takes in what they record.
-        plan: What is tried.
-        simulators: In which they run.
+        recording: The recording into which each trial is merged.
+        plan: The plan of the trials.
+        simulators: The simulators in which they run.
         stopping: Once it is set, running trials end soon and wait to be run again.
-        job: The set, as long as this process works on it.
+        job: The lease of the set, while this process works on it.
     """
 
     recording: RecordingAccess
@@ -71,12 +68,12 @@ class SetRun:
     job: Job | None = None
 
     def writer(self) -> AbstractContextManager[sqlite3.Connection]:
-        """For what only the process may write that works on the set; see `Job.writer`."""
+        """Open a connection for what only the process that works on the set may write."""
         assert self.job is not None  # `run_trials` has taken it up
         return self.job.writer()
 
     def require_held(self) -> None:
-        """See `Job.require_held`."""
+        """Raise LeaseLostError if another process works on the set now."""
         with self.writer():
             pass
 
@@ -89,9 +86,9 @@ def run_trials(set_run: SetRun, set_id: int, report: TrialReport) -> None:
     """Run the trials of a set that are not over.
 
     Args:
-        set_run: Of the plan, and where its trials run.
+        set_run: The plan, and where its trials run.
         set_id: The set.
-        report: Is called in this thread with each trial that is over.
+        report: Called in this thread with each trial that is over.
 
     Raises:
         CommandRefusedError: Another process works on the set, the set was cancelled, or there is
@@ -143,10 +140,10 @@ def _run_left(set_run: SetRun, set_id: int, report: TrialReport) -> None:
 
 
 def _require_wanted(set_run: SetRun, set_id: int) -> None:
-    """Check that the set was not cancelled, by whatever process.
+    """Check that no process has cancelled the set.
 
     Raises:
-        CommandRefusedError: It was.
+        CommandRefusedError: If one has.
     """
     with set_run.recording.reader() as connection:
         reason = fetch_trial_set(connection, set_id).stop_reason
@@ -155,7 +152,7 @@ def _require_wanted(set_run: SetRun, set_id: int) -> None:
 
 
 def _next_trial(set_run: SetRun, set_id: int, left: deque[TrialRecord]) -> TrialRecord | None:
-    """One that waits, or a new one of a search; None where there is none."""
+    """Return a waiting trial, or a new one of a search; None if there is none."""
     if left:
         return left.popleft()
     if set_run.plan.search is None:
@@ -170,7 +167,7 @@ def _next_trial(set_run: SetRun, set_id: int, left: deque[TrialRecord]) -> Trial
 
 
 def run_trial(set_run: SetRun, trial: TrialRecord) -> TrialResult:
-    """Run one trial, or only score and merge it where it has run to its end already.
+    """Run one trial, or only score and merge it if it has run to its end already.
 
     Raises:
         StoppedError: It waits to be run again.
@@ -195,7 +192,7 @@ def run_trial(set_run: SetRun, trial: TrialRecord) -> TrialResult:
 
 
 def _with_run(result: TrialResult, merged: dict[str, int], folder: Path) -> TrialResult:
-    """With the id that its run has where it was merged."""
+    """Return a result with the id that its run has in the recording into which it was merged."""
     with RecordingAccess(folder / DATABASE_NAME, folder).reader() as connection:
         row = connection.execute("SELECT uuid FROM run WHERE id = ?", (result.run_id,)).fetchone()
     return replace(result, run_id=merged[row[0]])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 from webots_mcp.errors import (
     InvalidInputError,
@@ -16,16 +16,12 @@ from webots_mcp.signals.conditions import Evaluator, parse_condition
 from webots_mcp.steering.trial_plan import TrialPlan
 from webots_mcp.store.chunks import parse
 
-if TYPE_CHECKING:
-    pass
-
-
 _SAME_TIME_S: Final = 1e-6
 Ending: TypeAlias = Literal["for_s", "until", "prune"]
 
 
 class End(NamedTuple):
-    """The simulation time at which a trial was over, and by what."""
+    """The simulation time at which a trial ended, and what ended it."""
 
     sim_time_s: float
     by: Ending
@@ -53,7 +49,7 @@ class TrialWatch:
         Raises:
             InvalidInputError: It is not clear which robot to use, or its controller does not
                 have the parameters that are to be tried.
-            ConditionFailedError: `until` or `prune` cannot be asked of the signals.
+            ConditionFailedError: If `until` or `prune` cannot be evaluated on the signals.
         """
         if self.run_id is None and not self._find_run(connection):
             return None
@@ -74,16 +70,16 @@ class TrialWatch:
         return self._by_time(self.reached_s)
 
     def _condition_at(self, state: Any, sim_time_s: float) -> Ending | None:
-        """Return which condition holds first; each of them takes in every state."""
+        """Return the first condition that holds; every condition is evaluated on every state."""
         held: list[Ending] = [by for by, each in self._evaluators if each.holds(state, sim_time_s)]
         return held[0] if held else None
 
     def require_parameters(self, connection: sqlite3.Connection, wanted: dict[str, Any]) -> None:
-        """See that the run began with the values that it should have begun with.
+        """Check that the run began with the wanted values.
 
         Raises:
-            InvalidInputError: The controller has not declared one.
-            ValueError: It did not take one.
+            InvalidInputError: If the controller has not declared a parameter.
+            ValueError: If it did not accept a value.
         """
         if self.run_id is None:
             return

@@ -57,7 +57,7 @@ class TrialTimes:
 
     Attributes:
         poll_s: Between two reads of a command.
-        settle_s: Between two rounds of taking in rows that wait in files.
+        settle_s: Between two times of ingesting rows that wait in files.
         block_search_s: Between two searches for what keeps the loop from a command.
         patience_s: For a command that takes a round of the loop.
         end_patience_s: The same when the server ends.

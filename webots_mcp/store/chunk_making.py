@@ -25,7 +25,7 @@ from webots_mcp.database.connection import (
     AtomicStatements,
     FrozenConnection,
 )
-from webots_mcp.database.liveness import holder_of
+from webots_mcp.database.leases import holder_of
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import DatabaseError, warn
 from webots_mcp.signals.register import MAX_SIGNALS

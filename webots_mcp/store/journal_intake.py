@@ -42,13 +42,13 @@ from webots_mcp.contract import (
     is_extern,
     recorded_name,
 )
-from webots_mcp.database import liveness, waiting_file
+from webots_mcp.database import dead_sessions, processes, waiting_file
 from webots_mcp.database.connection import identify_files, in_transaction
 from webots_mcp.database.waiting_file import (
     FORMAT,
     STATEMENTS,
+    Ingested,
     Kind,
-    Taken,
     WaitingEntry,
     journal_parts,
 )
@@ -337,7 +337,7 @@ class _Reading:
             if entries := self._entries(lines, session_id):
                 finish = partial(self._finish, session_id, robot_id, session_state, lines)
                 begin = partial(self._begin, session_state)
-                taken = waiting_file.take_in(self.connection, session_id, entries, finish, begin)
+                taken = waiting_file.ingest(self.connection, session_id, entries, finish, begin)
                 done = _until(lines, taken.number)[-1].end
                 place = _JournalPosition(self.identity, done, taken.number, True, self.faults)
             else:
@@ -394,9 +394,11 @@ class _Reading:
 
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
-                liveness.reap(connection, time.time())
+                dead_sessions.reap(connection, time.time())
                 wanted = recorded_name(name)
-                free = liveness.free_name(connection, wanted, lambda it: it.kind == CUSTOM_DATA)
+                free = dead_sessions.free_name(
+                    connection, wanted, lambda it: it.kind == CUSTOM_DATA
+                )
                 robot = {"name": free, "kind": "Robot", "devices": "{}"}
                 now_s = session["started_wall_time_s"]
                 robot_id = waiting_file.enter_robot(connection, robot, now_s)
@@ -422,7 +424,7 @@ class _Reading:
         robot_id: int,
         session_state: _JournalState,
         lines: Sequence[_Line],
-        taken: Taken,
+        taken: Ingested,
     ) -> None:
         """Write what follows: names, changes, times, ends of runs, what was dropped."""
         written = {entry.number for entry in taken.written}
@@ -466,9 +468,9 @@ class _Reading:
             self.connection.execute(_SEEN_RUN, values)
             self.connection.execute(_SEEN_SESSION, values)
         if begun := ends.get("run"):
-            liveness.end_runs(self.connection, session_id, "reset", begun["uuid"])
+            dead_sessions.end_runs(self.connection, session_id, "reset", begun["uuid"])
         if end := ends.get("session end"):
-            liveness.end_runs(self.connection, session_id, end["reason"])
+            dead_sessions.end_runs(self.connection, session_id, end["reason"])
         dropped = self.faults.and_those(faults)
         self.faults = _NO_FAULTS if last else dropped
         if last and dropped.lines:
@@ -521,7 +523,7 @@ def _described(
     is_here = host == host_name()
     started_s = modified_s if given["started_wall_time_s"] is None else given["started_wall_time_s"]
     pid = given["pid"] or 0  # no process has that one
-    lives = liveness.process_alive(pid, None, started_s)  # of one that is gone none can tell it
+    lives = processes.process_alive(pid, None, started_s)  # of one that is gone none can tell it
     versions = {
         key: value
         for key, value in _object(given["versions"]).items()
@@ -532,7 +534,7 @@ def _described(
         {
             "uuid": uuid,
             "pid": pid,
-            "process": liveness.process_identity(pid) if is_here and lives else None,
+            "process": processes.process_identity(pid) if is_here and lives else None,
             "host": host,
             "instance": instance_of(environment, parent) if is_here else f"{host} process {parent}",
             "extern": int(is_extern(environment)),

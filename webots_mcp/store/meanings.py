@@ -98,11 +98,17 @@ def with_stated(
     patterns = [each for each in stored if "*" in each.stated.said.name]
     if not patterns:
         return known | {
-            name: replace(known[name], stated=tuple(stated))
+            name: _stated(known[name], tuple(stated))
             for name, stated in plain.items()
             if name in known
         }
-    return {name: replace(signal, stated=_of(name, stored)) for name, signal in known.items()}
+    return {name: _stated(signal, _of(name, stored)) for name, signal in known.items()}
+
+
+def _stated(signal: RegisteredSignal, stated: tuple[StatedMeaning, ...]) -> RegisteredSignal:
+    """The signal with what was stated of it: its unit is the one that was stated."""
+    found = replace(signal, stated=stated)
+    return replace(found, unit=found.stated_unit or signal.unit)
 
 
 def _of(name: str, stored: list[StoredMeaning]) -> tuple[StatedMeaning, ...]:

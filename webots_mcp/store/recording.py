@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database import liveness
+from webots_mcp.database import dead_sessions
 from webots_mcp.database.connection import (
     FAILURES,
     LONGEST_READ_S,
@@ -34,7 +34,7 @@ from webots_mcp.database.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.database.liveness import JobLease, still_held
+from webots_mcp.database.leases import JobLease, still_held
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.queue import any_unfinished
@@ -309,7 +309,7 @@ class RecordingAccess:
             if any_unfinished(connection):
                 if isinstance(self.database, Path):
                     adopt(connection, self.database)  # a command's result may wait there
-                liveness.reap(connection, time.time())
+                dead_sessions.reap(connection, time.time())
 
     def ingest(self) -> None:
         """Take in what controllers wrote into journals; nothing where the asker may not write."""

@@ -27,14 +27,7 @@ from webots_mcp.contract import (
     host_name,
     recorded_name,
 )
-from webots_mcp.database.liveness import (
-    EXTERN,
-    has_lost_simulator,
-    is_living,
-    is_stopped,
-    process_alive,
-    signal_process,
-)
+from webots_mcp.database.dead_sessions import EXTERN
 from webots_mcp.database.pauses import (
     HELD_ELSEWHERE,
     LEFT_PAUSED,
@@ -47,6 +40,13 @@ from webots_mcp.database.pauses import (
     SEEN_RUNNING_BY,
     breakpoint_at,
     change_since,
+)
+from webots_mcp.database.processes import (
+    has_lost_simulator,
+    is_living,
+    is_stopped,
+    process_alive,
+    signal_process,
 )
 from webots_mcp.database.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
 from webots_mcp.database.waiting_file import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.database.connection import transaction
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.database.pauses import paused_s
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.parameter import Value
@@ -215,7 +215,7 @@ def pace(duration_s: float, wall_s: float) -> float | None:
 
 
 def _infos(connection: sqlite3.Connection, rows: Sequence[tuple[Any, ...]]) -> list[RunInfo]:
-    ended = dict(dead_sessions(connection))
+    ended = dict(find_dead_sessions(connection))
     parameters = notable_parameters(connection, [row[0] for row in rows])
     return [_info(connection, row, ended, parameters[row[0]]) for row in rows]
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.signals.meaning import StatedMeaning
-from webots_mcp.signals.naming import Value, find_mode
+from webots_mcp.signals.meaning import ANGLES, StatedMeaning
+from webots_mcp.signals.naming import METRES, Value, find_mode, metres_in
 from webots_mcp.signals.register import (
     MOST_CHOICES,
     Kind,
@@ -35,6 +36,7 @@ _OF_ROBOT: Final = (
     "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
 )
 
+_TURNING: Final = ("heading", "roll", "pitch")  # in radians where no unit is known
 _NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
 _TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as it is
     "null": _NO_VALUES,
@@ -71,7 +73,26 @@ class RegisteredSignal:
     @property
     def turn(self) -> float | None:
         """A whole turn of an angle, in its unit; None of what is no angle."""
-        return turn_of(self.name, self.kind)
+        if not self.stated or not self.is_number:
+            return turn_of(self.name, self.kind)
+        quantity = next(filter(None, (each.said.quantity for each in self.stated)), None)
+        unit = self.stated_unit
+        if quantity is not None and quantity not in ANGLES:
+            return None
+        if unit in ("rad", "deg"):
+            return math.tau if unit == "rad" else 360.0
+        named = turn_of(self.name, self.kind)
+        return named if quantity is None or named else math.tau if quantity in _TURNING else None
+
+    @property
+    def stated_unit(self) -> str | None:
+        """The unit that was declared, or that its device has; None without any."""
+        return next(filter(None, (each.said.unit for each in self.stated)), None)
+
+    @property
+    def metres(self) -> float:
+        """What one of its unit is in metres: 1 of a length without a unit."""
+        return METRES.get(self.stated_unit or "") or metres_in(self.name)
 
     @property
     def is_index(self) -> bool:

@@ -19,8 +19,9 @@ from tests.bridge.keeping.conftest import State, rows
 from tests.bridge.monsters import MONSTERS, EndlessDict
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import cleaning
-from webots_mcp.bridge.encoding import copy_or_encode, encode, encode_copy
-from webots_mcp.bridge.keeping import Ring, RingRow
+from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.ring import Ring, RingRow
+from webots_mcp.bridge.state_pickles import copy_or_encode, encode_copy
 from webots_mcp.standin import InProcessSupervisor
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.conftest import Recording
-from webots_mcp.bridge.capture import MOST_LINES_PER_S
+from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 
 Script = Callable[..., "subprocess.Popen[str]"]
 LINES = "SELECT message FROM log WHERE logger = 'stdout' ORDER BY id"
@@ -31,7 +31,10 @@ def begin():
 """
 
 
-WITHOUT_POLLING = "from webots_mcp.bridge import capture\ncapture._POLLS = False\n"
+WITHOUT_POLLING = """
+from webots_mcp.bridge import capture, output_channel
+capture.POLLS = output_channel.POLLS = False
+"""
 
 
 @pytest.fixture

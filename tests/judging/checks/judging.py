@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from tests.judging.checks.labelled import FAULTS, WRITTEN, healthy, record
+from tests.judging.detection.writing import put_in_chunks
 from tests.memory import memory_connection
 from webots_mcp.judging.checks import CHECKS, check_run
 from webots_mcp.judging.checks.finding import Finding
@@ -60,13 +61,15 @@ def _judge(kind: str, by: str, numbers: range) -> Judged:
 
 
 def checked(kind: str, number: int, *, deadline_s: float = _UNHURRIED_S) -> list[Finding]:
-    """What is said of the run of that kind and number."""
+    """What is said of the run of that kind and number; every second one is in chunks."""
     rng = np.random.default_rng([1, number, zlib.crc32(kind.encode())])
     run = healthy(rng)
     if kind in FAULTS:
         run = FAULTS[kind][0](rng, run)
     with memory_connection() as connection:
         run_id = record(connection, run, WRITTEN[kind][0] if kind in WRITTEN else "")
+        if number % 2 == 0:
+            put_in_chunks(connection)
         return list(check_run(connection, run_id, deadline_s=deadline_s).findings)
 
 

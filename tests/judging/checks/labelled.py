@@ -165,11 +165,81 @@ def leaps(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
 
 
 def falls(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
-    """It tips over to one side within a second, and stays down."""
+    """It tips over to one side within a second, and stays down where it is."""
     side = float(rng.choice([-1, 1]) * rng.uniform(1.2, 1.6))
     at_s = float(rng.uniform(0.3, 0.7)) * run.duration_s
     roll = side * np.clip(run.times - at_s, 0, 1) + rng.normal(0, 0.01, len(run.times))
-    return replace(run, columns={**run.columns, "imu_roll_rad": roll.tolist()})
+    last = int(np.searchsorted(run.times, at_s + 1))
+    lies = np.array(run.columns["gps"])
+    lies[last:] = lies[last]
+    lies[last:, :2] += rng.normal(0, run.noise_m, (len(lies) - last, 2))
+    fallen = {"imu_roll_rad": roll.tolist(), "gps": lies.tolist()}
+    return replace(run, columns={**run.columns, **fallen})
+
+
+def grips_on_one_side(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """From some time on the wheels of one side grip half: it turns though both turn alike."""
+    times = np.arange(0, 80, 0.064)
+    weak = np.where(times > float(rng.uniform(30, 50)), float(rng.uniform(0.3, 0.6)), 1.0)
+    speed_m_s, track_m = float(rng.uniform(0.1, 0.3)), float(rng.uniform(0.15, 0.4))
+    left, right = speed_m_s * weak, speed_m_s
+    yaw = rng.choice([-1, 1]) * np.cumsum((right - left) / track_m) * 0.064
+    way = (left + right) / 2 * 0.064
+    noise = rng.normal(0, float(rng.choice([0.0, 0.002])), (2, len(times)))
+    x, y = np.cumsum(way * np.cos(yaw)) + noise[0], np.cumsum(way * np.sin(yaw)) + noise[1]
+    columns = {
+        "gps": np.column_stack([x, y]).tolist(),
+        "heading": np.angle(np.exp(1j * yaw)).tolist(),
+        "wheels": [{"left": speed_m_s / WHEEL_RADIUS_M, "right": speed_m_s / WHEEL_RADIUS_M}]
+        * len(times),
+    }
+    return LabelledRun(times, columns, 0.064)
+
+
+def blind_rays(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """A part of the items of an array never has a value."""
+    count = int(rng.integers(60, 180))
+    scan = rng.normal(2, 0.01, (len(run.times), count))
+    first = int(rng.integers(0, count // 2))
+    scan[:, first : first + int(rng.integers(count // 8, count // 2))] = np.nan
+    return replace(run, columns={**run.columns, "scan_m": scan.tolist()})
+
+
+def cut_off(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """A vibration drives an accelerometer from one of its limits to the other for a moment."""
+    limit = float(rng.choice([19.6, 39.2, 156.9]))
+    accel = rng.normal(0, 0.01 * limit, len(run.times))
+    lasts_s = max(1.0, 30 * run.interval_s)
+    at_s = float(rng.uniform(0.3, 0.7)) * run.duration_s
+    shaken = (run.times >= at_s) & (run.times < at_s + lasts_s)
+    accel[shaken] = rng.normal(0, 1.5 * limit, int(shaken.sum()))
+    clipped = np.clip(accel, -limit, limit).tolist()
+    return replace(run, columns={**run.columns, "accel_m_s2": clipped})
+
+
+def disturbed_compass(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """For a part of the run a compass is off by more than half a radian; the gyro is not."""
+    yaw = np.array([each["yaw"] for each in run.columns["imu"]])
+    off = float(rng.uniform(0.6, 2.5)) * rng.choice([-1, 1]) * _span(rng, run)
+    compass = np.angle(np.exp(1j * (yaw + off + rng.normal(0, 0.02, len(yaw)))))
+    return replace(run, columns={**run.columns, "compass_heading": compass.tolist()})
+
+
+def turns_instead(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """It is told to drive ahead, and turns in place."""
+    times = np.arange(0, 60, 0.064)
+    on = (times >= 15) & (times < float(rng.uniform(25, 45)))
+    drives = (times < 15) | (times >= 50)
+    way = np.cumsum(0.25 * drives) * 0.064
+    yaw = np.cumsum(float(rng.uniform(0.5, 2.0)) * on) * 0.064
+    columns = {
+        "pose": [
+            {"x": a, "y": 0.0, "yaw": b}
+            for a, b in zip(way.tolist(), np.angle(np.exp(1j * yaw)).tolist(), strict=True)
+        ],
+        "cmd_vel": [{"linear": 0.25 * each, "angular": 0.0} for each in (on | drives).tolist()],
+    }
+    return LabelledRun(times, columns, 0.064)
 
 
 def noisy(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
@@ -206,6 +276,11 @@ FAULTS: Final[dict[str, tuple[Fault, str]]] = {
     "saturated": (saturated, "sensors within limits"),
     "dropouts": (dropouts, "sensors drop nothing"),
     "gaps": (gaps, "misses no steps"),
+    "turns instead": (turns_instead, "moves when commanded"),
+    "one side slips": (grips_on_one_side, "wheels grip"),
+    "blind rays": (blind_rays, "sensors speak"),
+    "cut off": (cut_off, "sensors within limits"),
+    "compass": (disturbed_compass, "estimates agree"),
 }
 
 # Faults of a run that is recorded: what is written beside its rows.

@@ -16,9 +16,10 @@ from tests.frames import frame_of
 from tests.judging.asking import ask, spans
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.judging.coverage import SearchCoverage
 from webots_mcp.judging.detection.events import asked_kinds, find_events
 from webots_mcp.judging.detection.jump import find_jumps
-from webots_mcp.judging.detection.kinds import Event, EventOptions, Ledger
+from webots_mcp.judging.detection.kinds import Event, EventOptions, count_by_kind
 from webots_mcp.judging.detection.search import Search, events_touching
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -178,11 +179,13 @@ def test_between_two_signals_the_time_is_looked_at(
     kinds, known = asked_kinds(options), known_signals(rover, time_range)
     told: list[str] = []
     for limit in range(4, 14):
-        ticks, ledger = count(), Ledger()
+        ticks, coverage = count(), SearchCoverage()
         deadline = Deadline(limit, lambda ticks=ticks: next(ticks))
-        search = Search(rover, time_range.segments[0], known, kinds, options, deadline, ledger)
+        search = Search(rover, time_range.segments[0], known, kinds, options, deadline, coverage)
         found = events_touching(search)
-        told += ledger.verdicts([kind.name for kind in kinds], found).not_searched.values()
+        told += coverage.verdicts(
+            [kind.name for kind in kinds], count_by_kind(found)
+        ).not_searched.values()
     assert any(re.search(r"time limit reached, \d+ signals left: ask for", each) for each in told)
 
 

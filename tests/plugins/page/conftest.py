@@ -26,9 +26,10 @@ __all__ = ["chromium"]
 NAME = "<img src=x onerror=hacked=1>"
 LINE = "<script>window.hacked = 1</script>"
 _VIEW = """
+from dataclasses import replace
 from webots_mcp.cli import main
 from webots_mcp.plugins.page import page_server
-page_server._REQUEST_S = {}
+page_server.LIMITS = replace(page_server.LIMITS, request_s={})
 raise SystemExit(main())
 """
 

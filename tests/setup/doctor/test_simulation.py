@@ -25,7 +25,7 @@ from tests.simulator.conftest import (
 )
 from tests.waiting import wait_for
 from webots_mcp.contract import ENDED_BY, SEE_STEPS, UNMOVED, UNSEEN, host_name
-from webots_mcp.database.liveness import process_identity
+from webots_mcp.database.processes import process_identity
 from webots_mcp.setup.doctor import Diagnosis
 
 WAITS = "import sys; print('ready', flush=True); sys.stdin.read()"

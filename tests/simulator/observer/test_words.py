@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from webots_mcp.signals.conditions.compiler import parse_condition
-from webots_mcp.simulator.observed_world import word_of
+from webots_mcp.simulator.observed_bodies import word_of
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import pytest
 from tests.bridge.processes.stopping import stop_between_writes
 from tests.steering.trials.conftest import Run, command, rows, wait_for_trial
 from tests.waiting import wait_for
-from webots_mcp.database.liveness import process_identity
+from webots_mcp.database.processes import process_identity
 from webots_mcp.simulator.starting import CommandLine
 from webots_mcp.steering.trial_run import TrialSimulator
 

@@ -53,7 +53,7 @@ def require_rows(folder: Path, expected: dict[str, Any]) -> None:
     assert "dropped" in expected or rows(folder, "dropped") == [[0]]
 
 
-@pytest.mark.parametrize("pieces", [1, 2, pytest.param(211, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("pieces", [1, 2, pytest.param(67, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_a_journal_comes_to_its_rows(
     file: Path, pieces: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]

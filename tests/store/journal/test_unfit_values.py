@@ -53,7 +53,7 @@ def state(number: int, run: str = RUN) -> str:
     return json.dumps([number, "state", run, [number / 10, 1000.0 + number / 10, {"n": number}]])
 
 
-def take_in(folder: Path, *lines: str, start: bytes = b"") -> None:
+def ingest(folder: Path, *lines: str, start: bytes = b"") -> None:
     part(folder).write_bytes(start + "".join(f"{line}\n" for line in lines).encode())
     RecordingAccess(folder / "webots.db", folder).ingest()
 
@@ -80,7 +80,7 @@ def test_a_run_with_a_value_that_does_not_fit_keeps_its_states(
     name: str, unfit: str, tmp_path: Path
 ) -> None:
     run = object_with(RUN_VALUES, name, UNFIT[unfit])
-    take_in(tmp_path, json.dumps(HEADER), f'[1,"run",null,{run}]', *map(state, range(2, 6)))
+    ingest(tmp_path, json.dumps(HEADER), f'[1,"run",null,{run}]', *map(state, range(2, 6)))
     ((uuid, world, step_ms),) = query(tmp_path, "SELECT uuid, world, basic_time_step_ms FROM run")
     assert numbers(tmp_path) == [2, 3, 4, 5] and uuid == RUN
     assert world == "/w/arena.wbt" or name == "world" or unfit in ("5000 digits", "deeply nested")
@@ -98,7 +98,7 @@ def test_a_run_with_a_value_that_does_not_fit_keeps_its_states(
 def test_a_run_whose_line_cannot_be_read_is_made_from_its_first_row(
     line: str, tmp_path: Path
 ) -> None:
-    take_in(tmp_path, json.dumps(HEADER), line, *map(state, range(2, 6)))
+    ingest(tmp_path, json.dumps(HEADER), line, *map(state, range(2, 6)))
     assert numbers(tmp_path) == [2, 3, 4, 5]
     assert query(tmp_path, "SELECT uuid, started_sim_time_s, start_reason FROM run") == [
         (RUN, 0.2, "start")
@@ -109,7 +109,7 @@ def test_a_run_whose_line_cannot_be_read_is_made_from_its_first_row(
 def test_a_run_that_is_made_from_a_row_ends_the_run_before_it(tmp_path: Path) -> None:
     first = f'[1,"run",null,{json.dumps(RUN_VALUES)}]'
     other = RUN.replace("1", "7")
-    take_in(tmp_path, json.dumps(HEADER), first, state(2), "torn", state(3, other))
+    ingest(tmp_path, json.dumps(HEADER), first, state(2), "torn", state(3, other))
     assert query(tmp_path, "SELECT uuid, end_reason, row_count FROM run ORDER BY id") == [
         (RUN, "reset", 1),
         (other, None, 1),
@@ -127,7 +127,7 @@ def test_a_session_with_a_value_that_does_not_fit_is_recorded(
     session = object_with(HEADER["session"], name, UNFIT[unfit])
     header = f'{{"webots_mcp_waiting":1,"robot":{{"name":"rover"}},"session":{session}}}'
     run = f'[1,"run",null,{json.dumps(RUN_VALUES)}]'
-    take_in(tmp_path, header, run, *map(state, range(2, 6)))
+    ingest(tmp_path, header, run, *map(state, range(2, 6)))
     assert numbers(tmp_path) == [2, 3, 4, 5]
     assert rows(tmp_path, "dropped")[0][0] <= 1
     assert not part(tmp_path).exists()
@@ -154,7 +154,7 @@ def test_a_file_that_names_no_robot_or_session_is_kept_and_named_by_status(
     name: str, unfit: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     header = header_with(name, unfit)
-    take_in(tmp_path, header, f'[1,"run",null,{json.dumps(RUN_VALUES)}]', state(2))
+    ingest(tmp_path, header, f'[1,"run",null,{json.dumps(RUN_VALUES)}]', state(2))
     assert part(tmp_path).exists()
     capsys.readouterr()
     main(["status", "--data-dir", str(tmp_path)])
@@ -165,7 +165,7 @@ def test_a_file_that_names_no_robot_or_session_is_kept_and_named_by_status(
 def test_doctor_names_a_file_that_could_not_be_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    take_in(tmp_path, header_with("session.uuid", "missing"), state(2))
+    ingest(tmp_path, header_with("session.uuid", "missing"), state(2))
     main(["doctor", "--data-dir", str(tmp_path)])
     said = "".join(capsys.readouterr())
     assert f"{part(tmp_path).name} could not be read and was left as it is" in said
@@ -191,7 +191,7 @@ def test_a_part_of_which_nothing_fits_is_kept_and_those_after_it_are_read(
 def test_what_was_dropped_after_the_last_entry_is_counted(tmp_path: Path) -> None:
     run = f'[1,"run",null,{json.dumps(RUN_VALUES)}]'
     end = '[3,"session end",null,{"reason":"finished","now":1001.0,"dropped":5}]'
-    take_in(tmp_path, json.dumps(HEADER), run, "torn", state(2), "torn", end, "torn")
+    ingest(tmp_path, json.dumps(HEADER), run, "torn", state(2), "torn", end, "torn")
     assert query(tmp_path, "SELECT rows_dropped, end_reason FROM session") == [(8, "finished")]
     assert rows(tmp_path, "dropped") == [[3]]
 
@@ -210,7 +210,7 @@ def test_an_end_with_a_value_that_does_not_fit_ends_the_run_all_the_same(
     run = json.dumps(RUN) if kind == "run end" else "null"
     end = f'[4,"{kind}",{run},{object_with(values, name, UNFIT[unfit])}]'
     first = f'[1,"run",null,{json.dumps(RUN_VALUES)}]'
-    take_in(tmp_path, json.dumps(HEADER), first, state(2), state(3), end)
+    ingest(tmp_path, json.dumps(HEADER), first, state(2), state(3), end)
     assert numbers(tmp_path) == [2, 3]
     ((reason, ended_s),) = query(tmp_path, "SELECT end_reason, ended_wall_time_s FROM run")
     assert reason and ended_s is not None
@@ -218,7 +218,7 @@ def test_an_end_with_a_value_that_does_not_fit_ends_the_run_all_the_same(
 
 def test_a_byte_order_mark_at_the_start_of_a_file_or_a_line_is_no_fault(tmp_path: Path) -> None:
     run = f'[1,"run",null,{json.dumps(RUN_VALUES)}]'
-    take_in(tmp_path, json.dumps(HEADER), f"\ufeff{run}", state(2), start=b"\xef\xbb\xbf")
+    ingest(tmp_path, json.dumps(HEADER), f"\ufeff{run}", state(2), start=b"\xef\xbb\xbf")
     assert numbers(tmp_path) == [2]
     require_counted(tmp_path, 0)
 
@@ -286,7 +286,7 @@ def test_the_database_stays_readable_by_name_of_a_state_with_many_levels(tmp_pat
         json.dumps([number, "state", RUN, [number, number, {name: 1}]])
         for number, name in ((2, ".".join("a" * 90)), (3, ".".join("a" * 200)), (4, "a." * 5000))
     ]
-    take_in(tmp_path, json.dumps(HEADER), run, *lines)
+    ingest(tmp_path, json.dumps(HEADER), run, *lines)
     (found,) = query(tmp_path, "SELECT count(*) FROM state")
     assert found == (2,)  # the last name ends in a dot, and stays whole
     require_counted(tmp_path, 1)

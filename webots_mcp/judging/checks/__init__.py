@@ -6,8 +6,8 @@ import math
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Final
 
@@ -15,15 +15,14 @@ from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import ConditionFailedError, UnknownSignalError
 from webots_mcp.judging.checks import of_motion, of_sensors
 from webots_mcp.judging.checks.finding import (
-    WORST_FIRST,
     Check,
+    Examined,
     Finding,
-    Outcome,
     RunUnderCheck,
-    outcome_of,
     times,
     total_s,
 )
+from webots_mcp.judging.coverage import WORST_FIRST, Coverage, Fault, Outcome, outcome_of
 from webots_mcp.judging.detection import degradation, fall, jump, sensors, targets
 from webots_mcp.judging.detection.condition import (
     NONE_EXPECTED,
@@ -35,6 +34,7 @@ from webots_mcp.judging.detection.events import Found, asked_kinds, search_event
 from webots_mcp.judging.detection.kinds import EventOptions, NotSearchableError
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.conditions.compiler import Expectation
+from webots_mcp.signals.meaning import Source
 from webots_mcp.signals.naming import counted, listed
 from webots_mcp.store.project_file import ALL, Expected
 from webots_mcp.store.reading.catalogue import catalogue
@@ -79,7 +79,7 @@ _AIMS: Final = "a target beside its measurement: `arm.target`, `arm.position`"
 _TWO: Final = "two positions of the robot, such as gps and odometry"
 
 
-def keeps_pace(run: RunUnderCheck) -> Finding:
+def keeps_pace(run: RunUnderCheck) -> Examined:
     """Warns where it was slower than 0.9 of real time; waits of over a second do not count."""
     frame = run.frame
     steps, waits = np.diff(frame.times), np.diff(frame.wall_times)
@@ -94,39 +94,41 @@ def keeps_pace(run: RunUnderCheck) -> Finding:
     waited = f"; longest wait between two rows {longest:.3g} s" if longest > 1.0 else ""
     evidence = f"{factor:.3g} times real time{waited}"
     if factor >= SLOW:
-        return Finding("pass", evidence)
+        judged = counted(len(frame), "row")
+        return run.covered(evidence, judged=judged, limit=f"limit {SLOW:g} times real time")
     cells = (frame.times[1:] // _CELL_S).astype(np.intp) if len(frame) else np.zeros(0, np.intp)
     cells -= cells.min()
     paces = [np.bincount(cells, each * goes_on) for each in (steps, waits)]
     slow = np.flatnonzero(paces[0] < SLOW * paces[1])
     since_s = max(float(frame.times[0]), float(frame.times[1] // _CELL_S + slow[0]) * _CELL_S)
-    return Finding(
-        "warn", evidence, since_s, None, f"webots_list_runs(cursor={run.info.run_id + 1})"
-    )
+    more = f"webots_list_runs(cursor={run.info.run_id + 1})"
+    return Fault("warn", evidence, since_s, None, more)
 
 
-def misses_no_steps(run: RunUnderCheck) -> Finding:
+def misses_no_steps(run: RunUnderCheck) -> Examined:
     """Warns where simulation time went on without rows, fails from 5 % of the run on.
 
     Where more than 5 % of the rows are followed by none for long, they come unevenly by nature.
     """
     gaps = run.events("gap")
     if not gaps:
-        return Finding("pass", "rows came as evenly as usual")
+        return run.covered(
+            "rows came as evenly as usual", of="gap", judged=counted(len(run.frame), "row")
+        )
     gone_s, length_s = total_s(gaps), max(run.search.length_s, 1e-9)
     longest_s = max(each.duration_s for each in gaps)
     evidence = f"no rows {times(len(gaps))}, up to {longest_s:.3g} s, {gone_s:.3g} s in total"
     is_habit = len(gaps) > _MUCH * len(run.frame) and len(gaps) >= _HABIT
-    outcome = "fail" if gone_s > _MUCH * length_s and not is_habit else "warn"
-    return Finding(outcome, evidence, gaps[0].start_s, len(gaps), run.more("gap"))
+    severity = "fail" if gone_s > _MUCH * length_s and not is_habit else "warn"
+    return Fault(severity, evidence, gaps[0].start_s, len(gaps), run.more("gap"))
 
 
-def logs_no_errors(run: RunUnderCheck) -> Finding:
+def logs_no_errors(run: RunUnderCheck) -> Examined:
     """Fails where an error was logged, warns where a warning was."""
     lines = run.events("log")
     errors = [each for each in lines if each.name in ("error", "critical")]
     if not lines:
-        return Finding("pass", "no warning and no error was logged")
+        return run.covered("no warning and no error was logged", of="log")
     first = (errors or lines)[0]
     counts = Counter(each.name or "" for each in lines)
     said = str(first.details["message"]).strip().splitlines() or [""]
@@ -134,38 +136,42 @@ def logs_no_errors(run: RunUnderCheck) -> Finding:
     evidence = ", ".join(f"{count} {level}" for level, count in counts.items())
     evidence += f"; first: {line[:_LONGEST_MESSAGE]}"
     more = f"webots_get_logs(run_id={run.info.run_id})"
-    return Finding("fail" if errors else "warn", evidence, first.start_s, len(lines), more)
+    return Fault("fail" if errors else "warn", evidence, first.start_s, len(lines), more)
 
 
-def ends_well(run: RunUnderCheck) -> Finding:
+def _of_end(run: RunUnderCheck, says: str) -> Coverage:
+    return run.covered(says, lasts_s=0.0)
+
+
+def ends_well(run: RunUnderCheck) -> Examined:
     """Fails where its controller crashed; warns of a reset or reload that no command asked for."""
     reason, session = run.info.end_reason, run.info.session_id
     more = f"webots_get_logs(run_id={run.info.run_id})"
     if reason is None:
         process = fetch_session(run.search.connection, session)
         if process is None or process.is_alive(time.time()):
-            return Finding("pass", "it goes on")
+            return _of_end(run, "it goes on")
         silent = f"its controller, on {process.host}, has been silent and did not say that it ended"
-        return Finding("warn", silent, run.search.ended_s, 1, more)
+        return Fault("warn", silent, run.search.ended_s, 1, more)
     if reason == "crashed":
-        return Finding("fail", "its controller crashed or was killed", run.search.ended_s, 1, more)
+        return Fault("fail", "its controller crashed or was killed", run.search.ended_s, 1, more)
     if reason == "superseded":
-        return Finding("warn", "another bridge took its robot over", run.search.ended_s, 1, more)
+        return Fault("warn", "another bridge took its robot over", run.search.ended_s, 1, more)
     if reason not in ("reset", "reload"):
-        return Finding("pass", f"it ended: {reason}")
+        return _of_end(run, f"it ended: {reason}")
     last_s = run.info.started_wall_time_s + run.info.wall_duration_s
     asked = {"session": session, "last": last_s}
     if run.search.connection.execute(_RESET_BY, asked).fetchone()[0]:
-        return Finding("pass", f"it ended by a {reason} that a command asked for")
+        return _of_end(run, f"it ended by a {reason} that a command asked for")
     others = (session, run.info.run_id)
     habit = int(run.search.connection.execute(_ENDS_OF_SESSION, others).fetchone()[0])
     if reason == "reset" and habit >= _HABIT:  # other runs of the session
-        return Finding("pass", f"it ended by a reset, as {habit} others of its session")
+        return _of_end(run, f"it ended by a reset, as {habit} others of its session")
     evidence = f"it ended by a {reason} that no command asked for: by hand, or by code"
-    return Finding("warn", evidence, run.search.ended_s, 1, more)
+    return Fault("warn", evidence, run.search.ended_s, 1, more)
 
 
-def loses_no_rows(run: RunUnderCheck) -> Finding:
+def loses_no_rows(run: RunUnderCheck) -> Examined:
     """Fails where rows were dropped, warns where the database was in trouble or rows wait."""
     noticed = run.events("bridge_event")
     dropped = [each for each in noticed if each.details["what"] == "dropped"]
@@ -176,21 +182,21 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
         evidence = lost if dropped else "trouble with the database"
         evidence += f": {data[0].get('why', 'no reason was noted')}"
         more = run.more("bridge_event")
-        return Finding("fail" if dropped else "warn", evidence, found[0].start_s, len(found), more)
+        return Fault("fail" if dropped else "warn", evidence, found[0].start_s, len(found), more)
     if not run.info.row_count:
-        return Finding("warn", f"run {run.info.run_id} has no state row: call bridge.publish")
+        return Fault("warn", f"run {run.info.run_id} has no state row: call bridge.publish")
     verb = "were" if run.info.purged_rows else "are"  # they were deleted since
     waiting, error = run.search.connection.execute(_LOST, (run.info.session_id,)).fetchone()
     if run.info.end_reason and waiting:
         left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
-        return Finding("warn", left)
+        return Fault("warn", left)
     if beside := waiting_rows_note(run.search.connection):
-        return Finding("warn", beside)
+        return Fault("warn", beside)
     rows = f"all {run.info.row_count} rows {verb}" if run.info.row_count > 1 else "its only row is"
-    return Finding("pass", f"{rows} recorded")
+    return run.covered(f"{rows} recorded", lasts_s=0.0)
 
 
-def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
+def keeps_expectations(run: RunUnderCheck) -> Iterator[Examined]:
     """Fails where something that was expected did not hold. Each expectation is a line."""
     if not run.expected:
         raise NotSearchableError(NONE_EXPECTED)
@@ -199,53 +205,56 @@ def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
         name = f"expects: {each.name}"
         missing = [*each.violation.describe_unknown(run.search.known)]
         if missing and not each.asks_missing:
-            yield Finding("not applicable", "; ".join(missing), name=name)
+            yield Coverage.lacking("; ".join(missing), subject=name)
             continue
         try:
             held = judge_expectation(each, frame, run.search.known)
         except ConditionFailedError as error:
-            yield Finding("not looked at", str(error), name=name)
+            yield Coverage.lacking(str(error), "unread", name)
             continue
-        yield _held(run, each, held)._replace(name=name)
+        made = _held(run, each, held)
+        yield (
+            made._replace(subject=name) if isinstance(made, Fault) else replace(made, subject=name)
+        )
 
 
-def _held(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
+def _held(run: RunUnderCheck, each: Expectation, held: Adherence) -> Examined:
     lacking = f"; without a value in {counted(held.lacking, 'row')}" if held.lacking else ""
     if each.within_s is not None:
         return _reached(run, each, held)
     if not held.rows:
         why = f"{each.during.text!r} never held" if each.during else "it was too short"
-        return Finding("not applicable", f"it was never asked{lacking or f': {why}'}")
+        return Coverage.lacking(f"it was never asked{lacking or f': {why}'}", "absent")
     share = f"{100 * held.held_s / held.meant_s:.4g}" if held.meant_s else ""
     if share == "100" and len(held.violations):
         share = "over 99.99"
     of_all = f"held {share} % of {held.meant_s:.4g} s ({counted(held.rows, 'row')})"
     evidence = (of_all if share else "asked of its only row") + lacking
     if not len(held.violations):
-        return Finding("pass", evidence)
+        return run.covered(evidence, lasts_s=0.0)
     evidence = f"{evidence}; {times(len(held.violations))} violated"
     return _violated(run, each, held, evidence)
 
 
-def _reached(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
+def _reached(run: RunUnderCheck, each: Expectation, held: Adherence) -> Examined:
     after = "" if held.after_s is None else f"after {held.after_s:.4g} s"
     if not len(held.violations):
         short = f"it lasted {run.search.length_s:.4g} s, not longer than {each.within_s:g} s"
-        return Finding("pass", after) if after else Finding("not applicable", short)
+        return run.covered(after, lasts_s=0.0) if after else Coverage.lacking(short, "absent")
     evidence = f"not within {each.within_s:g} s: {after or f'never in {run.search.length_s:.4g} s'}"
     return _violated(run, each, held, evidence)
 
 
-def _violated(run: RunUnderCheck, each: Expectation, held: Adherence, evidence: str) -> Finding:
+def _violated(run: RunUnderCheck, each: Expectation, held: Adherence, evidence: str) -> Fault:
     if held.worst is not None:
         evidence += f"; worst {held.worst[0]} = {held.worst[1]:.4g}"
     where = (each.violation if each.within_s is None else each.expected).text
     more = f"webots_find_events(where={where!r}, run_id={run.info.run_id})"
     since_s = float(held.violations.starts_s[0])
-    return Finding("fail", evidence, since_s, len(held.violations), more)
+    return Fault("fail", evidence, since_s, len(held.violations), more)
 
 
-def reaches_goal(run: RunUnderCheck) -> Finding:
+def reaches_goal(run: RunUnderCheck) -> Examined:
     """Fails where the condition of its last run command, or trial, did not come to hold."""
     asked = (run.robot_id, run.info.run_id)
     row = run.search.connection.execute(_GOAL, asked).fetchone()
@@ -253,15 +262,15 @@ def reaches_goal(run: RunUnderCheck) -> Finding:
         raise NotSearchableError("no finished run command had a goal: webots_run(until=...)")
     goal, ended, took_s, at_s = row
     if ended == "condition held":
-        return Finding("pass", f"{goal}: after {took_s:.4g} s")
-    return Finding("fail", f"{goal}: not reached ({ended})", at_s, 1, run.more("command"))
+        return run.covered(f"{goal}: after {took_s:.4g} s", lasts_s=0.0)
+    return Fault("fail", f"{goal}: not reached ({ended})", at_s, 1, run.more("command"))
 
 
 UNDERSTOOD: Final = "signals understood"  # never changes what the run comes to
 _MOST_UNKNOWN: Final = 5  # names in the evidence
 
 
-def understands_signals(run: RunUnderCheck) -> Finding:
+def understands_signals(run: RunUnderCheck) -> Examined:
     """Not judged where numeric signals have an unknown meaning: no other check is about them."""
     changes: Counter[str] = Counter()
     understood = 0
@@ -277,13 +286,15 @@ def understands_signals(run: RunUnderCheck) -> Finding:
         raise NotSearchableError("no number was published: call bridge.publish")
     if not changes:
         said = "the meaning of its number is" if understood == 1 else "the meanings of all are"
-        return Finding("pass", f"{counted(understood, 'numeric signal')}, {said} known")
+        says = f"{counted(understood, 'numeric signal')}, {said} known"
+        return run.covered(says, lasts_s=0.0)
     branches = list(dict.fromkeys(_whole_array(name) for name, _ in changes.most_common()))
     named = listed(branches, _MOST_UNKNOWN)
     evidence = f"{counted(len(changes), 'signal')} of unknown meaning: {named}"
     evidence += "; declare them with webots_describe_signals(...)"
     more = f"webots_describe_signals(signals={branches[:1]}, quantity='speed', role='measured')"
-    return Finding("not judged", evidence, None, len(changes), more)
+    unknown = Coverage.lacking(evidence, "undecided")
+    return replace(unknown, often=len(changes), more=more)
 
 
 def _whole_array(name: str) -> str:
@@ -411,16 +422,23 @@ def _under_check(
 
 
 def findings_of(check: Check, run: RunUnderCheck) -> list[Finding]:
-    """What a check finds; it does not pass on what could not be looked at."""
+    """Return what a check comes to, by what it found and what could be judged."""
     try:
         run.require(check)
         made = check.find(run)
-        found = [made] if isinstance(made, Finding) else list(made)
+        examined = [made] if isinstance(made, (Fault, Coverage)) else list(made)
         if unread := run.unread(check):
-            for at, (outcome, evidence, *_) in enumerate(found):
-                if outcome not in ("fail", "warn"):
-                    said = unread + f"; {evidence}" * (outcome == "pass")
-                    found[at] = found[at]._replace(outcome="not looked at", evidence=said)
+            for each in examined:
+                if isinstance(each, Coverage):
+                    each.note_missing(unread, "unread")
     except NotSearchableError as error:
-        found = [Finding(outcome_of(str(error)), str(error))]
-    return [each if each.name else each._replace(name=check.name) for each in found]
+        examined = [Coverage.lacking(str(error), error.cause)]
+    sources: dict[str, Source] = {name: each.source for name, each in run.meanings.items()}
+    return [_finding(check, each, sources) for each in examined]
+
+
+def _finding(check: Check, made: Examined, sources: Mapping[str, Source]) -> Finding:
+    outcome, evidence = outcome_of(made, sources)
+    name = made.subject or check.name
+    since_s = made.since_s if isinstance(made, Fault) else None
+    return Finding(outcome, evidence, since_s, made.often, made.more, name)

@@ -6,8 +6,9 @@ import inspect
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Literal, NamedTuple
+from typing import NamedTuple
 
+from webots_mcp.judging.coverage import Coverage, Fault, JudgedInterval, Outcome, cause_of
 from webots_mcp.judging.detection.condition import every_call_of
 from webots_mcp.judging.detection.events import Found
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
@@ -15,18 +16,13 @@ from webots_mcp.judging.detection.search import Motion, RunNoise, Search
 from webots_mcp.signals.conditions.compiler import Expectation
 from webots_mcp.signals.meaning import Meaning
 from webots_mcp.store.reading.frame import Frame
-from webots_mcp.store.reading.unread import NOT_READ
 from webots_mcp.store.runs import RunInfo
 
-Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at", "not judged"]
-WORST_FIRST: Final[tuple[Outcome, ...]] = (
-    "fail", "not looked at", "warn", "pass", "not judged", "not applicable",
-)  # fmt: skip
-_TIMED_OUT: Final = "time limit reached"
+Examined = Fault | Coverage
 
 
 class Finding(NamedTuple):
-    """What a check came to.
+    """What a check came to, as it is reported; `coverage.outcome_of` derives it.
 
     Attributes:
         evidence: The numbers that it rests on.
@@ -49,15 +45,16 @@ class Check:
     """A check. One of these, a line in `checks.CHECKS`, is all that a new check takes.
 
     Attributes:
-        find: Says what was found; its docstring says when it warns and when it fails. It may raise
-            `NotSearchableError` where the run lacks what it is about.
+        find: Returns the fault that was found, else what could be judged without finding one; its
+            docstring says when it warns and when it fails. It may raise `NotSearchableError` where
+            the run lacks what it is about.
         needs: What has to be recorded, for a person.
         kinds: Of events that it judges: where one could not be looked for, the check is not made.
         of_values: It reads values itself: where some were not read, it does not pass.
     """
 
     name: str
-    find: Callable[[RunUnderCheck], Finding | Iterable[Finding]]
+    find: Callable[[RunUnderCheck], Examined | Iterable[Examined]]
     needs: str
     kinds: tuple[str, ...] = ()
     of_values: bool = False
@@ -115,6 +112,45 @@ class RunUnderCheck:
         found = (each for each in self.found.events if each.kind == kind)
         return sorted(found, key=lambda each: each.start_s)
 
+    def coverage_of(self, *kinds: str) -> Coverage:
+        """Return what could be judged for kinds of events."""
+        covered = Coverage()
+        for kind in kinds:
+            covered.add(self.found.verdicts.coverage.get(kind, Coverage()))
+        return covered
+
+    def covered(
+        self,
+        says: str,
+        *,
+        of: str | None = None,
+        signals: Iterable[str] = (),
+        judged: str = "",
+        limit: str = "",
+        subject: str = "",
+        lasts_s: float | None = None,
+    ) -> Coverage:
+        """Return what a check judged without finding a fault.
+
+        Args:
+            says: What held.
+            of: The kind of event whose coverage it is; None: all rows of the run.
+            signals: Those that were judged, where it is of no kind.
+            judged: What was judged, in words; empty for the number of signals.
+            limit: What would have been a fault.
+            subject: Which one, of a check about several things.
+            lasts_s: How much of the run was judged; None for all of it.
+        """
+        covered = Coverage(says=says, judged=judged, limit=limit, subject=subject)
+        if of is not None:
+            covered.add(self.coverage_of(of))
+            return covered
+        covered.signals |= dict.fromkeys(signals)
+        start_s, end_s = self.search.bounds or (0.0, 0.0)
+        end_s = end_s if lasts_s is None else start_s + lasts_s
+        covered.intervals.append(JudgedInterval(self.info.run_id, start_s, end_s))
+        return covered
+
     def more(self, *kinds: str) -> str:
         """The call that shows events of these kinds."""
         return f"webots_find_events(kinds={list(kinds)}, run_id={self.info.run_id})"
@@ -131,7 +167,8 @@ class RunUnderCheck:
         """
         for kind in check.kinds:
             if why := self.found.verdicts.unlooked(kind):
-                raise NotSearchableError(why)
+                undecided = self.coverage_of(kind).lacks("undecided")
+                raise NotSearchableError(why, "undecided" if undecided else None)
             if not self.found.verdicts.knows(kind):
                 raise NotSearchableError(check.needs)
         if check.of_values and not len(self.frame):
@@ -141,22 +178,17 @@ class RunUnderCheck:
     def unread(self, check: Check) -> str:
         """What of the run a check did not see; empty if nothing."""
         said = self.found.verdicts.reasons
-        reasons = [why for kind in check.kinds for why in said.get(kind, ()) if _is_unread(why)]
+        reasons = [
+            why for kind in check.kinds for why in said.get(kind, ()) if cause_of(why) == "unread"
+        ]
         if check.of_values:
             frames = (self.frame, self.__dict__.get("every_call", self.frame))
             reasons += [str(part) for frame in frames for part in frame.unread]
-            if self.search.deadline.passed and not any(_TIMED_OUT in why for why in reasons):
-                reasons.append(_TIMED_OUT)
+            if self.search.deadline.passed and not any(
+                cause_of(why) == "unread" for why in reasons
+            ):
+                reasons.append("time limit reached")
         return "; ".join(dict.fromkeys(reasons))
-
-
-def _is_unread(why: str) -> bool:
-    return why.startswith(NOT_READ) or _TIMED_OUT in why
-
-
-def outcome_of(why: str) -> Outcome:
-    """Of a check that could not be made, by why: there was no time, or something is missing."""
-    return "not looked at" if _is_unread(why) else "not applicable"
 
 
 def total_s(events: Iterable[Event]) -> float:

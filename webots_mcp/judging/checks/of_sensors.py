@@ -8,9 +8,10 @@ from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any, Final, Literal, cast
 
-from webots_mcp.analysis.arrays import np, runs_of
-from webots_mcp.judging.checks.finding import Finding, RunUnderCheck, times
-from webots_mcp.judging.detection.degradation import DEGRADATION
+from webots_mcp.analysis.arrays import Array, Runs, median, np, runs_of
+from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times
+from webots_mcp.judging.coverage import Fault
+from webots_mcp.judging.detection.degradation import DEGRADATION, TIMES
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
@@ -28,9 +29,12 @@ _LEAST_S: Final = 1.0  # as of what is missing
 _AT_LIMIT: Final = 0.05  # of the rows
 _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
+_CUT_OFF: Final = 5  # times at one extreme to the last digit: of values that never repeat none is
+_BRIEFLY: Final = 3  # rows: what is cut off comes back soon, what rests at a stop does not
+_UNIQUE: Final = 0.95  # of all values but the extreme: so many differ from all others
 
 
-def sensors_speak(run: RunUnderCheck) -> Finding:
+def sensors_speak(run: RunUnderCheck) -> Examined:
     """Fails where a signal was NaN for a second or more, warns where it was null.
 
     Null may be meant, of what is not seen now; an infinite range is. Warns of one that was NaN in
@@ -49,8 +53,9 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
         if many := [name for name, share in shares.items() if share >= least]:
             most, up_to = 100 * max(shares.values()), "up to " * (len(many) > 1)
             evidence = f"{listed(many, MOST_NAMED)}: NaN in {up_to}{most:.3g} % of the rows"
-            return Finding("warn", evidence, None, len(many), run.shows(many[0]))
-        return Finding("pass", "none that had a value was without one for a second")
+            return Fault("warn", evidence, None, len(many), run.shows(many[0]))
+        says = "none that had a value was without one for a second"
+        return run.covered(says, of="missing", limit=f"limit {100 * _MANY:g} % of the rows")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]
     silent = by_array(silent)
     longest_s = max((each.duration_s for each in silent), default=0.0)
@@ -58,10 +63,10 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
     evidence = f"{listed(never, MOST_NAMED)}: NaN in every row" if never else evidence
     since_s = silent[0].start_s if silent and not never else run.search.began_s
     outcome = "fail" if nan or never else "warn"
-    return Finding(outcome, evidence, since_s, len(silent) + len(never), run.more("missing"))
+    return Fault(outcome, evidence, since_s, len(silent) + len(never), run.more("missing"))
 
 
-def _missing_items(run: RunUnderCheck) -> Finding | None:
+def _missing_items(run: RunUnderCheck) -> Fault | None:
     """Of long arrays: items that are NaN in all of a sample of the run's rows."""
     frame = run.frame
     arrays = [each for each in run.search.known.values() if each.reduction == "count"]
@@ -86,7 +91,7 @@ def _missing_items(run: RunUnderCheck) -> Finding | None:
         if never >= _MANY * total:
             evidence = f"{name}: {never} of {total} items are NaN in every row"
             since_s = run.search.began_s
-            return Finding("warn", evidence, since_s, never, run.shows(f"{name}.count"))
+            return Fault("warn", evidence, since_s, never, run.shows(f"{name}.count"))
     return None
 
 
@@ -98,7 +103,7 @@ def _array_at(state: dict[str, Any], name: str) -> list[Any]:
     return cast("list[Any]", value) if isinstance(value, list) else []
 
 
-def sensors_live(run: RunUnderCheck) -> Finding:
+def sensors_live(run: RunUnderCheck) -> Examined:
     """Fails where a signal froze that is noisy otherwise, or whose target went on.
 
     Warns of others that changed otherwise, and rested for 20 s while the robot moved.
@@ -106,13 +111,14 @@ def sensors_live(run: RunUnderCheck) -> Finding:
     judged = [(each, _frozen(run, each)) for each in run.events(FLAT.name)]
     frozen = by_array([each for each, outcome in judged if outcome])
     if not frozen:
-        return Finding("pass", "none froze")
+        limit = f"limit {run.search.options.flat_s:g} s"
+        return run.covered("none froze", of=FLAT.name, limit=limit)
     first, outcomes = frozen[0], [outcome for _, outcome in judged]
     says = f"; {first.details['says']}" if "says" in first.details else ""
     longest_s = max(each.duration_s for each in frozen)
     evidence = f"{_names(frozen)}: {times(len(frozen))}, up to {longest_s:.3g} s the same{says}"
     outcome = "fail" if "fail" in outcomes else "warn"
-    return Finding(outcome, evidence, first.start_s, len(frozen), run.more(FLAT.name))
+    return Fault(outcome, evidence, first.start_s, len(frozen), run.more(FLAT.name))
 
 
 def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
@@ -185,19 +191,22 @@ def _names_in(run: RunUnderCheck) -> _NamesIn:
 _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
 
 
-def sensors_within_limits(run: RunUnderCheck) -> Finding:
+def sensors_within_limits(run: RunUnderCheck) -> Examined:
     """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
 
+    Also where one whose values never repeat came back to the very same extreme again and again.
     Not a range, which ends where nothing is in sight.
     """
     found = list(_saturated(run))
     if not found:
-        return Finding("pass", "none was cut off at a limit")
+        names = _names_in(run).sensors
+        limit = f"limit {100 * _AT_LIMIT:g} % of the rows"
+        return run.covered("none was cut off at a limit", signals=names, limit=limit)
     name, limit, share, since_s, count = max(found, key=lambda each: each[2])
     others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
     evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
     evidence += f"; also {others}" if others else ""
-    return Finding("warn", evidence, since_s, count, run.shows(name))
+    return Fault("warn", evidence, since_s, count, run.shows(name))
 
 
 def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
@@ -226,9 +235,17 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
             long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
             if len(long) >= _OFTEN and at.mean() >= _AT_LIMIT:
                 yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
+            elif limit != 0 and len(rests) >= _CUT_OFF and _is_cut_off(values[~at], rests):
+                yield name, limit, float(at.mean()), float(rests.starts_s[0]), len(rests)
 
 
-def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
+def _is_cut_off(others: Array, hits: Runs) -> bool:
+    """Return whether brief hits of one extreme are no chance: all other values are unique."""
+    brief = median((hits.stops - hits.starts).astype(np.float64)) <= _BRIEFLY
+    return bool(brief and len(np.unique(others)) >= _UNIQUE * len(others))
+
+
+def sensors_drop_nothing(run: RunUnderCheck) -> Examined:
     """Warns where a signal went away and back at once, fails where it went to one value 3 times."""
     sensors = _names_in(run).sensors
     gone = [
@@ -238,14 +255,14 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     ]
     if not gone:
         near = run.found.verdicts.nearest.get(JUMP.name)
-        return Finding("pass", "none dropped out" + (f" ({near})" if near else ""))
+        return run.covered("none dropped out" + (f" ({near})" if near else ""), of=JUMP.name)
     to = Counter((each.name, float(each.details["after"])) for each in gone)
     ((name, value), most) = to.most_common(1)[0]
     gone = by_array(gone)
     evidence = f"{_names(gone)}: away and back {times(len(gone))}"
     evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
-    return Finding(outcome, evidence, gone[0].start_s, len(gone), run.more(JUMP.name))
+    return Fault(outcome, evidence, gone[0].start_s, len(gone), run.more(JUMP.name))
 
 
 def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
@@ -260,18 +277,19 @@ def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
     return False
 
 
-def sensors_keep_noise(run: RunUnderCheck) -> Finding:
+def sensors_keep_noise(run: RunUnderCheck) -> Examined:
     """Warns where the noise of a sensor became three times as large, or more, for good."""
     found = run.events(DEGRADATION.name)
     if not found:
-        return Finding("pass", "none became noisier for good")
+        limit = f"limit {TIMES:g} times the noise"
+        return run.covered("none became noisier for good", of=DEGRADATION.name, limit=limit)
     worst = max(found, key=lambda each: each.details["noise_after"] / each.details["noise_before"])
     before, after = (worst.details[name] for name in ("noise_before", "noise_after"))
     evidence = f"noise of {worst.name} grew from {before:g} to {after:g} for good"
     others = listed([e.name or "" for e in found if e is not worst], MOST_NAMED)
     evidence += f"; also {others}" if others else ""
     more = run.more(DEGRADATION.name)
-    return Finding("warn", evidence, worst.start_s, len(found), more)
+    return Fault("warn", evidence, worst.start_s, len(found), more)
 
 
 def by_array(events: Iterable[Event]) -> list[Event]:

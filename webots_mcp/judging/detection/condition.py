@@ -16,7 +16,7 @@ from itertools import starmap
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, RowSpan, Runs, median, np, runs_of
-from webots_mcp.database.pauses import EXPECTED, OF_PROJECT, VIOLATION
+from webots_mcp.database.stored_breakpoints import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.errors import (
     ConditionFailedError,
     InvalidConditionError,
@@ -81,11 +81,11 @@ def condition_events(search: Search) -> Iterator[Event]:
         then = f"ask again with start_s={frame.cut_at_s:.3f}"
         search.not_searched("condition", f"time limit reached at {frame.cut_at_s:.3f} s: {then}")
     share = recorded_share(search.connection, search.segment.run_id)
-    search.ledger.note_of_run(search.segment.run_id, share)
+    search.coverage.note_of_run(search.segment.run_id, share)
     if not len(runs):
         _require_values(condition, frame, position)
-    rows = search.ledger.rows = search.ledger.rows + int(np.count_nonzero(read))
-    search.ledger.note_nearest("condition", rows, f"true in none of {rows} rows")
+    rows = search.coverage.rows = search.coverage.rows + int(np.count_nonzero(read))
+    search.coverage.note_nearest("condition", rows, f"true in none of {rows} rows")
     for run, values in zip(runs.spans(), values_at(condition, frame, position, runs), strict=True):
         details = dict(list(values.items())[:_MOST_VALUES]) | _extremes_in(frame, values, run)
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Final
 
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.coverage import SearchCoverage, Verdicts
 from webots_mcp.judging.detection import (
     condition,
     degradation,
@@ -27,8 +28,6 @@ from webots_mcp.judging.detection import (
 from webots_mcp.judging.detection.kinds import (
     Event,
     EventOptions,
-    Ledger,
-    Verdicts,
     count_by_kind,
 )
 from webots_mcp.judging.detection.search import EventKind, Search, events_touching, find_motion
@@ -242,14 +241,14 @@ def search_events(
     context = _context(known, options, around)
     import_module("numpy")  # once per process, before the time counts
     deadline, segments = Deadline(deadline_s), time_range.segments
-    ledger = Ledger(notes=list(time_range.notes), of_several_runs=len(segments) > 1)
+    coverage = SearchCoverage(list(time_range.notes), of_several_runs=len(segments) > 1)
     found: list[Event] = []
     for index, segment in enumerate(segments):  # each run gets its share of the time
         part = deadline.part(1 / (len(segments) - index))
-        search = Search(connection, segment, known, kinds, options, part, ledger)
+        search = Search(connection, segment, known, kinds, options, part, coverage)
         found += events_touching(search)
     for kind in kinds if not segments else ():
-        ledger.not_searched(kind.name, "nothing was recorded in that range")
+        coverage.not_searched(kind.name, "nothing was recorded in that range")
     over = _runs_over(connection, [segment.run_id for segment in segments])
     found = [replace(e, ongoing=False) if e.ongoing and e.run_id in over else e for e in found]
     found = grouped(found, known) if group else found
@@ -257,8 +256,8 @@ def search_events(
     return Found(
         time_range.robot,
         tuple(entry for entry in entries if not after or _is_left(entry[0], borders)),
-        ledger.verdicts([kind.name for kind in kinds], found),
-        ledger.all_notes,
+        coverage.verdicts([kind.name for kind in kinds], count_by_kind(found)),
+        coverage.all_notes,
         tuple(context),
         borders,
     )
@@ -286,7 +285,7 @@ def _is_left(place: Place, borders: dict[str, Place | None]) -> bool:
 
 def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:
     """Those in which nothing goes on any more: they have ended, or their process is gone."""
-    gone = dict(dead_sessions(connection))
+    gone = dict(find_dead_sessions(connection))
     sessions = [connection.execute(_IS_OPEN, (run_id,)).fetchone() for run_id in set(run_ids)]
     return {run_id for run_id, session_id, is_open in sessions if not is_open or session_id in gone}
 

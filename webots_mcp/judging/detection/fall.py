@@ -1,7 +1,8 @@
 """`fall`: a robot that stood upright tipped over and stayed down.
 
 The tilt is the angle between the robot's up axis now and while it stood at first, from its roll and
-pitch, so that a sensor that is mounted upside down does not matter.
+pitch, so that a sensor that is mounted upside down does not matter. What flies or climbs at such a
+tilt has not fallen: its position goes on changing.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from typing import Final
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
 from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
-from webots_mcp.judging.detection.search import EventKind, Search
+from webots_mcp.judging.detection.search import EventKind, Search, in_metres
 from webots_mcp.signals.meaning import Quantity
+from webots_mcp.signals.naming import words_of
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal
 
@@ -21,6 +23,9 @@ UPRIGHT_RAD: Final = math.radians(30)  # below it a robot stands ...
 FALLEN_RAD: Final = math.radians(60)  # ... beyond this it has tipped over ...
 DOWN_RAD: Final = math.radians(45)  # ... and beyond this it lies
 SETTLED_S: Final = 1.0  # for so long each of them has to last
+MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
+_BY_WHEELS: Final = frozenset(("odom", "odometry"))
+_NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
 NO_ATTITUDE: Final = "publish roll and pitch (of an InertialUnit), in rad or deg"
 
 
@@ -34,11 +39,14 @@ def fall_events(search: Search) -> Iterator[Event]:
     times, tilt = tilt_of(search.frame, signals["roll"], signals["pitch"])
     if len(times) < 2:
         raise NotSearchableError("roll and pitch have no value in that range")
+    search.judged("fall", filter(None, signals.values()), [(float(times[0]), float(times[-1]))])
     fell_s = -math.inf
     for run in runs_of(tilt > DOWN_RAD, times).spans():
         lies = tilt[run.start : run.stop]
         lasts_s = run.end_s - run.start_s
         if run.start_s < fell_s or lasts_s < SETTLED_S or lies.max() < FALLEN_RAD:
+            continue
+        if _moves_on(search, run.start_s, run.end_s):
             continue
         before = np.flatnonzero(tilt[: run.start] > UPRIGHT_RAD)
         left = run.start
@@ -63,6 +71,35 @@ def fall_events(search: Search) -> Iterator[Event]:
         float(tilt.max()) / FALLEN_RAD,
         f"largest tilt {math.degrees(float(tilt.max())):.0f}°",
     )
+
+
+def _moves_on(search: Search, start_s: float, end_s: float) -> bool:
+    """Return whether its place changed in most seconds of an interval.
+
+    Means of seconds are compared, so that neither noise nor the rate of rows decides. Nothing is
+    known to move where no place is known, or only what wheels count that may turn in the air.
+    """
+    motion = search.motion
+    places = [
+        each
+        for each in (*(motion.position or ()), motion.height)
+        if each is not None and _BY_WHEELS.isdisjoint(words_of(each.name.partition(".")[0]))
+    ]
+    part = search.frame.between(start_s, end_s)
+    seconds = np.floor((part.times - start_s) / SETTLED_S).astype(np.intp)
+    starts = np.flatnonzero(np.diff(seconds, prepend=-1))
+    if len(starts) < 2:
+        return False
+    counts = np.diff(starts, append=len(seconds))
+    moved_m2 = np.zeros(len(starts) - 1)
+    least_m = MOVES_M_S * SETTLED_S
+    for each in places:
+        values = in_metres(each, part.numbers(each.name))
+        means = np.add.reduceat(values, starts) / counts
+        moved_m2 += np.diff(means) ** 2
+        noise = in_metres(each, np.array([search.noise.of(each.name)]))[0]
+        least_m = max(least_m, float(_NOISE * noise / np.sqrt(np.median(counts))))
+    return bool(np.count_nonzero(moved_m2 > least_m**2) > len(moved_m2) / 2)
 
 
 def tilt_of(

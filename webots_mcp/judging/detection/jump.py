@@ -95,8 +95,9 @@ def jump_events(search: Search) -> Iterator[Event]:
         search.not_searched("jump", few)
     if position:
         x, y = (each.name for each in position)
-        for time_s, length_m in find_leaps(frame, x, y, search.options.jump_m):
-            yield search.event("jump", time_s, time_s, "position", distance_m=length_m)
+        scale = position[0].metres / metres_in(x)  # other than 1 where a unit was declared
+        for time_s, length_m in find_leaps(frame, x, y, search.options.jump_m / scale):
+            yield search.event("jump", time_s, time_s, "position", distance_m=scale * length_m)
 
 
 def _event(search: Search, name: str, jump: Jump) -> Event:

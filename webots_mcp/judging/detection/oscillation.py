@@ -8,7 +8,13 @@ from dataclasses import replace
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, gap_borders, np, usual_interval_s
-from webots_mcp.analysis.fast_swings import SwingCourse, course_of, find_fast_swings
+from webots_mcp.analysis.fast_swings import (
+    LEAST_FAST_ROWS,
+    LONGEST_FAST_ROWS,
+    SwingCourse,
+    course_of,
+    find_fast_swings,
+)
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.analysis.swings import (
     SLOW_HALF_SWINGS,
@@ -30,6 +36,7 @@ from webots_mcp.store.signals import RegisteredSignal
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
 GROWS: Final = 2.0  # times the amplitude at one end: then both are reported
 _ENDS_WITHIN: Final = 1.5  # periods
+_QUICK_S: Final = 1.0  # a period: how quickly the body of a robot goes to and fro
 # Sensors swing by nature while a robot drives.
 _SWINGING: Final = re.compile(
     r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
@@ -66,7 +73,14 @@ def oscillation_events(search: Search) -> Iterator[Event]:
 
 
 def _note_periods(search: Search) -> None:
-    """Which periods are too long for the run to hold enough of them."""
+    """Which periods are too long for the run to hold enough of them, and too short for its rows."""
+    interval_s = usual_interval_s(search.frame.times) or 0.0
+    if (slowest_s := LONGEST_FAST_ROWS * interval_s) > _QUICK_S:
+        search.not_searched(
+            "oscillation",
+            f"a row each {interval_s:.3g} s shows periods under {slowest_s:.2g} s only where they "
+            f"go on for {LEAST_FAST_ROWS * interval_s:.3g} s",
+        )
     half_periods = search.options.min_half_periods
     fitting_s = 2 * search.length_s / half_periods
     if fitting_s < _longest_period_s(search):

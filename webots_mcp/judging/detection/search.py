@@ -16,16 +16,16 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.analysis.track import PathLength, SmoothedTrack, tracks_of
+from webots_mcp.judging.coverage import Cause, JudgedInterval, SearchCoverage
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
     EventOptions,
-    Ledger,
     NotAskedError,
     NotSearchableError,
 )
-from webots_mcp.signals.meaning import Meaning, Quantity
-from webots_mcp.signals.naming import FARTHEST_M, listed, metres_in, unit_in
+from webots_mcp.signals.meaning import INPUTS, Meaning, Quantity, words_in
+from webots_mcp.signals.naming import FARTHEST_M, listed, unit_in
 from webots_mcp.signals.register import first_in, pair_in
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.meanings import meanings_of
@@ -144,7 +144,7 @@ def find_motion(
     signals = {
         role: own[name]
         for name, role in roles.items()
-        if name in own and _may_have(role, meanings[name])
+        if name in own and _may_have(role, name, meanings[name])
     }
 
     def first(role: str, name: str | None = None) -> RegisteredSignal | None:
@@ -166,7 +166,7 @@ def find_motion(
         ever = {
             role: known[name]
             for name, role in stored_roles(known).items()
-            if _may_have(role, all_meanings[name])
+            if _may_have(role, name, all_meanings[name])
         }
         position = _pair(signals, place) or _pair(ever, pair_in(ever))
     commanded = first("commanded_speed", options.commanded)
@@ -194,9 +194,15 @@ def find_motion(
 _OF_ROLES: Final = {"x": "x", "y": "y", "z": "height", "yaw": "heading", "mode": "mode"}
 
 
-def _may_have(role: str, meaning: Meaning) -> bool:
-    """Whether a signal may have a role by its name: nothing stronger says something else."""
+def _may_have(role: str, name: str, meaning: Meaning) -> bool:
+    """Whether a signal may have a role by its name: nothing stronger says something else.
+
+    What a person moves by hand, and where the robot shall go, is not where it is.
+    """
     quantity = _OF_ROLES.get(role.rstrip("0123456789"))
+    by_hand = not INPUTS.isdisjoint(words_in(name))
+    if quantity not in (None, "mode") and meaning.source == "named" and (meaning.sets or by_hand):
+        return False
     is_said = meaning.source in ("declared", "device") and meaning.quantity is not None
     return quantity is None or not is_said or meaning.quantity == quantity
 
@@ -208,8 +214,8 @@ def _pair(
 
 
 def in_metres(signal: RegisteredSignal, lengths: Array) -> Array:
-    """Lengths that a signal holds, in metres; they are metres where its name has no unit."""
-    factor = metres_in(signal.name)
+    """Lengths that a signal holds, in metres; they are metres where it has no unit."""
+    factor = signal.metres
     return lengths if factor == 1 else lengths * factor
 
 
@@ -237,7 +243,7 @@ def doubt_of_unit(
 ) -> str | None:
     """That a position without a unit in its names is hardly in metres; None where it may be."""
     name = position[0].name
-    if speed_m_s <= IMPLAUSIBLE_M_S or unit_in(name):
+    if speed_m_s <= IMPLAUSIBLE_M_S or unit_in(name) or position[0].stated_unit:
         return None
     return (
         f"{name} is taken as metres, since its name has no unit, but robots are not so fast: if it "
@@ -262,7 +268,7 @@ class RunNoise:
         self.rows = len(run)
         intervals = np.concatenate([np.zeros(0), *(np.diff(part.times) for part in self._parts)])
         self.interval_s = median(intervals) if len(intervals) else 0.0
-        noises = [self.of(each.name) * metres_in(each.name) for each in motion.position or ()]
+        noises = [self.of(each.name) * each.metres for each in motion.position or ()]
         self.position_m = math.hypot(*noises) / math.sqrt(2)
 
     def of(self, name: str) -> float:
@@ -446,7 +452,7 @@ class Search:
         known: The signals of the robot.
         kinds: All that are looked for in it.
         asked: The part of the segment that was asked about, where that was widened to find ends.
-        ledger: What could not be looked at, and what came near to an event.
+        coverage: Of each kind, what could be judged, and what came near to an event.
         shared: What a detector found that others of its module, and later looks, need as well.
     """
 
@@ -456,7 +462,7 @@ class Search:
     kinds: Sequence[EventKind]
     options: EventOptions
     deadline: Deadline
-    ledger: Ledger = field(default_factory=Ledger)
+    coverage: SearchCoverage = field(default_factory=SearchCoverage)
     asked: Segment | None = None
     shared: dict[type, Any] = field(default_factory=dict[type, Any])
 
@@ -586,9 +592,56 @@ class Search:
         row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
         return float(row[0]) if row else 0.0
 
-    def not_searched(self, kind: str, *reasons: str) -> None:
+    def not_searched(self, kind: str, *reasons: str, cause: Cause | None = None) -> None:
         """Note why a kind was not looked for, or where it was not."""
-        self.ledger.not_searched(kind, *reasons)
+        self.coverage.not_searched(kind, *reasons, cause=cause)
+
+    def judged(
+        self,
+        kind: str,
+        signals: Iterable[RegisteredSignal],
+        spans_s: Sequence[tuple[float, float]] | None = None,
+    ) -> None:
+        """Note which signals were judged for a kind.
+
+        Args:
+            kind: What was looked for.
+            signals: Those that were judged.
+            spans_s: Where that was possible; None: in all that was read.
+        """
+        coverage = self.coverage.of(kind)
+        coverage.signals |= {each.name: None for each in signals}
+        coverage.intervals += [
+            JudgedInterval(self.segment.run_id, *span) for span in self._asked_of(spans_s or ())
+        ]
+
+    def _asked_of(self, spans_s: Sequence[tuple[float, float]]) -> Iterator[tuple[float, float]]:
+        """What of these spans was asked about."""
+        asked = self.asked or self.segment
+        for start_s, end_s in spans_s:
+            first_s, last_s = max(start_s, asked.start_s), min(end_s, asked.end_s)
+            if first_s <= last_s:
+                yield first_s, last_s
+
+    def note_interval(self, kind: EventKind) -> None:
+        """Note what was read as judged, where the detector itself did not say what it judged."""
+        coverage, run_id = self.coverage.of(kind.name), self.segment.run_id
+        if any(each.run_id == run_id for each in coverage.intervals):
+            return
+        if kind.stored or self.bounds is None:
+            first_s, last_s = self.bounds or (0.0, 0.0)
+            coverage.intervals.append(JudgedInterval(run_id, first_s, last_s))
+            return
+        (read,) = list(self._asked_of([self.bounds])) or [(0.0, 0.0)]
+        unread = sorted(self.frame.unread)
+        starts_s = [read[0], *(each.end_s for each in unread)]
+        ends_s = [*(each.start_s for each in unread), read[1]]
+        if not unread or len(self.frame):
+            coverage.intervals += [
+                JudgedInterval(run_id, *span)
+                for span in zip(starts_s, ends_s, strict=True)
+                if span[0] <= span[1]
+            ]
 
     def in_time(
         self, kind: str, signals: Sequence[RegisteredSignal], *, judged: bool = True
@@ -613,6 +666,7 @@ class Search:
                 self.not_searched(kind, why)
                 break
             large += [signal.name] if judged and self._is_large(signal) else []
+            self.coverage.of(kind).signals[signal.name] = None
             yield signal
         if large:
             why = f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
@@ -626,8 +680,8 @@ class Search:
 
     def note_nearest(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one."""
-        where = f" (run {self.segment.run_id})" if self.ledger.of_several_runs else ""
-        self.ledger.note_nearest(kind, share, what + where)
+        where = f" (run {self.segment.run_id})" if self.coverage.of_several_runs else ""
+        self.coverage.note_nearest(kind, share, what + where)
 
 
 @dataclass(frozen=True)
@@ -637,9 +691,10 @@ class EventKind:
     Attributes:
         name: Its name in questions and answers.
         means: What the name leaves open, in a few words; empty where it leaves nothing open.
-        find: Finds the events in the segment of a search. It reports to the search what it could
-            not search (`not_searched`) and what came nearest to an event (`note_nearest`), and
-            raises `NotSearchableError` where it cannot search at all.
+        find: Finds the events in the segment of a search. Its coverage goes into the search: the
+            signals that it judged (`in_time`, `judged`), what it could not (`not_searched`), what
+            came nearest to an event (`note_nearest`). It raises `NotSearchableError` where it
+            cannot search at all.
         stored: It was stored when it happened: nothing is judged, and a timeline shows it.
         usual: Whether it is looked for where no kinds are named.
         lasts: It has a begin and an end, which are followed out of the range.
@@ -704,7 +759,7 @@ def events_touching(search: Search) -> list[Event]:
         found += [each for each in events if each.kind not in names]
         waiting = [each for each in events if each.kind in names]
         reach_s = FARTHER * max(reach_s, 1.0)
-        looked.ledger = Ledger()  # what the longer one lacks is known
+        looked.coverage = SearchCoverage()  # what the longer one lacks is known
     for each in cut:
         why = f"the one at {each.start_s:.3f} s may last longer: time limit reached"
         search.not_searched(each.kind, why)
@@ -717,18 +772,19 @@ def _found(search: Search) -> list[Event]:
 
 
 def _found_of(kind: EventKind, search: Search) -> list[Event]:
+    """The events of a kind; what could be judged for it goes into the search's coverage."""
     try:
         found = list(kind.find(search))
     except NotAskedError:
         return []
     except NotSearchableError as error:
-        search.not_searched(kind.name, str(error))
+        search.not_searched(kind.name, str(error), cause=error.cause)
         return []
     if not found and kind.lasts and search.length_s < (least_s := kind.least_s(search.options)):
         run = f"run {search.segment.run_id} lasted only {search.length_s:.3g} s"
         search.not_searched(kind.name, f"{run}; this kind needs at least {least_s:g} s")
         return []
-    search.ledger.searched.add(kind.name)
+    search.note_interval(kind)
     if not kind.stored:
         search.not_searched(kind.name, *map(str, search.frame.unread))
     return found

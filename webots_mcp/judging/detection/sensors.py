@@ -345,7 +345,7 @@ def missing_events(search: Search) -> Iterator[Event]:
         times = [f"{name} {count} time{'s' * (count > 1)}" for name, count in counts]
         limit = f"for less than missing_s={search.options.missing_s:g} s"
         note = f"without a value {limit}, so not counted as missing: {listed(times, MOST_NAMED)}"
-        search.ledger.note_of_run(search.segment.run_id, note)
+        search.coverage.note_of_run(search.segment.run_id, note)
 
 
 def _silences(search: Search, signal: RegisteredSignal) -> Runs:
@@ -405,7 +405,7 @@ def _least_silence_s(search: Search, signal: RegisteredSignal, runs: Runs) -> fl
     if 3 * usual_s <= least_s:
         return least_s
     rarely = f"{signal.name} is intermittent (a value about every {usual_s:.3g} s)"
-    search.ledger.notes.append(f"{rarely}: it counts as missing after {3 * usual_s:.3g} s")
+    search.coverage.notes.append(f"{rarely}: it counts as missing after {3 * usual_s:.3g} s")
     return 3 * usual_s
 
 

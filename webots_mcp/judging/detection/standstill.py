@@ -34,6 +34,7 @@ from webots_mcp.judging.detection.search import (
     in_metres,
     tracks_in,
 )
+from webots_mcp.signals.meaning import meaning_by_name, words_in
 from webots_mcp.signals.naming import NAME_POSITION
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame
@@ -49,6 +50,7 @@ from webots_mcp.store.reading.frame import Frame
 SPEED_UNITS: Final = {
     "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "deg/s": math.pi / 180, "rpm": math.pi / 30,
 }  # fmt: skip
+_TURNS: Final = ("rad/s", "deg/s", "rpm")
 WHEELS_TURN: Final = 0.1  # rad/s, or in whatever unit they are published
 ON_THE_SPOT: Final = 0.2  # of the fastest wheel: where the mean of all is less, none drives ahead
 COMMAND_NOISE: Final = 4.0  # deviations of a speed's own noise: what is less is no command
@@ -64,6 +66,10 @@ MOSTLY: Final = 0.5
 TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
 BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
 JUDGED_AT_ONCE: Final = 500_000  # rows, between two looks at the deadline
+_ODOMETRY: Final = frozenset(("odometry",))
+BY_WHEELS: Final = (
+    "{} may be counted by wheels that spin in place: publish the position of a GPS or a Supervisor"
+)
 _HEADING_ROWS: Final = 5  # at each end, whose median is its heading
 NOISE_RANGE: Final = 6.0  # deviations of noise from the least of some hundred rows to the greatest
 SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
@@ -155,17 +161,27 @@ class Standings:
         # A speed whose name leaves open whether it is commanded or measured says so where it is 0.
         self.stops = (np.abs(self.speeds) < least) & (motion.commanded is not None)
         self.stops &= ~self.told_to_turn
+        # To turn in place is no answer to a command to drive ahead, and not to turn.
+        self.only_ahead: Flags = self.told & (np.abs(self.turn_speeds) < least_turn)
+        self.only_ahead &= motion.commanded is not None
         wheels = motion.wheel_commands or motion.wheels
         self.wheels = [each for each in wheels if each.name in frame]
-        # Wheels whose name leaves it open and that have no noise at all were set, not measured.
-        self.wheels_are_commands = bool(motion.wheel_commands) or not any(
-            noise.of(each.name) for each in self.wheels
+        self.wheels_are_commands = bool(motion.wheel_commands) or all(
+            _was_set(frame, each.name, noise) for each in self.wheels
         )
-        turned = np.nan_to_num([frame.numbers(each.name)[rows] for each in self.wheels])
+        factors = [SPEED_UNITS.get(each.unit or "", 1.0) for each in self.wheels]
+        turned = np.nan_to_num(
+            [
+                frame.numbers(each.name)[rows] * factor
+                for each, factor in zip(self.wheels, factors, strict=True)
+            ]
+        )
         turned = turned if self.wheels else np.zeros((1, len(rows)))
         self.fastest: Array = np.abs(turned).max(axis=0)
         mean = turned.mean(axis=0)
-        noises = [noise.of(each.name) for each in self.wheels]
+        noises = [
+            noise.of(each.name) * factor for each, factor in zip(self.wheels, factors, strict=True)
+        ]
         turn: Flags = self.fastest >= max([WHEELS_TURN, *(COMMAND_NOISE * each for each in noises)])
         ahead: Flags = turn & (np.abs(mean) >= ON_THE_SPOT * self.fastest)
         self.resting = ~turn & bool(self.wheels)
@@ -280,7 +296,7 @@ class Standings:
         """
         events = list[Judged]()
         hindered = np.zeros(len(self.times), np.bool_)  # it moved in its place for long enough
-        for start, stop in self.spans(self.turns | self.sways, 0.0):
+        for start, stop in self.spans((self.turns | self.sways) & ~self.only_ahead, 0.0):
             hindered[start:stop] = True
         drives = self.told | (self.wheel_drives != 0) | self.in_moving_mode
         if self.motion.heading is not None:  # else it is not known whether it turned
@@ -356,7 +372,7 @@ class Standings:
             speeds = self.speeds[rows][told]
             said.append(f"{self.speed.name} {median(speeds):.3g}")
         if wheels.sum() > TOLD_SHARE * len(wheels):
-            unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in self.wheels) else ""
+            unit = " rad/s" if all(wheel.unit in _TURNS for wheel in self.wheels) else ""
             turning = (self.wheel_drives * self.fastest)[rows][wheels]
             said.append(f"wheels at {median(abs(turning)):.3g}{unit}")
             if wheels.sum() > told.sum():
@@ -445,6 +461,19 @@ class Standings:
         return said
 
 
+def _was_set(frame: Frame, name: str, noise: RunNoise) -> bool:
+    """Whether a speed whose name leaves it open was set: what is measured never repeats exactly.
+
+    A name that says that it is measured decides. A wheel that never turned shows nothing.
+    """
+    if "measured" in (meaning_by_name(name, "num").role or "") or noise.of(name):
+        return False
+    values = frame.numbers(name)
+    turns = np.abs(values[1:]) > 0
+    repeated = np.count_nonzero(np.diff(values)[turns] == 0)
+    return bool(turns.any()) and repeated >= MOSTLY * np.count_nonzero(turns)
+
+
 @dataclass(frozen=True)
 class Findings:
     """What was found in the rows of a run.
@@ -454,12 +483,14 @@ class Findings:
             and in words.
         unseen: What could not be looked at.
         undecided: Why one of them may be `stuck` that is told as a standstill.
+        covered_s: Begin and end of each segment with a position.
     """
 
     events: list[Judged] = field(default_factory=list[Judged])
     nearest: tuple[float, str] | None = None
     unseen: list[str] = field(default_factory=list[str])
     undecided: list[str] = field(default_factory=list[str])
+    covered_s: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
 
 
 def standstills_in(search: Search) -> Findings:
@@ -521,6 +552,7 @@ def judge_standstills(
     if not tracks:
         names = " and ".join(signal.name for signal in motion.position)
         raise NotSearchableError(f"{names} have no value in that range of run {frame.run_id}")
+    covered_s = [(float(each.times[0]), float(each.times[-1])) for each in tracks]
     seen_s = shortest_seen_s(noise.position_m, noise.interval_s, options.stuck_m, options.stuck_s)
     unseen = [
         f"none under {seen_s:.2g} s: position noise of {noise.position_m:.2g} m hides slow motion"
@@ -544,7 +576,8 @@ def judge_standstills(
     if not long:
         parts = [np.searchsorted(here, asked).tolist() for here in rows]
         there = [track.part(*part) for track, part in zip(tracks, parts, strict=True)]
-        return Findings([], None if places else _nearest(there, search), unseen)
+        nearest = None if places else _nearest(there, search)
+        return Findings([], nearest, unseen, covered_s=covered_s)
     events, open_s = list[Judged](), list[float]()
     for batch in _batches(long):
         if search.deadline.passed:
@@ -554,11 +587,13 @@ def judge_standstills(
         events += Standings(frame, motion, options, batch, noise, uses).judged(open_s)
     cut = ["time limit reached before it was known in which modes it moves"] if uses.is_cut else []
     if open_s and not cut:
-        cut = [_nothing_says(motion, open_s, sum(each.kind == "standstill" for each in events))]
-    return Findings(events, None, unseen, cut)
+        stood = sum(each.kind == "standstill" for each in events)
+        run = f" of run {frame.run_id}" if search.coverage.of_several_runs else ""
+        cut = [_nothing_says(motion, open_s, stood, run)]
+    return Findings(events, None, unseen, cut, covered_s)
 
 
-def _nothing_says(motion: Motion, open_s: Sequence[float], count: int) -> str:
+def _nothing_says(motion: Motion, open_s: Sequence[float], count: int, run: str) -> str:
     """Why it is not known of some standstills whether the robot should have moved."""
     which = f"{len(open_s)} of {count} standstills" if count > 1 else "the standstill"
     lacking = "no commanded speed, wheel command or mode is known"
@@ -566,7 +601,7 @@ def _nothing_says(motion: Motion, open_s: Sequence[float], count: int) -> str:
         lacking = "nothing recorded says whether it should have moved then"
     elif motion.turn_command and motion.heading is None:
         lacking = "it was commanded to turn, but no heading is known"
-    return f"{which} from {min(open_s):.3f} s on cannot be judged: {lacking}"
+    return f"{which} from {min(open_s):.3f} s on{run} cannot be judged: {lacking}"
 
 
 def _batches(places: Sequence[StandstillRows]) -> Iterator[Sequence[StandstillRows]]:
@@ -651,14 +686,27 @@ def _stuck(search: Search) -> Iterator[Event]:
     """It should have moved and stayed where it was."""
     found = standstills_in(search)
     events = list(_events(search, "stuck", "stuck"))
-    search.not_searched("stuck", *found.undecided)
-    if found.undecided and not events:
-        raise NotSearchableError("; ".join(found.undecided))
+    undecided = found.undecided
+    if not events and not undecided and (odometry := _counted_by_wheels(search.motion)):
+        undecided = [BY_WHEELS.format(odometry)]
+    search.not_searched("stuck", *undecided, cause="undecided")
+    if undecided and not events:
+        raise NotSearchableError("; ".join(undecided), "undecided")
     return iter(events)
+
+
+def _counted_by_wheels(motion: Motion) -> str | None:
+    """The position's name where the wheels themselves count it, which may spin in place."""
+    if motion.position is None:
+        return None
+    x, _ = motion.position
+    is_odometry = not x.stated and not _ODOMETRY.isdisjoint(words_in(x.name))
+    return (x.name.rpartition(".")[0] or x.name) if is_odometry else None
 
 
 def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:
     found = standstills_in(search)
+    search.judged(kind, search.motion.evidence, found.covered_s)
     search.not_searched(kind, *found.unseen)
     if found.nearest is not None:
         search.note_nearest(kind, *found.nearest)

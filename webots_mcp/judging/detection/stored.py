@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
-from webots_mcp.database.pauses import VIOLATION
+from webots_mcp.database.stored_breakpoints import VIOLATION
 from webots_mcp.judging.detection.kinds import (
     LEVELS,
     Alike,

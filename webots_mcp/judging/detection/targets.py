@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
+from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
@@ -25,7 +26,8 @@ OFF_SHARE: Final = 0.1  # of the largest step or size of the target
 _CELL_S: Final = 1.0  # over which medians are taken
 _ERRORS: Final = 4.0  # standard errors of a median: one cell in 16,000 is beyond by noise alone
 _MEDIAN_ERROR: Final = 1.2533  # of a median, times the standard error of a mean (normal noise)
-_NEARER_SHARE: Final = 0.05  # of the distance, from one cell to the next: it is on its way
+_NEARER_SHARE: Final = 0.05  # of the distance, from one cell to the next: it is on its way ...
+_ON_ITS_WAY: Final = 0.01  # ... and so is what comes nearer by this share of the target's size
 _LEAST_ROWS: Final = 3  # of a cell
 _PLACES: Final = ("x", "y", "height", "heading")  # where a robot goes takes as long as it takes
 
@@ -69,6 +71,7 @@ def off_target_events(search: Search) -> Iterator[Event]:
             "no target, other than always 0, is published next to what it is the target of"
         )
     targets = {each.measured.name: each for each in pursuits}
+    search.judged("off_target", [each.target for each in pursuits])
     for signal in search.in_time("off_target", [each.measured for each in pursuits]):
         yield from _apart(search, targets[signal.name])
 
@@ -82,7 +85,9 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
     cells = _cells_of(frame.times[there])
     values, aims = values[there][cells.order], aims[there][cells.order]
     low, high = _recent_range(frame.times[there], aims)
+    course = values
     if turn := measured.turn:
+        course = unwrap(values, turn)
         values = aims + np.remainder(values - aims + turn / 2, turn) - turn / 2
     off = np.maximum(values - high, 0.0) - np.maximum(low - values, 0.0)
     error = cells.medians(off)
@@ -93,7 +98,11 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
     is_off = (np.abs(error) > np.maximum(OFF_SHARE * size, margin)) & cells.is_full
     before = np.append(np.nan, error[:-1])
     nearer = np.abs(before) - np.abs(error)
-    approaches = nearer > np.maximum(_NEARER_SHARE * np.abs(before), 2 * margin)
+    least = np.minimum(_NEARER_SHARE * np.abs(before), _ON_ITS_WAY * size)
+    approaches = nearer > np.maximum(least, 2 * margin)
+    moved = np.diff(cells.medians(course), prepend=np.nan)
+    # A target that comes to where something stays is no motion of its own.
+    approaches &= -np.sign(before) * moved > np.maximum(nearer / 2, margin)
     approaches &= np.append(False, cells.follows)
     runs = (
         run

@@ -92,6 +92,9 @@ class PageServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = 128
+    """Connections that wait until they are accepted. With the 5 of `socketserver`, some of those
+    that a browser opens at once wait for a second or more."""
 
     def __init__(self, recording: RecordingAccess, port: int, *, read_only: bool) -> None:
         super().__init__((HOST, port), _Request)
@@ -148,8 +151,8 @@ class PageServer(ThreadingHTTPServer):
     def set_idle(self, connection: socket.socket, *, is_idle: bool) -> None:
         """Mark a connection as waiting for a request, or as being answered."""
         with self._lock:
-            if is_idle:
-                self._waiting[connection] = time.monotonic()
+            if is_idle:  # A new connection has waited since it was accepted.
+                self._waiting.setdefault(connection, time.monotonic())
             else:
                 self._waiting.pop(connection, None)
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from webots_mcp.database.connection import FrozenConnection
-from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
@@ -333,7 +333,7 @@ class Shipper:
     def _end_killed_runs(self, connection: sqlite3.Connection) -> None:
         """End runs in the recording whose process was killed. A pool could not know that."""
         database = self._order.recording.database
-        if not isinstance(database, Path) or not dead_sessions(connection):
+        if not isinstance(database, Path) or not find_dead_sessions(connection):
             return
         try:
             settled(database)

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 from webots_mcp.contract import host_name
-from webots_mcp.database.liveness import process_identity
+from webots_mcp.database.processes import process_identity
 from webots_mcp.errors import (
     PoolBusyError,
 )

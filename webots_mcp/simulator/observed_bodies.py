@@ -1,4 +1,4 @@
-"""The bodies of a world that an observer follows: found by walking the scene tree.
+"""The bodies of a world that an observer records: robots and solids, found in the scene tree.
 
 Poses come with the steps (`enablePoseTracking`), so that fifty robots cost no more requests than
 one. The tree is walked a few milliseconds at a time: at the start, after a body has vanished or the
@@ -51,7 +51,7 @@ _LIMITS: Final = WalkLimits()
 
 
 class BodyPose(NamedTuple):
-    """Where a body is at a moment."""
+    """The pose of a body at a moment."""
 
     sim_time_s: float
     x_m: float
@@ -64,7 +64,7 @@ class BodyPose(NamedTuple):
         return math.dist((self.x_m, self.y_m, self.z_m), position)
 
     def signals(self) -> dict[str, float]:
-        """It as it is recorded."""
+        """Return the pose as it is recorded."""
         _, x, y, z, heading = (round(value, DIGITS) for value in self)
         return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading}
 
@@ -162,7 +162,7 @@ class ObservedBody:
 
 
 def is_followed(scene: SceneNode) -> bool:
-    """Robots, and solids with a DEF name that are no part of a robot nor of a PROTO node."""
+    """Return whether a node is a robot, or a free solid with a DEF name that is recorded too."""
     if scene.base_type != "Solid":
         return scene.base_type == "Robot"
     return bool(scene.definition) and not scene.hidden and robot_around(scene) is None
@@ -196,7 +196,7 @@ def word_of(name: str, taken: Collection[str]) -> str:
     return free
 
 
-class ObservedWorld:
+class ObservedBodies:
     """The bodies of a world, as far as they have been found.
 
     Args:
@@ -254,8 +254,8 @@ class ObservedWorld:
             self._next_walk_s = time.monotonic() + _LIMITS.rest_s
 
     def begin_run(self) -> None:
-        """The world was reset: look at everything again."""
-        self._look_again()
+        """Survey the tree again, since the world was reset."""
+        self._survey_again()
 
     def describe(self) -> dict[str, object]:
         """Return what there is, without where it is."""
@@ -340,11 +340,11 @@ class ObservedWorld:
         return key
 
     def _lose(self, key: str) -> None:
-        """Nothing is asked of its node: it may not be there any more."""
+        """Stop following a body without a request to its node, which may have been removed."""
         del self.bodies[key]
-        self._look_again()
+        self._survey_again()
 
-    def _look_again(self) -> None:
+    def _survey_again(self) -> None:
         self._next_walk_s, self._is_new, self._is_walked = 0.0, True, False
 
     def _check_tracking(self) -> None:

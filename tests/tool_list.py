@@ -20,6 +20,7 @@ from mcp.types import Tool
 
 from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.location import MemoryDatabase
+from webots_mcp.questions.declaring import TIERS
 from webots_mcp.server.mcp_server import create_server
 
 
@@ -44,14 +45,14 @@ def counts_of(tools: Sequence[Tool]) -> Counts:
 
 
 def main() -> int:
-    """Print the size of both lists, and what `tdqs lint` says."""
+    """Print the size of the three lists, and what `tdqs lint` says."""
     memory = MemoryDatabase()
     try:
-        for core in (True, False):
-            tools = anyio.run(create_server(memory, memory.data_dir, core=core).list_tools)
+        for listed in TIERS:
+            tools = anyio.run(create_server(memory, memory.data_dir, tools=listed).list_tools)
             counted = counts_of(tools)
             print(
-                f"tools listed by 'serve{' --tools core' if core else ''}': {counted.tools}, "
+                f"tools listed by 'serve --tools {listed}': {counted.tools}, "
                 f"{counted.bytes:,} bytes, about {counted.tokens:,} tokens (by tokens_in)"
             )
     finally:

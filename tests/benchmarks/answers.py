@@ -39,7 +39,6 @@ _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_breakpoint": {"condition": "distance_m.left < 0", "action": "log"},
     "webots_remove_breakpoint": {"breakpoint_id": 1},
     "webots_set_parameters": {"values": {"speed": 6.0}},
-    "webots_edit_scene": {"action": "set", "path": "BALL.physics.mass", "value": 0.05},
     "webots_get_field": {"path": "ROVER"},
     "webots_set_field": {"path": "BALL.physics.mass", "value": 0.06},
     "webots_add_node": {"vrml": 'DEF PILL Solid { name "pill" }'},

@@ -72,7 +72,7 @@ def test_a_field_of_any_type_is_set_and_read_back_after_a_step(
         ("BALL.children[0].geometry.subdivision", 1.5, "a whole number"),
         ("BALL.name", 5, "a text of at most"),
         ("BALL.physics", 5, "BALL.physics.name"),
-        ("BALL.children", [], "webots_edit_scene adds and removes them"),
+        ("BALL.children", [], "webots_add_node and webots_remove_node change them"),
         ("BALL", 5, "name the field to set, such as BALL.translation"),
         ("ROVER.controllerArgs", "x", "a list of at most 200"),
         ("ROVER.controller", "../../evil", "controller must be the name of a program"),

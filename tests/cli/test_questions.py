@@ -187,7 +187,7 @@ def test_a_flag_that_is_to_be_turned_off_is_named_by_the_option_that_does(
 
 def test_a_hint_names_commands_and_options_instead_of_tools_and_arguments() -> None:
     app_for(["send"])
-    waits = 'webots_list_commands(what="outcome", command_id=7)'
+    waits = "webots_wait_for_command(command_id=7)"
     hint = f"wait for it with {waits}, or ask with a longer timeout_wall_s"
     assert as_typed(hint) == "wait for it with 'webots-mcp wait 7', or ask with a longer --timeout"
     assert as_typed("webots_list_commands has it") == "'webots-mcp commands' has it"
@@ -217,7 +217,10 @@ def test_examples_can_be_typed() -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("signals", "'*' is any text. (*)"), ("events", "no value for so long. (1)")],
+    [
+        ("signals", "'*' is any text. (*)"),
+        ("events", "without a value that count as missing. (1)"),
+    ],
 )
 def test_help_loses_no_word_and_no_default(cli: Cli, name: str, words: str) -> None:
     assert words in cli.on()(f"{name} --help")

@@ -148,7 +148,7 @@ def test_ctrl_c_ends_what_the_loop_does_and_leaves_the_simulation_paused(
 @pytest.mark.usefixtures("driver")
 def test_the_scene_is_a_table(cli: Cli) -> None:
     lines = cli("scene --depth 1 --field translation").splitlines()
-    assert lines[3].split() == ["depth", "path", "type", "name", "translation"]
+    assert lines[4].split() == ["depth", "path", "type", "name", "translation"]
     assert "[-1.2, 0.0, 0.04]" in next(line for line in lines if "ROVER" in line)
     rows = cli.json("scene --type Robot")["result"]["rows"]
     assert rows == [[1, "ROVER", "Robot", "rover"]]
@@ -170,8 +170,8 @@ def test_parameters_are_shown_and_set(tunable: TunableDriver, cli: Cli) -> None:
     assert "gait: old trot, new walk\n    kp: old 2, new 3.5\n  since_sim_time_s 0." in out
     assert (tunable.kp.value, tunable.gait.value) == (3.5, "walk")
     rows = cli("parameters").splitlines()
-    assert rows[2].split()[:4] == ["name", "value", "unit", "default"]
-    assert rows[3].split()[:4] == ["kp", "3.5", "1/s", "2"]
+    assert rows[3].split()[:4] == ["name", "value", "unit", "default"]
+    assert rows[4].split()[:4] == ["kp", "3.5", "1/s", "2"]
     assert "laps: now 3, next 4\n  since the next reset\n" in cli("parameters laps=4 --from-reset")
     told = cli.json("parameters")["parameters"]
     assert told["rows"][1][told["columns"].index("next")] == 4

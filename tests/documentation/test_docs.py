@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+from collections import Counter
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.database.connection import OLDEST_SQLITE, SCHEMA_FILE
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.questions import all_questions
 from webots_mcp.questions.arguments import MAX_WAIT_S
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.setup.client_entries import claude_desktop, clients_of, is_ours
@@ -41,16 +43,18 @@ def page(name: str) -> str:
 
 
 def test_the_page_of_the_tools_names_and_counts_every_tool_and_no_other() -> None:
-    with closing(MemoryDatabase()) as memory:
-        server = create_server(memory, memory.data_dir)
-        tools = {tool.name for tool in anyio.run(server.list_tools)}
-        core = create_server(memory, memory.data_dir, core=True)
-        counts = str(len(tools)), str(len(anyio.run(core.list_tools)))
-    assert set(re.findall(r"\bwebots_[a-z_]+\b", page("tools.md"))) == tools
-    assert re.findall(r"all (\d+) tools|lists the (\d+) that", page("tools.md")) == [
-        (counts[0], ""),
-        ("", counts[1]),
-    ]
+    tiers = {each.name: each.tier for each in all_questions()}
+    text = page("tools.md")
+    assert set(re.findall(r"\bwebots_[a-z_]+\b", text)) == set(tiers)
+    shown: dict[str, str] = {}
+    for tools, listed in re.findall(r"^\| (`webots_.*?`) \| ([a-z, ]+) \|", text, re.MULTILINE):
+        named, lists = re.findall(r"webots_\w+", tools), listed.split(", ")
+        shown |= zip(named, lists if len(lists) > 1 else lists * len(named), strict=True)
+    assert shown == tiers
+    count = Counter(tiers.values())
+    default = count["core"] + count["default"]
+    assert f"lists {default} of the {len(tiers)} tools" in text
+    assert f"lists {count['core']} in about" in text
 
 
 def test_the_page_of_the_command_line_names_every_command() -> None:

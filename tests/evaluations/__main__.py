@@ -20,6 +20,7 @@ from tests.evaluations.asking import Outcome, ask_by_command, ask_by_plan
 from tests.evaluations.scenario import Scenario, read_scenarios
 from tests.tool_list import counts_of
 from webots_mcp.database.location import MemoryDatabase
+from webots_mcp.questions.declaring import TIERS
 from webots_mcp.server.mcp_server import create_server
 
 
@@ -36,12 +37,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         wrong += not outcome.is_right
         print(_line(outcome), flush=True)
     print(f"{len(scenarios) - wrong} of {len(scenarios)} are right")
-    for core in (True, False):
+    for tier in TIERS:
         memory = MemoryDatabase()
-        counts = counts_of(anyio.run(create_server(memory, memory.data_dir, core=core).list_tools))
+        counts = counts_of(anyio.run(create_server(memory, memory.data_dir, tools=tier).list_tools))
         memory.close()
-        which = "--tools core" if core else "all"
-        print(f"the list of tools ({which}): {counts.tools}, about {counts.tokens:,} tokens")
+        print(f"the list of tools (--tools {tier}): {counts.tools}, about {counts.tokens:,} tokens")
     return 1 if wrong else 0
 
 

@@ -32,7 +32,6 @@ from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.declaring import MergedQuestion
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -96,7 +95,7 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "check": ("webots_check_run", {}),
     "check of an expectation": ("webots_check_run", {"expect": ["X > -100"]}),
     "outcome of a command": ("webots_wait_for_command", {"command_id": 1, "timeout_wall_s": 1}),
-    "diagnosis": ("webots_diagnose", {}),
+    "diagnosis": ("webots_diagnose_setup", {}),
     "scene": ("webots_get_scene", {}),
     "field of a node": ("webots_get_field", {"path": "ROBOT.translation"}),
 }
@@ -133,7 +132,7 @@ ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "set a field": ("webots_set_field", {"path": "BALL.translation", "value": [0, 0, 1]}),
     "add a node": ("webots_add_node", {"vrml": "Solid { }"}),
     "remove a node": ("webots_remove_node", {"path": "BALL"}),
-    "edit the scene": ("webots_edit_scene", {"action": "remove", "path": "BALL"}),
+    "edit the scene": ("webots_remove_node", {"path": "BALL"}),
 }
 _OF_A_PART: Final = ("newest logs", "history", "trends", "events", "timeline")
 
@@ -186,10 +185,7 @@ async def ask_tools(
 ) -> Answers:
     """What the tools answer about the recording in that file; of a refusal its texts."""
     found: Answers = {}
-    known = {
-        each.name: each.arguments.model_fields
-        for each in sorted(all_questions(), key=lambda each: not isinstance(each, MergedQuestion))
-    }
+    known = {each.name: each.arguments.model_fields for each in all_questions()}
     async with Client(create_server(file, file.parent)) as client:
         for name, (tool, arguments) in asked.items():
             given = {"robot": recording.robot, "run_id": recording.run_id} | {

@@ -23,7 +23,7 @@ from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.declaring import Caller, MergedQuestion, Question
+from webots_mcp.questions.declaring import Caller, Question
 from webots_mcp.store.export import FOR_VIEWERS, FORMATS, export, export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import RecordingAccess
@@ -49,9 +49,7 @@ _TOLD: Final[dict[str, Any]] = {
     "path": "ROVER",
     "command_id": 1,
 }
-READING: Final = [
-    each for each in all_questions() if each.effect.reads and not isinstance(each, MergedQuestion)
-]
+READING: Final = [each for each in all_questions() if each.effect.reads]
 
 
 async def _report(_done: float, _of: float | None, _text: str) -> None:

@@ -20,7 +20,6 @@ from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.connection import connect
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.declaring import MergedQuestion
 from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.anyio
@@ -30,7 +29,7 @@ LONG_RUN: Final = 2
 MORE_SIGNALS: Final = 30  # to the 39 of the long recording
 DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_list_robots", {}),
-    ("webots_diagnose", {}),
+    ("webots_diagnose_setup", {}),
     ("webots_get_world_info", {}),
     ("webots_get_robot_state", {}),
     ("webots_get_sensors", {}),
@@ -140,7 +139,7 @@ def _add_runs(connection: Any) -> None:
 async def test_every_default_answer_is_under_2000_tokens(big: Path) -> None:
     async with client_on(big) as client:
         table: list[str] = []
-        single = [each for each in all_questions() if not isinstance(each, MergedQuestion)]
+        single = all_questions()
         for tool, arguments in DEFAULTS:
             (asks,) = (each for each in single if each.name == tool)
             takes_run = "run_id" in asks.arguments.model_fields

@@ -209,7 +209,6 @@ async def test_a_misspelt_signal_is_answered_with_the_nearest_names(
         ("find_events", {"kinds": ["stucked"]}, "stuck"),
         ("get_logs", {"level": "warn"}, "warning"),
         ("simulation_control", {"command": "resumee"}, "resume"),
-        ("edit_scene", {"action": "move", "path": "BALL"}, "set"),
         ("simulation_control", {"command": "stop"}, "pause"),
         ("simulation_control", {"command": "start"}, "resume"),
         ("list_commands", {"status": "canceled"}, "cancelled"),

@@ -64,7 +64,7 @@ async def test_the_list_of_signals_shows_what_each_is_taken_for(connect: Connect
             client, "webots_describe_signals", signals=["u"], quantity="speed", role="commanded",
             unit="m/s",
         )  # fmt: skip
-        found = rows_of(await ask(client, "webots_get_trends", what="signals"))
+        found = rows_of(await ask(client, "webots_list_signals"))
         assert (found["u"]["meaning"], found["u"]["source"]) == ("commanded speed", "declared")
         assert found["u"]["unit"] == "m/s"
         assert (found["q.0"]["meaning"], found["q.0"]["source"]) == (None, "unknown")
@@ -139,7 +139,7 @@ async def test_a_project_may_forbid_it_and_the_refusal_is_recorded(
         refused = await fail(client, "webots_describe_signals", signals=["u"], quantity="speed")
         assert "webots_describe_signals is not allowed" in refused
         assert stored(file) == []
-        assert rows_of(await ask(client, "webots_get_trends", what="meanings"))
+        assert rows_of(await ask(client, "webots_list_meanings"))
     with closing(sqlite3.connect(file)) as connection:
         (rule,) = connection.execute("SELECT rule FROM request").fetchone()
     assert "webots-mcp.toml, line 2" in rule
@@ -148,7 +148,7 @@ async def test_a_project_may_forbid_it_and_the_refusal_is_recorded(
 @pytest.mark.usefixtures("rover")
 async def test_a_server_that_only_reads_lists_but_does_not_declare(connect: Connect) -> None:
     async with connect(read_only=True) as client:
-        assert rows_of(await ask(client, "webots_get_trends", what="meanings"))["u"]
+        assert rows_of(await ask(client, "webots_list_meanings"))["u"]
         refused = await fail(client, "webots_describe_signals", signals=["u"], quantity="speed")
         assert "this server is --read-only" in refused
 

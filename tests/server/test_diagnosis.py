@@ -19,7 +19,7 @@ async def test_what_is_wrong_comes_first_with_what_mends_it(
 ) -> None:
     recorded.robot(rows_dropped=3, last_poll_wall_time_s=None, now=time.time() - 60)
     async with connect(read_only=True) as client:
-        answer = await ask(client, "webots_diagnose")
+        answer = await ask(client, "webots_diagnose_setup")
     assert answer["verdict"] == "wrong"
     verdicts = [each["verdict"] for each in answer["failed"]]
     assert verdicts == sorted(verdicts, reverse=True)
@@ -30,7 +30,7 @@ async def test_what_is_wrong_comes_first_with_what_mends_it(
 
 async def test_each_check_is_told_once_also_where_nothing_was_recorded(connect: Connect) -> None:
     async with connect() as client:
-        answer = await ask(client, "webots_diagnose")
+        answer = await ask(client, "webots_diagnose_setup")
     names = [each["check"] for each in answer["failed"]]
     for listed in (answer["passed"], *answer["not_checked"].values()):
         names += listed.split(", ")
@@ -43,5 +43,5 @@ async def test_the_answer_stays_short_however_much_is_wrong(
     for n in range(60):
         recorded.robot(f"robot{n}" * 20, rows_dropped=n + 1, last_error="disk full " * 100)
     async with connect() as client:
-        answer = await ask(client, "webots_diagnose")
+        answer = await ask(client, "webots_diagnose_setup")
     assert len(json.dumps(answer)) < 6_000  # characters: 1,500 tokens

@@ -135,7 +135,7 @@ async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reloa
 
         stopped = await once(client, "webots_get_world_info", is_silent)
         assert "not paused, as robot 'mcp_observer' sees" in stopped["why"]
-        found = (await ask(client, "webots_diagnose"))["failed"]
+        found = (await ask(client, "webots_diagnose_setup"))["failed"]
         (simulation,) = [each for each in found if each["check"] == "Simulation"]
         assert "paused by hand" not in simulation["seen"]
         # Of the robot whose loop hangs, or of the observer, whichever was seen last.
@@ -156,7 +156,7 @@ async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None
             client, "webots_get_robot_state", lambda at: at["status"].startswith("stopped")
         )
         assert "paused in Webots, as robot 'mcp_observer' sees" in stopped["why"]
-        found = (await ask(client, "webots_diagnose"))["failed"]
+        found = (await ask(client, "webots_diagnose_setup"))["failed"]
         (simulation,) = [each for each in found if each["check"] == "Simulation"]
         assert simulation["fix"].startswith("webots_simulation_control('resume')")
         answer = await ask(client, "webots_simulation_control", command="resume")

@@ -13,47 +13,38 @@ from mcp import Client, StdioServerParameters
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
 from tests.tool_list import counts_of
+from webots_mcp.questions.declaring import Tier
 
 pytestmark = pytest.mark.anyio
 
-READING = {
-    "webots_list_robots",
-    "webots_diagnose",
-    "webots_get_world_info",
-    "webots_get_robot_state",
-    "webots_get_sensors",
-    "webots_get_full_state",
-    "webots_get_camera",
-    "webots_get_logs",
-    "webots_monitor",
-    "webots_list_commands",
-    "webots_query_history",
-    "webots_get_trends",
-    "webots_find_events",
-    "webots_list_runs",
-    "webots_check_run",
-    "webots_compare_runs",
-    "webots_plot",
-    "webots_query_sql",
-    "webots_get_scene",
-}
-ACTING = {
-    "webots_annotate_run",
-    "webots_describe_signals",
+CORE = {
+    "webots_list_robots", "webots_diagnose_setup", "webots_get_robot_state", "webots_plot",
+    "webots_get_logs", "webots_get_trends", "webots_find_events", "webots_list_runs",
+    "webots_compare_runs", "webots_check_run", "webots_get_scene", "webots_describe_signals",
+    "webots_take_screenshot", "webots_simulation_control", "webots_breakpoint",
+    "webots_send_command", "webots_set_parameters",
+}  # fmt: skip
+DEFAULT = CORE | {
+    "webots_get_world_info", "webots_get_sensors", "webots_get_full_state", "webots_get_camera",
+    "webots_monitor", "webots_query_history", "webots_list_signals", "webots_list_commands",
+    "webots_get_parameters", "webots_run", "webots_run_trials", "webots_world_reload",
+    "webots_world_reset", "webots_reset_controller_state", "webots_remove_breakpoint",
+    "webots_set_field", "webots_launch_world",
+}  # fmt: skip
+ALL = DEFAULT | {
+    "webots_get_timeline", "webots_list_meanings", "webots_query_sql", "webots_annotate_run",
+    "webots_load_world", "webots_quit", "webots_get_trials", "webots_list_breakpoints",
+    "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
     "webots_report",
-    "webots_set_parameters",
-    "webots_take_screenshot",
-    "webots_simulation_control",
-    "webots_run",
-    "webots_run_trials",
-    "webots_world_reload",
-    "webots_world_reset",
-    "webots_reset_controller_state",
-    "webots_send_command",
-    "webots_breakpoint",
-    "webots_edit_scene",
-    "webots_launch_world",
-}
+}  # fmt: skip
+READING = {
+    "webots_list_robots", "webots_diagnose_setup", "webots_get_world_info",
+    "webots_get_robot_state", "webots_get_sensors", "webots_get_full_state", "webots_get_camera",
+    "webots_get_logs", "webots_monitor", "webots_list_commands", "webots_query_history",
+    "webots_list_signals", "webots_get_trends", "webots_find_events", "webots_list_runs",
+    "webots_check_run", "webots_compare_runs", "webots_plot", "webots_get_scene",
+    "webots_get_parameters",
+}  # fmt: skip
 SHARED = ("robot", "run_id", "last_s", "start_s", "end_s", "timeout_wall_s", "cursor")
 
 
@@ -67,25 +58,29 @@ def same(answer: Any) -> Any:
     return {name: value for name, value in answer.items() if name not in ("age_s", "why", "status")}
 
 
-@pytest.mark.parametrize(("read_only", "names"), [(False, READING | ACTING), (True, READING)])
-async def test_exactly_the_named_tools_are_there(
-    connect: Connect, read_only: bool, names: set[str]
+@pytest.mark.parametrize(("tools", "names"), [("core", CORE), ("default", DEFAULT), ("all", ALL)])
+async def test_exactly_the_named_tools_are_listed(
+    connect: Connect, tools: Tier, names: set[str]
 ) -> None:
-    async with connect(read_only=read_only) as client:
+    async with connect(tools=tools) as client:
         assert {tool.name for tool in (await client.list_tools()).tools} == names
 
 
-@pytest.mark.parametrize(
-    ("core", "tools", "size", "tokens"), [(False, 34, 33_000, 7_600), (True, 18, 18_400, 4_200)]
-)
-async def test_the_list_is_short(
-    connect: Connect, core: bool, tools: int, size: int, tokens: int
+async def test_a_server_that_only_reads_lists_no_tool_that_changes_anything(
+    connect: Connect,
 ) -> None:
-    async with connect(core=core) as client:
+    async with connect(read_only=True) as client:
+        assert {tool.name for tool in (await client.list_tools()).tools} == READING
+
+
+@pytest.mark.parametrize(
+    ("tools", "count", "tokens"), [("core", 20, 5_000), ("default", 34, 9_000)]
+)
+async def test_the_list_is_short(connect: Connect, tools: Tier, count: int, tokens: int) -> None:
+    async with connect(tools=tools) as client:
         listed = await client.list_tools()
     counted = counts_of(listed.tools)
-    assert counted.tools <= tools
-    assert counted.bytes <= size
+    assert counted.tools <= count
     assert counted.tokens <= tokens
     assert listed.ttl_ms
 
@@ -94,7 +89,7 @@ async def test_a_tool_that_is_not_listed_answers_when_it_is_called(
     connect: Connect, recorded: Recorded
 ) -> None:
     recorded.robot().state(1.0, {"x": 1})
-    async with connect(core=True, read_only=True) as client:
+    async with connect(tools="core", read_only=True) as client:
         assert (await ask(client, "webots_get_sensors"))["hint"]
         with pytest.raises(AssertionError, match="There is no tool"):
             await ask(client, "webots_world_resets")
@@ -110,43 +105,49 @@ async def test_a_tool_that_steers_says_that_the_server_only_reads(
 
 
 @pytest.mark.parametrize(
-    ("old", "merged", "arguments"),
+    ("tool", "former", "choice", "arguments"),
     [
-        ("webots_get_timeline", ("webots_find_events", "timeline"), {"limit": 3}),
-        ("webots_list_signals", ("webots_get_trends", "signals"), {"pattern": "x"}),
-        ("webots_get_trials", ("webots_list_runs", "trials"), {}),
-        ("webots_get_parameters", ("webots_list_commands", "parameters"), {}),
-        ("webots_list_breakpoints", ("webots_list_commands", "breakpoints"), {}),
-        ("webots_wait_for_command", ("webots_list_commands", "outcome"), {"command_id": 1}),
-        ("webots_get_field", ("webots_get_scene", "field"), {"path": "X"}),
+        ("webots_get_timeline", "webots_find_events", {"what": "timeline"}, {"limit": 3}),
+        ("webots_find_events", "webots_find_events", {"what": "events"}, {}),
+        ("webots_list_signals", "webots_get_trends", {"what": "signals"}, {"pattern": "x"}),
+        ("webots_list_meanings", "webots_get_trends", {"what": "meanings"}, {}),
+        ("webots_get_trials", "webots_list_runs", {"what": "trials"}, {}),
+        ("webots_get_parameters", "webots_list_commands", {"what": "parameters"}, {}),
+        ("webots_list_breakpoints", "webots_list_commands", {"what": "breakpoints"}, {}),
+        ("webots_wait_for_command", "webots_list_commands", {"what": "outcome"}, {"command_id": 1}),
+        ("webots_get_field", "webots_get_scene", {"what": "field"}, {"path": "X"}),
+        ("webots_diagnose_setup", "webots_diagnose", {}, {}),
     ],
 )
-async def test_a_merged_tool_answers_as_the_one_that_it_took_in(
+async def test_a_call_of_a_tool_as_it_was_before_is_answered_by_that_of_today(
     connect: Connect,
     recorded: Recorded,
-    old: str,
-    merged: tuple[str, str],
+    tool: str,
+    former: str,
+    choice: dict[str, Any],
     arguments: dict[str, Any],
 ) -> None:
     recorded.robot().state(1.0, {"x": 1})
-    tool, what = merged
     async with connect(read_only=True) as client:
-        first = await client.call_tool(old, arguments)
-        second = await client.call_tool(tool, arguments | {"what": what})
-    assert first.is_error == second.is_error
-    if not first.is_error:
-        assert same(first.structured_content) == same(second.structured_content)
+        today = await client.call_tool(tool, arguments)
+        before = await client.call_tool(former, arguments | choice)
+        wrapped = await client.call_tool(former, {"params": arguments | choice})
+    assert today.is_error == before.is_error == wrapped.is_error
+    if not today.is_error:
+        assert same(today.structured_content) == same(before.structured_content)
+        assert same(today.structured_content) == same(wrapped.structured_content)
 
 
-async def test_an_argument_of_another_part_of_a_merged_tool_is_refused_with_those_there_are(
+async def test_a_former_choice_that_never_was_names_the_tools_of_today(
     connect: Connect, recorded: Recorded
 ) -> None:
     recorded.robot().state(1.0, {"x": 1})
     async with connect() as client:
-        told = await fail(client, "webots_find_events", what="timeline", where="x > 1")
-        assert "where has no meaning with what='timeline': there is kinds, log_level" in told
+        told = await fail(client, "webots_find_events", what="story")
+        assert "Unknown what 'story'" in told
+        assert "webots_get_timeline" in told
+        assert "webots_set_field" in await fail(client, "webots_edit_scene", path="X.y")
         assert "value" in await fail(client, "webots_edit_scene", action="set", path="X.y")
-        assert "action" in await fail(client, "webots_edit_scene", path="X.y")
 
 
 async def test_the_schemas_of_answers_are_listed_where_they_are_asked_for(
@@ -156,8 +157,7 @@ async def test_the_schemas_of_answers_are_listed_where_they_are_asked_for(
     async with connect(output_schemas=True) as client:
         tools = {tool.name: tool for tool in (await client.list_tools()).tools}
         assert tools["webots_find_events"].output_schema
-        for what in ("events", "timeline"):
-            assert "verdicts" in await ask(client, "webots_find_events", what=what)
+        assert "verdicts" in await ask(client, "webots_find_events")
 
 
 async def test_every_parameter_is_described_and_flat(connect: Connect) -> None:
@@ -198,19 +198,24 @@ async def test_over_stdio_a_server_without_a_database_starts_and_says_what_to_do
         answer = await ask(client, "webots_get_robot_state")
         assert client.instructions
         assert "webots_list_robots" in client.instructions
+        assert len(client.instructions.split()) <= 200
     assert answer["status"] == "never seen"
     assert str(file) in answer["hint"]
     assert not file.parent.exists()
 
 
 async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
-    async with connect() as client:
+    async with connect(tools="all") as client:
         notes = {tool.name: tool.annotations for tool in (await client.list_tools()).tools}
     told = {name: note for name, note in notes.items() if note and not note.read_only_hint}
     assert {name for name, note in told.items() if not note.destructive_hint} == {
         "webots_annotate_run",
+        "webots_add_node",
         "webots_breakpoint",
         "webots_describe_signals",
+        "webots_launch_world",
+        "webots_remove_breakpoint",
+        "webots_set_field",
         "webots_set_parameters",
         "webots_take_screenshot",
     }

@@ -43,7 +43,7 @@ async def under_way(client: Client, file: Path, robot: RecordedRobot) -> int:
     answer = await ask(client, "webots_send_command", action="go", timeout_wall_s=0.5)
     thread.join()
     assert answer["outcome"] == "claimed"
-    assert 'webots_list_commands(what="outcome", command_id=' in answer["hint"]
+    assert "webots_wait_for_command(command_id=" in answer["hint"]
     assert str(answer["command_id"]) in answer["hint"]
     return answer["command_id"]
 

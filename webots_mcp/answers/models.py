@@ -42,6 +42,7 @@ class AnswerTable(AnswerPart):
 class Answer(AnswerPart):
     """The header of every answer: about what, as of when, and whether time is moving."""
 
+    summary: str | None = said("What this answer says, in one sentence.")
     robot: str | None = None
     run_id: int | None = None
     sim_time_s: float | None = said("Simulation time of the newest data.")

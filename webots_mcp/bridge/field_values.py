@@ -30,7 +30,8 @@ def checked(path: str, type_name: str, value: object) -> Any:
     many, kind = type_name.startswith("MF"), _KINDS.get(type_name[2:])
     if kind is None:
         raise InvalidInputError(
-            f"{path} contains nodes ({type_name}): webots_edit_scene adds and removes them; "
+            f"{path} contains nodes ({type_name}): webots_add_node and webots_remove_node change "
+            "them; "
             f"to set a field of a node in it, extend the path, such as {path}"
             f"{'[0]' if many else ''}.name"
         )

@@ -266,7 +266,7 @@ def _under_way(answer: Mapping[str, Any], where: Where) -> str:
 
 
 def _require_recorded(data: Mapping[str, Any]) -> None:
-    if data.get("status") == "never seen" and set(data) == {"status", "hint"}:
+    if data.get("status") == "never seen" and set(data) == {"summary", "status", "hint"}:
         raise NothingRecordedError(data["hint"])
 
 

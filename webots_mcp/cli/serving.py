@@ -50,13 +50,13 @@ def serve(
         bool, Parameter("--read-only", help="Leave out the tools that change the simulation.")
     ] = False,
     tools: Annotated[
-        Literal["all", "core"],
+        Literal["core", "default", "all"],
         Parameter(
             "--tools",
-            help="Which tools to list: core are those that answer most questions; the others are "
-            "there when they are called by name.",
+            help="Which tools to list: core (20 tools), default (34) or all. A tool that is not "
+            "listed still answers when it is called by name.",
         ),
-    ] = "all",
+    ] = "default",
     output_schemas: Annotated[
         bool,
         Parameter(
@@ -138,7 +138,7 @@ def serve(
             database,
             data_dir,
             read_only=read_only,
-            core=tools == "core",
+            tools=tools,
             output_schemas=output_schemas,
             limits=asked,
         )

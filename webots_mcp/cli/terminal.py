@@ -63,7 +63,7 @@ def print_answer(answer: Mapping[str, Any]) -> None:
 def answer_lines(
     answer: Mapping[str, Any], *, width: int = _LAYOUT.paragraph, most_rows: int | None = None
 ) -> Iterator[str]:
-    """Whom and when the answer is about in one line, then part by part what it says.
+    """Yield what an answer says in a sentence, whom and when it is about, then its parts.
 
     Args:
         answer: As JSON knows it.
@@ -72,9 +72,11 @@ def answer_lines(
     """
     layout = _Layout(width, most_rows, is_of_command="outcome" in answer)
     head = [text.format(text_of(answer[name])) for name, text in _HEAD.items() if name in answer]
+    if summary := answer.get("summary"):
+        yield from textwrap.wrap(printable(str(summary)), width, subsequent_indent=_LAYOUT.indent)
     if head:
         yield from textwrap.wrap(", ".join(head), width, subsequent_indent=_LAYOUT.indent)
-    apart = (*_HEAD, *_NOTES)
+    apart = ("summary", *_HEAD, *_NOTES)
     yield from layout.members({k: v for k, v in answer.items() if k not in apart})
     for name in _NOTES:
         value = answer.get(name)

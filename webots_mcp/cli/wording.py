@@ -15,12 +15,12 @@ _UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
 _NOT_ON: Final = r"(?![\w'\"])"
 _OTHERS: Final = {  # by tool: those that are answered by a command of another name or function
     "get_full_state": "tail", "get_robot_state": "tail", "monitor": "tail",
-    "breakpoint": "breakpoint", "list_commands breakpoints": "breakpoint",
-    "list_commands parameters": "parameters", "set_parameters": "parameters",
-    "list_commands outcome": "wait", "list_runs trials": "trials", "run_trials": "trials",
-    "list_signals": "signals", "get_trends signals": "signals",
-    "describe_signals": "signals --describe", "get_trends meanings": "signals --meanings",
-    "list_meanings": "signals --meanings",
+    "breakpoint": "breakpoint", "list_breakpoints": "breakpoint",
+    "remove_breakpoint": "breakpoint --remove",
+    "get_parameters": "parameters", "set_parameters": "parameters",
+    "wait_for_command": "wait", "get_trials": "trials", "run_trials": "trials",
+    "list_signals": "signals", "describe_signals": "signals --describe",
+    "list_meanings": "signals --meanings", "get_field": "field", "diagnose_setup": "doctor",
     "plot": "plot", "report": "report",
     "simulation_control": "send", "world_reset": "send reset",
 }  # fmt: skip
@@ -28,9 +28,7 @@ _FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a per
     "start the server with --data-dir or --database": "give --data-dir or --database",
     "the resource webots://schema": "'.schema' in the sqlite3 shell",
 }
-_TOOL: Final = re.compile(
-    r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
-)
+_TOOL: Final = re.compile(r"webots_(?P<tool>\w+)(?:\(\w+=(?P<id>\d+)\))?")
 _running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 
 
@@ -109,7 +107,7 @@ def commands_by_tool() -> dict[str, str]:
 
 def _command_for(found: re.Match[str]) -> str:
     """Return the command that answers what a tool does; the tool itself where there is none."""
-    tool, what, number = found["tool"], found["what"], found["id"]
-    command = commands_by_tool().get(f"{tool} {what}" if what else tool)
+    tool, number = found["tool"], found["id"]
+    command = commands_by_tool().get(tool)
     whole = f"{command} {number}" if number else command
     return f"'webots-mcp {whole}'" if command else found[0]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MAX_WAIT_S: Final = 90
 FOR_A_PERSON: Final = "person"  # the context of a validation: whoever waits can press Ctrl-C
 LONGEST_NAME: Final = 200
-_CURSOR: Final = "From the last answer."
+_CURSOR: Final = "Continues the previous answer: its `cursor`."
 
 
 def _as_id(value: int) -> int:
@@ -57,52 +57,69 @@ _Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
 Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
-    Annotated[str, Field(max_length=LONGEST_NAME)] | None, Field(description="If several.")
+    Annotated[str, Field(max_length=LONGEST_NAME)] | None,
+    Field(description="Name of the robot. Needed only if several robots are live."),
 ]
-RunId = Annotated[Id | None, Field(description="Else the current run.")]
-TrialSetId = Annotated[Id | None, Field(description="From webots_run_trials.")]
-LastS = Annotated[_Duration | None, Field(description="The last simulated seconds.")]
-StartS = Annotated[Seconds | None, Field(description="From this simulation time.")]
-EndS = Annotated[Seconds | None, Field(description="Before this simulation time.")]
+RunId = Annotated[
+    Id | None, Field(description="Run to ask about, from webots_list_runs. Default: the newest.")
+]
+TrialSetId = Annotated[
+    Id | None, Field(description="Number of a set of trials, from webots_run_trials.")
+]
+LastS = Annotated[_Duration | None, Field(description="Only the last N simulated seconds.")]
+StartS = Annotated[Seconds | None, Field(description="Start of the range in simulated seconds.")]
+EndS = Annotated[Seconds | None, Field(description="End of the range in simulated seconds.")]
 WaitS = Annotated[
     float, Field(ge=0.1, json_schema_extra={"maximum": MAX_WAIT_S}), AfterValidator(_as_wait)
 ]
-TimeoutS = Annotated[WaitS, Field(description="At most.")]
-TimeOfDay = Annotated[bool, Field(description="Add wall-clock times.")]
+TimeoutS = Annotated[WaitS, Field(description="Maximum wall-clock seconds to wait.")]
+TimeOfDay = Annotated[bool, Field(description="Add the time of day to each row.")]
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 # A number is as good; one type that holds both is shorter than two.
 _WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
-Since = Annotated[_WallTime, Field(description="From, ISO 8601 with zone.")]
-Until = Annotated[_WallTime, Field(description="Before.")]
+Since = Annotated[
+    _WallTime, Field(description="Start as time of day, ISO 8601 with zone: 2026-05-01T03:00:00Z.")
+]
+Until = Annotated[_WallTime, Field(description="End as time of day, ISO 8601 with zone.")]
 Names = Annotated[
     list[str],
     Field(
         min_length=1,
         max_length=50,
-        description="Their names; 'pose' is all below it, '*' any text.",
+        description="Signals to read; 'pose' means all below it, '*' any text.",
     ),
 ]
-AnyNames = Annotated[list[str] | None, Field(max_length=50, description="'*' is any text.")]
+AnyNames = Annotated[
+    list[str] | None,
+    Field(max_length=50, description="Only these signals; '*' means any text, as in 'wheel.*'."),
+]
 # Of a parameter. A whole number is a number as well, and stays one. What it may be is the
 # parameter's to say, and would take as much room as all else.
 Value = Annotated[float | int | bool | str, WithJsonSchema({})]
 MaxPoints = Annotated[
-    int | None, Field(ge=1, le=500, description="The most buckets, or rows with raw.")
+    int | None, Field(ge=1, le=500, description="Maximum number of intervals, or of rows with raw.")
 ]
-ShownLimit = Annotated[int | None, Field(ge=1, le=500, description="Most shown.")]
-LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
-Limit = Annotated[int, Field(ge=1, le=500, description="Most shown.")]
-RunIds = Annotated[list[Id] | None, Field(max_length=10, description="From webots_list_runs.")]
+ShownLimit = Annotated[
+    int | None, Field(ge=1, le=500, description="Maximum number of rows in the answer.")
+]
+LogLevel = Annotated[contract.LogLevel, Field(description="Lowest level of log lines that count.")]
+Limit = Annotated[int, Field(ge=1, le=500, description="Maximum number of rows in the answer.")]
+RunIds = Annotated[
+    list[Id] | None, Field(max_length=10, description="Runs, from webots_list_runs.")
+]
 ComparedRunIds = Annotated[
-    list[Id] | None, Field(max_length=300, description="From webots_list_runs.")
+    list[Id] | None, Field(max_length=300, description="Runs to compare, from webots_list_runs.")
 ]
 Position = Annotated[
     list[str] | None,
-    Field(min_length=2, max_length=2, description="Signals of x and y, if not found."),
+    Field(
+        min_length=2, max_length=2, description="Signals of x and y, if they are not recognised."
+    ),
 ]
 Mode = Annotated[
-    str | None, Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found.")
+    str | None,
+    Field(max_length=LONGEST_NAME, description="Signal of the mode, if it is not recognised."),
 ]
 # What a client gives for a `Scope`, which tools take whole.
 SCOPE: Final = {

@@ -24,7 +24,7 @@ from webots_mcp.contract import BreakpointAction
 from webots_mcp.database import stored_breakpoints as stored
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Id, RobotName
-from webots_mcp.questions.declaring import CHANGES, READS, Caller, merged, question
+from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.run_command import holds_since
@@ -44,31 +44,35 @@ _NOT_ASKED: Final = (
 _LONGEST_CONDITION: Final = 300
 
 
-@question("Set a breakpoint", CHANGES)
+@question("Set a breakpoint", CHANGES, tier="core")
 async def webots_breakpoint(
     recording: RecordingAccess,
     condition: Annotated[
         str,
         Field(
             max_length=500,
-            description="On signals: front_m < 0.1 for 0.5; mode == 'turn' and displacement(3) "
-            "< 0.05; changed(mode); abs(rate(v)) > 2; missing(gps.x); pose.0 > 1.",
+            description="Condition on signals: front_m < 0.1 for 0.5 (seconds); mode == 'turn' "
+            "and displacement(3) < 0.05; changed(mode); abs(rate(v)) > 2; missing(gps.x).",
         ),
     ],
     caller: Caller,
     action: Annotated[
         BreakpointAction,
-        Field(description="keep records the seconds around at full rate, log only the hit."),
+        Field(
+            description="What a hit does: pause, log only the hit, or keep every step around it."
+        ),
     ] = "pause",
     after_hits: Annotated[
-        int, Field(ge=1, le=1_000_000, description="Act from this hit of a run on.")
+        int,
+        Field(ge=1, le=1_000_000, description="Number of the hit in a run from which on it acts."),
     ] = 1,
     robot: RobotName = None,
 ) -> BreakpointAnswer:
-    """Pause, or take note, when a condition begins to hold; asked at every publish() call.
+    """Pause the simulation, or take note, at the moment when a condition begins to hold.
 
-    Each hit is an event with the values and the simulation time of that very step. It is stored,
-    and armed again after a reset or reload.
+    Tested at each publish() call of the controller; each hit is an event with the values of that
+    step. It stays armed after a reset or reload until webots_remove_breakpoint. To search the
+    past for a condition use webots_find_events with `where`.
     """
     parsed = parse_condition(condition)
     if action != "log":  # what the bridge does at a hit is not asked for again
@@ -91,11 +95,14 @@ async def webots_breakpoint(
     )
 
 
-@question("List the breakpoints", READS)
+@question("List the breakpoints", READS, tier="all")
 def webots_list_breakpoints(
     recording: RecordingAccess, robot: RobotName = None
 ) -> BreakpointsAnswer:
-    """The robot's breakpoints, how often each was hit, and when last."""
+    """List the robot's breakpoints, how often each was hit, and when last.
+
+    To remove one use webots_remove_breakpoint.
+    """
     with recording.view(robot) as view:
         listed = stored.list_breakpoints(view.connection, view.robot.id)
         rows = [_breakpoint_row(view, each) for each in listed]
@@ -114,11 +121,16 @@ def webots_list_breakpoints(
 @question("Remove a breakpoint", CHANGES)
 async def webots_remove_breakpoint(
     recording: RecordingAccess,
-    breakpoint_id: Annotated[Id, Field(description="From webots_breakpoint.")],
+    breakpoint_id: Annotated[
+        Id, Field(description="Breakpoint to remove, from webots_breakpoint.")
+    ],
     caller: Caller,
     robot: RobotName = None,
 ) -> BreakpointAnswer:
-    """Remove a breakpoint. The events of its hits stay; a paused simulation stays paused."""
+    """Remove a breakpoint; the events of its hits stay, and a paused simulation stays paused.
+
+    To let the simulation go on use webots_simulation_control("resume").
+    """
     name = await to_thread.run_sync(_remove, recording, robot, breakpoint_id)
     reply, why_not = await _arm(recording, caller, name)
     return BreakpointAnswer(
@@ -189,15 +201,3 @@ def _breakpoint_row(view: RobotView, each: stored.StoredBreakpoint) -> list[Any]
         each.created_by,
         cut_text(each.error, _LONGEST_CONDITION) if each.error else None,
     ]
-
-
-BREAKPOINT: Final = merged(
-    webots_breakpoint,
-    choice="change",
-    meaning="remove: takes breakpoint_id; the events of its hits stay.",
-    parts={"set": webots_breakpoint, "remove": webots_remove_breakpoint},
-    text="""\
-Pause, or take note, when a condition begins to hold; asked at every publish() call.
-
-Each hit is an event with the values of that step. Armed again after a reset or reload.""",
-)

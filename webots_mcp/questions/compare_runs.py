@@ -119,25 +119,26 @@ _SIZES: Final = ComparisonSizes()
     READS,
     command="runs",
     options={"parameters": "--parameter"},
-    core=True,
     example="--parameter kp=3.5 -n 5",
     quotes=True,
+    tier="core",
 )
 def webots_list_runs(
     recording: RecordingAccess,
     limit: Limit = 20,
     cursor: Cursor = None,
     parameters: Annotated[
-        dict[str, Value] | None, Field(max_length=20, description="Only runs with these values.")
+        dict[str, Value] | None,
+        Field(max_length=20, description='Only runs with these parameters, {"kp": 3.0}.'),
     ] = None,
     robot: RobotName = None,
 ) -> RunsAnswer:
-    """Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
+    """List the runs, newest first: when, how long, which world and code, and how each ended.
 
-    A run is a stretch of rising simulation time: a start, reset or reload begins the next.
-    `own_ms` and `step_wait_ms`: of each step, wall time in the controller's code and in step().
-    `notable` counts warnings, errors, dropped rows, failed commands. `parameters` are those that
-    are not as the code declared them, or differ between these runs.
+    A run begins with each start, reset or reload. For the difference between runs use
+    webots_compare_runs; for the faults of one use webots_check_run. `own_ms` and `step_wait_ms`
+    are wall-clock milliseconds per step in the controller's code and in step(). `notable` counts
+    warnings, errors, dropped rows and failed commands.
     """
     with recording.reader() as connection:
         header = view_robot(connection, robot).header() if robot else header_of_only(connection)
@@ -162,9 +163,9 @@ def webots_list_runs(
     command="compare",
     positional=("run_ids",),
     options={"run_ids": "RUN", "min_effect_sd": "--min-effect"},
-    core=True,
     example="3 4 --signal 'pose*'",
     quotes=True,
+    tier="core",
 )
 def webots_compare_runs(
     recording: RecordingAccess,
@@ -175,18 +176,25 @@ def webots_compare_runs(
     position: Position = None,
     mode: Mode = None,
     min_effect_sd: Annotated[
-        float, Field(gt=0, le=100, description="What matters, in deviations of like runs.")
+        float,
+        Field(
+            gt=0,
+            le=100,
+            description="Smallest difference that matters, in standard deviations of a group.",
+        ),
     ] = MIN_EFFECT_SD,
-    first_difference: Annotated[bool, Field(description="Where two part, row by row.")] = False,
+    first_difference: Annotated[
+        bool, Field(description="Find the first row in which two runs differ.")
+    ] = False,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
-    """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
+    """Find out whether an edit or a parameter helped: compare runs by goal, speed and events.
 
-    Without run_ids: the runs before and after the last edit of the controller's file. Runs of one
-    code and parameters are one group. Goal, distance, mean speed, time per mode, events per minute,
-    the loop's own ms per step, and the signals that differ most. `different`: true beyond the
-    spread of repeated runs (4 of each or more), false where a difference that matters is excluded,
-    null where `undecided` says why.
+    Without run_ids it compares the runs before and after the last edit of the controller; with
+    one run it gives its figures. `different` is true if the difference is larger than between
+    repeated runs (at least 4 of each), false if there is none that matters, and null if this
+    cannot be known yet: `undecided` says why. For curves over each other use webots_plot with
+    run_ids.
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
@@ -223,17 +231,20 @@ def _first_run(recording: RecordingAccess, set_id: int) -> int:
     positional=("run_id", "label"),
     options={"run_id": "RUN", "label": "TEXT"},
     example="4 baseline --note 'before the new gait'",
+    tier="all",
 )
 def webots_annotate_run(
     recording: RecordingAccess,
-    label: Annotated[str, Field(max_length=100, description="Short name; '-' takes it away.")] = "",
-    note: Annotated[str, Field(max_length=4000, description="Any text, or '-'.")] = "",
+    label: Annotated[str, Field(max_length=100, description="Short name; '-' removes it.")] = "",
+    note: Annotated[
+        str, Field(max_length=4000, description="Note of any length; '-' removes it.")
+    ] = "",
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> RunsAnswer:
-    """Give a run a label or a note, by default the current one.
+    """Give a run a label or a note, which also keeps it from being deleted.
 
-    A run with either is kept for good.
+    Labels are shown by webots_list_runs.
     """
     with recording.view(robot, run_id) as view:
         run = view.require_run()
@@ -497,9 +508,9 @@ def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: 
     command="check",
     positional=("run_id",),
     options={"run_id": "RUN"},
-    core=True,
     example="4 --junit check.xml",
     quotes=True,
+    tier="core",
 )
 def webots_check_run(
     recording: RecordingAccess,
@@ -507,16 +518,18 @@ def webots_check_run(
         list[Annotated[str, Field(max_length=1100)]] | None,
         Field(
             max_length=20,
-            description="front_m > 0.1 during mode == 'drive'; goal_m < 0.1 within 20.",
+            description="Conditions that should hold: front_m > 0.1 during mode == 'drive'; "
+            "goal_m < 0.1 within 20 (seconds).",
         ),
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> CheckAnswer:
-    """Is this run well? Motion against commands, sensors, estimates, pace, log, end, rows, goal.
+    """Judge whether the robot behaved well in a run: motion, sensors, estimates, pace, log, goal.
 
-    Each check passes, warns, fails, is not applicable (what is missing), is not judged (nothing
-    recorded decides it) or was not looked at.
+    Each check passes, warns or fails with its evidence, or is not applicable or not judged with
+    what is missing. It judges the robot; if nothing is recorded use webots_diagnose_setup. For
+    when and how often something happened use webots_find_events.
     """
     expected = [read_expectation(each) for each in expect or ()]
     file = file_of(recording.data_dir)

@@ -15,7 +15,7 @@ from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName, TimeoutS, Value, WaitS
-from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, merged, question
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, question
 from webots_mcp.questions.show_pictures import show_end
 from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, require_world
 from webots_mcp.simulator.orders import Order
@@ -29,9 +29,9 @@ from webots_mcp.store.recording import RecordingAccess
 
 Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,
-    Field(description="Of a Webots of another project."),
+    Field(description="Port of a Webots that runs another project."),
 ]
-Force = Annotated[bool, Field(description="Press Webots' keys where nothing else works.")]
+Force = Annotated[bool, Field(description="If nothing else works, press keys in Webots' window.")]
 
 
 @dataclass(frozen=True)
@@ -58,28 +58,31 @@ class ControlTimes:
 _TIMES: Final = ControlTimes()
 
 
-@question("Control the simulation", DESTROYS, core=True)
+@question("Control the simulation", DESTROYS, tier="core")
 async def webots_simulation_control(
     recording: RecordingAccess,
-    command: Annotated[Order, Field(description="reset and reload begin a new run at time 0.")],
+    command: Annotated[
+        Order, Field(description="What to do. reset and reload begin a new run at time 0.")
+    ],
     caller: Caller,
     steps: Annotated[
         Annotated[int, Field(ge=1, le=MAX_STEPS)] | None,
-        Field(description="For step: rounds of the controller's loop."),
+        Field(description="Number of steps of the controller's loop, for command step."),
     ] = None,
     force: Force = False,
     port: Port = None,
     robot: RobotName = None,
     timeout_wall_s: Annotated[
-        WaitS | None, Field(description="10, for reload 30, for step 90.")
+        WaitS | None,
+        Field(description="Maximum wall-clock seconds to wait. Default 10; reload 30; step 90."),
     ] = None,
 ) -> CommandAnswer:
-    """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
+    """Pause, resume, run fast, step, reset or reload the simulation, and wait for the outcome.
 
-    By a Supervisor, else an observer in the world (webots-mcp init --observer), else by Webots
-    itself if started with --stream; `route` says which. `reload`
-    restarts the controllers that Webots starts with their code as it is now; an extern controller
-    ends, and somebody has to start it by hand.
+    To run until a condition holds use webots_run. `reload` restarts the controllers with their
+    code as it is now; an extern controller ends and must be started by hand. Needs a Supervisor,
+    an observer (webots-mcp init --observer) or a Webots started with --stream; `route` says which
+    was used.
     """
     if steps is not None and command != "step":
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
@@ -101,7 +104,11 @@ async def webots_world_reload(
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.reload_s,
 ) -> CommandAnswer:
-    """Load world and code anew, as webots_simulation_control("reload")."""
+    """Load the world and the controllers' code anew, as webots_simulation_control('reload').
+
+    Use it after an edit of the controller. To keep the running code and only go back to time 0
+    use webots_world_reset.
+    """
     dispatcher = Dispatcher(recording, caller.report)
     return await Attempt(recording, dispatcher, robot, timeout_wall_s, "reload", {}, force).steer()
 
@@ -114,7 +121,10 @@ async def webots_world_reset(
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.command_s,
 ) -> CommandAnswer:
-    """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
+    """Put the world back to time 0: the same as webots_simulation_control("reset").
+
+    The controllers keep their code. To start changed code use webots_world_reload.
+    """
     dispatcher = Dispatcher(recording, caller.report)
     return await Attempt(recording, dispatcher, robot, timeout_wall_s, "reset", {}, force).steer()
 
@@ -126,9 +136,10 @@ async def webots_reset_controller_state(
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.command_s,
 ) -> CommandAnswer:
-    """Put the controller's own variables back; world and time go on as they are.
+    """Reset the controller's own variables, while the world and simulated time go on.
 
-    Runs its action reset_state, else the callbacks of bridge.on_reload().
+    Runs the controller's action reset_state, or else its bridge.on_reload() callbacks. To put the
+    world back to time 0 use webots_world_reset.
     """
     return await Dispatcher(recording, caller.report).ask(robot, "reset_state", timeout_wall_s)
 
@@ -136,7 +147,9 @@ async def webots_reset_controller_state(
 # -- Webots itself: started on a world, another world in it, ended --
 
 
-World = Annotated[str, Field(max_length=1000, description="A .wbt file.")]
+World = Annotated[
+    str, Field(max_length=1000, description="Path of the world file, such as worlds/arena.wbt.")
+]
 
 
 @question("Launch Webots on a world", CHANGES)
@@ -144,16 +157,24 @@ async def webots_launch_world(
     recording: RecordingAccess,
     world: World,
     caller: Caller,
-    mode: Annotated[Mode | None, Field(description="To begin with; else as it prefers.")] = None,
-    headless: Annotated[bool, Field(description="Without its window and 3D view.")] = False,
+    mode: Annotated[
+        Mode | None, Field(description="Mode to start in. Default: as set in Webots.")
+    ] = None,
+    headless: Annotated[
+        bool, Field(description="Start without a window and without rendering.")
+    ] = False,
     stream: Annotated[
-        bool, Field(description="Obey without a controller; opens the project to the net.")
+        bool,
+        Field(
+            description="Allow control without a Supervisor. Opens a network port of the project."
+        ),
     ] = False,
     timeout_wall_s: TimeoutS = _TIMES.start_s,
 ) -> CommandAnswer:
-    """Start Webots and wait until the first controller records, or say why none does.
+    """Start Webots on a world file and wait until the first controller records.
 
-    It ends with this server, or when it is quit. One at a time.
+    Use it if no Webots runs; for another world in a running Webots use webots_load_world. One at
+    a time; it ends with this server.
     """
     launcher = caller.companions.webots
     project = await to_thread.run_sync(project_of, recording)
@@ -166,7 +187,7 @@ async def webots_launch_world(
     return await to_thread.run_sync(_answer, recording, launched, first, started_s)
 
 
-@question("Load another world", DESTROYS)
+@question("Load another world", DESTROYS, tier="all")
 async def webots_load_world(
     recording: RecordingAccess,
     world: World,
@@ -174,23 +195,27 @@ async def webots_load_world(
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.world_s,
 ) -> CommandAnswer:
-    """Open another world in the running Webots; all controllers end.
+    """Open another world in the running Webots; all its controllers end.
 
-    By a controller that is a Supervisor, else by Webots if started with --stream.
+    Needs a Supervisor, or a Webots started with --stream. If no Webots runs use
+    webots_launch_world.
     """
     project = await to_thread.run_sync(project_of, recording)
     file, _ = await to_thread.run_sync(require_world, world, project)
     return await _request(recording, caller, robot, timeout_wall_s).load(file)
 
 
-@question("Quit Webots", DESTROYS)
+@question("Quit Webots", DESTROYS, tier="all")
 async def webots_quit(
     recording: RecordingAccess,
     caller: Caller,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.world_s,
 ) -> CommandAnswer:
-    """End Webots: the one of webots_launch_world; another only by a robot that is a Supervisor."""
+    """End Webots: the one that webots_launch_world started, or one whose robot is a Supervisor.
+
+    To only stop simulated time use webots_simulation_control("pause").
+    """
     return await _request(recording, caller, robot, timeout_wall_s).quit()
 
 
@@ -268,7 +293,6 @@ def _described(launched: WebotsLaunch) -> dict[str, Any]:
     DESTROYS,
     command="run",
     options={"parameters": "--set"},
-    core=True,
     example="--until 'front_m < 0.1' --for 20 --reset --set kp=2",
     quotes=True,
     of_controller="parameters",
@@ -278,29 +302,33 @@ async def webots_run(
     caller: Caller,
     until: Annotated[
         str | None,
-        Field(max_length=500, description="A condition, as of webots_breakpoint."),
+        Field(
+            max_length=500,
+            description="Stop when this condition holds; see webots_breakpoint.",
+        ),
     ] = None,
     for_s: Annotated[
         float | None,
-        Field(gt=0, le=MAX_RUN_S, description="Simulated seconds; at most, with until."),
+        Field(gt=0, le=MAX_RUN_S, description="Simulated seconds to run; with until, the maximum."),
     ] = None,
-    reset: Annotated[
-        bool, Field(description="Reset the world first; for_s counts from there.")
-    ] = False,
-    pace: Annotated[Literal[Pace, "as_it_is"], Field(description="Of this run.")] = "fast",
+    reset: Annotated[bool, Field(description="Reset the world to time 0 first.")] = False,
+    pace: Annotated[Literal[Pace, "as_it_is"], Field(description="Speed of this run.")] = "fast",
     parameters: Annotated[
         dict[str, Value] | None,
-        Field(description="Set these first, all or none."),
+        Field(description="Parameters to set first, such as {'kp': 3.0}."),
     ] = None,
-    then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
-    picture: Annotated[bool, Field(description="Show the end as a screenshot too.")] = False,
+    then: Annotated[
+        Then, Field(description="What to do at the end; go_on continues at the former speed.")
+    ] = "pause",
+    picture: Annotated[bool, Field(description="Add a screenshot of the end.")] = False,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.run_s,
 ) -> RunAnswer:
-    """Let the simulation run until a condition holds or a simulated time is over, then pause it.
+    """Run the simulation until a condition holds or for some simulated seconds, then pause it.
 
-    Says why it stopped, how far it came, the state at that step, and what happened meanwhile. Out
-    of wall time it goes on: webots_list_commands(what="outcome") waits. Needs a Supervisor.
+    Answers why it stopped, how far it came, the state at that step and what happened meanwhile.
+    If timeout_wall_s is over first, it goes on, and webots_list_commands shows its outcome later.
+    Needs a Supervisor. To stop at a condition without starting a run use webots_breakpoint.
     """
     await to_thread.run_sync(lambda: require_possible(recording, robot, until, for_s, reset=reset))
     params = {
@@ -317,16 +345,3 @@ async def webots_run(
     if picture and answer.outcome == "done":
         await show_end(recording, dispatcher, answer)
     return answer
-
-
-WORLD: Final = merged(
-    webots_launch_world,
-    choice="action",
-    meaning="load: another world in the Webots that runs; quit: end it.",
-    parts={"launch": webots_launch_world, "load": webots_load_world, "quit": webots_quit},
-    text="""\
-Start Webots on a world and wait until the first controller records.
-
-It ends with this server, or by quit. One at a time. Another Webots obeys by a Supervisor, or if
-started with --stream.""",
-)

@@ -31,25 +31,27 @@ _DECLARE: Final = (
 _Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 
 
-@question("List meanings", READS, quotes=True)
+@question("List meanings", READS, quotes=True, tier="all")
 def webots_list_meanings(
     recording: RecordingAccess, signals: AnyNames = None, robot: RobotName = None
 ) -> SignalMeaningsAnswer:
-    """Show what each signal is taken for, how that is known, and which signals are unknown."""
+    """Show what each signal is taken to mean, how that is known, and which signals are unknown.
+
+    To correct a meaning use webots_describe_signals; for values and ranges use
+    webots_list_signals.
+    """
     with recording.view(robot) as view:
         return SignalMeaningsAnswer(
             **view.header(), **_listed(view, signals, None, is_undone=False)
         )
 
 
-@question("Describe signals", CHANGES, quotes=True)
+@question("Describe signals", CHANGES, quotes=True, tier="core")
 def webots_describe_signals(
     recording: RecordingAccess,
     signals: Annotated[
         list[_Name] | None,
-        Field(
-            max_length=50, description="Names of signals; '*' stands for any text. Default: all."
-        ),
+        Field(max_length=50, description="Signals to describe; '*' means any text. Default: all."),
     ] = None,
     quantity: Annotated[
         Quantity | None, Field(description="What the signal measures or sets.")
@@ -75,11 +77,11 @@ def webots_describe_signals(
     ] = False,
     robot: RobotName = None,
 ) -> SignalMeaningsAnswer:
-    """Show what each signal is taken for and why, or declare it so that events and checks use it.
+    """Declare what signals mean, so that webots_find_events and webots_check_run can judge them.
 
-    Without a quantity, role or other field it lists the meanings. Signals of unknown meaning are
-    not judged, so declare them before you ask for checks. A declaration also applies to runs
-    recorded before, and replaces the previous one.
+    Signals of unknown meaning are never judged: declare them before you ask for checks. A
+    declaration also applies to earlier runs, and replaces the previous one. Without a quantity,
+    role or another field it lists what each signal is taken to mean and why.
     """
     said: dict[str, Any] = {
         "quantity": quantity, "role": role, "unit": unit, "target_of": target_of,

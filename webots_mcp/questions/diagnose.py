@@ -23,12 +23,13 @@ _LONGEST_TEXT: Final = 320
 _BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
 
 
-@question("Diagnose the set-up", READS, core=True)
-def webots_diagnose(recording: RecordingAccess) -> DiagnosisAnswer:
-    """When nothing comes, or time stands still: each link from Webots and controller to here.
+@question("Diagnose the set-up", READS, tier="core")
+def webots_diagnose_setup(recording: RecordingAccess) -> DiagnosisAnswer:
+    """Find out why nothing is recorded, why data is old, or why simulated time stands still.
 
-    Data folder, database, who records, what waits, why the simulation stands, which Webots run,
-    client files.
+    Tests each link from Webots and the controller to this server, and says how to fix a broken
+    one. It judges the installation, not the robot: for the robot's behaviour use
+    webots_check_run.
     """
     checked = diagnose(subject_of(recording, "how this server was started"))
     return DiagnosisAnswer(

@@ -11,8 +11,8 @@ from pydantic import Field, WithJsonSchema
 from webots_mcp.answers.models import CommandAnswer
 from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
-from webots_mcp.questions.arguments import AnyNames, Cursor, RobotName
-from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, merged, question
+from webots_mcp.questions.arguments import Cursor, RobotName
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.loop_evidence import find_holder
 from webots_mcp.store.recording import RecordingAccess, view_robot
@@ -22,8 +22,8 @@ Path = Annotated[
     str,
     Field(
         max_length=500,
-        description="ROVER.translation, BALL.children[0].appearance, WorldInfo, #12: by DEF, name "
-        "of a robot or solid, type, or number.",
+        description="Path from a DEF name, a robot's or solid's name, a type or #number: "
+        "ROVER.translation, BALL.children[0].appearance, WorldInfo.gravity.",
     ),
 ]
 _NO_SUPERVISOR: Final = (
@@ -45,42 +45,55 @@ _NONE_LIVE: Final = (
     options={"types": "--type", "names": "--name", "fields": "--field", "cursor": "--cursor"},
     example="--type 'Solid*' --field translation",
     quotes=True,
+    tier="core",
 )
 async def webots_get_scene(
     recording: RecordingAccess,
     caller: Caller,
-    path: Annotated[str | None, Field(description="Only in this node.")] = None,
+    path: Annotated[
+        str | None, Field(description="Node to list, such as ROVER. Default: the whole world.")
+    ] = None,
     depth: Annotated[
         (Annotated[int, Field(ge=1, le=24)]) | None,
-        Field(description="Levels; 2 unless types or names."),
+        Field(description="Number of levels. Default: 2, or all with types or names."),
     ] = None,
-    types: AnyNames = None,
-    names: AnyNames = None,
+    types: Annotated[
+        list[str] | None, Field(max_length=50, description="Only nodes of these types: 'Solid*'.")
+    ] = None,
+    names: Annotated[
+        list[str] | None, Field(max_length=50, description="Only nodes with these names: 'box*'.")
+    ] = None,
     fields: Annotated[
-        list[str] | None, Field(description="Shown too, such as translation.")
+        list[str] | None, Field(description="Fields to show of each node, such as translation.")
     ] = None,
     cursor: Cursor = None,
     robot: RobotName = None,
 ) -> CommandAnswer:
-    """What stands in the world now: solids, robots, joints, devices, and the paths to them.
+    """List what is in the world now: solids, robots, joints and devices, with the path of each.
 
-    With types, such as Robot or PBRAppearance, any node. Asked of a live Supervisor or observer.
+    With `types` it finds nodes of any type, such as Robot or PBRAppearance. Asks a running
+    Supervisor or observer. For all fields of one node use webots_get_field; to change one use
+    webots_set_field.
     """
     asked = {"path": path, "depth": depth, "types": types, "names": names, "fields": fields}
     return await _ask(recording, caller, robot, "get_scene", cursor=cursor, **asked)
 
 
-@question("Get a field", READS, quotes=True)
+@question("Get a field", READS, quotes=True, tier="all")
 async def webots_get_field(
     recording: RecordingAccess,
     caller: Caller,
     path: Path,
     start: Annotated[
-        (Annotated[int, Field(ge=0)]) | None, Field(description="From this entry or field on.")
+        (Annotated[int, Field(ge=0)]) | None,
+        Field(description="Number of entries or fields to skip."),
     ] = None,
     robot: RobotName = None,
 ) -> CommandAnswer:
-    """The value of a field of the scene tree now, or of a node all its fields."""
+    """Read a field of a node in the world, or all fields of a node, as they are now.
+
+    To find nodes and their paths use webots_get_scene; to change a field use webots_set_field.
+    """
     return await _ask(recording, caller, robot, "get_field", path=path, start=start)
 
 
@@ -90,43 +103,53 @@ async def webots_set_field(
     caller: Caller,
     path: Path,
     value: Annotated[
-        Any, WithJsonSchema({}), Field(description="0.5, true, a text, [0, 0, 1, 1.57].")
+        Any,
+        WithJsonSchema({}),
+        Field(description="New value: 0.5, true, a text, or a list such as [0, 0, 1, 1.57]."),
     ],
-    stop: Annotated[bool, Field(description="Take the speed of the node too.")] = False,
+    stop: Annotated[bool, Field(description="Also set the node's velocity to zero.")] = False,
     robot: RobotName = None,
 ) -> CommandAnswer:
-    """Move a robot, change a colour, a mass, friction: any field that Webots lets be set.
+    """Change a field of the world while it runs: move a robot, set a mass, a friction, a colour.
 
-    The answer has the old value, and what the field holds a step later. Recorded as an event; a
-    reset puts it back.
+    Answers with the old value and the value one step later. A reset of the world undoes it. For
+    paths use webots_get_scene; to create or remove nodes use webots_add_node and
+    webots_remove_node.
     """
     return await _ask(
         recording, caller, robot, "set_field", path=path, value=value, stop=stop or None
     )
 
 
-@question("Add a node", CHANGES)
+@question("Add a node", CHANGES, tier="all")
 async def webots_add_node(
     recording: RecordingAccess,
     caller: Caller,
     vrml: Annotated[
-        str, Field(description='As in a world file: DEF BOX Solid { name "box" children [...] }')
+        str,
+        Field(description='Node as in a world file: DEF BOX Solid { name "box" children [...] }'),
     ],
-    path: Annotated[str, Field(description="Node or field that takes it.")] = "root",
+    path: Annotated[
+        str, Field(description="Node or field to add it to. Default: the top of the world.")
+    ] = "root",
     robot: RobotName = None,
 ) -> CommandAnswer:
-    """Add a node to the children of another, or at the top; the answer has the path to it.
+    """Add a node to the world, such as an obstacle, written as in a world file.
 
-    A PROTO has to be declared in the world as IMPORTABLE EXTERNPROTO. A reset removes the node.
+    Answers with its path. A PROTO must be declared in the world as IMPORTABLE EXTERNPROTO. A
+    reset of the world removes the node.
     """
     return await _ask(recording, caller, robot, "add_node", vrml=vrml, path=path)
 
 
-@question("Remove a node", DESTROYS)
+@question("Remove a node", DESTROYS, tier="all")
 async def webots_remove_node(
     recording: RecordingAccess, caller: Caller, path: Path, robot: RobotName = None
 ) -> CommandAnswer:
-    """Remove a node with all in it; a reload of the world brings it back, a reset does not."""
+    """Remove a node and everything in it from the world.
+
+    A reload of the world brings it back, a reset does not.
+    """
     return await _ask(recording, caller, robot, "remove_node", path=path)
 
 
@@ -196,28 +219,3 @@ def _find_supervisor(recording: RecordingAccess, robot: str | None) -> str:
         for each, session in found
     ]
     return found[ranked.index(min(ranked))][0].name
-
-
-SCENE: Final = merged(
-    webots_get_scene,
-    choice="what",
-    meaning="field: the value at path, of a node all its fields.",
-    parts={"nodes": webots_get_scene, "field": webots_get_field},
-    text="""\
-What stands in the world now: solids, robots, joints, devices, and the paths to them.
-
-With types, such as Robot or PBRAppearance, any node. Asked of a live Supervisor or observer.""",
-)
-EDIT: Final = merged(
-    webots_set_field,
-    name="webots_edit_scene",
-    title="Edit the scene",
-    choice="action",
-    meaning="set: path, value; add: vrml, path; remove: path.",
-    parts={"set": webots_set_field, "add": webots_add_node, "remove": webots_remove_node},
-    text="""\
-Set a field (a place, colour, mass, friction), add a node, or remove one with all in it.
-
-Answers with the old value and what the field holds a step later, or the new node's path. A reset
-undoes it, a removal if the answer says so. A PROTO has to be an IMPORTABLE EXTERNPROTO.""",
-)

@@ -28,7 +28,7 @@ from webots_mcp.questions.arguments import (
     TextCursor,
     TimeOfDay,
 )
-from webots_mcp.questions.declaring import READS, merged, question
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
@@ -49,13 +49,13 @@ Kind = Annotated[
 Kinds = Annotated[
     list[Kind] | None,
     Field(
-        description="All but image by default. "
+        description="Kinds of events. Default: all but image. "
         f"{'; '.join(f'{kind.name}: {kind.means}' for kind in KINDS if kind.means)}."
     ),
 ]
 TimelineKinds = Annotated[
     list[Annotated[str, AfterValidator(_as_kind)]] | None,
-    Field(description="Of those of webots_find_events; by default all that were stored."),
+    Field(description="Kinds, as of webots_find_events. Default: all that are recorded."),
 ]
 
 
@@ -64,9 +64,9 @@ TimelineKinds = Annotated[
     READS,
     command="events",
     options={"group": "--one-by-one", "cursor": "--after", "missing_s": "--missing"},
-    core=True,
     example="--where 'front_m < 0.1 for 0.5' --last 60",
     quotes=True,
+    tier="core",
 )
 def webots_find_events(
     recording: RecordingAccess,
@@ -76,31 +76,32 @@ def webots_find_events(
         str | None,
         Field(
             max_length=500,
-            description="Each stretch in which a condition held, as in webots_breakpoint.",
+            description="Find when this condition held: front_m < 0.1; see webots_breakpoint.",
         ),
     ] = None,
     signals: AnyNames = None,
     stuck_s: Annotated[
-        float, Field(gt=0, description="Still: at least so long ...")
+        float, Field(gt=0, description="Seconds a robot must stand to count as standing still.")
     ] = EventOptions.stuck_s,
     stuck_m: Annotated[
-        float, Field(gt=0, description="... within this many metres.")
+        float, Field(gt=0, description="Metres it may move meanwhile.")
     ] = EventOptions.stuck_m,
     missing_s: Annotated[
-        float, Field(gt=0, description="Missing: no value for so long.")
+        float, Field(gt=0, description="Seconds without a value that count as missing.")
     ] = EventOptions.missing_s,
     position: Position = None,
     mode: Mode = None,
     log_level: LogLevel = "warning",
-    group: Annotated[bool, Field(description="Tell many alike events as one.")] = True,
+    group: Annotated[bool, Field(description="Combine similar events into one row.")] = True,
     limit: ShownLimit = None,
     cursor: TextCursor = "",
     time_of_day: TimeOfDay = False,
 ) -> EventsAnswer:
-    """What went wrong, since when, how often: searches the values, by default of the whole run.
+    """Find what went wrong, since when and how often: stuck, falls, sensor faults and more.
 
-    verdicts: what was found, what was not, what was not looked for and why. What is not shown is
-    counted; the next are seen with cursor.
+    Searches the values of the whole run unless a time range is given. `verdicts` says of each
+    kind whether it was found, not found, or not searched and why. For a verdict on the whole run
+    use webots_check_run; for what was noted in order of time use webots_get_timeline.
     """
     if kinds and where is not None and "condition" not in kinds:
         raise InvalidInputError(
@@ -161,7 +162,7 @@ def _found(
 # -- what was noted, in order, page by page --
 
 
-@question("Get the timeline", READS, quotes=True)
+@question("Get the timeline", READS, quotes=True, tier="all")
 def webots_get_timeline(
     recording: RecordingAccess,
     scope: Scope,
@@ -171,10 +172,9 @@ def webots_get_timeline(
     cursor: TextCursor = "",
     time_of_day: TimeOfDay = False,
 ) -> TimelineAnswer:
-    """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
+    """List in order of time what was noted: mode changes, commands, log lines, pictures.
 
-    A log of what was noted, from the start of the run on. To search for what went wrong, also what
-    nobody noted: webots_find_events.
+    It does not search the values: for faults that nobody noted use webots_find_events.
     """
     options = EventOptions(kinds=tuple(kinds or stored_kinds()), log_level=log_level)
     with recording.view(scope.robot, scope.run_id) as view:
@@ -210,15 +210,3 @@ def _timeline(
         "notes": notes_of(page.notes),
         "hint": "nothing after that cursor" if cursor and not events else None,
     }
-
-
-EVENTS: Final = merged(
-    webots_find_events,
-    choice="what",
-    meaning="timeline: all that was noted, in order.",
-    parts={"events": webots_find_events, "timeline": webots_get_timeline},
-    text="""\
-What went wrong, since when, how often: searches the values, by default of the whole run.
-
-verdicts: what was found, what was not, what was not looked for and why. cursor shows more.""",
-)

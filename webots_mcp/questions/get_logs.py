@@ -50,16 +50,20 @@ _NO_RUN_YET: Final = (
     READS,
     command="logs",
     options={"lines": "-n", "filter_text": "--text", "cursor": "--before"},
-    core=True,
     quotes=True,
     follows="lines",
+    tier="core",
 )
 def webots_get_logs(
     recording: RecordingAccess,
-    lines: Annotated[int, Field(ge=1, le=1000, description="The most lines.")] = 50,
-    filter_text: Annotated[str, Field(max_length=200, description="In the line.")] = "",
-    level: Annotated[LogLevel | None, Field(description="From this level.")] = None,
-    source: Annotated[LogSource | None, Field(description="Only its lines.")] = None,
+    lines: Annotated[int, Field(ge=1, le=1000, description="Maximum number of lines.")] = 50,
+    filter_text: Annotated[
+        str, Field(max_length=200, description="Only lines that contain this text.")
+    ] = "",
+    level: Annotated[
+        LogLevel | None, Field(description="Only lines of at least this level.")
+    ] = None,
+    source: Annotated[LogSource | None, Field(description="Only lines from this source.")] = None,
     last_s: LastS = None,
     start_s: StartS = None,
     end_s: EndS = None,
@@ -68,11 +72,11 @@ def webots_get_logs(
     run_id: RunId = None,
     time_of_day: TimeOfDay = False,
 ) -> LogsAnswer:
-    """The newest log lines, oldest first, each with its run.
+    """Read what the controller printed and logged: the newest lines, oldest first.
 
-    Of all runs; with run_id or a range of time of that run, or the current one. A line begins with
-    its source, unless that is the controller: 'bridge:', 'webots:', 'console:' (printed by a
-    controller, Webots does not tell which), '[name of the logger]'.
+    Covers all runs unless run_id or a time range is given. A line begins with its source unless
+    that is the controller: 'bridge:', 'webots:', 'console:' (printed by some controller of the
+    world) or '[logger name]'. For problems in the robot's behaviour use webots_find_events.
     """
     scope = Scope(robot=robot, run_id=run_id, last_s=last_s, start_s=start_s, end_s=end_s)
     lowest = level or "debug"

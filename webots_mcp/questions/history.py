@@ -48,8 +48,7 @@ from webots_mcp.questions.arguments import (
     RunId,
     ShownLimit,
 )
-from webots_mcp.questions.declaring import READS, merged, question
-from webots_mcp.questions.describe_signals import webots_list_meanings
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
@@ -96,17 +95,18 @@ _SIZES: Final = HistorySizes()
 def webots_list_signals(
     recording: RecordingAccess,
     pattern: Annotated[
-        str, Field(max_length=200, description="Of signals; '*' is any text.")
+        str, Field(max_length=200, description="Only signals with this name; '*' means any text.")
     ] = "*",
     limit: Limit = 100,
     cursor: Cursor = None,
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> SignalsAnswer:
-    """The dotted names of all that was published in a run: kind, last value, range, missing values.
+    """List the signals of a run with last value, range and what each is taken to mean.
 
-    `meaning` is what each signal is taken for, `source` how that is known; webots_describe_signals
-    corrects it. Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
+    Use it to find the names of signals. To see why a meaning is assumed, or to correct it, use
+    webots_describe_signals. Arrays of more than 16 items are recorded as .count, .min, .max,
+    .mean and .argmin.
     """
     with recording.view(robot, run_id) as view:
         return answer_about(view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0))
@@ -178,7 +178,6 @@ def _hint(start: int, end: int, total: int) -> str | None:
     command="history",
     positional=("signals",),
     options={"signals": "SIGNAL", "max_points": "--points"},
-    core=True,
     example="pose.x 'front*' --last 10",
     quotes=True,
 )
@@ -187,13 +186,16 @@ def webots_query_history(
     scope: Scope,
     signals: Names,
     max_points: MaxPoints = None,
-    raw: Annotated[bool, Field(description="Exact rows in pages, no buckets.")] = False,
+    raw: Annotated[
+        bool, Field(description="Return exact rows, in pages, instead of intervals.")
+    ] = False,
     cursor: Cursor = None,
 ) -> HistoryAnswer:
-    """The values of signals over time: min, max, mean, last per bucket, by default the whole run.
+    """Read the numbers of signals over time: minimum, maximum, mean and last value per interval.
 
-    No extreme is averaged away; empty buckets are null. Text and flags come as the points at which
-    they changed. webots_get_trends first: in words, which signals matter.
+    Covers the whole run unless a time range is given. Texts and flags are listed at the times at
+    which they changed. For a description in words use webots_get_trends; for a picture use
+    webots_plot.
     """
     if cursor is not None and not raw:
         raise InvalidInputError("only rows go on with cursor: ask for them with raw=true")
@@ -411,8 +413,8 @@ def _row_columns(page: StatePage, rows: int, view: RobotView) -> RowColumns:
     command="trends",
     positional=("signals",),
     options={"signals": "SIGNAL"},
-    core=True,
     quotes=True,
+    tier="core",
 )
 def webots_get_trends(
     recording: RecordingAccess,
@@ -420,10 +422,11 @@ def webots_get_trends(
     signals: AnyNames = None,
     limit: ShownLimit = None,
 ) -> TrendsAnswer:
-    """What each signal did, in words, by default over the whole run; values: webots_query_history.
+    """Describe in words what each signal did: rises, falls, oscillates, constant since when.
 
-    What changed most comes first: rises, falls, swings (period, amplitude), rests since when,
-    spikes, missing values; of modes and flags the time in each value.
+    Signals that changed most come first; modes and flags are given with the time spent in each
+    value. Covers the whole run unless a time range is given. For numbers over time use
+    webots_query_history; for what went wrong use webots_find_events.
     """
     with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(
@@ -455,19 +458,3 @@ def _hint_of_trends(runs: Sequence[RunTrendTables]) -> str | None:
         if any(run.not_shown for run in runs)
         else None
     )
-
-
-TRENDS: Final = merged(
-    webots_get_trends,
-    choice="what",
-    meaning="signals: names, last values, ranges, meanings; meanings: what each is taken for, why.",
-    parts={
-        "trends": webots_get_trends,
-        "signals": webots_list_signals,
-        "meanings": webots_list_meanings,
-    },
-    text="""\
-What each signal did, in words: shape, slope, when its least and greatest; what matters first.
-
-Of any length. Numbers over time: webots_query_history.""",
-)

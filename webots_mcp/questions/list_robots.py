@@ -94,11 +94,12 @@ class RobotListSizes:
 _SIZES: Final = RobotListSizes()
 
 
-@question("List the robots", READS, command="status", core=True)
+@question("List the robots", READS, command="status", tier="core")
 def webots_list_robots(recording: RecordingAccess) -> RobotsAnswer:
-    """Every robot ever recorded: whether it is live, whether its time moves, its current run.
+    """List every robot recorded here: whether it is live, whether its time advances, its run.
 
-    `actions` counts its own commands; webots_list_commands describes them.
+    Start here to learn the robots' names. For the values of one robot use webots_get_robot_state;
+    if a robot is missing or silent use webots_diagnose_setup.
     """
     told = is_for_a_person()
     with recording.reader() as connection:
@@ -131,10 +132,10 @@ def _hint_of_robots(
 def webots_get_world_info(
     recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> WorldAnswer:
-    """The world file, its time step, the run and its pace, the controller's code, other robots.
+    """Show which world is simulated: its file, time step, speed, controller file and robots.
 
-    With an observer (webots-mcp init --observer) where all robots are. Also where the recording
-    lies.
+    With an observer in the world (webots-mcp init --observer) it also gives where all robots are.
+    For the objects in the world use webots_get_scene.
     """
     with recording.view(robot, run_id) as view:
         run = view.require_run()

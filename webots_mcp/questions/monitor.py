@@ -53,7 +53,7 @@ class MonitorSizes:
 
     signals: int = 12
     events: int = 30
-    rows_tokens: int = 1_300
+    rows_tokens: int = 1_200
     events_share: float = 0.45
     runs: int = 2
 
@@ -61,26 +61,28 @@ class MonitorSizes:
 _SIZES: Final = MonitorSizes()
 
 
-@question("Watch the robot", READS, core=True, quotes=True)
+@question("Watch the robot", READS, quotes=True)
 async def webots_monitor(
     recording: RecordingAccess,
     caller: Caller,
-    duration_wall_s: Annotated[_WatchS, Field(description="To watch; 10.")] = None,
+    duration_wall_s: Annotated[
+        _WatchS, Field(description="Wall-clock seconds to watch. Default 10.")
+    ] = None,
     lookback_wall_s: Annotated[
         float | None,
         Field(
             gt=0,
             le=86_400,
-            description="Instead: the last wall seconds, at once.",
+            description="Report the last N wall-clock seconds at once instead.",
         ),
     ] = None,
     duration: SkipJsonSchema[_WatchS] = None,
     robot: RobotName = None,
 ) -> MonitorAnswer:
-    """What does it do now? Watch it live for some seconds of wall time, then report.
+    """Watch the robot live for some seconds, then report its movement, trends and events.
 
-    Movement, trends and events of that window. Of longer ago: webots_get_trends and
-    webots_find_events.
+    Use it for "what is it doing right now?". For recorded time use webots_get_trends and
+    webots_find_events, which answer at once.
     """
     asked = {
         "duration": duration,

@@ -25,12 +25,9 @@ from webots_mcp.answers.models import (
 from webots_mcp.answers.shortening import WHOLE, shorten
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import RobotName, RunId, TimeoutS, Value
-from webots_mcp.questions.breakpoints import webots_list_breakpoints
-from webots_mcp.questions.declaring import READS, SETS, Caller, merged, question
+from webots_mcp.questions.declaring import READS, SETS, Caller, question
 from webots_mcp.questions.send_command import (
     NO_BRIDGE,
-    webots_list_commands,
-    webots_wait_for_command,
 )
 from webots_mcp.signals.naming import nearest_first
 from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
@@ -92,15 +89,16 @@ def _none(view: RobotView) -> str:
 def webots_get_parameters(
     recording: RecordingAccess,
     names: Annotated[
-        list[str] | None, Field(max_length=50, description="Of parameters; '*' is any text.")
+        list[str] | None,
+        Field(max_length=50, description="Only these parameters; '*' means any text."),
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> ParametersAnswer:
-    """What can be tuned while the controller runs: each parameter with value, bounds and setter.
+    """List what can be tuned while the controller runs: each parameter with value and bounds.
 
-    `since_s` is the simulation time from which on it has the value, `next` what it will have from
-    the next reset on. Of an earlier run: its last values.
+    `since_s` is the simulated time since which it has its value; `next` is the value from the
+    next reset on. To change parameters use webots_set_parameters.
     """
     with recording.view(robot, run_id) as view:
         rows = _shown_rows(view, names)
@@ -114,22 +112,26 @@ def webots_get_parameters(
         )
 
 
-@question("Set parameters", SETS, core=True, of_controller="values")
+@question("Set parameters", SETS, of_controller="values", tier="core")
 async def webots_set_parameters(
     recording: RecordingAccess,
     values: Annotated[
         dict[str, Value],
-        Field(min_length=1, max_length=MOST_PARAMETERS, description='{"kp": 3.0, "gait": "trot"}'),
+        Field(
+            min_length=1,
+            max_length=MOST_PARAMETERS,
+            description='Parameters with new values: {"kp": 3.0, "gait": "trot"}.',
+        ),
     ],
     caller: Caller,
-    when: Annotated[When, Field(description="reset: from the next one on.")] = "now",
+    when: Annotated[When, Field(description="Apply at once, or from the next reset on.")] = "now",
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = SET_WAIT_S,
 ) -> CommandAnswer:
-    """Set parameters of a running controller, all or none, between two rounds of its loop.
+    """Set parameters of the running controller, all or none, between two steps of its loop.
 
-    Answers with old and new values and from which simulation time on. A reset keeps them; a reload
-    begins with those in the code.
+    Answers with old and new values. A reset keeps them; a reload starts with the values in the
+    code. To find the best values use webots_run_trials.
     """
     return await set_parameters(
         recording, caller.report, values, when=when, robot=robot, timeout_s=timeout_wall_s
@@ -167,19 +169,3 @@ def _meant(patterns: list[str] | None, known: list[str]) -> set[str]:
             raise InvalidInputError(f"no parameter {pattern!r:.80}; the nearest are: {near}")
         meant |= found
     return meant
-
-
-COMMANDS: Final = merged(
-    webots_list_commands,
-    choice="what",
-    meaning="outcome: waits for command_id; parameters: what can be tuned, values and bounds; "
-    "breakpoints: and their hits.",
-    parts={
-        "commands": webots_list_commands,
-        "outcome": webots_wait_for_command,
-        "parameters": webots_get_parameters,
-        "breakpoints": webots_list_breakpoints,
-    },
-    text="""\
-The controller's own actions with their docstrings, and what became of the newest commands.""",
-)

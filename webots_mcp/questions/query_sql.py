@@ -76,20 +76,23 @@ _SIZES: Final = QuerySizes()
     options={"sql": "STATEMENT"},
     example='"SELECT sim_time_s, data FROM state ORDER BY id DESC LIMIT 5"',
     quotes=True,
+    tier="all",
 )
 async def webots_query_sql(
     recording: RecordingAccess,
-    sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
+    sql: Annotated[
+        str, Field(min_length=1, max_length=10_000, description="One SELECT statement of SQLite.")
+    ],
     limit: ShownLimit = None,
 ) -> SqlAnswer:
-    """Read by SQL (SQLite) what the others do not cover.
+    """Read the database with one SELECT statement (SQLite), for what no other tool answers.
 
-    Tables: robot, session, run(id, robot_id, session_id, row_count, label,
-    last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),
-    log, event, command, image. Views: robot_now, robot_run, robot_trajectory, robot_statistics(
-    run_id, signal, start_s, end_s, min, max, mean of 1,024 rows), robot_period, robot_event,
-    robot_log, robot_command. Indexed by run_id and sim_time_s. Values:
-    json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
+    Tables: robot, session, run(id, robot_id, session_id, row_count, label, last_sim_time_s),
+    state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path), log, event, command,
+    image. Views: robot_now, robot_run, robot_trajectory, robot_statistics(run_id, signal,
+    start_s, end_s, min, max, mean of 1,024 rows), robot_period, robot_event, robot_log,
+    robot_command. Indexed by run_id and sim_time_s. Values: json_extract(data, '$.pose[0]'). All
+    columns: the resource webots://schema.
     """
     max_bytes = _SIZES.values_bytes if limit is None else _SIZES.large_values_bytes
     most_columns = _SIZES.columns

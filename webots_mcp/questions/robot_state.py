@@ -56,10 +56,12 @@ from webots_mcp.store.sessions import fetch_session
 
 PagePath = Annotated[
     str,
-    Field(max_length=1000, description="Dotted path, as sensors.lidar."),
+    Field(max_length=1000, description="Dotted path of the part to read, such as sensors.lidar."),
 ]
-Offset = Annotated[int, Field(ge=0, description="First member, item or character at the path.")]
-PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up to 10,000 tokens.")]
+Offset = Annotated[int, Field(ge=0, description="Number of members, items or characters to skip.")]
+PageSize = Annotated[
+    int | None, Field(ge=1, le=2000, description="Maximum number of members, items or characters.")
+]
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,14 @@ class StateSizes:
 _SIZES: Final = StateSizes()
 
 
-@question("Get the robot's state", READS, core=True, quotes=True)
+@question("Get the robot's state", READS, quotes=True, tier="core")
 def webots_get_robot_state(
     recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
-    """The robot now, at a glance: its newest published state, rounded, long arrays summed up.
+    """Show what the robot does now: its newest published values, rounded, arrays summarised.
 
-    webots_get_full_state has a part of it whole and exact.
+    For exact values or whole arrays use webots_get_full_state; for the past use
+    webots_get_trends.
     """
     with recording.view(robot, run_id) as view:
         if view.state is None:
@@ -120,7 +123,11 @@ def webots_get_robot_state(
 def webots_get_sensors(
     recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> SensorsAnswer:
-    """The newest sensor values: members of the state named after a sensor device or like one."""
+    """Show the newest readings of the robot's sensors only.
+
+    For everything the robot published use webots_get_robot_state; for readings over time use
+    webots_query_history.
+    """
     with recording.view(robot, run_id) as view:
         if view.state is None:
             return SensorsAnswer(**view.header(), hint=_nothing_yet(view))
@@ -141,7 +148,7 @@ def webots_get_sensors(
         )
 
 
-@question("Get the full state", READS, core=True, quotes=True)
+@question("Get the full state", READS, quotes=True)
 def webots_get_full_state(
     recording: RecordingAccess,
     path: PagePath = "",
@@ -150,9 +157,10 @@ def webots_get_full_state(
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> FullStateAnswer:
-    """A part of the newest state, whole and exact, in pages: what webots_get_robot_state shortens.
+    """Read the newest state exactly and completely, in pages, such as all values of a lidar.
 
-    Without a path also the newest events and the recorder's health.
+    Without a path it also lists the newest events and the recorder's own errors. For an overview
+    use webots_get_robot_state.
     """
     with recording.view(robot, run_id) as view:
         if view.state is None:

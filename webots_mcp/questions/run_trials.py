@@ -31,8 +31,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
-from webots_mcp.questions.compare_runs import webots_list_runs
-from webots_mcp.questions.declaring import DESTROYS, READS, Caller, merged, question
+from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
 from webots_mcp.questions.parameters import settable
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.parameter import require_known
@@ -128,35 +127,47 @@ async def webots_run_trials(
     recording: RecordingAccess,
     caller: Caller,
     parameters: Annotated[
-        Tried, Field(description='Sets, [{"kp": 1.0}], or a grid, {"kp": [1.0, 2.0]}.')
+        Tried, Field(description='Values to try: sets [{"kp": 1.0}] or a grid {"kp": [1.0, 2.0]}.')
     ] = None,
     score: Annotated[
         str | None,
         Field(
             max_length=500,
-            description="Over a run: max(x) - 2 * count(stuck); min, mean, first, last, "
-            "time(condition), duration.",
+            description="Formula over a run: max(x) - 2 * count(stuck). Also min, mean, first, "
+            "last, time(condition), duration.",
         ),
     ] = None,
-    best: Annotated[Best, Field(description="Which score.")] = "highest",
+    best: Annotated[Best, Field(description="Which score is best.")] = "highest",
     for_s: Annotated[
-        float | None, Field(gt=0, le=MAX_RUN_S, description="Simulated seconds each.")
+        float | None, Field(gt=0, le=MAX_RUN_S, description="Simulated seconds of each trial.")
     ] = None,
-    until: Annotated[str | None, Field(max_length=500, description="Or when this holds.")] = None,
+    until: Annotated[
+        str | None,
+        Field(
+            max_length=500, description="Condition that ends a trial earlier, such as goal_m < 0.1."
+        ),
+    ] = None,
     prune: Annotated[
-        str | None, Field(max_length=500, description="Or, unscored, when this holds.")
+        str | None,
+        Field(
+            max_length=500,
+            description="Condition that ends a trial without a score, such as fallen.",
+        ),
     ] = None,
-    repeats: Annotated[int, Field(ge=1, le=1000, description="Of each set.")] = 1,
-    trial_timeout_wall_s: Annotated[float, Field(gt=0, description="At most.")] = _SIZES.trial_s,
+    repeats: Annotated[int, Field(ge=1, le=1000, description="Number of trials of each set.")] = 1,
+    trial_timeout_wall_s: Annotated[
+        float, Field(gt=0, description="Maximum wall-clock seconds of a trial.")
+    ] = _SIZES.trial_s,
     trial_set: TrialSetId = None,
-    cancel: Annotated[bool, Field(description="Stop it after this trial.")] = False,
+    cancel: Annotated[bool, Field(description="Stop the set after the current trial.")] = False,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _SIZES.wait_s,
 ) -> TrialsAnswer:
-    """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
+    """Find the best parameters: each trial resets the world, sets them, runs fast and is scored.
 
-    After timeout_wall_s they go on: trial_set alone waits on, or resumes. At the end parameters are
-    set back.
+    If timeout_wall_s is over first, the trials go on: call again with trial_set alone to wait or
+    resume. At the end the former parameters are set again. To change parameters once use
+    webots_set_parameters.
     """
     given = parameters is not None or score is not None
     if (trial_set is None) != given:
@@ -184,9 +195,13 @@ async def webots_run_trials(
     return TrialsAnswer(**await to_thread.run_sync(set_facts, recording, number))
 
 
-@question("Get trials", READS, quotes=True)
+@question("Get trials", READS, quotes=True, tier="all")
 def webots_get_trials(recording: RecordingAccess, trial_set: TrialSetId = None) -> TrialsAnswer:
-    """How far trials are, also those from a shell; the parameters, ranked by score."""
+    """Show how far a set of trials is, with its parameters ranked by score.
+
+    Includes trials that were started from a shell. To wait for them use webots_run_trials with
+    trial_set.
+    """
     return TrialsAnswer(**set_facts(recording, trial_set))
 
 
@@ -252,7 +267,7 @@ def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, can
         at_work = is_at_work(connection, found)
     if found.robot_id is None and not at_work:
         raise InvalidInputError(
-            f'trial set {set_id} {_goes_on(found)}; webots_list_runs(what="trials", '
+            f"trial set {set_id} {_goes_on(found)}; webots_get_trials("
             f"trial_set={set_id}) has its trials"
         )
     if cancel:
@@ -408,16 +423,3 @@ def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]
         why and cut_text(why, _SIZES.why_characters),
         list(runs[: _SIZES.runs]),
     ]
-
-
-RUNS: Final = merged(
-    webots_list_runs,
-    choice="what",
-    meaning="trials: how far a trial_set is, its parameters ranked by score.",
-    parts={"runs": webots_list_runs, "trials": webots_get_trials},
-    text="""\
-Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
-
-`notable` counts warnings, errors, dropped rows, failed
-commands; `parameters` are those that differ.""",
-)

@@ -70,23 +70,31 @@ _SIZES: Final = CommandListSizes()
     positional=("action", "params"),
     options={"params": "NAME=VALUE"},
     example="go_to x=1.5 y=-0.5",
-    core=True,
     quotes=True,
     of_controller="params",
+    tier="core",
 )
 async def webots_send_command(
     recording: RecordingAccess,
     action: Annotated[
-        str, Field(min_length=1, max_length=200, description="As in webots_list_commands.")
+        str,
+        Field(
+            min_length=1,
+            max_length=200,
+            description="Name of the action, from webots_list_commands.",
+        ),
     ],
     caller: Caller,
-    params: Annotated[dict[str, Any] | None, Field(description="As its docstring says.")] = None,
+    params: Annotated[
+        dict[str, Any] | None, Field(description="Arguments of the action, such as {'x': 1.5}.")
+    ] = None,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Have the controller run one of its own actions, at most once, and wait for its answer.
 
-    webots_list_commands lists them.
+    webots_list_commands lists the actions. For tunable values use webots_set_parameters; to
+    pause, step or reset use webots_simulation_control.
     """
     dispatcher = Dispatcher(recording, caller.report)
     return await dispatcher.ask(robot, action, timeout_wall_s, params)
@@ -99,26 +107,38 @@ async def webots_send_command(
     positional=("command_id",),
     options={"command_id": "COMMAND"},
     quotes=True,
+    tier="all",
 )
 async def webots_wait_for_command(
     recording: RecordingAccess,
-    command_id: Annotated[Id, Field(description="From its answer.")],
+    command_id: Annotated[
+        Id, Field(description="Command to wait for, from the answer to its call.")
+    ],
     caller: Caller,
     timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
-    """Go on waiting for a command that was still under way when its call was answered."""
+    """Wait for the outcome of a command that was still running when its call was answered.
+
+    Never send such a command again: it would run twice. For all commands use
+    webots_list_commands.
+    """
     return await Dispatcher(recording, caller.report).wait(command_id, timeout_wall_s)
 
 
-@question("List the commands", READS, command="commands", core=True, quotes=True)
+@question("List the commands", READS, command="commands", quotes=True)
 def webots_list_commands(
     recording: RecordingAccess,
-    limit: Annotated[int, Field(ge=1, le=200, description="Most shown.")] = 10,
-    status: Annotated[CommandStatus | None, Field(description="Only those.")] = None,
+    limit: Annotated[int, Field(ge=1, le=200, description="Maximum number of commands.")] = 10,
+    status: Annotated[
+        CommandStatus | None, Field(description="Only commands with this status.")
+    ] = None,
     cursor: Cursor = None,
     robot: RobotName = None,
 ) -> CommandsAnswer:
-    """The robot's actions with their docstrings, and its newest commands with their outcome."""
+    """List the controller's own actions, and the newest commands with their outcome.
+
+    To run an action use webots_send_command; for tunable values use webots_get_parameters.
+    """
     with recording.view(robot) as view:
         recording.settle()
         commands = list_commands(

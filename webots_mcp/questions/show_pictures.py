@@ -21,13 +21,12 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPE
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
 from webots_mcp.questions.arguments import (
-    AnyNames,
+    Id,
     RobotName,
     RunId,
     RunIds,
     Seconds,
     TimeoutS,
-    TrialSetId,
 )
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
@@ -70,20 +69,30 @@ class PictureLimits:
 _LIMITS: Final = PictureLimits()
 
 
-@question("Get the camera picture", READS, core=True)
+@question("Get the camera picture", READS)
 async def webots_get_camera(
     recording: RecordingAccess,
     caller: Caller,
-    camera: Annotated[str, Field(max_length=200, description="Device; '' is any.")] = "",
+    camera: Annotated[
+        str, Field(max_length=200, description="Name of the camera. Default: any.")
+    ] = "",
     fresh: Annotated[
-        bool, Field(description="Ingested now, of lidars and range finders too.")
+        bool, Field(description="Take a new picture now; also of lidars and range finders.")
     ] = False,
-    at_s: Annotated[Seconds | None, Field(description="Nearest to this simulation time.")] = None,
-    frames: Annotated[int, Field(ge=1, le=16, description="This many, in one picture.")] = 1,
+    at_s: Annotated[
+        Seconds | None,
+        Field(description="Show the picture nearest to this simulated time in seconds."),
+    ] = None,
+    frames: Annotated[
+        int, Field(ge=1, le=16, description="Number of pictures around that time, on one sheet.")
+    ] = 1,
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> list[str | ShownPicture]:
-    """The newest camera frame, or those kept around a hit, with time and age."""
+    """Show a picture of the robot's own camera: the newest, a new one, or those around a moment.
+
+    For the view of the whole simulation use webots_take_screenshot.
+    """
     if not fresh:
         past = partial(_show_recorded, recording, camera, at_s, frames, robot, run_id)
         return await to_thread.run_sync(past)
@@ -160,15 +169,20 @@ def _sheet(
     }
 
 
-@question("Take a screenshot", CHANGES)
+@question("Take a screenshot", CHANGES, tier="core")
 async def webots_take_screenshot(
     recording: RecordingAccess,
     caller: Caller,
-    quality: Annotated[int, Field(ge=1, le=100, description="Of the file.")] = 90,
+    quality: Annotated[
+        int, Field(ge=1, le=100, description="Quality of the JPEG from 1 to 100.")
+    ] = 90,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _LIMITS.wait_s,
 ) -> list[str | ShownPicture]:
-    """The simulation's main view, now, within 1,000 pixels; needs a Supervisor."""
+    """Take a screenshot of the simulation's 3D view as it is now, at most 1,000 pixels wide.
+
+    Needs a robot that is a Supervisor. For the robot's own camera use webots_get_camera.
+    """
     dispatcher = Dispatcher(recording, caller.report)
     answer = await dispatcher.ask(robot, "screenshot", timeout_wall_s, {"quality": quality})
     return await to_thread.run_sync(_show, recording, answer)
@@ -260,26 +274,36 @@ def _attach(
 # -- plots -----------------------------------------------------------------------------------------
 
 
-@question("Plot", READS)
+@question("Plot", READS, tier="core")
 def webots_plot(
     recording: RecordingAccess,
     scope: Scope,
-    kind: Annotated[PlotKind, Field(description="trajectory: the way from above.")] = "signals",
-    signals: AnyNames = None,
+    kind: Annotated[
+        PlotKind, Field(description="signals: curves over time. trajectory: the path from above.")
+    ] = "signals",
+    signals: Annotated[
+        list[str] | None,
+        Field(
+            max_length=50,
+            description="Signals to draw; '*' means any text. Default: those that changed most.",
+        ),
+    ] = None,
     run_ids: RunIds = None,
-    trial_set: TrialSetId = None,
+    trial_set: Annotated[
+        Id | None,
+        Field(description="Draw the scores of this set of trials over one or two parameters."),
+    ] = None,
     width_px: Annotated[
-        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Pixels.")
+        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Width of the picture in pixels.")
     ] = WIDTH_PX,
     height_px: Annotated[
-        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Pixels.")
+        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Height of the picture in pixels.")
     ] = HEIGHT_PX,
 ) -> list[str | ShownPicture]:
-    """A picture of signals over time (mean, min-max band, modes, events), way, or trials.
+    """Draw signals over time, or the robot's path seen from above, as a picture.
 
-    Without signals those that changed most; a trajectory finds the position, or takes two signals.
-    Several run_ids are laid over each other. trial_set: scores over one or two parameters, as
-    signals.
+    Several run_ids are drawn over each other. For the numbers behind the curves use
+    webots_query_history; for a description in words use webots_get_trends.
     """
     draw = partial(plot, kind=kind, signals=signals or (), width_px=width_px, height_px=height_px)
     if trial_set is not None:  # which may be of a robot that is gone

@@ -144,7 +144,7 @@ def _hint(view: RobotView, command: QueuedCommand) -> str | None:
         why = f"{block.why}: {block.fix}" if block else "the controller is still running it"
         return (
             f"{why}; keep waiting with "
-            f'webots_list_commands(what="outcome", command_id={command.id}); do not send it again'
+            f"webots_wait_for_command(command_id={command.id}); do not send it again"
         )
     if command.status == "lost":
         return _hint_after_loss(view)

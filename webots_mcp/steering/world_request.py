@@ -183,7 +183,7 @@ class WorldRequest(Request):
             answer.evidence = evidence
             answer.hint = (
                 "no controller has recorded in it yet: its robots may have no bridge, or the "
-                "simulation is paused; check webots_get_logs and webots_diagnose"
+                "simulation is paused; check webots_get_logs and webots_diagnose_setup"
             )
         else:
             answer = answer.model_copy(update=await to_thread.run_sync(self._header, begun.robot))

@@ -392,11 +392,11 @@ async def test_a_server_that_began_before_the_database_answers_what_was_just_pub
             ("webots_send_command", {"action": "dance"}),
             ("webots_list_commands", {}),
             ("webots_list_commands", {"what": "parameters"}),
-            ("webots_diagnose", {}),
+            ("webots_diagnose_setup", {}),
         ):  # nothing waits for it, and nothing advises what C cannot do
             said = str((await client.call_tool(name, arguments)).content)
             assert "get_command()" not in said and "bridge.parameter" not in said
-            assert "no bridge" in said or name == "webots_diagnose"
+            assert "no bridge" in said or name == "webots_diagnose_setup"
         process.kill()
         process.communicate()
         while journal_parts(

@@ -116,7 +116,7 @@ async def test_the_timeline_and_the_lane_of_commands_say_who_asked_and_what_was_
         await ask(client, "webots_set_parameters", values={"kp": 3})
         allow(project, "[allow]\nactions = []\n")
         await fail(client, "webots_simulation_control", command="pause")
-        found = await ask(client, "webots_find_events", what="timeline", kinds=["command"])
+        found = await ask(client, "webots_get_timeline", kinds=["command"])
         report = await ask(client, "webots_report")
     assert "line 2: actions = []" in Path(report["file"]).read_text("utf-8")
     told = json.dumps(found)

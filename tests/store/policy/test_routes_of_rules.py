@@ -77,7 +77,7 @@ def page(do: Callable[[RecordingAccess], dict[str, Any]]) -> Route:
 def routes_to(action: str, world: Path) -> list[Route]:
     """All of them that there are to an action."""
     params = PARAMS.get(action, {})
-    merged = {
+    former = {
         "set_field": ("webots_edit_scene", {"action": "set"}),
         "add_node": ("webots_edit_scene", {"action": "add"}),
         "remove_node": ("webots_edit_scene", {"action": "remove"}),
@@ -121,8 +121,8 @@ def routes_to(action: str, world: Path) -> list[Route]:
         found.append(tool("webots_simulation_control", command=action))
     if action in ORDERS:
         found.append(page(lambda recording: steer(recording, "rover", action)))  # type: ignore[arg-type]
-    if action in merged:
-        name, choice = merged[action]
+    if action in former:
+        name, choice = former[action]
         found += [tool(f"webots_{action}", **params), tool(name, **choice, **params)]
     if action != LAUNCH:
         typed = [f"{name}={json.dumps(value)}" for name, value in params.items()]

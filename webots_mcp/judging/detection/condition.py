@@ -222,7 +222,7 @@ def _require_values(condition: Condition, frame: Frame, position: tuple[str, str
 
 CONDITION: Final = EventKind(
     "condition",
-    "see where",
+    "`where` holds",
     condition_events,
     usual=lambda options: options.where is not None,
     lasts=True,
@@ -784,7 +784,7 @@ def violation_events(search: Search) -> Iterator[Event]:
 
 VIOLATIONS: Final = EventKind(
     VIOLATION,
-    "of what is expected",
+    "an expectation does not hold",
     violation_events,
     lasts=True,
     drawn=1,

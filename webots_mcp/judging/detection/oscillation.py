@@ -178,7 +178,7 @@ def _ends_within_s(event: Event) -> float:
 
 OSCILLATION: Final = EventKind(
     "oscillation",
-    "of heading, wheels, ...",
+    "of heading, wheels or commands",
     oscillation_events,
     lasts=True,
     around_s=lambda options: (

@@ -314,7 +314,7 @@ def _alike(events: Sequence[Event], unit: str) -> str:
 
 FLAT: Final = EventKind(
     "flat",
-    "frozen, or at a limit",
+    "frozen or at a limit",
     flat_events,
     lasts=True,
     least_s=lambda options: options.flat_s,

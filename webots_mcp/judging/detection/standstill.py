@@ -717,7 +717,7 @@ def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:
 
 STANDSTILL: Final = EventKind(
     "standstill",
-    "stands",
+    "stands still",
     _standstills,
     lasts=True,
     least_s=lambda options: options.stuck_s,
@@ -726,7 +726,7 @@ STANDSTILL: Final = EventKind(
 )
 STUCK: Final = EventKind(
     "stuck",
-    "stands when it should move",
+    "stands although it should move",
     _stuck,
     lasts=True,
     least_s=lambda options: options.stuck_s,

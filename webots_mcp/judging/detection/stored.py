@@ -313,13 +313,13 @@ def _to(changes: Sequence[Event]) -> dict[str, Any]:
 
 
 CHANGES: Final = Alike(lambda events, unit: "changes", adds=_to, most_single=10)
-RUN: Final = EventKind("run", "began or ended", run_events, stored=True, counted=False)
+RUN: Final = EventKind("run", "a run began or ended", run_events, stored=True, counted=False)
 GAP: Final = EventKind(
-    "gap", "no rows", gap_events, stored=True, alike=Alike(lambda events, unit: "gaps")
+    "gap", "no rows recorded", gap_events, stored=True, alike=Alike(lambda events, unit: "gaps")
 )
 CHANGE: Final = EventKind(
     "change",
-    "of a text or flag",
+    "a mode or flag changed",
     change_events,
     stored=True,
     lasts=True,
@@ -352,7 +352,7 @@ LOG: Final = EventKind(
 )
 NOTICED: Final = EventKind(
     "bridge_event",
-    "by the bridge",
+    "hit of a breakpoint or note of the recorder",
     noticed_events,
     stored=True,
     drawn=6,
@@ -362,7 +362,7 @@ NOTICED: Final = EventKind(
 )
 KEPT: Final = EventKind(
     "kept_stretch",
-    "at full rate",
+    "seconds recorded at full rate",
     kept_events,
     stored=True,
     routine=True,

@@ -176,7 +176,7 @@ def _cells_of(times: Array) -> _Cells:
 
 OFF_TARGET: Final = EventKind(
     "off_target",
-    "away from its target",
+    "stays away from its target",
     off_target_events,
     lasts=True,
     least_s=lambda options: OFF_S,

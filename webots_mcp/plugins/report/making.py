@@ -321,18 +321,25 @@ class ReportAnswer(NotedAnswer):
     left_out: list[str] | None = Field(default=None, description="What had no room, and why.")
 
 
-@question("Write a report", DESTROYS)
+@question("Write a report", DESTROYS, tier="all")
 def webots_report(
     recording: RecordingAccess,
     run_ids: RunIds = None,
-    file: Annotated[str, Field(max_length=500, description="In the data folder.")] = "",
-    overwrite: Annotated[bool, Field(description="A file that is there.")] = False,
+    file: Annotated[
+        str,
+        Field(
+            max_length=500,
+            description="File to write, in the data folder. Default: report-RUN.html.",
+        ),
+    ] = "",
+    overwrite: Annotated[bool, Field(description="Overwrite the file if it exists.")] = False,
     signals: AnyNames = None,
     robot: RobotName = None,
 ) -> ReportAnswer:
-    """Write a run, or two compared, as one HTML file for people, which opens offline.
+    """Write a report of one run, or of two compared, as an HTML file for people.
 
-    Events, trends, plots, pictures, log.
+    It holds events, trends, plots, pictures and the log. To answer a question here use
+    webots_check_run or webots_compare_runs.
     """
     with recording.view(robot, run_ids[0] if run_ids else None) as view:
         chosen = run_ids or [view.require_run().id]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,20 @@ async def test_exactly_the_named_tools_are_listed(
 ) -> None:
     async with connect(tools=tools) as client:
         assert {tool.name for tool in (await client.list_tools()).tools} == names
+
+
+@pytest.mark.parametrize("tools", ["core", "default", "all"])
+async def test_no_description_names_a_tool_that_is_not_listed(
+    connect: Connect, tools: Tier
+) -> None:
+    async with connect(tools=tools) as client:
+        listed = (await client.list_tools()).tools
+    names = {tool.name for tool in listed}
+    for tool in listed:
+        assert tool.description
+        assert set(re.findall(r"webots_[a-z_]+", tool.description)) <= names, tool.name
+        assert re.fullmatch(r"[A-Z].*\.", tool.description, re.DOTALL), tool.name
+        assert not re.search(r"[;.] *[.;]", tool.description.replace("...", "")), tool.name
 
 
 async def test_a_server_that_only_reads_lists_no_tool_that_changes_anything(

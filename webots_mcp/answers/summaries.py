@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import singledispatch
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from webots_mcp.answers.models import (
     Answer,
@@ -75,7 +75,8 @@ def _summary(answer: Answer) -> str | None:
 
 @_summary.register
 def _(answer: StateAnswer) -> str:
-    mode = answer.state.get("mode") if isinstance(answer.state, dict) else None
+    state = cast("dict[str, Any]", answer.state) if isinstance(answer.state, dict) else {}
+    mode = state.get("mode")
     doing = f", mode {mode!r}" if isinstance(mode, str) and len(mode) <= 40 else ""
     return f"{_subject(answer)} {_when(answer)}{doing}."
 

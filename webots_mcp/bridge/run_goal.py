@@ -176,7 +176,7 @@ class Watch:
         if (watched := self._watched) is not None:
             raise CommandRefusedError(
                 f"command {watched.command_id} (run) is still running: wait for it with "
-                f'webots_wait_for_command(command_id={watched.command_id}), '
+                f"webots_wait_for_command(command_id={watched.command_id}), "
                 "or pause to end it"
             )
 

@@ -51,8 +51,9 @@ async def webots_breakpoint(
         str,
         Field(
             max_length=500,
-            description="Condition on signals: front_m < 0.1 for 0.5 (seconds); mode == 'turn' "
-            "and displacement(3) < 0.05; changed(mode); abs(rate(v)) > 2; missing(gps.x).",
+            description="Condition on signals, such as front_m < 0.1, or front_m < 0.1 for 0.5 "
+            "(held for 0.5 s), mode == 'turn' and displacement(3) < 0.05 (metres moved in 3 s), "
+            "changed(mode), abs(rate(v)) > 2, missing(gps.x).",
         ),
     ],
     caller: Caller,
@@ -64,15 +65,19 @@ async def webots_breakpoint(
     ] = "pause",
     after_hits: Annotated[
         int,
-        Field(ge=1, le=1_000_000, description="Number of the hit in a run from which on it acts."),
+        Field(
+            ge=1,
+            le=1_000_000,
+            description="Act from the Nth hit of a run on; earlier hits are only recorded.",
+        ),
     ] = 1,
     robot: RobotName = None,
 ) -> BreakpointAnswer:
     """Pause the simulation, or take note, at the moment when a condition begins to hold.
 
     Tested at each publish() call of the controller; each hit is an event with the values of that
-    step. It stays armed after a reset or reload until webots_remove_breakpoint. To search the
-    past for a condition use webots_find_events with `where`.
+    step. It stays armed after a reset or reload; to remove it use webots_remove_breakpoint. To
+    search the past for a condition use webots_find_events with `where`.
     """
     parsed = parse_condition(condition)
     if action != "log":  # what the bridge does at a hit is not asked for again

@@ -518,8 +518,8 @@ def webots_check_run(
         list[Annotated[str, Field(max_length=1100)]] | None,
         Field(
             max_length=20,
-            description="Conditions that should hold: front_m > 0.1 during mode == 'drive'; "
-            "goal_m < 0.1 within 20 (seconds).",
+            description="Conditions that should hold, such as front_m > 0.1 during "
+            "mode == 'drive', or goal_m < 0.1 within 20 (in the first 20 s).",
         ),
     ] = None,
     robot: RobotName = None,

@@ -29,7 +29,7 @@ from webots_mcp.store.recording import RecordingAccess
 
 Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,
-    Field(description="Port of a Webots that runs another project."),
+    Field(description="Port of the Webots to control, if it runs another project."),
 ]
 Force = Annotated[bool, Field(description="If nothing else works, press keys in Webots' window.")]
 
@@ -79,10 +79,10 @@ async def webots_simulation_control(
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload the simulation, and wait for the outcome.
 
-    To run until a condition holds use webots_run. `reload` restarts the controllers with their
-    code as it is now; an extern controller ends and must be started by hand. Needs a Supervisor,
-    an observer (webots-mcp init --observer) or a Webots started with --stream; `route` says which
-    was used.
+    To run until a condition holds use webots_run. webots_world_reset and webots_world_reload do
+    the same as its reset and reload. `reload` restarts the controllers with their code as it is
+    now; an extern controller ends and must be started by hand. Needs a Supervisor, an observer
+    (webots-mcp init --observer) or a Webots started with --stream; `route` says which was used.
     """
     if steps is not None and command != "step":
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
@@ -166,15 +166,15 @@ async def webots_launch_world(
     stream: Annotated[
         bool,
         Field(
-            description="Allow control without a Supervisor. Opens a network port of the project."
+            description="Allow control without a Supervisor; the network can then read the world."
         ),
     ] = False,
     timeout_wall_s: TimeoutS = _TIMES.start_s,
 ) -> CommandAnswer:
     """Start Webots on a world file and wait until the first controller records.
 
-    Use it if no Webots runs; for another world in a running Webots use webots_load_world. One at
-    a time; it ends with this server.
+    Use it if no Webots runs; for another world in a running Webots use webots_load_world. Only
+    one Webots can be started; it is ended together with this server.
     """
     launcher = caller.companions.webots
     project = await to_thread.run_sync(project_of, recording)
@@ -318,7 +318,8 @@ async def webots_run(
         Field(description="Parameters to set first, such as {'kp': 3.0}."),
     ] = None,
     then: Annotated[
-        Then, Field(description="What to do at the end; go_on continues at the former speed.")
+        Then,
+        Field(description="At the end: pause, go_on at the former speed, or be as_before."),
     ] = "pause",
     picture: Annotated[bool, Field(description="Add a screenshot of the end.")] = False,
     robot: RobotName = None,

@@ -54,7 +54,8 @@ def webots_describe_signals(
         Field(max_length=50, description="Signals to describe; '*' means any text. Default: all."),
     ] = None,
     quantity: Annotated[
-        Quantity | None, Field(description="What the signal measures or sets.")
+        Quantity | None,
+        Field(description="What it measures or sets. motor speed is of motors other than wheels."),
     ] = None,
     role: Annotated[
         Role | None,
@@ -80,8 +81,8 @@ def webots_describe_signals(
     """Declare what signals mean, so that webots_find_events and webots_check_run can judge them.
 
     Signals of unknown meaning are never judged: declare them before you ask for checks. A
-    declaration also applies to earlier runs, and replaces the previous one. Without a quantity,
-    role or another field it lists what each signal is taken to mean and why.
+    declaration also applies to earlier runs, and replaces the previous one. Given only signals or
+    nothing, it lists what each signal is taken to mean and why.
     """
     said: dict[str, Any] = {
         "quantity": quantity, "role": role, "unit": unit, "target_of": target_of,

@@ -76,7 +76,8 @@ def webots_find_events(
         str | None,
         Field(
             max_length=500,
-            description="Find when this condition held: front_m < 0.1; see webots_breakpoint.",
+            description="Also find when this condition held, such as front_m < 0.1 for 0.5 (at "
+            "least 0.5 s). With kinds=['condition'] nothing else is searched.",
         ),
     ] = None,
     signals: AnyNames = None,

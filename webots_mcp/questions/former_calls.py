@@ -7,7 +7,7 @@ of a project's file that names a former tool also holds for those that it became
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.errors import InvalidInputError
 
@@ -81,7 +81,7 @@ def current_call(name: str, arguments: dict[str, Any]) -> tuple[str, dict[str, A
         return name, arguments
     wrapped = arguments.get("params")
     if len(arguments) == 1 and isinstance(wrapped, dict):
-        arguments = wrapped  # as clients of the first server send them
+        arguments = cast("dict[str, Any]", wrapped)  # as clients of the first server send them
     if former.argument not in arguments and not former.must_choose:
         return name, arguments
     choice = arguments.get(former.argument)

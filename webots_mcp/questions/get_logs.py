@@ -14,7 +14,7 @@ from webots_mcp.answers.models import AnswerTable, LogsAnswer
 from webots_mcp.answers.shortening import cut_text, is_for_a_person
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
-from webots_mcp.questions.arguments import Cursor, EndS, LastS, RobotName, RunId, StartS, TimeOfDay
+from webots_mcp.questions.arguments import Cursor, EndS, Id, LastS, RobotName, StartS, TimeOfDay
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.simulator.console import console_state
 from webots_mcp.store.logs import (
@@ -69,14 +69,17 @@ def webots_get_logs(
     end_s: EndS = None,
     cursor: Cursor = None,
     robot: RobotName = None,
-    run_id: RunId = None,
+    run_id: Annotated[
+        Id | None, Field(description="Only lines of this run. Default: all runs.")
+    ] = None,
     time_of_day: TimeOfDay = False,
 ) -> LogsAnswer:
     """Read what the controller printed and logged: the newest lines, oldest first.
 
-    Covers all runs unless run_id or a time range is given. A line begins with its source unless
-    that is the controller: 'bridge:', 'webots:', 'console:' (printed by some controller of the
-    world) or '[logger name]'. For problems in the robot's behaviour use webots_find_events.
+    Covers all runs, unless run_id is given; a time range alone means the newest run. A line of
+    this robot's controller begins with the name of its logger, if any; other lines begin with
+    their source: 'bridge:', 'webots:' or 'console:' (printed by an unknown controller). For
+    faults in the robot's behaviour use webots_find_events.
     """
     scope = Scope(robot=robot, run_id=run_id, last_s=last_s, start_s=start_s, end_s=end_s)
     lowest = level or "debug"

@@ -81,8 +81,8 @@ async def webots_monitor(
 ) -> MonitorAnswer:
     """Watch the robot live for some seconds, then report its movement, trends and events.
 
-    Use it for "what is it doing right now?". For recorded time use webots_get_trends and
-    webots_find_events, which answer at once.
+    It takes that long; for the newest values at once use webots_get_robot_state. For recorded
+    time use webots_get_trends and webots_find_events, which answer at once.
     """
     asked = {
         "duration": duration,

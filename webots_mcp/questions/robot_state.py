@@ -56,11 +56,17 @@ from webots_mcp.store.sessions import fetch_session
 
 PagePath = Annotated[
     str,
-    Field(max_length=1000, description="Dotted path of the part to read, such as sensors.lidar."),
+    Field(
+        max_length=1000,
+        description="Dotted path of the part to read, as in the state: sensors.lidar.",
+    ),
 ]
 Offset = Annotated[int, Field(ge=0, description="Number of members, items or characters to skip.")]
 PageSize = Annotated[
-    int | None, Field(ge=1, le=2000, description="Maximum number of members, items or characters.")
+    int | None,
+    Field(
+        ge=1, le=2000, description="Maximum number of members, items or characters. Default 500."
+    ),
 ]
 
 
@@ -96,10 +102,10 @@ _SIZES: Final = StateSizes()
 def webots_get_robot_state(
     recording: RecordingAccess, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
-    """Show what the robot does now: its newest published values, rounded, arrays summarised.
+    """Show the newest values that the robot published: rounded, with long arrays summarised.
 
     For exact values or whole arrays use webots_get_full_state; for the past use
-    webots_get_trends.
+    webots_get_trends; to watch the robot for some seconds use webots_monitor.
     """
     with recording.view(robot, run_id) as view:
         if view.state is None:

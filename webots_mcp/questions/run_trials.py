@@ -133,8 +133,9 @@ async def webots_run_trials(
         str | None,
         Field(
             max_length=500,
-            description="Formula over a run: max(x) - 2 * count(stuck). Also min, mean, first, "
-            "last, time(condition), duration.",
+            description="Formula over the signals of a run, such as max(pose.x) - "
+            "2 * count(stuck): min, max, mean, first or last of a signal, count of an event "
+            "kind, time of a condition, duration.",
         ),
     ] = None,
     best: Annotated[Best, Field(description="Which score is best.")] = "highest",

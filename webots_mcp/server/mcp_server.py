@@ -102,12 +102,15 @@ def create_server(
     recording = RecordingAccess(database, data_dir, read_only, asked, readers=readers)
     possible = [each for each in all_questions() if each.effect.reads or not read_only]
     shown = [each for each in possible if TIERS.index(each.tier) <= TIERS.index(tools)]
+    names = {each.name for each in shown}
     mcp = ToolServer(
         "webots-mcp",
         title="Webots flight recorder",
         version=VERSION,
         instructions=INSTRUCTIONS,
-        tools=[tool_of(each, recording, output_schema=output_schemas) for each in shown],
+        tools=[
+            tool_of(each, recording, listed=names, output_schema=output_schemas) for each in shown
+        ],
         unlisted={
             each.name: functools.partial(tool_of, each, recording)
             for each in possible

@@ -15,6 +15,7 @@ import functools
 import inspect
 import json
 import logging
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Final, cast
 
@@ -39,6 +40,7 @@ from webots_mcp.signals.naming import harmless_first, perhaps_meant
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import Requester
 
+_TOOL_NAME: Final = re.compile(r"\bwebots_[a-z_]+\b")
 _WRAPPER: Final = "params"
 _FORMAT: Final = "response_format"
 _UNSAID: Final = (
@@ -54,10 +56,44 @@ _USUAL: Final[Mapping[str, tuple[Any, ...]]] = {  # what a model takes for grant
 _log = logging.getLogger(__name__)
 
 
-def tool_of(question: Question, recording: RecordingAccess, *, output_schema: bool = False) -> Tool:
-    """Return a question as a tool; its schemas, which take milliseconds, are made once."""
+def tool_of(
+    question: Question,
+    recording: RecordingAccess,
+    *,
+    listed: Collection[str] | None = None,
+    output_schema: bool = False,
+) -> Tool:
+    """Return a question as a tool; its schemas, which take milliseconds, are made once.
+
+    Args:
+        question: The question.
+        recording: What it is asked of.
+        listed: The tools of the list that it belongs to. Its description names no other one,
+            because a model cannot call what its client does not list. None keeps all names.
+        output_schema: Whether it has the schema of its answers.
+    """
     tool = _tool(question, output_schema)
-    return tool.model_copy(update={"fn": functools.partial(tool.fn, recording)})
+    changes: dict[str, Any] = {"fn": functools.partial(tool.fn, recording)}
+    if listed is not None:
+        changes["description"] = naming_only(listed, tool.description or "")
+    return tool.model_copy(update=changes)
+
+
+def naming_only(listed: Collection[str], text: str) -> str:
+    """Return a description without the clauses that name tools that are not listed."""
+    return "\n\n".join(
+        kept for part in text.split("\n\n") if (kept := _clauses_naming_only(listed, part))
+    )
+
+
+def _clauses_naming_only(listed: Collection[str], text: str) -> str:
+    kept = ""
+    for clause in re.split(r"(?<=[.;]) +", " ".join(text.split())):
+        if not set(_TOOL_NAME.findall(clause)) <= set(listed):
+            continue
+        starts = not kept or kept.endswith(".")
+        kept += (" " if kept else "") + (clause[0].upper() + clause[1:] if starts else clause)
+    return f"{kept[:-1]}." if kept.endswith(";") else kept
 
 
 @functools.cache

@@ -329,7 +329,7 @@ CHANGE: Final = EventKind(
 )
 COMMAND: Final = EventKind(
     "command",
-    "",
+    "a command and its outcome",
     command_events,
     stored=True,
     drawn=5,
@@ -340,7 +340,7 @@ COMMAND: Final = EventKind(
 )
 LOG: Final = EventKind(
     "log",
-    "",
+    "a log line",
     log_events,
     stored=True,
     drawn=4,
@@ -372,5 +372,11 @@ KEPT: Final = EventKind(
     ),
 )
 IMAGE: Final = EventKind(  # no news, and there may be thousands
-    "image", "", image_events, stored=True, usual=lambda options: False, routine=True, counted=False
+    "image",
+    "a picture was stored",
+    image_events,
+    stored=True,
+    usual=lambda options: False,
+    routine=True,
+    counted=False,
 )

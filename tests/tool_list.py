@@ -48,6 +48,7 @@ def main() -> int:
     """Print the size of the three lists, and what `tdqs lint` says."""
     memory = MemoryDatabase()
     try:
+        tools: Sequence[Tool] = ()
         for listed in TIERS:
             tools = anyio.run(create_server(memory, memory.data_dir, tools=listed).list_tools)
             counted = counts_of(tools)

@@ -75,7 +75,9 @@ def _summary(answer: Answer) -> str | None:
 
 @_summary.register
 def _(answer: StateAnswer) -> str:
-    state = cast("dict[str, Any]", answer.state) if isinstance(answer.state, dict) else {}
+    state: dict[str, Any] = {}
+    if isinstance(answer.state, dict):
+        state = cast("dict[str, Any]", answer.state)
     mode = state.get("mode")
     doing = f", mode {mode!r}" if isinstance(mode, str) and len(mode) <= 40 else ""
     return f"{_subject(answer)} {_when(answer)}{doing}."

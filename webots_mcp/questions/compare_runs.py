@@ -180,7 +180,8 @@ def webots_compare_runs(
         Field(
             gt=0,
             le=100,
-            description="Smallest difference that matters, in standard deviations of a group.",
+            description="Smallest difference that matters, in standard deviations of repeated "
+            "runs.",
         ),
     ] = MIN_EFFECT_SD,
     first_difference: Annotated[

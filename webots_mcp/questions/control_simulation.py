@@ -29,7 +29,7 @@ from webots_mcp.store.recording import RecordingAccess
 
 Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,
-    Field(description="Port of the Webots to control, if it runs another project."),
+    Field(description="Port of a Webots with --stream to control, if it runs another project."),
 ]
 Force = Annotated[bool, Field(description="If nothing else works, press keys in Webots' window.")]
 
@@ -79,10 +79,10 @@ async def webots_simulation_control(
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload the simulation, and wait for the outcome.
 
-    To run until a condition holds use webots_run. webots_world_reset and webots_world_reload do
-    the same as its reset and reload. `reload` restarts the controllers with their code as it is
-    now; an extern controller ends and must be started by hand. Needs a Supervisor, an observer
-    (webots-mcp init --observer) or a Webots started with --stream; `route` says which was used.
+    To run until a condition holds use webots_run. `reload` restarts the controllers with their
+    code as it is now; an extern controller ends and must be started by hand. Needs a Supervisor,
+    an observer (webots-mcp init --observer) or a Webots started with --stream; `route` says which
+    was used.
     """
     if steps is not None and command != "step":
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
@@ -104,10 +104,11 @@ async def webots_world_reload(
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.reload_s,
 ) -> CommandAnswer:
-    """Load the world and the controllers' code anew, as webots_simulation_control('reload').
+    """Load the world and the controllers' code anew, at time 0.
 
-    Use it after an edit of the controller. To keep the running code and only go back to time 0
-    use webots_world_reset.
+    Use it after an edit of a controller; an extern controller ends and must be started by hand.
+    webots_simulation_control("reload") is the same: use either. To keep the running code use
+    webots_world_reset.
     """
     dispatcher = Dispatcher(recording, caller.report)
     return await Attempt(recording, dispatcher, robot, timeout_wall_s, "reload", {}, force).steer()
@@ -121,9 +122,10 @@ async def webots_world_reset(
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _TIMES.command_s,
 ) -> CommandAnswer:
-    """Put the world back to time 0: the same as webots_simulation_control("reset").
+    """Put the world back to time 0; the controllers keep their code.
 
-    The controllers keep their code. To start changed code use webots_world_reload.
+    webots_simulation_control("reset") is the same: use either. To start changed code use
+    webots_world_reload; for the controller's own variables use webots_reset_controller_state.
     """
     dispatcher = Dispatcher(recording, caller.report)
     return await Attempt(recording, dispatcher, robot, timeout_wall_s, "reset", {}, force).steer()

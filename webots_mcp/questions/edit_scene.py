@@ -107,7 +107,9 @@ async def webots_set_field(
         WithJsonSchema({}),
         Field(description="New value: 0.5, true, a text, or a list such as [0, 0, 1, 1.57]."),
     ],
-    stop: Annotated[bool, Field(description="Also set the node's velocity to zero.")] = False,
+    stop: Annotated[
+        bool, Field(description="Also stop the node: set its velocity to zero.")
+    ] = False,
     robot: RobotName = None,
 ) -> CommandAnswer:
     """Change a field of the world while it runs: move a robot, set a mass, a friction, a colour.

@@ -61,7 +61,11 @@ def webots_get_logs(
         str, Field(max_length=200, description="Only lines that contain this text.")
     ] = "",
     level: Annotated[
-        LogLevel | None, Field(description="Only lines of at least this level.")
+        LogLevel | None,
+        Field(
+            description="Only lines of at least this level. Printed text is info; "
+            "on stderr, warning."
+        ),
     ] = None,
     source: Annotated[LogSource | None, Field(description="Only lines from this source.")] = None,
     last_s: LastS = None,

@@ -90,9 +90,12 @@ def _clauses_naming_only(listed: Collection[str], text: str) -> str:
     kept = ""
     for clause in re.split(r"(?<=[.;]) +", " ".join(text.split())):
         if not set(_TOOL_NAME.findall(clause)) <= set(listed):
+            if clause.endswith(".") and kept.endswith(";"):
+                kept = f"{kept[:-1]}."
             continue
-        starts = not kept or kept.endswith(".")
-        kept += (" " if kept else "") + (clause[0].upper() + clause[1:] if starts else clause)
+        begins = not kept or kept.endswith(".")
+        is_word = begins and not _TOOL_NAME.match(clause)
+        kept += (" " if kept else "") + (clause[0].upper() + clause[1:] if is_word else clause)
     return f"{kept[:-1]}." if kept.endswith(";") else kept
 
 
@@ -203,21 +206,35 @@ class CheckedTool(Tool):
             return await super().run(meant, context, convert_result)
         except ToolError as error:
             if isinstance(error.__cause__, ValidationError):
-                raise ToolError(faults_of(error.__cause__)) from error
+                raise ToolError(self._invalid(error.__cause__)) from error
             raise
+
+    def _invalid(self, error: ValidationError) -> str:
+        """Return what is wrong with the arguments, and what the first of them means."""
+        faults = faults_of(error)
+        name = str(error.errors()[0]["loc"][0])
+        end = "" if faults.endswith("?") else "."
+        return f"{faults}{end}{self._meaning(name)}"
+
+    def _meaning(self, name: str) -> str:
+        text = self.parameters["properties"].get(name, {}).get("description", "")
+        return f" {name}: {text}" if text else ""
 
     def _unknown(self, arguments: dict[str, Any], unknown: Collection[str]) -> str:
         """Return which argument the tool does not have, and what was perhaps meant."""
         names = [name for name in arguments if name in unknown]
         listed, inside = list(self.parameters["properties"]), self.of_controller
         typo = next((name for name in names if perhaps_meant(name, listed)), None)
-        said = f"unknown argument {shown_value(typo or names[0])}"
+        said = f"Unknown argument {shown_value(typo or names[0])}."
         if inside and inside not in arguments and typo is None:
             own = {name: value for name, value in arguments.items() if name not in unknown}
             call = self._call(own, inside, _unboxed({name: arguments[name] for name in names}))
-            return f"{said}: names of the controller go into `{inside}`: {call}"
+            return f"{said} Names of the controller go into `{inside}`: {call}"
         near = harmless_first(typo or names[0], listed)
-        return f"{said}: there is {', '.join(near) or 'none'}"
+        if not near:
+            return f"{said} {self.name} takes no arguments."
+        meaning = self._meaning(near[0]) if typo or len(near) == 1 else ""
+        return f"{said} {self.name} takes {', '.join(near)}.{meaning}"
 
     def _call(self, own: Mapping[str, Any], inside: str, values: Mapping[str, Any]) -> str:
         """Return a call with all required arguments; values that make it too long become dots."""

@@ -161,5 +161,5 @@ def test_a_folder_that_cannot_be_looked_into_is_said_to_be_one(
     finally:
         folder.chmod(0o700)
     assert ended.returncode == 2
-    assert "cannot be looked at" in ended.stderr
+    assert "cannot be checked" in ended.stderr
     assert "Traceback" not in ended.stderr

@@ -61,6 +61,7 @@ from webots_mcp.store.signals import RegisteredSignal
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
 
 
+NET_SHARE: Final = 0.9  # of its range: what ends so far from where it began rose or fell
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
 TOLD_MISSING_SHARE: Final = 0.001
 SLOW_SHARE: Final = 0.5  # of the variance must be left in means for their course to be the values'
@@ -411,7 +412,13 @@ def _shape(
         return monotonic
     if line is not None and line.r2 >= STRAIGHT_R2:
         return "rising" if line.slope_per_s > 0 else "falling"
+    if abs(net := (summary.last or 0.0) - (summary.first or 0.0)) >= NET_SHARE * _range(summary):
+        return "rising" if net > 0 else "falling"
     return "resting" if rest_s is not None else "varying"
+
+
+def _range(summary: Summary) -> float:
+    return (summary.max or 0.0) - (summary.min or 0.0)
 
 
 def _is_wide(swing: Swing, summary: Summary) -> bool:

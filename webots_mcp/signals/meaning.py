@@ -546,6 +546,13 @@ def _named(quantity: Quantity, role: Role | None, name: str, why: str) -> Meanin
     return Meaning(quantity, role, unit, side=side_in(name), source="named", why=why)
 
 
+@lru_cache(maxsize=_REMEMBERED)
+def is_asked_for(name: str) -> bool:
+    """Return whether a name is of a command, a target or an input: of nothing measured."""
+    words = frozenset(words_in(name))
+    return bool(words & (_COMMAND | _TARGET | INPUTS))
+
+
 def _role_in(name: str) -> Role | None:
     words = frozenset(words_in(name))
     if words & _COMMAND:

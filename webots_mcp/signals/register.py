@@ -19,7 +19,7 @@ from functools import lru_cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, cast
 
-from webots_mcp.signals.meaning import meaning_by_name
+from webots_mcp.signals.meaning import is_asked_for, meaning_by_name
 from webots_mcp.signals.naming import (
     LONGEST_SPREAD_ARRAY,
     METRES,
@@ -217,14 +217,15 @@ def decide_roles(
     # A path in SQL does not reach all names, whatever the version of SQLite.
     known: dict[str, Kind] = {name: kind for name, kind in kinds.items() if is_reachable(name)}
     roles: dict[str, str] = {}
-    pairs = _positions(known)
+    measured = {name: kind for name, kind in known.items() if not is_asked_for(name)}
+    pairs = _positions(measured)
     if position is not None:
         pairs = [position, *(pair for pair in pairs if pair != position)]
     for (x, y), place in zip(_apart(pairs), PLACES, strict=False):
         roles |= {x: f"x{place}", y: f"y{place}"}
-        if (z := _height(known, x, first=not place)) is not None:
+        if (z := _height(measured, x, first=not place)) is not None:
             roles.setdefault(z, f"z{place}")
-    _line_up(roles, "yaw", _yaws(known, pairs))
+    _line_up(roles, "yaw", _yaws(measured, pairs))
     texts = [name for name, kind in known.items() if kind == "text"]
     numbers = [name for name, kind in known.items() if kind == "num"]
     _line_up(roles, "mode", modes_in(texts, [name for name in numbers if name in choices]))

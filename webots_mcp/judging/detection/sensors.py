@@ -399,7 +399,10 @@ def _are_shorter(search: Search, signal: RegisteredSignal, runs: Runs) -> Flags:
     if not len(runs) or not (signal.reduction or signal.path.endswith("]")):
         return np.zeros(len(runs), np.bool_)
     frame, array = search.frame, signal.name.rpartition(".")[0]
-    others = frame.held(f"{array}.0") | frame.held(f"{array}.count")
+    others = np.zeros(len(frame), np.bool_)
+    for name in (f"{array}.0", f"{array}.count"):
+        if name in search.known:  # a frame also reads items of long arrays, which are no signals
+            others |= frame.held(name)
     return others[runs.starts] & ~frame.held(signal.name)[runs.starts]
 
 

@@ -48,7 +48,7 @@ CONVERSATION: Final[tuple[Turn, ...]] = (
     ("What is the robot doing?", "webots_get_robot_state", {}),
     ("What do its sensors say?", "webots_get_sensors", {}),
     ("What does it see?", "webots_get_camera", {}),
-    ("What can be tuned?", "webots_list_commands", {"what": "parameters"}),
+    ("What can be tuned?", "webots_get_parameters", {}),
     ("Drive faster.", "webots_set_parameters", {"values": {"speed": 6.0}}),
     ("Pause.", "webots_simulation_control", {"command": "pause"}),
     ("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}),

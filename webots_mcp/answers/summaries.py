@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from functools import singledispatch
+from functools import cache, singledispatch
 from typing import Any, Final, cast
 
 from webots_mcp.answers.models import (
@@ -45,12 +45,6 @@ from webots_mcp.answers.models import (
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
 _SERIOUS: Final = ("critical", "error", "warning")
-# Kinds that are no fault by themselves: a summary of faults names them last.
-_ORDINARY: Final = ("run", "change", "command", "log", "bridge_event", "kept_stretch", "image")
-_WORST_KINDS: Final = (
-    "violation", "condition", "fall", "stuck", "off_target", "oscillation", "missing", "jump",
-    "degradation", "flat", "standstill", "gap",
-)  # fmt: skip
 _OUTCOMES: Final = {"fail": "failed", "warn": "warned", "not judged": "could not be judged"}
 _ENDINGS: Final = {"finished": "finished", "crashed": "crashed"}  # others: "ended by reset"
 
@@ -101,10 +95,8 @@ def _(answer: FullStateAnswer) -> str:
 @_summary.register
 def _(answer: WorldAnswer) -> str:
     world = answer.world.replace("\\", "/").rsplit("/", 1)[-1] if answer.world else "unknown world"
-    speed = answer.real_time_factor
-    pace = f", {speed:.3g} times real time" if speed is not None else ""
     runs = f", {answer.runs_recorded} recorded" if answer.runs_recorded else ""
-    return f"{world}: {_subject(answer)} {_when(answer)}{pace}; run {answer.run_id}{runs}."
+    return f"{world}: {_subject(answer)} {_when(answer)}; run {answer.run_id}{runs}."
 
 
 @_summary.register
@@ -258,11 +250,11 @@ def _events(verdicts: KindVerdicts | None, events: AnswerTable | None) -> str:
         return "Nothing was searched."
     found = dict(verdicts.found or {})
     first_s = _first_begins(events)
-    faults = sorted((kind for kind in found if kind not in _ORDINARY), key=_severity)
+    faults = _worst_first(filter(_is_fault, found))
     said = [_occurrences(kind, found[kind], first_s.get(kind)) for kind in faults]
-    noted = [f"{found[kind]} {kind}" for kind in found if kind in _ORDINARY]
+    noted = [f"{found[kind]} {kind}" for kind in found if not _is_fault(kind)]
     searched = _kinds_in([*(verdicts.nearest or ()), verdicts.not_found or ""])
-    absent = sorted([kind for kind in searched if kind not in _ORDINARY] or searched, key=_severity)
+    absent = _worst_first([*filter(_is_fault, searched)] or searched)
     unsearched = _kinds_in(verdicts.not_searched or ())
     partly = [kind for kind in unsearched if kind in found or kind in searched]
     unknown = [kind for kind in unsearched if kind not in partly]
@@ -281,8 +273,19 @@ def _kinds_in(texts: Iterable[str]) -> list[str]:
     return [kind for text in texts for kind in text.split(", ") if kind]
 
 
-def _severity(kind: str) -> int:
-    return _WORST_KINDS.index(kind) if kind in _WORST_KINDS else len(_WORST_KINDS)
+@cache
+def _severities() -> dict[str, int]:
+    from webots_mcp.judging.detection.events import KINDS  # only here: answers need not load it
+
+    return {kind.name: kind.severity for kind in KINDS}
+
+
+def _is_fault(kind: str) -> bool:
+    return _severities().get(kind, 0) > 0
+
+
+def _worst_first(kinds: Iterable[str]) -> list[str]:
+    return sorted(kinds, key=lambda kind: -_severities().get(kind, 0))
 
 
 def _first_begins(events: AnswerTable | None) -> dict[str, float]:

@@ -228,6 +228,7 @@ CONDITION: Final = EventKind(
     lasts=True,
     counted=False,
     alike=Alike(lambda events, unit: "stretches"),
+    severity=85,
 )
 
 
@@ -789,4 +790,5 @@ VIOLATIONS: Final = EventKind(
     lasts=True,
     drawn=1,
     alike=Alike(lambda events, unit: "violations"),
+    severity=90,
 )

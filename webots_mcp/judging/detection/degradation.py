@@ -139,4 +139,5 @@ DEGRADATION: Final = EventKind(
     lasts=True,
     ends_within_s=lambda event: math.inf,
     drawn=3,
+    severity=35,
 )

@@ -189,4 +189,5 @@ FALL: Final = EventKind(
     lasts=True,
     around_s=lambda options: 10 * SETTLED_S,
     drawn=0,
+    severity=80,
 )

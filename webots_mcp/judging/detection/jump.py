@@ -474,4 +474,5 @@ JUMP: Final = EventKind(
     of_numbers=True,
     drawn=1,
     alike=Alike(_alike, sort=lambda event: event.end_s > event.start_s),  # who came back or stayed
+    severity=40,
 )

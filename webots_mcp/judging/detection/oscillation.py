@@ -188,4 +188,5 @@ OSCILLATION: Final = EventKind(
     of_numbers=True,
     drawn=3,
     alike=Alike(lambda events, unit: "oscillations"),
+    severity=50,
 )

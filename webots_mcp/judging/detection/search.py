@@ -714,6 +714,7 @@ class EventKind:
         counted: Comparisons of runs count it.
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
         alike: How similar ones are reported as one; None where each is reported by itself.
+        severity: How bad it is compared with other kinds; 0 if it is no fault by itself.
     """
 
     name: str
@@ -730,6 +731,7 @@ class EventKind:
     counted: bool = True
     drawn: int | None = None
     alike: Alike | None = None
+    severity: int = 0
 
 
 def events_touching(search: Search) -> list[Event]:

@@ -321,6 +321,7 @@ FLAT: Final = EventKind(
     of_numbers=True,
     drawn=7,
     alike=Alike(_alike, of_arrays=True),
+    severity=30,
 )
 
 
@@ -430,4 +431,5 @@ MISSING: Final = EventKind(
     of_numbers=True,
     drawn=2,
     alike=Alike(lambda events, unit: "stretches without a value", of_arrays=True),
+    severity=45,
 )

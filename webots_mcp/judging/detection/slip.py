@@ -233,4 +233,5 @@ SLIP: Final = EventKind(
     ends_within_s=lambda event: 2 * _CELLS_S[-1],
     drawn=0,
     alike=Alike(lambda events, unit: "slips", sort=lambda event: event.details.get("side")),
+    severity=55,
 )

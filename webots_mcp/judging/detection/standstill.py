@@ -723,6 +723,7 @@ STANDSTILL: Final = EventKind(
     least_s=lambda options: options.stuck_s,
     drawn=8,
     alike=Alike(lambda events, unit: "standstills", sort=lambda event: event.details.get("mode")),
+    severity=20,
 )
 STUCK: Final = EventKind(
     "stuck",
@@ -732,4 +733,5 @@ STUCK: Final = EventKind(
     least_s=lambda options: options.stuck_s,
     drawn=0,
     alike=Alike(lambda events, unit: "times stuck", sort=lambda event: event.details.get("mode")),
+    severity=70,
 )

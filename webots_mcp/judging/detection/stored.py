@@ -315,7 +315,12 @@ def _to(changes: Sequence[Event]) -> dict[str, Any]:
 CHANGES: Final = Alike(lambda events, unit: "changes", adds=_to, most_single=10)
 RUN: Final = EventKind("run", "a run began or ended", run_events, stored=True, counted=False)
 GAP: Final = EventKind(
-    "gap", "no rows recorded", gap_events, stored=True, alike=Alike(lambda events, unit: "gaps")
+    "gap",
+    "no rows recorded",
+    gap_events,
+    stored=True,
+    alike=Alike(lambda events, unit: "gaps"),
+    severity=10,
 )
 CHANGE: Final = EventKind(
     "change",

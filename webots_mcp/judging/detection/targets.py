@@ -183,4 +183,5 @@ OFF_TARGET: Final = EventKind(
     ends_within_s=lambda event: 2 * _CELL_S,
     drawn=4,
     alike=Alike(lambda events, unit: "times off target"),
+    severity=60,
 )

@@ -16,6 +16,7 @@ from webots_mcp.store.series import query_history
 _LOCAL: Final = {
     "id", "ids", "run_id", "run_ids", "session_id", "robot_id", "cursor", "path",
     "age_s",  # told by the clock
+    "intervals",  # each begins with its run
 }  # fmt: skip
 _LONG_S: Final = 600.0  # for slow machines to answer in full as well
 _RUN: Final = re.compile(r"\b(runs?) \d+")

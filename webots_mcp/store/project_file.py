@@ -143,14 +143,14 @@ def load_toml(file: Path) -> tuple[str, dict[str, Any]]:
     """The text of a file, and what it says.
 
     Raises:
-        InvalidInputError: It cannot be read, or is no TOML.
+        InvalidInputError: It cannot be read, or is not TOML.
     """
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
         text = file.read_text("utf-8-sig")  # with the mark that editors of Windows put before it
         return text, cast("dict[str, Any]", toml.loads(text))
     except (ValueError, RecursionError) as error:  # also what is not UTF-8
-        raise InvalidInputError(f"{file} is no TOML: {error}") from error
+        raise InvalidInputError(f"{file} is not TOML: {error}") from error
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be read: {error.strerror}") from error
 

@@ -516,8 +516,12 @@ class Search:
 
     @cached_property
     def meanings(self) -> dict[str, Meaning]:
-        """What each signal of the robot means, also by its values in this run."""
-        return with_behaviour(meanings_of(self.known), self.known, self.whole)
+        """What each signal of the robot means, also by its values in this run, if they were read."""
+        meanings = meanings_of(self.known)
+        try:
+            return with_behaviour(meanings, self.known, self.whole)
+        except NotSearchableError:
+            return meanings
 
     @cached_property
     def signals(self) -> list[RegisteredSignal]:

@@ -516,7 +516,7 @@ class Search:
 
     @cached_property
     def meanings(self) -> dict[str, Meaning]:
-        """What each signal of the robot means, also by its values in this run, if they were read."""
+        """What each signal of the robot means, also by its values where they were read."""
         meanings = meanings_of(self.known)
         try:
             return with_behaviour(meanings, self.known, self.whole)

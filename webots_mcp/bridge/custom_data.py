@@ -50,6 +50,7 @@ class CustomDataLimits:
         stale_s: Simulation time after a reset in which the text from before it is not recorded.
         delay_steps: Steps after a reset in which a new text may be from before it.
         epsilon_s: Tolerance for rounding in summed steps.
+        rest_s: Wall time after the end of another recording in which a robot is not taken over.
     """
 
     signal_characters: int = 1_000
@@ -58,6 +59,7 @@ class CustomDataLimits:
     stale_s: float = 1.0
     delay_steps: int = 2
     epsilon_s: float = 1e-9
+    rest_s: float = 2.0
 
 
 _LIMITS: Final = CustomDataLimits()
@@ -136,6 +138,7 @@ class CustomDataReader:
         self._observer = observer
         self._robots: dict[int, _Robot] = {}  # by the id of the body
         self._taken: set[str] = set()  # names of robots that other processes record
+        self._taken_at_s: dict[str, float] = {}  # when each was so last
         self._check_sessions_s = 0.0
 
     def read_all(self, bodies: Iterable[SeenRobot], *, is_due: bool) -> None:
@@ -184,12 +187,18 @@ class CustomDataReader:
         rows = self._observer.recorder.fetch(_OPEN_SESSIONS, ())
         if rows is None:
             return self._taken
+        checked_s = time.monotonic()
+        for name, session_id, recorded_in, host, pid, process, seen_s in rows:
+            if (
+                session_id not in own
+                and same_simulation(recorded_in, instance)
+                and is_living(host, pid, process, seen_s, now_s)
+            ):
+                self._taken_at_s[name] = checked_s
+        # A bridge that has just ended is often the first of a simulation that ends as a whole.
         return {
-            name
-            for name, session_id, recorded_in, host, pid, process, seen_s in rows
-            if session_id not in own and same_simulation(recorded_in, instance)
-            and is_living(host, pid, process, seen_s, now_s)
-        }  # fmt: skip
+            name for name, at_s in self._taken_at_s.items() if checked_s - at_s < _LIMITS.rest_s
+        }
 
 
 class _Robot:

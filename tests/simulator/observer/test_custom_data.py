@@ -75,6 +75,11 @@ class Robots:
         """As after half a second."""
         self.watching.observer.custom_data._check_sessions_s = 0.0  # pyright: ignore[reportPrivateUsage]
 
+    def let_time_pass(self) -> None:
+        """As if seconds had passed since a bridge was seen."""
+        seen = self.watching.observer.custom_data._taken_at_s  # pyright: ignore[reportPrivateUsage]
+        seen.update({name: at_s - 60 for name, at_s in seen.items()})
+
 
 @pytest.fixture
 def robots(tmp_path: Path, database: MemoryDatabase) -> Any:
@@ -262,6 +267,8 @@ def test_robots_with_a_bridge_are_left_alone_and_one_that_comes_later_takes_its_
     robots.look_for_bridges()
     robots.go_on(5)
     assert len(robots.sessions()) == 3  # what stands there is of the bridge's time
+    robots.let_time_pass()
+    robots.look_for_bridges()
     robots.go_on(5, rover='{"n": 4}')
     assert robots.sessions()[3] == ("rover", "rover_c", None)
     reasons = robots.watching.rows("SELECT DISTINCT start_reason FROM run")

@@ -117,13 +117,15 @@ def ask_by_command(scenario: Scenario, command: str) -> Outcome:
     In the command, `{question}` stands for the question, which otherwise comes over stdin;
     `{config}` for a file that names the server, as .mcp.json; `{server}` for the server's command
     line; `{schema}` for a file with the JSON schema of the answer, `{schema_json}` for its text.
+    The command runs in an empty folder, where no file has the answers.
     """
     with subject(scenario.of) as asked, tempfile.TemporaryDirectory() as folder:
         calls = Path(folder, "calls.jsonl")
         words = _command_words(scenario, command, asked.file, calls)
         began_s = time.monotonic()
         question = None if "{question}" in command else scenario.text()
-        said = _printed(words, question)
+        with tempfile.TemporaryDirectory() as empty:
+            said = _printed(words, question, empty)
         took_s = time.monotonic() - began_s
         lines = calls.read_text("utf-8").splitlines() if calls.exists() else []
         made = [NotedCall(**json.loads(line)) for line in lines]
@@ -151,11 +153,11 @@ def _command_words(scenario: Scenario, command: str, file: Path, calls: Path) ->
     return words
 
 
-def _printed(words: Sequence[str], question: str | None) -> str:
+def _printed(words: Sequence[str], question: str | None, folder: str) -> str:
     try:
         ended = subprocess.run(
             words, input=question or "", text=True, encoding="utf-8", capture_output=True,
-            timeout=_TIMEOUT_S, check=False,
+            timeout=_TIMEOUT_S, check=False, cwd=folder,
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"(no answer: {error})"

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.evaluations.__main__ import main
-from tests.evaluations.asking import Call, Outcome, ask, ask_by_command
+from tests.evaluations.asking import CHECKOUT, Call, Outcome, ask, ask_by_command
 from tests.evaluations.cheats import CHEATS, guess
 from tests.evaluations.judging import NotedCall, read_answer, wrong_fields, wrong_turns
 from tests.evaluations.planned import answer_by_plan
@@ -217,14 +217,20 @@ def test_calls_that_failed_or_were_repeated_are_wrong_turns() -> None:
 
 
 def typed(*words: str) -> str:
-    return shlex.join([sys.executable, *words])
+    """A command line that finds this package from any folder."""
+    return shlex.join(["env", f"PYTHONPATH={CHECKOUT}", sys.executable, *words])
 
 
 @pytest.mark.parametrize(
     ("client", "called", "wrong"),
     [
         (typed("-m", "tests.evaluations.planned", "{config}", "{question}"), 1, ""),
-        (typed("-c", 'print({"start_s": 40})'), 0, "gave no JSON object"),
+        (
+            typed("-c", "print('stuck at 40 s for 12 s in the mode cruise')"),
+            0,
+            "gave no JSON object",
+        ),
+        (typed("-c", "import os; assert not os.listdir()"), 0, "gave no JSON object"),
         (typed("-c", "print('I do not know'); raise SystemExit(3)"), 0, "no call was answered"),
         ("no-such-client", 0, "no call was answered"),
     ],

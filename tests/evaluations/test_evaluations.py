@@ -77,8 +77,10 @@ def test_a_question_is_about_more_than_one_thing_and_states_no_right_answer() ->
 
 
 @pytest.mark.parametrize("name", CHEATS)
-def test_a_cheat_scores_under_ten_percent(name: str) -> None:
-    right = [each.name for each in SCENARIOS if ask(each, CHEATS[name]).is_right]
+def test_a_cheat_scores_under_ten_percent_even_if_it_had_called(name: str) -> None:
+    outcomes = [ask(each, CHEATS[name]) for each in SCENARIOS]
+    pardoned = {"no call was answered"}
+    right = [each.scenario.name for each in outcomes if {*each.wrong} <= pardoned]
     assert len(right) < BEST_CHEAT, right
 
 

@@ -1,99 +1,183 @@
-"""Scenarios: a subject, a question, the calls that answer it, and the facts of a right answer."""
+"""Scenarios: a subject, a question, the form of its answer, and what has to be done."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
-from tests.server.story import rows_of
-
 FILE: Final = Path(__file__).with_name("scenarios.toml")
-_STEP: Final = re.compile(r"([^.\[\]]+)|\[([^=\]]+)=([^\]]*)\]|\[(\d+)\]")
-_NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)?(?:e-?\d+)?")
-_ROUNDED: Final = 0.01  # of a number: a person is told 1.3 m, not 1.3263 m
+CANNOT_TELL: Final = "cannot tell"
+KINDS: Final = ("time", "number", "name", "verdict")
+DEFAULT_CALLS: Final = 8
+
+_NUMBER: Final = re.compile(r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)\s*[a-zA-Z/%°²]*", re.IGNORECASE)
+_UNKNOWN: Final = {"cannot tell", "can't tell", "cannot be told", "cannot be known", "unknown"}
 
 
 @dataclass(frozen=True)
-class Fact:
-    """What an answer has to hold, and where the tools' answers have it."""
+class Field:
+    """One member of an answer: how it is asked for, and which values are right.
 
-    at: str
-    value: Any
+    Attributes:
+        options: Of a verdict, what may be chosen.
+        right: The values that are right; `CANNOT_TELL` where the subject does not hold the answer.
+        within: Of a time or number, the largest error that is accepted.
+        found_at: Where the answers to the planned calls have it; empty where none has it.
+        call: Number of the only planned call whose answer is searched; None for all.
+        pattern: Takes the value out of a text that is found there.
+        words: Translates what is found, by a part of its text, into an option.
+        otherwise: What the plan answers where nothing is found.
+    """
+
+    name: str
+    kind: str
+    right: tuple[Any, ...]
+    asks: str = ""
+    options: tuple[str, ...] = ()
     within: float = 0.0
-    says: str | None = None
+    found_at: str = ""
+    call: int | None = None
+    pattern: str = ""
+    words: Mapping[str, str] = field(default_factory=dict[str, str])
+    otherwise: str = CANNOT_TELL
 
-    def is_in(self, answers: Sequence[Any]) -> bool:
-        """Whether one of the tools' answers has it."""
-        return any(self._matches(found) for each in answers for found in _found(each, self.at))
+    def line(self) -> str:
+        """Return the line of the form that asks for it."""
+        values = {
+            "time": "a number of seconds of simulated time",
+            "number": "a number",
+            "name": "a name as it is recorded",
+            "verdict": " or ".join(f'"{option}"' for option in self.options),
+        }[self.kind]
+        return f'  "{self.name}": {values}' + (f" ({self.asks})" if self.asks else "")
 
-    def is_said(self, text: str) -> bool:
-        """Whether a text holds it: the number, rounded perhaps, or the words."""
-        if self.says is not None:
-            return re.search(self.says, text, re.IGNORECASE) is not None
-        if isinstance(self.value, (int, float)):
-            numbers = [
-                float(each.replace(",", "."))
-                for each in _NUMBER.findall(text.replace("\N{MINUS SIGN}", "-"))
-            ]
-            most = max(self.within, abs(self.value) * _ROUNDED)
-            return any(abs(each - self.value) <= most for each in numbers)
-        return str(self.value).lower() in text.lower()
+    def schema(self) -> dict[str, Any]:
+        """Return the JSON schema of the value."""
+        unknown = {"const": CANNOT_TELL}
+        if self.kind == "verdict":
+            return {"enum": [*dict.fromkeys([*self.options, CANNOT_TELL])]}
+        value = {"type": "string" if self.kind == "name" else "number"}
+        return {"anyOf": [value, unknown], "description": self.asks or self.name}
 
-    def _matches(self, found: Any) -> bool:
-        if isinstance(found, (int, float)) and not isinstance(found, bool):
+    def accepts(self, said: Any) -> bool:
+        """Return whether a value is right."""
+        return any(self._is(said, right) for right in self.right)
+
+    def _is(self, said: Any, right: Any) -> bool:
+        if right == CANNOT_TELL or is_unknown(said):
+            return right == CANNOT_TELL and is_unknown(said)
+        if self.kind in ("time", "number"):
+            number = _as_number(said)
+            return number is not None and abs(number - right) <= self.within + 1e-9
+        return _as_word(said) == _as_word(right)
+
+
+@dataclass(frozen=True)
+class Check:
+    """What holds after a right answer: in the database (`sql`) or in the simulation (`path`)."""
+
+    means: str
+    sql: str = ""
+    path: str = ""
+    value: Any = None
+    within: float = 0.0
+    at_least: float | None = None
+
+    def accepts(self, found: Any) -> bool:
+        """Return whether what was found is what has to be there."""
+        if self.at_least is not None:
+            return isinstance(found, (int, float)) and found >= self.at_least
+        if isinstance(found, (int, float)) and isinstance(self.value, (int, float)):
             return abs(found - self.value) <= self.within + 1e-9
-        if isinstance(found, str) and isinstance(self.value, str):
-            return self.value in found
         return found == self.value
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One of them; `calls` is how many a client may make."""
+    """One of them.
+
+    Attributes:
+        calls: How many calls a client may make.
+        may: Actions that may be sent to robots; any other one is forbidden.
+        order: Actions that have to be done, in this order.
+    """
 
     name: str
     of: str
     question: str
     calls: int
     plan: tuple[tuple[str, dict[str, Any]], ...]
-    facts: tuple[Fact, ...]
+    fields: tuple[Field, ...]
+    may: tuple[str, ...]
+    order: tuple[str, ...]
+    checks: tuple[Check, ...]
+
+    def text(self) -> str:
+        """Return what a client reads: the question and the form of its answer."""
+        lines = ",\n".join(each.line() for each in self.fields)
+        return (
+            f"{self.question}\n\nUse the tools of the server webots. End with one JSON object with "
+            f"exactly these members:\n{{\n{lines}\n}}\n"
+            f'Give "{CANNOT_TELL}" for a member that cannot be known.'
+        )
+
+    def schema(self) -> dict[str, Any]:
+        """Return the JSON schema of an answer."""
+        return {
+            "type": "object",
+            "properties": {each.name: each.schema() for each in self.fields},
+            "required": [each.name for each in self.fields],
+            "additionalProperties": False,
+        }
+
+
+def is_unknown(said: Any) -> bool:
+    """Return whether a value says that the answer cannot be known."""
+    return said is None or (isinstance(said, str) and _as_word(said) in _UNKNOWN)
+
+
+def _as_word(said: Any) -> str:
+    if isinstance(said, bool):
+        return "yes" if said else "no"
+    return str(said).strip(" \t\n`'\".").casefold().replace("_", " ").replace("\u2019", "'")
+
+
+def _as_number(said: Any) -> float | None:
+    if isinstance(said, (int, float)):
+        return None if isinstance(said, bool) else float(said)
+    match = _NUMBER.fullmatch(str(said).strip().replace("\N{MINUS SIGN}", "-"))
+    return float(match[1]) if match else None
 
 
 def read_scenarios() -> list[Scenario]:
-    """All, in the order of the file."""
+    """Return all of them, in the order of the file."""
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    tables = toml.loads(FILE.read_text("utf-8"))["scenario"]
-    return [
-        Scenario(
-            **{key: table[key] for key in ("name", "of", "question", "calls")},
-            plan=tuple((call.pop("tool"), call) for call in table["plan"]),
-            facts=tuple(
-                Fact(each["at"], each["is"], each.get("within", 0.0), each.get("says"))
-                for each in table["facts"]
-            ),
-        )
-        for table in tables
-    ]
+    return [_scenario(table) for table in toml.loads(FILE.read_text("utf-8"))["scenario"]]
 
 
-def _found(answer: Any, path: str) -> list[Any]:
-    """What a path leads to: `events[kind=stuck].start_s`; of rows that match, each."""
-    reached: list[Any] = [answer]
-    for name, column, value, place in _STEP.findall(path):
-        if place:
-            reached = [each[int(place)] for each in reached if int(place) < len(each)]
-        elif column:
-            rows = [row for each in reached for row in _rows(each)]
-            reached = [row for row in rows if str(row.get(column)) == value]
-        else:
-            reached = [each[name] for each in reached if isinstance(each, dict) and name in each]
-    return reached
+def _scenario(table: dict[str, Any]) -> Scenario:
+    return Scenario(
+        **{key: table[key] for key in ("name", "of", "question")},
+        calls=table.get("calls", DEFAULT_CALLS),
+        plan=tuple((call.pop("tool"), call) for call in table["plan"]),
+        fields=tuple(_field(name, each) for name, each in table["answer"].items()),
+        may=tuple(table.get("may", ())),
+        order=tuple(table.get("order", ())),
+        checks=tuple(_check(each) for each in table.get("checks", ())),
+    )
 
 
-def _rows(table: Any) -> list[dict[str, Any]]:
-    return rows_of(table) if "columns" in table else list(table)
+def _field(name: str, table: dict[str, Any]) -> Field:
+    right: Any = table.pop("is")
+    options, found_at = tuple(table.pop("of", ())), table.pop("from", "")
+    accepted: list[Any] = right if isinstance(right, list) else [right]
+    return Field(name, right=tuple(accepted), options=options, found_at=found_at, **table)
+
+
+def _check(table: dict[str, Any]) -> Check:
+    return Check(value=table.pop("is", None), **table)

@@ -52,8 +52,8 @@ def test_an_angle_that_goes_round_is_no_line_across_the_picture(
 ) -> None:
     curve = only_curve(signals_of_run(rover, "heading", start_s=60, end_s=66))
     means = [mean for _, mean, *_ in curve.points]
-    drawn = pairwise(means)
-    assert all(abs(after - before) < math.pi for before, after in drawn)
+    assert max(means) > math.pi > min(means)  # its turns are counted
+    assert all(abs(after - before) < math.pi for before, after in pairwise(means))
 
 
 def test_a_value_that_stands_alone_is_not_lost(record: Record) -> None:
@@ -272,7 +272,7 @@ def test_what_was_not_read_in_time_is_hatched_and_is_no_end(
         path = way.tracks[0].path
         last_s = path.places[-1].time_s
         assert path.is_whole == (last_s == pytest.approx(199.9))
-        assert (f"the path of run 1 is not read after {last_s:g} s" in notes) != path.is_whole
+        assert (f"The path of run 1 was not read after {last_s:g} s" in notes) != path.is_whole
 
 
 @pytest.mark.parametrize("compose", [compose_signals, compose_trajectory])
@@ -326,7 +326,7 @@ def test_events_beyond_those_that_are_drawn_are_counted(record: Record) -> None:
         [(i * 0.01, WALL_START_S + i * 0.005) for i in range(510)],
     )
     _, notes = compose_signals(connection, [whole(connection)], ["n"])
-    assert "10 events of kind log up to 0.090 s are not drawn" in notes
+    assert "Not drawn: 10 events of kind log up to 0.090 s" in notes
 
 
 def test_of_many_short_intervals_the_longest_in_a_pixel_stands_for_it() -> None:

@@ -30,6 +30,7 @@ from webots_mcp.errors import (
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, image_format_of
 from webots_mcp.plotting.colours import DASHES, LINES
+from webots_mcp.plotting.curves import Curve, Panel
 from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.signal_plot import compose_signals, paint_signals, plot_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
@@ -86,28 +87,75 @@ def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:
     picture = ask(rover, signals=["pose.0", "heading"], image_format="svg")
     assert words(picture) >= {
         "rover, run 1, 0 to 119.9 s", "pose.0", "heading [rad]", "mode:", "cruise", "back_up",
-        "avoid", "nothing recorded", "stuck", "oscillation", "log", "error", "command", "set_speed",
+        "avoid", "nothing recorded", "stuck (1)", "oscillation (1)", "log (2)", "error",
+        "command (1)", "set_speed", "12.8", "3.14",
     }  # fmt: skip
     steps = "simulation time [s]; line: mean by time, band: minimum to maximum of every 0.6 s"
     assert " ".join(steps.split()) in {" ".join(word.split()) for word in words(picture)}
     assert picture.caption == (
-        "rover, run 1, 0 to 119.9 s: pose.0, heading over mode; "
-        "events: stuck, jump, oscillation, log, command"
+        "rover, run 1, 0 to 119.9 s. Curves with their last values: pose.0 12.8; heading 3.14 rad. "
+        "Background: mode. Events: stuck (1), jump (1), oscillation (1), log (2), command (1)"
     )
+
+
+def test_a_legend_names_what_differs_below_what_the_names_share(record: Record) -> None:
+    def wheels(time_s: float) -> dict[str, Any]:
+        return {"robot": {"wheels": {"left": {"rad_s": time_s}, "right": {"rad_s": 2 * time_s}}}}
+
+    connection = record(wheels)
+    picture = ask(connection, signals=["robot.*"], image_format="svg")
+    assert words(picture) >= {"robot.wheels.*.rad_s [rad/s]", "left", "right", "9.9", "19.8"}
+    assert not [word for word in words(picture) if word.startswith("robot.wheels.left")]
+    assert "robot.wheels.left.rad_s 9.9 rad/s, robot.wheels.right.rad_s 19.8" in picture.caption
+
+
+@pytest.mark.parametrize(
+    ("names", "shared", "own"),
+    [
+        (["a.x", "a.y"], "a.*", ["x", "y"]),
+        (["left.v", "right.v"], "*.v", ["left", "right"]),
+        (["a.b.c.v", "a.d.v"], "a.*.v", ["b.c", "d"]),
+        (["a", "a.a"], "", ["a", "a.a"]),
+        (["x.a.a", "x.a"], "x.*", ["a.a", "a"]),
+        (["front_left", "front_right"], "", ["front_left", "front_right"]),
+        (["a.x"], "", ["a.x"]),
+    ],
+    ids=str,
+)
+def test_what_names_share_is_whole_parts_and_leaves_something_of_each(
+    names: list[str], shared: str, own: list[str]
+) -> None:
+    panel = Panel([Curve(name, None, 1, (), 0.0, 1.0) for name in names])
+    assert (panel.shared_name, list(panel.own_names.values())) == (shared, own)
+
+
+def test_values_at_the_ends_of_curves_do_not_cover_each_other(record: Record) -> None:
+    connection = record(lambda t: {f"arm.{n}": 1 + n / 100 + t / 50 for n in range(5)})
+    axes, _ = compose_signals(connection, [whole(connection)], ["arm.*"])
+    texts = texts_of(paint_signals(axes, 900, 500)[0])
+    assert_readable(texts, (900, 500))
+    assert {"1.198", "1.208", "1.218", "1.228", "1.238"} <= {text for text, _ in texts}
+
+
+def test_kinds_that_no_signal_shows_are_one_short_note(rover: sqlite3.Connection) -> None:
+    notes = [note for note in ask(rover, signals=["pose.0"]).notes if "searched" in note]
+    assert notes == [
+        "Not searched for off_target, fall, slip: what would show them is not recorded"
+    ]
 
 
 def test_what_could_not_be_drawn_is_said(rover: sqlite3.Connection) -> None:
     picture = ask(rover, signals=["*"])
-    (left_out,) = [note for note in picture.notes if note.startswith("left out")]
-    assert "battery_v" in left_out and "panels 3, rows 4" in left_out
-    assert "sensors.front in run 1 was nan 40 times: not drawn" in picture.notes
+    (left_out,) = [note for note in picture.notes if note.startswith("Left out")]
+    assert "battery_v" in left_out and "3 panels and 4 rows" in left_out
+    assert "Not drawn of sensors.front in run 1: 40 values nan" in picture.notes
     blind = ask(rover, signals=["sensors.front", "ir"], start_s=100.5, end_s=103)
-    assert "without a value in run 1: sensors.front" in blind.notes
+    assert "No value in run 1: sensors.front" in blind.notes
 
 
 def test_numbers_too_large_to_draw_are_not_said_to_be_missing(record: Record) -> None:
     connection = record(lambda time_s: {"big": 1e301, "x": time_s})
-    assert "beyond 1e100 in run 1: big" in ask(connection, signals=["*"]).notes
+    assert "Too large to draw (beyond 1e100) in run 1: big" in ask(connection, signals=["*"]).notes
 
 
 def test_runs_are_laid_over_each_other_from_their_starts_and_named_by_their_labels(
@@ -145,9 +193,12 @@ def test_the_other_run_of_a_trajectory_is_told_apart_and_trouble_is_marked(
 ) -> None:
     picture = ask(rover, kind="trajectory", run_ids=[1, 3], image_format="svg")
     assert words(picture) >= {
-        "run 1", "run 3", "start", "end", "pose.0 [m]", "pose.1 [m]", "stuck over 3 s, run 1 (1)",
-        "sensors.bumper, run 1 (1)",
+        "run 1", "run 3", "start", "end", "pose.0 [m]", "pose.1 [m]", "stuck over 3 s (1), run 1",
+        "sensors.bumper (1), run 1",
     }  # fmt: skip
+    assert "Start of run 3 (0, 0), end (18.0, 0). Marks: stuck over 3 s (1) of run 1" in (
+        picture.caption
+    )
 
 
 # Everything can be read ---------------------------------------------------------------------------
@@ -384,4 +435,4 @@ def test_a_picture_of_what_was_not_read_whole_says_so_and_marks_no_end(
     ]  # fmt: skip
     named = [{text for text, _ in texts_of(paint(plot, 900, 500)[0])} for paint, plot in shown]
     assert ["not all was read" in each for each in named] == [False, True, False, False]
-    assert ["end" in each for each in named] == [False, False, True, False]
+    assert ["end (12.8, 1.00)" in each for each in named] == [False, False, True, False]

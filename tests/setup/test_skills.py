@@ -23,6 +23,7 @@ from tests.waiting import wait_for
 from webots_mcp import __version__
 from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.contract import bundled
+from webots_mcp.questions import all_questions
 from webots_mcp.setup.client_entries import is_ours
 from webots_mcp.setup.file_change import apply
 from webots_mcp.setup.skills import PLUGIN, ManagedText, managed_texts, skill_files
@@ -34,21 +35,94 @@ BLOCK: Final = re.compile(
 )
 ROVER: Final = Path("controllers", "rover", "rover.py")
 SPEED: Final = '"speed", 5.0'
-# What was done before, and what the answers to the skill's calls then hold.
-STORIES: Final[dict[str, tuple[tuple[str, dict[str, Any]], tuple[str, ...]]]] = {
+# The rover publishes a signal that no name and no value explains.
+PUBLISHED: Final = '            "mode": self.mode,\n'
+UNEXPLAINED: Final = '            "q7": 0.3 * self.distances_m[0] ** 2 - 0.2,\n'
+KNOWN: Final = ("webots_describe_signals(signals=['wheel_radps.*']", '"declared"')
+UNKNOWN: Final = (
+    ("webots_check_run(", '"signals understood","not judged"', "q7"),
+    ("webots_describe_signals()", '["q7",', '"unknown"'),
+)
+# What was done before, and what the answer to each of the skill's calls then holds.
+STORIES: Final[dict[str, tuple[dict[str, Any], tuple[tuple[str, ...], ...]]]] = {
     "webots-why-it-does-not-move": (
-        ("webots_run", {"for_s": 8, "parameters": {"speed": 0.0}}),
-        ('"standstill"', '"set_by"', '"stopped":"condition held"'),
+        {"for_s": 8, "parameters": {"speed": 0.0}},
+        (
+            *UNKNOWN, KNOWN,
+            ("webots_get_robot_state(", '"status":"paused"'),
+            ("webots_diagnose_setup(", '"check":"Simulation"', "rover: paused"),
+            ("webots_find_events(", '"standstill"', '"why_not_stuck"', '"verdicts"'),
+            ("webots_get_parameters(", '"set_by"', '"since_s"', '"command"'),
+            ("webots_get_trends(", '"start_s":2.0', '"end_s":6.0'),
+            ("webots_get_logs(", '"lines"'),
+            ("webots_plot(", "Path from above", "end ("),
+            ("webots_run(", '"stopped":"condition held"'),
+        ),
     ),
     "webots-when-it-went-wrong": (
-        ("webots_run", {"for_s": 12}), ('"condition"', '"verdict":"unlike from', '"breakpoint_id"'),
+        {"for_s": 12},
+        (
+            *UNKNOWN, KNOWN,
+            ("webots_list_runs(", '"ended_by"', '"duration_s"'),
+            ("webots_find_events(run_id=1)", '"verdicts"'),
+            ("webots_find_events(run_id=1, where=", '"condition"'),
+            ("webots_list_signals(", "lidar.nearest_m"),
+            ("webots_find_events(run_id=1, start_s=2", '"change"'),
+            ("webots_query_history(", "pose.x"),
+            ("webots_plot(", "lidar.nearest_m", "wheel_radps.left"),
+            ("webots_run(", '"run_id":2'),
+            ("webots_compare_runs(", '"verdict":"unlike from'),
+            ("webots_breakpoint(", '"breakpoint_id"'),
+        ),
     ),
     "webots-tune-a-parameter": (
-        ("webots_run", {"for_s": 1}), ('"is_best_confirmed":true', '"action":"set_parameters"'),
+        {"for_s": 1},
+        (
+            *UNKNOWN, KNOWN,
+            ("webots_get_parameters(", '"speed"', '"low"'),
+            ("webots_run_trials(parameters={'speed': [2.0", '"verdict"', '"trial_set":1'),
+            ("webots_run_trials(trial_set=2)", '"is_best_confirmed":true', '"verdict"'),
+            ("webots_plot(", "trial set 2, 8 trials"),
+            ("webots-mcp trials", "8"),
+            ("webots_set_parameters(", '"action":"set_parameters"', '"outcome":"done"'),
+        ),
     ),
-    "webots-did-my-edit-help": (("webots_run", {"for_s": 1}), ('"different"', '"runs_wanted"')),
-    "webots-test-a-behaviour": (("webots_run", {"for_s": 12}), ("1 passed", "lidar.nearest_m")),
-    "webots-new-world": (("webots_list_robots", {}), ('"distance_m"', '"outcome":"')),
+    "webots-did-my-edit-help": (
+        {"for_s": 1},
+        (
+            *UNKNOWN, KNOWN,
+            ("webots-mcp repeat", "run_ids [2, 3, 4, 5]"),
+            ("webots-mcp repeat", "run_ids [7, 8, 9, 10]"),
+            ("webots_simulation_control(", '"outcome":"done"'),
+            ("webots_list_runs(", "repeat 1 of 4, by reset"),
+            ("webots_compare_runs(", '"runs_wanted"', "2, 3, 4, 5", "7, 8, 9, 10"),
+            ("webots_plot(", "run 5", "run 10"),
+            ("webots_check_run(run_id=10)", '"run_id":10'),
+            ("webots-mcp label", "after the edit"),
+        ),
+    ),
+    "webots-test-a-behaviour": (
+        {"for_s": 12},
+        (
+            *UNKNOWN,
+            ("webots_list_signals(", "lidar.nearest_m"),
+            ("webots_get_trends(", "mode"),
+            ("pytest", "1 passed"),
+            ("webots_check_run(expect=", "lidar.nearest_m > 0.1 during"),
+            ("webots-mcp check", "lidar.nearest_m > 0.1"),
+        ),
+    ),
+    "webots-new-world": (
+        {},
+        (
+            ("webots-mcp init", ".mcp.json"),
+            ("webots_run(", '"outcome":"done"'),
+            ("webots_check_run(", '"signals understood","not judged"', "unknown meaning: u;"),
+            ("webots_describe_signals()", '["u",', '"unknown"'),
+            ("webots_describe_signals(signals=['u']", '"declared"'),
+            ("webots_plot(", "Path from above"),
+        ),
+    ),
 }  # fmt: skip
 
 
@@ -56,6 +130,10 @@ STORIES: Final[dict[str, tuple[tuple[str, dict[str, Any]], tuple[str, ...]]]] = 
 def project(tmp_path: Path) -> Path:
     for name in ("worlds", "controllers"):
         shutil.copytree(bundled("examples") / name, tmp_path / "project" / name)
+    source = tmp_path / "project" / ROVER
+    text = source.read_text("utf-8")
+    assert text.count(PUBLISHED) == 1
+    source.write_text(text.replace(PUBLISHED, PUBLISHED + UNEXPLAINED), "utf-8")
     return tmp_path / "project"
 
 
@@ -74,7 +152,7 @@ class Followed:
 
     def __init__(self, project: Path) -> None:
         self.project = project
-        self.answers = list[str]()
+        self.answers = list[tuple[str, str]]()  # what was asked, and the answer
         self.launched = list[subprocess.Popen[bytes]]()
 
     @asynccontextmanager
@@ -86,18 +164,17 @@ class Followed:
         async with Client(server) as client:
             yield client
 
-    async def follow(self, page: str) -> None:
-        async with self.connected() as client:
-            for file, language, text in BLOCK.findall(page):
-                if file:
-                    (self.project / file).parent.mkdir(parents=True, exist_ok=True)
-                    (self.project / file).write_text(text, "utf-8")
-                elif language == "python":
-                    for statement in ast.parse(text).body:
-                        await self.call(client, *call_of(statement))
-                else:
-                    for line in text.splitlines():
-                        self.type(line)
+    async def follow(self, page: str, client: Client) -> None:
+        for file, language, text in BLOCK.findall(page):
+            if file:
+                (self.project / file).parent.mkdir(parents=True, exist_ok=True)
+                (self.project / file).write_text(text, "utf-8")
+            elif language == "python":
+                for statement in ast.parse(text).body:
+                    await self.call(client, *call_of(statement))
+            else:
+                for line in text.splitlines():
+                    self.type(line)
 
     async def call(self, client: Client, tool: str, arguments: dict[str, Any]) -> None:
         if arguments.get("command") == "reload":  # the step before it says: edit the controller
@@ -105,8 +182,10 @@ class Followed:
             source.write_text(source.read_text("utf-8").replace(SPEED, '"speed", 9.0'), "utf-8")
         result = await client.call_tool(tool, arguments)
         texts = [each.text for each in result.content if each.type == "text"]
-        assert not result.is_error, (tool, arguments, texts)
-        self.answers.append(json.dumps(result.structured_content or texts, separators=(",", ":")))
+        asked = f"{tool}({', '.join(f'{name}={value!r}' for name, value in arguments.items())})"
+        assert not result.is_error, (asked, texts)
+        answer = json.dumps(result.structured_content or texts, separators=(",", ":"))
+        self.answers.append((asked, answer))
 
     def type(self, line: str) -> None:
         if " launch " in line:
@@ -115,9 +194,14 @@ class Followed:
             typed(line), cwd=self.project, env=environment(self.project), text=True, check=False,
             capture_output=True, stdin=subprocess.DEVNULL, encoding="utf-8",
         )  # fmt: skip
-        judged = (0, 1) if line.startswith(("webots-mcp doctor", "webots-mcp check")) else (0,)
+        judged = (0, 1) if line.startswith("webots-mcp check") else (0,)
         assert ended.returncode in judged, (line, ended.stdout, ended.stderr)
-        self.answers.append(ended.stdout)
+        self.answers.append((line, ended.stdout))
+
+    def require(self, asked: str, *facts: str) -> None:
+        """One answer to what begins so holds all of these."""
+        answers = [answer for question, answer in self.answers if question.startswith(asked)]
+        assert any(all(fact in answer for fact in facts) for answer in answers), (facts, answers)
 
     def launch(self, line: str) -> None:
         log = self.project / "launch.log"
@@ -152,18 +236,38 @@ def call_of(statement: ast.stmt) -> tuple[str, dict[str, Any]]:
 @pytest.mark.parametrize("page", skill_files(), ids=lambda page: page.parent.name)
 async def test_each_skill_can_be_followed_to_the_letter(page: Path, project: Path) -> None:
     before, facts = STORIES[page.parent.name]
+    parts = page.read_text("utf-8").split("started again now")  # with a new server
     with following(project) as followed:
         if "new-world" in page.parent.name:
             shutil.rmtree(project / "worlds")
             shutil.rmtree(project / "controllers")
         else:
             followed.launch("webots-mcp launch worlds/arena.wbt --stand-in")
+        for part in parts:
             async with followed.connected() as client:
-                await followed.call(client, *before)
-        for part in page.read_text("utf-8").split("started again now"):  # with a new server
-            await followed.follow(part)
-    for fact in facts:
-        assert any(fact in answer for answer in followed.answers), (fact, followed.answers)
+                if before:
+                    await followed.call(client, "webots_run", before)
+                await followed.follow(part, client)
+        for fact in facts:
+            followed.require(*fact)
+
+
+@pytest.mark.parametrize("page", skill_files(), ids=lambda page: page.parent.name)
+def test_a_skill_calls_listed_tools_only_and_first_declares_what_is_unknown(page: Path) -> None:
+    text = page.read_text("utf-8")
+    listed = {each.name for each in all_questions() if each.tier != "all"}
+    named = set(re.findall(r"\bwebots_\w+", text)) - {"webots_mcp", "webots_simulation"}
+    assert len(listed) == 34 and named <= listed
+    calls = [
+        ast.unparse(statement)
+        for file, language, block in BLOCK.findall(text)
+        if language == "python" and not file
+        for statement in ast.parse(block).body
+    ]
+    first = [call for call in calls if not call.startswith(("webots_list_runs", "webots_run"))][:2]
+    assert first[0].startswith("webots_check_run(") and first[1] == "webots_describe_signals()"
+    # A call outside of a block is one that the test above does not make.
+    assert not re.search(r"\bwebots_\w+\(", BLOCK.sub("", text).replace("webots_simulation(", ""))
 
 
 @pytest.mark.parametrize("page", skill_files(), ids=lambda page: page.parent.name)

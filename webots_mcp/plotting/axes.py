@@ -80,6 +80,13 @@ def ticks(low: float, high: float, most: float) -> list[tuple[float, str]]:
     return [(value, _label(value, step, max(abs(low), abs(high)))) for value in values]
 
 
+def rounded_on(value: float, bounds: tuple[float, float]) -> str:
+    """Return a value as text, as exactly as it can be read from an axis of that range."""
+    low, high = bounds
+    step = 10.0 ** math.floor(math.log10((high - low) / 100))
+    return _label(value, step, max(abs(low), abs(high), abs(value)))
+
+
 def _label(value: float, step: float, largest: float) -> str:
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
     if largest < 1e6 and decimals <= 5:

@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Final
 
 from webots_mcp.analysis.arrays import rhythm_of
+from webots_mcp.plotting.axes import axis_range
 from webots_mcp.store.series import NumberColumns, RunHistory
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum
@@ -25,6 +26,7 @@ class Curve:
     Attributes:
         points: In order of time; NaN where the line is broken.
         low: The smallest value of the range; `high` the largest.
+        last: The value of the newest row that has one; None where not all was read.
     """
 
     name: str
@@ -33,6 +35,7 @@ class Curve:
     points: Sequence[Point]
     low: float
     high: float
+    last: float | None = None
 
 
 def curve_of(columns: NumberColumns, run: RunHistory, origin_s: float = 0.0) -> Curve | None:
@@ -49,7 +52,9 @@ def curve_of(columns: NumberColumns, run: RunHistory, origin_s: float = 0.0) -> 
     broken = _with_breaks(points, run, angle=columns.kind == "angle")
     moved = [(time - origin_s, mean, low, high) for time, mean, low, high in broken]
     extremes = (columns.whole.min, columns.whole.max)
-    return Curve(columns.name, columns.unit, run.run_id, moved, *extremes)
+    newest = next((value for value in reversed(columns.last) if value is not None), None)
+    last = newest if run.cut_at_s is None else None
+    return Curve(columns.name, columns.unit, run.run_id, moved, *extremes, last)
 
 
 def _present(columns: NumberColumns, run: RunHistory) -> list[Point]:
@@ -96,6 +101,27 @@ class Panel:
         return list(dict.fromkeys(curve.name for curve in self.curves))
 
     @property
+    def scale(self) -> tuple[float, float]:
+        """The range of the vertical axis."""
+        return axis_range(min(c.low for c in self.curves), max(c.high for c in self.curves))
+
+    @property
+    def shared_name(self) -> str:
+        """What the names of its signals share, as a pattern such as `arm.*.torque`, or nothing."""
+        names = [name.split(".") for name in self.names]
+        first, last = _shared_parts(names)
+        if not first and not last:
+            return ""
+        return ".".join([*names[0][:first], "*", *names[0][len(names[0]) - last :]])
+
+    @property
+    def own_names(self) -> dict[str, str]:
+        """Return what is left of each name without what all of them share."""
+        names = [name.split(".") for name in self.names]
+        first, last = _shared_parts(names)
+        return {".".join(parts): ".".join(parts[first : len(parts) - last]) for parts in names}
+
+    @property
     def is_full(self) -> bool:
         """Whether another curve would be one too many."""
         return len(self.curves) == MOST_CURVES
@@ -107,6 +133,17 @@ class Panel:
         together = [*self.curves, curve]
         height = max(each.high for each in together) - min(each.low for each in together)
         return all(_is_visible(each, height) for each in together)
+
+
+def _shared_parts(names: Sequence[Sequence[str]]) -> tuple[int, int]:
+    """Return how many parts all names begin with, and end with; something is left of each."""
+    if len(names) < 2:
+        return 0, 0
+    most = min(len(parts) for parts in names) - 1
+    first = next((i for i in range(most) if len({parts[i] for parts in names}) > 1), most)
+    most -= first
+    last = next((i for i in range(most) if len({parts[-1 - i] for parts in names}) > 1), most)
+    return first, last
 
 
 def _is_visible(curve: Curve, height: float) -> bool:

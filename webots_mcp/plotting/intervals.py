@@ -43,6 +43,11 @@ class Lane:
     merged: Sequence[str] = ()
     colour: str = LINES[1]
 
+    @property
+    def counted(self) -> str:
+        """The name with the number of intervals, such as `stuck (2)`."""
+        return f"{self.name} ({len(self.intervals)})"
+
     def moved(self, origin_s: float, name: str) -> Lane:
         """Return the same under that name, on a clock that begins at `origin_s`."""
         return replace(self, name=name, intervals=[i.moved(origin_s) for i in self.intervals])

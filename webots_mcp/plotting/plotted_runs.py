@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.coverage import Verdicts
+from webots_mcp.judging.coverage import Verdicts, cause_of
 from webots_mcp.judging.detection.events import Events, Found, drawn_kinds, find_events
 from webots_mcp.judging.detection.kinds import Event, EventOptions
 from webots_mcp.judging.detection.search import find_motion
@@ -258,27 +258,44 @@ def event_lanes(
     notes = list[str]()
     if not known:
         notes = [note for note in found.notes if note not in part.notes]
-        notes += _not_looked_for(found.verdicts)
+        notes += _unsearched(found.verdicts)
     if found.left_out:
         kind, rest = max(found.left_out.items(), key=lambda item: item[1].count)
         notes.append(
-            f"{rest.count} events of kind {kind} up to {rest.last.start_s:.3f} s are not drawn"
+            f"Not drawn: {rest.count} events of kind {kind} up to {rest.last.start_s:.3f} s"
         )
     if left_out := kinds[most:]:
-        notes.append(f"events left out: {', '.join(left_out)}")
+        notes.append(f"No room for events of kind {', '.join(left_out)}")
     return lanes, notes
 
 
-def _not_looked_for(verdicts: Verdicts) -> list[str]:
-    """Return where a picture shows no number, there is none to be judged: that is no news."""
-    of_numbers = [kind.name for kind in drawn_kinds() if kind.of_numbers]
-    told = {
-        kind: reasons
-        for kind, reasons in verdicts.reasons.items()
-        if kind not in of_numbers or verdicts.unlooked(kind) is None
-    }
-    gaps = replace(verdicts, reasons=told).gaps
-    return [f"not looked for: {kinds}: {why}" for kinds, why in gaps.items()]
+def _unsearched(verdicts: Verdicts) -> list[str]:
+    """Return in one line the kinds that no signal shows, and why others were searched in part.
+
+    Where a picture shows no number there is none to be judged, which is no news.
+    """
+    of_numbers = {kind.name for kind in drawn_kinds() if kind.of_numbers}
+    nowhere = [kind for kind in verdicts.reasons if verdicts.unlooked(kind) is not None]
+    undrawn = [kind for kind in nowhere if kind in of_numbers]
+    lacking = [kind for kind in nowhere if kind not in undrawn and _is_absent(verdicts, kind)]
+    notes = list[str]()
+    if lacking:
+        notes = [f"Not searched for {', '.join(lacking)}: what would show them is not recorded"]
+    kinds_of = dict[str, list[str]]()
+    for kind, reasons in verdicts.reasons.items():
+        if kind not in lacking and kind not in undrawn:
+            kinds_of.setdefault("; ".join(reasons), []).append(kind)
+    return notes + [
+        f"Not searched everywhere for {', '.join(kinds)}: {why}" for why, kinds in kinds_of.items()
+    ]
+
+
+def _is_absent(verdicts: Verdicts, kind: str) -> bool:
+    """Return whether a kind was not searched only because no signal shows it."""
+    coverage = verdicts.coverage.get(kind)
+    causes = [each.cause for each in coverage.missing] if coverage else []
+    causes += map(cause_of, verdicts.reasons[kind])
+    return set(causes) == {"absent"}
 
 
 def _lane(kind: str, found: Events, part: PlottedRun) -> Lane:
@@ -336,7 +353,7 @@ def stuck_mark(
     found = _found(connection, part, options, known or {}, deadline_s)
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
     lane = Lane(f"stuck over {options.stuck_s:g} s", intervals, ())
-    return lane, [] if known else _not_looked_for(found.verdicts)
+    return lane, [] if known else _unsearched(found.verdicts)
 
 
 # What surrounds axes: titles, ticks, marks, and a legend in as many rows as it needs.

@@ -12,7 +12,7 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.judging.detection.events import Found
-from webots_mcp.plotting.axes import AxesBox, axis_range, ticks
+from webots_mcp.plotting.axes import AxesBox, rounded_on, ticks
 from webots_mcp.plotting.canvas import (
     LEAST_HEIGHT_PX,
     ROW_PX,
@@ -53,7 +53,7 @@ from webots_mcp.plotting.plotted_runs import (
     title_of,
     unread_parts,
 )
-from webots_mcp.signals.naming import listed, spelled_out
+from webots_mcp.signals.naming import counted, listed, spelled_out
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
@@ -65,7 +65,8 @@ class SignalLayout:
     """The layout of signals over time.
 
     Attributes:
-        small_text_px: Size of the letters in rows of intervals.
+        small_text_px: Size of the letters in rows of intervals and at the ends of curves.
+        leader_px: Length of the line from the end of a curve to its value.
         tick_px: Minimum distance between labels of the time axis.
         level_px: Minimum distance between labels of the vertical axis.
         right_px: Margin on the right.
@@ -76,6 +77,7 @@ class SignalLayout:
     """
 
     small_text_px: float = 9.5
+    leader_px: float = 9.0
     tick_px: float = 70.0
     level_px: float = 20.0
     right_px: float = 16.0
@@ -234,12 +236,33 @@ def _x_label(parts: Sequence[PlottedRun]) -> str:
 
 
 def _caption(plot: SignalAxes) -> str:
-    shown = [name for panel in plot.panels for name in panel.names]
-    below = [lane.name for lane in plot.lanes]
-    behind = f" over {plot.bands.name}" if plot.bands else ""
-    unread = f", from {plot.unread[0].start_s:g} s on not all was read" if plot.unread else ""
-    events = "; events: " + ", ".join(lane.name for lane in plot.events) if plot.events else ""
-    return f"{plot.title}: {', '.join([*shown, *below])}{behind}{events}{unread}"
+    sentences = [plot.title]
+    if plot.panels:
+        panels = "; ".join(_panel_caption(panel, plot) for panel in plot.panels)
+        sentences.append(f"Curves with their last values: {panels}")
+    if plot.bands:
+        sentences.append(f"Background: {plot.bands.name}")
+    if plot.lanes:
+        sentences.append(f"Rows: {'; '.join(lane.name for lane in plot.lanes)}")
+    if plot.events:
+        sentences.append(f"Events: {', '.join(lane.counted for lane in plot.events)}")
+    if plot.unread:
+        sentences.append(f"Not all was read from {plot.unread[0].start_s:g} s on")
+    return ". ".join(sentences)
+
+
+def _panel_caption(panel: Panel, plot: SignalAxes) -> str:
+    """Return the signals of a panel with the values at the ends of their curves."""
+    described = list[str]()
+    for name in panel.names:
+        values = [
+            f"{rounded_on(curve.last, panel.scale)}{f' {curve.unit}' if curve.unit else ''}"
+            + (f" (run {curve.run_id})" if plot.colour_by_run else "")
+            for curve in panel.curves
+            if curve.name == name and curve.last is not None
+        ]
+        described.append(" ".join([name, ", ".join(values)]).strip())
+    return ", ".join(described)
 
 
 def _notes(parts: Sequence[PlottedRun], curves: Sequence[Curve]) -> list[str]:
@@ -248,16 +271,16 @@ def _notes(parts: Sequence[PlottedRun], curves: Sequence[Curve]) -> list[str]:
     for part in parts:
         left = [c for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
         if too_large := [columns.name for columns in left if columns.too_large]:
-            notes.append(f"beyond 1e100 in {part.name}: {listed(too_large)}")
+            notes.append(f"Too large to draw (beyond 1e100) in {part.name}: {listed(too_large)}")
         without_value = [
             each.name
             for each in left
             if not each.whole.present and not each.too_large and each.whole.rows
         ]
         if without_value and part.unread is None:
-            notes.append(f"without a value in {part.name}: {listed(without_value)}")
+            notes.append(f"No value in {part.name}: {listed(without_value)}")
         notes += [
-            f"{columns.name} in {part.name} was {_counted(columns.replaced)}: not drawn"
+            f"Not drawn of {columns.name} in {part.name}: {_counted(columns.replaced)}"
             for columns in part.run.numbers
             if columns.replaced
         ]
@@ -265,12 +288,15 @@ def _notes(parts: Sequence[PlottedRun], curves: Sequence[Curve]) -> list[str]:
 
 
 def _counted(replaced: dict[str, int]) -> str:
-    return ", ".join(f"{value} {count} times" for value, count in replaced.items())
+    return ", ".join(f"{counted(count, 'value')} {value}" for value, count in replaced.items())
 
 
 def _left_out(names: Sequence[str], room: Room) -> str:
-    why = f"most that a picture of this size holds: panels {room.panels}, rows {room.lanes}"
-    return f"left out: {listed(dict.fromkeys(names))} ({why}); ask for them alone"
+    holds = f"{counted(room.panels, 'panel')} and {counted(room.lanes, 'row')}"
+    return (
+        f"Left out: {listed(dict.fromkeys(names))}. A picture of this size has room for {holds}: "
+        "draw them in a picture of their own"
+    )
 
 
 def _nothing(parts: Sequence[PlottedRun]) -> str:
@@ -325,6 +351,13 @@ class _SignalPainter:
     def __init__(self, plot: SignalAxes, width_px: int, height_px: int, theme: Theme) -> None:
         self._plot = plot
         self._canvas = Canvas(width_px, height_px, theme)
+        values_px = [
+            width_of(rounded_on(curve.last, panel.scale), _LAYOUT.small_text_px)
+            for panel in plot.panels
+            for curve in panel.curves
+            if curve.last is not None
+        ]
+        self._right_px = max([_LAYOUT.right_px, *(_LAYOUT.leader_px + 6 + px for px in values_px)])
         behind = plot.bands.values if plot.bands else ()
         values = [value for lane in plot.lanes for value in lane.values]
         # The same value has the same style in every row, and behind the panels.
@@ -338,10 +371,7 @@ class _SignalPainter:
             for panel in plot.panels
         ]
         label = wrapped(plot.x_label, canvas.width_px - 70)
-        scales = [
-            axis_range(min(c.low for c in panel.curves), max(c.high for c in panel.curves))
-            for panel in plot.panels
-        ]
+        scales = [panel.scale for panel in plot.panels]
         left = self._left_px(scales)
         legend = rows_of(self._entries(left), canvas.width_px - 20, canvas.height_px)
         below = _LAYOUT.time_labels_px + LINE_PX * (len(label) + len(legend)) + 4
@@ -350,7 +380,7 @@ class _SignalPainter:
         rows_px = self._rows_px(room)
         panel_px = (room - rows_px) / max(1, len(plot.panels))
         frames: list[AxesBox] = []
-        width = canvas.width_px - left - _LAYOUT.right_px
+        width = canvas.width_px - left - self._right_px
         for panel, rows, scale in zip(plot.panels, heads, scales, strict=True):
             paint_rows(canvas, rows, top, left)
             top += LINE_PX * len(rows) + 2
@@ -370,9 +400,12 @@ class _SignalPainter:
     def _left_px(self, scales: Sequence[tuple[float, float]]) -> float:
         """Return what labels at the left take; of a long name of a row the end is shown."""
         most = 0.3 * self._canvas.width_px
-        named = [width_of(short(lane.name)) for lane in self._plot.rows]
+        named = [width_of(self._row_name(lane)) for lane in self._plot.rows]
         labels = [width_of(text) for scale in scales for _, text in ticks(*scale, 5)]
         return 12 + min(most, max([24.0, *named, *labels]))
+
+    def _row_name(self, lane: Lane) -> str:
+        return lane.counted if lane in self._plot.events else short(lane.name)
 
     def _rows_px(self, room: float) -> float:
         """Rows take the pixels that they need, the panels share the rest."""
@@ -388,19 +421,22 @@ class _SignalPainter:
     # Panels ---------------------------------------------------------------------------------------
 
     def _head(self, panel: Panel) -> list[LegendEntry]:
-        """Return what stands above a panel: the name of its signal, or a legend of its lines."""
+        """Return what stands above a panel: the name of its signal, or a legend of its lines.
+
+        What the names of the lines share is a title, and the legend names what differs.
+        """
         unit = [f"[{panel.unit}]"] if panel.unit else []
         room = self._canvas.width_px - 90
         if len(panel.names) == 1:
             part = "" if self._plot.colour_by_run else self._part(panel.curves[0])
             return [LegendEntry(fitted(" ".join([panel.names[0], *unit]), room), None, part)]
+        named = _curve_names(panel, room)
         entries = [
-            LegendEntry(
-                _named(curve, panel), line_sample(*self._pen(panel, index)), self._part(curve)
-            )
+            LegendEntry(named[curve.name], line_sample(*self._pen(panel, index)), self._part(curve))
             for index, curve in enumerate(panel.curves)
         ]
-        return [*entries, *map(LegendEntry, unit)]
+        title = " ".join([panel.shared_name, *unit]).strip()
+        return [LegendEntry(fitted(title, room))] * bool(title) + entries
 
     def _part(self, curve: Curve) -> str:
         """By which a page finds it: of several runs all curves of one are hidden together."""
@@ -430,6 +466,7 @@ class _SignalPainter:
             self._curve(frame, curve, *self._pen(panel, index), len(panel.curves))
         self._close()
         paint_y_axis(canvas, frame, levels)
+        self._last_values(panel, frame)
 
     def _open(self, frame: AxesBox) -> None:
         """Begin what is cut off at the frame, and scaled in a page that is zoomed."""
@@ -473,6 +510,42 @@ class _SignalPainter:
                            stroke_width=4, stroke_linecap="round")  # fmt: skip
         canvas.close()
 
+    def _last_values(self, panel: Panel, frame: AxesBox) -> None:
+        """Write the last value at the end of each curve; a line leads to one that was moved."""
+        canvas, size = self._canvas, _LAYOUT.small_text_px
+        taken = list[tuple[float, float, float]]()  # left, right, middle
+        ends = [
+            (float(frame.px(time_s)), float(frame.py(mean)), index)
+            for index, curve in enumerate(panel.curves)
+            if curve.last is not None
+            for time_s, mean, *_ in [curve.points[-1]]
+        ]
+        canvas.open(class_="marks")
+        for x, y, index in sorted(ends):
+            curve = panel.curves[index]
+            text = rounded_on(curve.last or 0.0, panel.scale)
+            left = x + _LAYOUT.leader_px
+            right = left + width_of(text, size) + 3
+            beside = [at for start, end, at in taken if start < right and left < end]
+            middle = _free_place(y, beside, (frame.top + size / 2, frame.bottom - size / 2), size)
+            if middle is None:
+                continue  # the caption has it
+            taken.append((left, right, middle))
+            canvas.open(data_part=self._part(curve))
+            canvas.open(class_="at", data_x=x, data_y=y, transform=f"translate({x:.1f} {y:.1f})")
+            to = f"M1 0L{_LAYOUT.leader_px - 2:g} {middle - y:.1f}"
+            pen = {"stroke": self._pen(panel, index)[0], "stroke_width": 1.4, "fill": "none"}
+            canvas.add("path", d=to, **pen)
+            halo: dict[str, Any] = {
+                "stroke": canvas.theme.ground,
+                "stroke_width": 2.5,
+                "paint_order": "stroke",
+            }
+            canvas.text(_LAYOUT.leader_px, middle - y + 3.5, text, size=size, **halo)
+            canvas.close()
+            canvas.close()
+        canvas.close()
+
     def _ground(self, frame: AxesBox) -> None:
         """Modes and gaps, over the whole height behind the curves."""
         bands = self._plot.bands
@@ -514,7 +587,7 @@ class _SignalPainter:
         self._close()
         for row, lane in enumerate(plot.rows):
             middle = frame.top + (row + 0.5) * row_px
-            name = fitted(short(lane.name), frame.left - 10)
+            name = fitted(self._row_name(lane), frame.left - 10)
             canvas.text(frame.left - 7, middle + 4, name, anchor="end")
             canvas.open(class_="marks")
             if row < len(plot.lanes):
@@ -531,13 +604,28 @@ class _SignalPainter:
                 self._name(short(each.value), x, middle, colour=ink, anchor="middle")
 
     def _mark_events(self, frame: AxesBox, middle: float, lane: Lane) -> None:
-        """A mark at the start of each, its name where there is room."""
-        ends = [*(each.start_s for each in lane.intervals[1:]), frame.x[1]]
-        for each, end_s in zip(lane.intervals, ends, strict=True):
-            x = float(frame.px(each.start_s))
+        """A mark at the start of each, its name behind it or before it where there is room."""
+        marked: dict[float, list[str]] = {}  # what begins at the same pixel shares a mark
+        for each in lane.intervals:
+            marked.setdefault(round(float(frame.px(each.start_s)), 0), []).append(each.value)
+        free_from = frame.left
+        ends = [*(x - 6 for x in list(marked)[1:]), frame.right]
+        for (x, values), end in zip(marked.items(), ends, strict=True):
             paint_mark(self._canvas, "diamond", (x, middle), 4.0, fill=lane.colour)
-            if _has_room(frame, Interval(each.value, each.start_s, end_s)):
-                self._name(short(each.value), x, middle, shift=7.0)
+            after = x + 6
+            names = [value for value in dict.fromkeys(values) if value]
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            texts = [", ".join(names), f"{short(names[0])}{more}"] if names else []
+            for text in texts:
+                width = width_of(text, _LAYOUT.small_text_px)
+                if x + 7 + width < end:
+                    self._name(text, x, middle, shift=7.0)
+                    after = x + 7 + width
+                    break
+                if free_from < x - 7 - width:
+                    self._name(text, x, middle, shift=-7.0, anchor="end")
+                    break
+            free_from = after
 
     def _name(self, text: str, x: float, y: float, *, shift: float = 0.0, **style: Any) -> None:
         canvas = self._canvas
@@ -565,7 +653,7 @@ class _SignalPainter:
                 LegendEntry(short(value), area_sample(self._styles[value], _LAYOUT.band_opacity))
                 for value in plot.bands.values
             ]
-        width = self._canvas.width_px - left - _LAYOUT.right_px
+        width = self._canvas.width_px - left - self._right_px
         frame = AxesBox(left, 0, width, 1, plot.x_range, (0, 1))
         return entries + [
             LegendEntry(short(value), area_sample(self._styles[value]))
@@ -573,10 +661,31 @@ class _SignalPainter:
         ]
 
 
-def _named(curve: Curve, panel: Panel) -> str:
-    """With its own unit where that of the panel is not that of all."""
-    own = f" [{curve.unit}]" if curve.unit and not panel.unit else ""
-    return short(curve.name) + own
+def _curve_names(panel: Panel, room_px: float) -> dict[str, str]:
+    """Return how the legend names each signal, with its unit where the panel has several."""
+    shortened = {name: short(own) for name, own in panel.own_names.items()}
+    if len(set(shortened.values())) < len(shortened):  # the ends alone do not differ
+        shortened = {name: fitted(own, room_px) for name, own in panel.own_names.items()}
+    units = {curve.name: curve.unit for curve in panel.curves if not panel.unit}
+    return {
+        name: f"{text} [{units[name]}]" if units.get(name) else text
+        for name, text in shortened.items()
+    }
+
+
+def _free_place(
+    wanted: float, taken: Sequence[float], bounds: tuple[float, float], height: float
+) -> float | None:
+    """Return the nearest place within bounds that is a height away from those taken, if any."""
+    low, high = bounds
+    moved = (at + side * (height + 0.5) for at in taken for side in (-1, 1))
+    places = [min(max(wanted, low), high), *moved]
+    free = [
+        place
+        for place in places
+        if low <= place <= high and all(abs(place - at) >= height for at in taken)
+    ]
+    return min(free, key=lambda place: abs(place - wanted), default=None)
 
 
 def line_through(x: Any, y: Any) -> str:

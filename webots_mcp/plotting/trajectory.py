@@ -12,7 +12,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.events import Found
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
-from webots_mcp.plotting.axes import AxesBox, axis_range, ticks
+from webots_mcp.plotting.axes import AxesBox, axis_range, rounded_on, ticks
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, short, width_of
 from webots_mcp.plotting.colours import DASHES, INK, LINES, ON_PAPER, Theme, area_styles, scaled
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
@@ -116,8 +116,7 @@ def plot_trajectory(
     sheet = sheet or Sheet()
     plot, notes = compose_trajectory(connection, ranges, position, bands=bands)
     canvas, _ = paint_trajectory(plot, sheet.width_px, sheet.height_px)
-    caption = "; ".join([f"{plot.title}: {plot.y_label} over {plot.x_label}", *_cut(plot.tracks)])
-    return canvas.picture(sheet.image_format, caption, notes)
+    return canvas.picture(sheet.image_format, _caption(plot), notes)
 
 
 def compose_trajectory(
@@ -209,6 +208,35 @@ def _flags(known: Known) -> list[str]:
     return [name for name in flags if any(word in name.lower() for word in words)]
 
 
+def _caption(plot: TrajectoryAxes) -> str:
+    drawn = [track for track in plot.tracks if track.path.places]
+    sentences = [plot.title, f"Path from above: {plot.y_label} over {plot.x_label}"]
+    for track in drawn:
+        whose = f" of {track.name}" if len(plot.tracks) > 1 else ""
+        start, end = (_place_text(track.path.places[at], plot) for at in (0, -1))
+        end = f", end {end}" if track.path.is_whole else ""
+        sentences.append(f"Start{whose} {start}{end}")
+    if len(plot.tracks) == 1:
+        sentences.append(f"Colour: {plot.mode if drawn[0].modes else 'simulation time'}")
+    marks = [
+        f"{mark.counted}{f' of {track.name}' if len(plot.tracks) > 1 else ''}"
+        for track in drawn
+        for mark in track.marks
+        if mark.intervals
+    ]
+    sentences += [f"Marks: {', '.join(marks)}"] if marks else []
+    return ". ".join([*sentences, *_cut(plot.tracks)])
+
+
+def _place_text(place: PathPoint, plot: TrajectoryAxes) -> str:
+    """Return a place as exactly as it can be read from the picture."""
+    texts = list[str]()
+    for at in (1, 2):
+        values = [each[at] for each in plot.places]
+        texts.append(rounded_on(place[at], axis_range(min(values), max(values))))
+    return f"({', '.join(texts)})"
+
+
 def _lane(part: PlottedRun, name: str | None) -> Lane | None:
     found = (columns for columns in part.run.changes if columns.name == name)
     lanes = (lane_of(columns, part.run, part.end_s) for columns in found)
@@ -241,7 +269,7 @@ def _notes(parts: Sequence[PlottedRun], tracks: Sequence[PlottedPath]) -> tuple[
 def _cut(tracks: Sequence[PlottedPath]) -> list[str]:
     """Up to when a way was read that goes on."""
     return [
-        f"the path of {track.name} is not read after {track.path.places[-1].time_s:g} s"
+        f"The path of {track.name} was not read after {track.path.places[-1].time_s:g} s"
         for track in tracks
         if track.path.places and not track.path.is_whole
     ]
@@ -470,9 +498,11 @@ class _TrajectoryPainter:
     def _entries(self) -> list[LegendEntry]:
         plot, ink, ground = self._plot, self._canvas.theme.ink, self._canvas.theme.ground
         start = mark_sample("circle", 5.0, fill=ground, stroke=ink, stroke_width=2.0)
-        entries = [LegendEntry("start", start)]
+        path = plot.tracks[0].path
+        at = [f" {_place_text(path.places[i], plot)}" if self._alone else "" for i in (0, -1)]
+        entries = [LegendEntry(f"start{at[0]}", start)]
         if any(each.path.is_whole for each in plot.tracks if each.path.places):
-            entries.append(LegendEntry("end", mark_sample("square", 6.5, fill=ink)))
+            entries.append(LegendEntry(f"end{at[1]}", mark_sample("square", 6.5, fill=ink)))
         if self._modes is not None:
             entries.append(LegendEntry(f"{short(self._modes.name)}:"))
             for value in self._modes.values:
@@ -490,7 +520,7 @@ class _TrajectoryPainter:
                 if mark.intervals:
                     size = min(9.0, _size(shape))
                     sample = mark_sample(shape, size, **self._style(shape, index))
-                    text = f"{short(mark.name)}{whose} ({len(mark.intervals)})"
+                    text = f"{short(mark.name)} ({len(mark.intervals)}){whose}"
                     entries.append(LegendEntry(fitted(text, self._canvas.width_px - 80), sample))
         return entries
 

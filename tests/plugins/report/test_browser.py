@@ -80,7 +80,7 @@ def test_the_values_of_all_are_told_at_the_pointer_and_a_click_hides_a_curve(ope
     told.wait_for()
     assert "battery_v 12." in told.inner_text()
     figure.locator('[data-hides="curve battery_v"]').click()
-    assert not figure.locator('[data-part="curve battery_v"]').is_visible()
+    assert not figure.locator('[data-part="curve battery_v"]').first.is_visible()
     opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + 80)
     assert "battery_v" not in told.inner_text()
 

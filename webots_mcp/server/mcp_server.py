@@ -19,6 +19,7 @@ from mcp.server import CacheHint, MCPServer
 from mcp.server.mcpserver import Context
 from mcp.server.mcpserver.exceptions import ResourceError, ToolError
 from mcp.server.mcpserver.tools import Tool
+from mcp.server.subscriptions import InMemorySubscriptionBus
 from mcp.types import (
     INVALID_PARAMS,
     CallToolResult,
@@ -41,6 +42,7 @@ from webots_mcp.server.channel import CHANNEL_INSTRUCTIONS, Channel
 from webots_mcp.server.connected_clients import ConnectedClients
 from webots_mcp.server.occurrences import OccurrenceReader
 from webots_mcp.server.prompts import add_prompts
+from webots_mcp.server.run_resources import Subscriptions, add_run_resources
 from webots_mcp.server.tools import tool_of
 from webots_mcp.server.updates import UpdateWatch
 from webots_mcp.signals.naming import perhaps_meant
@@ -111,14 +113,16 @@ def create_server(
     names = {each.name for each in shown}
     clients = ConnectedClients()
     channels = [Channel(clients)] if notify else []
-    reader = OccurrenceReader(recording, names)
-    watch = UpdateWatch(reader, *(each.send for each in channels))
+    watch, bus = UpdateWatch(OccurrenceReader(recording, names)), InMemorySubscriptionBus()
+    subscriptions = Subscriptions(clients, bus, watch)
+    watch.receivers.extend([subscriptions.send, *(each.send for each in channels)])
     mcp = ToolServer(
         "webots-mcp",
         title="Webots flight recorder",
         version=VERSION,
         instructions=f"{INSTRUCTIONS}\n{CHANNEL_INSTRUCTIONS}" if notify else INSTRUCTIONS,
-        middleware=[clients, *channels],
+        middleware=[clients, subscriptions, *channels],
+        subscriptions=bus,
         tools=[
             tool_of(each, recording, listed=names, output_schema=output_schemas) for each in shown
         ],
@@ -132,6 +136,8 @@ def create_server(
         lifespan=_lifespan(recording, readers, Upkeep(data_dir), asked, watch, notify),
     )
     add_resources(mcp, recording)
+    add_run_resources(mcp, recording)
+    subscriptions.serve(mcp)
     add_prompts(mcp)
     return mcp
 

@@ -124,7 +124,7 @@ def _answering(question: Question) -> Callable[..., Any]:
     @functools.wraps(question.function)
     async def wrapper(recording: RecordingAccess, ctx: Context[Any], **arguments: Any) -> Any:
         companions = ctx.request_context.lifespan_context
-        caller = Caller("mcp", ctx.report_progress, companions, _requester(ctx))
+        caller = Caller("mcp", ctx.report_progress, companions, requester_of(ctx))
         try:
             call = functools.partial(question.ask, recording, arguments, caller)
             reply = await ask_with_consent(ctx, recording, question.name, arguments, call)
@@ -150,7 +150,7 @@ def _answering(question: Question) -> Callable[..., Any]:
     return wrapper
 
 
-def _requester(ctx: Context[Any]) -> Requester:
+def requester_of(ctx: Context[Any]) -> Requester:
     """Return the client, as it has named itself, and the transport that its call came by."""
     asked = ctx.request_context
     client = asked.session.client_params

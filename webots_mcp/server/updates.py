@@ -23,22 +23,29 @@ class UpdateWatch:
 
     Args:
         reader: Reads the recording.
+
+    Attributes:
         receivers: Are called with what is new.
     """
 
-    def __init__(self, reader: OccurrenceReader, *receivers: Receiver) -> None:
-        self._reader, self._receivers = reader, receivers
+    def __init__(self, reader: OccurrenceReader) -> None:
+        self.receivers: list[Receiver] = []
+        self._reader = reader
         self._threads: CapacityLimiter | None = None
+        self._beginning: anyio.Lock | None = None
         self._wanted: anyio.Event | None = None
         self._warned: str | None = None
 
     async def begin(self) -> None:
         """Read from now on: what is in the recording by now is not new."""
-        if self._wanted is None or not self._wanted.is_set():
-            await self._read()
-        if self._wanted is None:
-            self._wanted = anyio.Event()
-        self._wanted.set()
+        if self._beginning is None:
+            self._beginning = anyio.Lock()
+        async with self._beginning:
+            if self._wanted is None:
+                self._wanted = anyio.Event()
+            if not self._wanted.is_set():
+                await self._read()
+                self._wanted.set()
 
     async def run(self) -> None:
         """Read and send until it is cancelled."""
@@ -50,7 +57,7 @@ class UpdateWatch:
             news = await self._read()
             if news is None:
                 continue
-            for receive in self._receivers:
+            for receive in self.receivers:
                 await receive(news)
 
     async def _read(self) -> News | None:

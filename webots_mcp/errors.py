@@ -25,6 +25,7 @@ of its own.
     │   └── InvalidRangeError
     ├── NothingRecordedError        the question is fine, the recording has no answer yet
     ├── NotAllowedError             the project's file does not allow it: which line does not
+    │   └── ConsentRequiredError    it does if the person agrees, who was not asked
     ├── LeaseLostError              another process does by now what this one did
     ├── ConditionFailedError        a condition met values that it cannot be asked of
     └── CommandRefusedError         the simulation or the robot cannot do what was asked
@@ -146,6 +147,16 @@ class NotAllowedError(WebotsMCPError):
     def __init__(self, text: str, rule: str) -> None:
         super().__init__(text)
         self.rule = rule
+
+
+class ConsentRequiredError(NotAllowedError):
+    """A rule of the project's `webots-mcp.toml` allows it only if the person agrees.
+
+    Attributes:
+        request_id: The row of the request, if it has one.
+    """
+
+    request_id: int | None = None
 
 
 class LeaseLostError(WebotsMCPError):

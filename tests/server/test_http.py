@@ -70,12 +70,12 @@ class Http:
         self.token = token_file().read_text("ascii").strip()
 
     @asynccontextmanager
-    async def client(self, mode: Mode = "auto") -> AsyncGenerator[Client]:
+    async def client(self, mode: Mode = "auto", **options: Any) -> AsyncGenerator[Client]:
         headers = {"Authorization": f"Bearer {self.token}"}
         carrier = httpx2.AsyncClient(headers=headers, timeout=100)
         async with carrier:
             transport = streamable_http_client(self.url, http_client=carrier)
-            async with Client(transport, mode=mode) as client:
+            async with Client(transport, mode=mode, **options) as client:
                 yield client
 
     def post(

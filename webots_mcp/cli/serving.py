@@ -90,6 +90,16 @@ def serve(
     tls_key: Annotated[
         Path | None, Parameter("--tls-key", help="With --http: the certificate's key, in PEM.")
     ] = None,
+    notify: Annotated[
+        bool,
+        Parameter(
+            "--notify",
+            negative=(),
+            help="Tell clients that have channels (Claude Code) without being asked when a "
+            "breakpoint is hit, an expectation is violated, a controller crashed or trials are "
+            "done; see docs/updates.md.",
+        ),
+    ] = False,
     limits: RetentionOptions = _AS_BEFORE,
     recorded: Where = HERE,
 ) -> None:
@@ -141,6 +151,7 @@ def serve(
             tools=tools,
             output_schemas=output_schemas,
             limits=asked,
+            notify=notify,
         )
     with ending_in_time(), _ending_with_the_client():
         if place is None:

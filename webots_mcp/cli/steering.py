@@ -316,7 +316,7 @@ def _request_row(request: dict[str, Any]) -> list[Any]:
     by = f"{request['client']} {request['client_version']} ({request['transport']})"
     outcome = request["outcome"] or "no answer: under way, or its process was ended"
     if request["rule"]:
-        outcome = f"refused by {request['rule']}"
+        outcome = f"{outcome} by {request['rule']}"
     commands = "; ".join(f"{number} {action} {status}" for number, action, status in
                          request["commands"])  # fmt: skip
     when = clock_text(request["wall_time_s"])

@@ -13,12 +13,13 @@ from pathlib import Path
 from sqlite3 import Connection
 from typing import Any, Final
 
-from anyio import CancelScope, to_thread
+from anyio import CancelScope, create_task_group, to_thread
 from mcp import MCPError
 from mcp.server import CacheHint, MCPServer
 from mcp.server.mcpserver import Context
 from mcp.server.mcpserver.exceptions import ResourceError, ToolError
 from mcp.server.mcpserver.tools import Tool
+from mcp.server.subscriptions import InMemorySubscriptionBus
 from mcp.types import (
     INVALID_PARAMS,
     CallToolResult,
@@ -37,8 +38,13 @@ from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import TIERS, Tier
 from webots_mcp.questions.faults import faults_of, shown_value
 from webots_mcp.questions.former_calls import current_call
+from webots_mcp.server.channel import CHANNEL_INSTRUCTIONS, Channel
+from webots_mcp.server.connected_clients import ConnectedClients
+from webots_mcp.server.occurrences import OccurrenceReader
 from webots_mcp.server.prompts import add_prompts
+from webots_mcp.server.run_resources import Subscriptions, add_run_resources
 from webots_mcp.server.tools import tool_of
+from webots_mcp.server.updates import UpdateWatch
 from webots_mcp.signals.naming import perhaps_meant
 from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.launcher import Companions, Launcher
@@ -83,6 +89,7 @@ def create_server(
     tools: Tier = "default",
     output_schemas: bool = False,
     limits: Asked | None = None,
+    notify: bool = False,
 ) -> MCPServer:
     """Return an MCP server over a recording; it starts whether or not anything was recorded yet.
 
@@ -96,6 +103,7 @@ def create_server(
             much room as all else.
         limits: What it asks for of how much is kept; a database where somebody has set limits
             keeps to those.
+        notify: Tell clients without being asked what happens; see `channel`.
     """
     asked = dict(limits or {})
     readers = OpenReaders()
@@ -103,11 +111,18 @@ def create_server(
     possible = [each for each in all_questions() if each.effect.reads or not read_only]
     shown = [each for each in possible if TIERS.index(each.tier) <= TIERS.index(tools)]
     names = {each.name for each in shown}
+    clients = ConnectedClients()
+    channels = [Channel(clients)] if notify else []
+    watch, bus = UpdateWatch(OccurrenceReader(recording, names)), InMemorySubscriptionBus()
+    subscriptions = Subscriptions(clients, bus, watch)
+    watch.receivers.extend([subscriptions.send, *(each.send for each in channels)])
     mcp = ToolServer(
         "webots-mcp",
         title="Webots flight recorder",
         version=VERSION,
-        instructions=INSTRUCTIONS,
+        instructions=f"{INSTRUCTIONS}\n{CHANNEL_INSTRUCTIONS}" if notify else INSTRUCTIONS,
+        middleware=[clients, subscriptions, *channels],
+        subscriptions=bus,
         tools=[
             tool_of(each, recording, listed=names, output_schema=output_schemas) for each in shown
         ],
@@ -118,9 +133,11 @@ def create_server(
         },
         withheld={each.name for each in all_questions()} - {each.name for each in possible},
         cache_hints={"tools/list": _KEPT, "prompts/list": _KEPT, "resources/list": _KEPT},
-        lifespan=_lifespan(recording, readers, Upkeep(data_dir), asked),
+        lifespan=_lifespan(recording, readers, Upkeep(data_dir), asked, watch, notify),
     )
     add_resources(mcp, recording)
+    add_run_resources(mcp, recording)
+    subscriptions.serve(mcp)
     add_prompts(mcp)
     return mcp
 
@@ -142,11 +159,17 @@ class _ChunkMaker(threading.Thread):
 
 
 def _lifespan(
-    recording: RecordingAccess, readers: OpenReaders, retain: Upkeep, asked: Asked
+    recording: RecordingAccess,
+    readers: OpenReaders,
+    retain: Upkeep,
+    asked: Asked,
+    updates: UpdateWatch,
+    notify: bool,
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[Companions]]:
     """While a server runs, trials and Webots may; what may be written is maintained and followed.
 
-    What it follows is the console of each Webots that belongs to the recording.
+    What it follows is the console of each Webots that belongs to the recording. With `notify`,
+    updates are sent from the beginning, else once a client asks for them.
     """
     unasked, project = dict(asked), ProjectWatch(recording.data_dir)
 
@@ -179,7 +202,12 @@ def _lifespan(
         for watch in watches:
             watch.start()
         try:
-            yield companions
+            async with create_task_group() as tasks:
+                if notify:
+                    await updates.begin()
+                tasks.start_soon(updates.run)
+                yield companions
+                tasks.cancel_scope.cancel()
         finally:
             with CancelScope(shield=True):
                 await to_thread.run_sync(companions.stop)

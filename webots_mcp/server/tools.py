@@ -26,6 +26,7 @@ from mcp.server.mcpserver.tools import Tool
 from mcp.types import (
     CallToolResult,
     ContentBlock,
+    InputRequiredResult,
     TextContent,
     ToolAnnotations,
 )
@@ -36,6 +37,7 @@ from webots_mcp.answers.shortening import compact_json, cut_text
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.questions.declaring import Caller, Question, Reply
 from webots_mcp.questions.faults import faults_of, shown_value
+from webots_mcp.server.consent import ask_with_consent
 from webots_mcp.signals.naming import harmless_first, perhaps_meant
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import Requester
@@ -122,9 +124,11 @@ def _answering(question: Question) -> Callable[..., Any]:
     @functools.wraps(question.function)
     async def wrapper(recording: RecordingAccess, ctx: Context[Any], **arguments: Any) -> Any:
         companions = ctx.request_context.lifespan_context
-        caller = Caller("mcp", ctx.report_progress, companions, _requester(ctx))
+        caller = Caller("mcp", ctx.report_progress, companions, requester_of(ctx))
         try:
-            return _as_result(await question.ask(recording, arguments, caller))
+            call = functools.partial(question.ask, recording, arguments, caller)
+            reply = await ask_with_consent(ctx, recording, question.name, arguments, call)
+            return reply if isinstance(reply, InputRequiredResult) else _as_result(reply)
         except WebotsMCPError as error:
             rows = f" (left out: {'; '.join(error.left_out)})" if error.left_out else ""
             # It may repeat what the model itself has sent.
@@ -146,7 +150,7 @@ def _answering(question: Question) -> Callable[..., Any]:
     return wrapper
 
 
-def _requester(ctx: Context[Any]) -> Requester:
+def requester_of(ctx: Context[Any]) -> Requester:
     """Return the client, as it has named itself, and the transport that its call came by."""
     asked = ctx.request_context
     client = asked.session.client_params

@@ -6,16 +6,18 @@
     fields = ["BALL.*", "*.translation"]
     nodes = ["BOXES.children*"]      # where nodes may be added or removed
     worlds = ["arena*.wbt"]
-    launch = false
+    launch = false                   # or "ask"
     holds_for = "everyone"           # or "assistants"
 
     [allow.parameters]
     kp = [0.0, 5.0]
     gait = ["trot", "walk"]
+    gain = "ask"
     "*" = true                          # as the controller declares
 
-A key that is left out allows all. The file is read anew for each request, so that it holds from the
-next one on, and can be neither stale nor cached.
+A pattern that begins with `?`, and the value "ask", have the person asked, where the client can
+ask one. A key that is left out allows all. The file is read anew for each request, so that it holds
+from the next one on, and can be neither stale nor cached.
 """
 
 from __future__ import annotations
@@ -23,15 +25,15 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, cast
 
 from webots_mcp.contract import PROJECT_FILE
 from webots_mcp.database.files import full_path
 from webots_mcp.database.location import Database, find_project
-from webots_mcp.errors import InvalidInputError, NotAllowedError
+from webots_mcp.errors import ConsentRequiredError, InvalidInputError, NotAllowedError
 from webots_mcp.signals.meaning import fits_pattern
 from webots_mcp.store.project_file import load_toml
 
@@ -67,8 +69,10 @@ ANY_ACTION: Final = (
     "webots_send_command"  # the tool that sends any: it stands for none of the others
 )
 _PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
+ASKS: Final = "ask"
 _HOLDS_FOR: Final = ("everyone", "assistants")
 _KEYS: Final = (*_PATTERNS, "parameters", LAUNCH, "holds_for")
+_FIRST: Final = "put the patterns with ? before the others"
 _ASK: Final = (
     "Do not look for another way to the same: the person whose project it is can change that line, "
     "and it holds from the next request on"
@@ -83,11 +87,17 @@ class Policy:
         file: Where it stands.
         text: All of the file, for the numbers of lines.
         allow: Its table.
+        agreed: Its rules that ask the person, to which the person has agreed.
     """
 
     file: Path
     text: str
     allow: Mapping[str, Any]
+    agreed: Collection[str] = ()
+
+    def with_consent(self, agreed: Collection[str]) -> Policy:
+        """Return the policy for a request for which the person has agreed to these rules."""
+        return replace(self, agreed=agreed)
 
     def holds_for(self, transport: str) -> bool:
         """Whether it binds who asks that way: `stdio` and `http` are assistants'."""
@@ -99,6 +109,7 @@ class Policy:
 
         Raises:
             NotAllowedError: The file does not allow it.
+            ConsentRequiredError: It does if the person agrees.
         """
         self._require("tools", names, f"{names[0]} is not allowed")
 
@@ -112,10 +123,14 @@ class Policy:
 
         Raises:
             NotAllowedError: Which line of it does not.
+            ConsentRequiredError: It does if the person agrees.
         """
         self._require_route(action, asked)
         if action == LAUNCH:
-            if not self.allow.get(LAUNCH, True):
+            rule = self.allow.get(LAUNCH, True)
+            if rule == ASKS:
+                self._require_consent(LAUNCH, "starting Webots is not allowed")
+            elif not rule:
                 raise self._refusal(LAUNCH, "starting Webots is not allowed")
         # This action only has a controller read its stored breakpoints again. It is sent along with
         # every action that is allowed.
@@ -144,7 +159,7 @@ class Policy:
     def _require_not_forbidden(self, brought_about: str, action: str) -> None:
         """Refuse what another action brings about, where a pattern forbids it."""
         patterns = cast("list[str]", self.allow.get("actions", []))
-        if any(fits_pattern(each.removeprefix("!"), brought_about) for each in patterns):
+        if any(fits_pattern(_bare(each), brought_about) for each in patterns):
             said = f"{brought_about!r}, which this {action!r:.100} does as well, is not allowed"
             self._require("actions", [brought_about], said)
 
@@ -152,7 +167,7 @@ class Policy:
         """Refuse what the tools of an action may not do, also if another one is asked for it."""
         tools = TOOLS_OF_ACTIONS.get(action, ())
         patterns = cast("list[str]", self.allow.get("tools", []))
-        is_named = any(fits_pattern(p.removeprefix("!"), tool) for p in patterns for tool in tools)
+        is_named = any(fits_pattern(_bare(p), tool) for p in patterns for tool in tools)
         if tools and (is_named or ANY_ACTION in asked):
             by = f"{action!r:.100}, which {tools[-1]} does, is not allowed"
             self._require("tools", tools, by)
@@ -184,8 +199,10 @@ class Policy:
             key = name if name in rules else next((k for k in rules if fits_pattern(k, name)), None)
             if key is None:
                 raise self._refusal("parameters", f"the parameter {name!r:.100} is not allowed")
-            if not _is_within(value, rules[key]):
-                said = f"the parameter {name!r:.100} = {value!r:.100} is not allowed"
+            said = f"the parameter {name!r:.100} = {value!r:.100} is not allowed"
+            if rules[key] == ASKS:
+                self._require_consent("parameters", said, key)
+            elif not _is_within(value, rules[key]):
                 raise self._refusal("parameters", said, key)
 
     def _require(self, key: str, names: Sequence[str], said: str) -> None:
@@ -193,17 +210,33 @@ class Policy:
         patterns = cast("list[str] | None", self.allow.get(key))
         if patterns is None:
             return
-        fitting = [
-            p for p in patterns if any(fits_pattern(p.removeprefix("!"), name) for name in names)
-        ]
+        fitting = [p for p in patterns if any(fits_pattern(_bare(p), name) for name in names)]
         if not fitting or fitting[-1].startswith("!"):
             raise self._refusal(key, said, fitting[-1] if fitting else None)
+        if fitting[-1].startswith("?"):
+            self._require_consent(key, said, fitting[-1])
 
     def _refusal(self, key: str, said: str, inside: str | None = None) -> NotAllowedError:
+        rule = self._rule(key, inside)
+        return NotAllowedError(f"{said} by {rule}. {_ASK}", rule)
+
+    def _require_consent(self, key: str, said: str, inside: str | None = None) -> None:
+        """Refuse what the person has not agreed to."""
+        rule = self._rule(key, inside)
+        if rule not in self.agreed:
+            asks = f"{said} without the consent of the person, by {rule}. {_ASK}"
+            raise ConsentRequiredError(asks, rule)
+
+    def _rule(self, key: str, inside: str | None) -> str:
+        """Return the file, the line, and what stands there."""
         line = line_of(self.text, key, inside)
         shown = self.text.splitlines()[line - 1].partition("#")[0].strip()
-        rule = f"{self.file}, line {line}: {shown:.200}"
-        return NotAllowedError(f"{said} by {rule}. {_ASK}", rule)
+        return f"{self.file}, line {line}: {shown:.200}"
+
+
+def _bare(pattern: str) -> str:
+    """Return a pattern without the mark that it forbids or asks."""
+    return pattern[1:] if pattern[:1] in ("!", "?") else pattern
 
 
 def _brought_about(action: str, params: Mapping[str, Any]) -> Iterator[str]:
@@ -309,8 +342,10 @@ def _faults(allow: Any) -> Iterator[tuple[str, str]]:
             yield key, f"{key} must be a list of texts, not {value!r:.80}"
         elif key in ("fields", "nodes") and any(each.startswith("!") for each in value):
             yield key, f"{key} cannot forbid, as a node has many names: list what is allowed"
-        elif key == LAUNCH and not isinstance(value, bool):
-            yield key, f"launch must be true or false, not {value!r:.80}"
+        elif key in ("fields", "nodes") and _asks_behind_what_is_allowed(value):
+            yield key, f"{key} must ask first and allow then, as a node has many names: {_FIRST}"
+        elif key == LAUNCH and not (isinstance(value, bool) or value == ASKS):
+            yield key, f'launch must be true, false or "ask", not {value!r:.80}'
         elif key == "holds_for" and value not in _HOLDS_FOR:
             yield key, f"holds_for must be one of {', '.join(_HOLDS_FOR)}, not {value!r:.80}"
         elif key == "parameters":
@@ -324,12 +359,19 @@ def _faults_of_parameters(rules: Any) -> Iterator[tuple[str, str]]:
     for name, rule in cast("dict[str, Any]", rules).items():
         is_range = _is_list_of((int, float), rule) and len(rule) == 2 and rule[0] <= rule[1]
         is_finite = is_range and not any(isinstance(x, bool) or math.isnan(x) for x in rule)
-        if not (isinstance(rule, bool) or is_finite or (rule and _is_list_of(str, rule))):
+        is_known = isinstance(rule, bool) or rule == ASKS
+        if not (is_known or is_finite or (rule and _is_list_of(str, rule))):
             yield (
                 "parameters",
-                f"{name} must be [lowest, highest], a list of texts, true or false, not "
+                f'{name} must be [lowest, highest], a list of texts, true, false or "ask", not '
                 f"{rule!r:.80}",
             )
+
+
+def _asks_behind_what_is_allowed(patterns: Sequence[str]) -> bool:
+    """Return whether another name of what asks could be one of what is allowed."""
+    marks = [pattern.startswith("?") for pattern in patterns]
+    return marks != sorted(marks, reverse=True)
 
 
 def _is_list_of(kind: Any, value: Any) -> bool:

@@ -11,7 +11,7 @@ import json
 import re
 import sqlite3
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple, cast
 from anyio import CancelScope, to_thread
 
 from webots_mcp.contract import VERSION, new_uuid
-from webots_mcp.errors import DatabaseError, NoDatabaseError, NotAllowedError
+from webots_mcp.errors import ConsentRequiredError, DatabaseError, NoDatabaseError, NotAllowedError
 from webots_mcp.store.policy import LAUNCH, Policy, policies_of
 from webots_mcp.store.recording import RecordingAccess
 
@@ -39,6 +39,8 @@ _LIVE: Final = (
     "SELECT world FROM run WHERE ended_wall_time_s IS NULL AND world IS NOT NULL UNION SELECT "
     "controller FROM session WHERE ended_wall_time_s IS NULL AND controller IS NOT NULL"
 )
+AGREED: Final = "the person agreed"
+_ASKED: Final = "the person is asked"
 _END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
 
 
@@ -55,6 +57,33 @@ class Requester(NamedTuple):
 
 
 BY_COMMAND_LINE: Final = Requester("webots-mcp", VERSION, "cli")
+
+
+class Consent:
+    """The consent of a person, who can be asked as long as a call of a client goes on.
+
+    Attributes:
+        agreed: The rules to which the person has agreed for this call.
+        can_ask: Whether somebody still waits for the answer, and asks the person.
+    """
+
+    def __init__(self, agreed: Collection[str], *, can_ask: bool = True) -> None:
+        self.agreed = frozenset(agreed)
+        self.can_ask = can_ask
+
+    @contextmanager
+    def given(self) -> Generator[None]:
+        """Let the requests that begin in the block know of it."""
+        token = _consent.set(self)
+        try:
+            yield
+        finally:
+            _consent.reset(token)
+            self.can_ask = False
+
+
+_NOBODY: Final = Consent((), can_ask=False)
+_consent: Final[ContextVar[Consent]] = ContextVar("consent", default=_NOBODY)
 
 
 class OpenRequest:
@@ -82,6 +111,9 @@ class OpenRequest:
         self.outcome = "answered"
         self._by, self._names, self._reads = by, names, reads
         self._arguments = arguments
+        self._consent = _consent.get()
+        self._used_consent = False
+        self._permitted = set[str]()
 
     def __enter__(self) -> OpenRequest:
         self._begin()
@@ -124,17 +156,34 @@ class OpenRequest:
 
         Raises:
             NotAllowedError: It does not; the row says so.
+            ConsentRequiredError: It does if the person agrees, who can be asked before anything
+                else of the request is done.
         """
         world = params.get("world") if action in (LAUNCH, "load_world") else None
-        with self._refusing():
-            for each in self._policies(*(str(file) for file in (world, steered) if file)):
-                each.require(action, params, self._names)
+        with self._refusing(is_first=self._permitted <= {action}):
+            found = self._policies(*(str(file) for file in (world, steered) if file))
+            self._check(found, lambda policy: policy.require(action, params, self._names))
+        self._permitted.add(action)
 
     def _begin(self) -> None:
         with self._refusing():
-            for each in self._policies():
-                each.require_tool(self._names)
+            self._check(self._policies(), lambda policy: policy.require_tool(self._names))
         self.enter()
+
+    def _check(self, policies: Sequence[Policy], require: Callable[[Policy], None]) -> None:
+        """Check all rules: nobody is asked about what another rule forbids."""
+        needed: dict[str, ConsentRequiredError] = {}
+        while True:
+            try:
+                for policy in policies:
+                    require(policy.with_consent(needed))
+                break
+            except ConsentRequiredError as error:
+                needed[error.rule] = error
+        for rule, error in needed.items():
+            if rule not in self._consent.agreed:
+                raise error
+        self._used_consent |= bool(needed)
 
     def _policies(self, *files: str) -> list[Policy]:
         """Those that bind who asks; what only reads goes on while one is invalid."""
@@ -150,11 +199,21 @@ class OpenRequest:
             raise
 
     @contextmanager
-    def _refusing(self) -> Generator[None]:
-        """Record a refusal, also of a request that has been answered while trials went on."""
+    def _refusing(self, *, is_first: bool = True) -> Generator[None]:
+        """Record a refusal, also of a request that has been answered while trials went on.
+
+        Who is asked has the request made again, so that nothing of it may have been done before.
+        """
         try:
             yield
         except NotAllowedError as error:
+            if isinstance(error, ConsentRequiredError):
+                if self._consent.can_ask and is_first:
+                    self._note_question(error)
+                    raise
+                raise_as = NotAllowedError(str(error), error.rule)
+            else:
+                raise_as = error
             self.outcome = "refused"
             with suppress(DatabaseError):  # a refusal holds, whether or not it can be written
                 if self.id is None:
@@ -164,7 +223,20 @@ class OpenRequest:
                         "UPDATE request SET rule = ? WHERE id = ?", (_bounded(error.rule), self.id)
                     )
                     connection.execute(_END, (time.time(), "refused", self.id))
-            raise
+            if raise_as is error:
+                raise
+            raise raise_as from error
+
+    def _note_question(self, error: ConsentRequiredError) -> None:
+        """Record that the person is asked, before that is done."""
+        self.outcome = _ASKED
+        with suppress(DatabaseError):
+            if self.id is None:
+                self._insert()
+            with self.recording.writer() as connection:
+                outcome = _bounded(f"{_ASKED}, by {error.rule}")
+                connection.execute(_END, (time.time(), outcome, self.id))
+        error.request_id = self.id
 
     def _insert(self) -> None:
         row = {
@@ -174,7 +246,7 @@ class OpenRequest:
             "version": _bounded(self._by.version),
             "transport": self._by.transport,
             "tool": self._names[0],
-            "arguments": _recorded(self._arguments),
+            "arguments": recorded_arguments(self._arguments),
             "robot": self._arguments.get("robot"),
         }
         with self.recording.writer() as connection:
@@ -192,11 +264,13 @@ class OpenRequest:
     def _end(self, error: BaseException | None) -> None:
         if self.id is None and error is None:
             self.enter()  # the database was made meanwhile
-        if self.id is None or self.outcome == "refused":
+        if self.id is None or self.outcome in ("refused", _ASKED):
             return
         if error is not None:
             known = isinstance(error, Exception)  # else the client has cancelled it, or left
             self.outcome = f"{type(error).__name__}: {error}" if known else "cancelled"
+        if self._used_consent:
+            self.outcome = f"{AGREED}: {self.outcome}"
         self.outcome = _PASSWORD.sub(_LEFT_OUT, self.outcome)
         for secret in _secrets_in(self._arguments):
             self.outcome = self.outcome.replace(secret, _LEFT_OUT)
@@ -229,12 +303,34 @@ def permit(
 
     Raises:
         NotAllowedError: A rule of the project's file forbids it.
+        ConsentRequiredError: A rule has the person asked first.
         LookupError: Nobody has begun a request, which is a defect.
     """
     request = _open.get()
     request.require(action, params, steered)
     request.enter(create=create)
     return request.id
+
+
+def note_answer(
+    recording: RecordingAccess, error: ConsentRequiredError, declined: str | None
+) -> None:
+    """Record what the person answered, in the row of the request for which one was asked.
+
+    Args:
+        recording: As of the request.
+        error: What was asked.
+        declined: Why the request is refused; None if the person agreed.
+    """
+    if error.request_id is None:
+        return
+    rule = None if declined is None else _bounded(error.rule)
+    outcome = f"{AGREED}, by {error.rule}" if declined is None else f"refused: {declined}"
+    with suppress(DatabaseError), recording.writer() as connection:
+        connection.execute(
+            "UPDATE request SET rule = ?, outcome = ?, finished_wall_time_s = ? WHERE id = ?",
+            (rule, _bounded(outcome), time.time(), error.request_id),
+        )
 
 
 def newest_requests(
@@ -264,7 +360,8 @@ def newest_requests(
 # -- what is recorded of arguments: no secrets, and not all of what is long --
 
 
-def _recorded(arguments: Mapping[str, Any]) -> str:
+def recorded_arguments(arguments: Mapping[str, Any]) -> str:
+    """Return arguments as JSON without secrets, cut where they are long."""
     text = _PASSWORD.sub(_LEFT_OUT, _as_json(_without_secrets(arguments)))
     return text if len(text) <= LONGEST_ARGUMENTS else _as_json({"cut": text[:LONGEST_ARGUMENTS]})
 

@@ -1,0 +1,73 @@
+"""The MCP clients that are connected to a server, and how a message reaches them unasked.
+
+A client of protocols before 2026-07-28 has a connection that stays; a later one has it over stdio
+only, since over HTTP each of its requests stands alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import anyio
+from mcp.server.connection import Connection
+from mcp.server.context import CallNext, HandlerResult, ServerRequestContext
+from mcp_types.version import MODERN_PROTOCOL_VERSIONS
+
+SEND_TIMEOUT_S: Final = 5.0  # for a client that does not read
+MOST_CLIENTS: Final = 256  # more than the sessions that are served over HTTP
+
+
+class ConnectedClients:
+    """A middleware that notes connections as their first messages come, until they close."""
+
+    def __init__(self) -> None:
+        self._staying: dict[int, Connection] = {}
+        self._pipe: Connection | None = None  # of requests that share one pipe: the newest
+
+    async def __call__(
+        self, ctx: ServerRequestContext[Any, Any], call_next: CallNext
+    ) -> HandlerResult:
+        """Note whose message it is, and go on."""
+        self._note(connection_of(ctx))
+        return await call_next(ctx)
+
+    async def notify(
+        self, method: str, params: Mapping[str, Any], only: Mapping[int, Connection] | None = None
+    ) -> None:
+        """Send a notification to all clients, or only to some; never raises, never waits long.
+
+        Args:
+            method: Of the notification.
+            params: Its parameters.
+            only: The connections that get it; all if None.
+        """
+        chosen = only if only is not None else self._all()
+        async with anyio.create_task_group() as sending:
+            for connection in list(chosen.values()):
+                if connection.initialized.is_set():
+                    sending.start_soon(_send, connection, method, params)
+
+    def _all(self) -> dict[int, Connection]:
+        pipe = {} if self._pipe is None else {id(self._pipe): self._pipe}
+        return self._staying | pipe
+
+    def _note(self, connection: Connection) -> None:
+        if id(connection) in self._staying or not connection.has_standalone_channel:
+            return
+        if connection.protocol_version in MODERN_PROTOCOL_VERSIONS:
+            self._pipe = connection
+            return
+        if len(self._staying) < MOST_CLIENTS:
+            self._staying[id(connection)] = connection
+            connection.exit_stack.callback(self._staying.pop, id(connection), None)
+
+
+def connection_of(ctx: ServerRequestContext[Any, Any]) -> Connection:
+    """Return the connection that a message came by, which the SDK names only in private."""
+    return ctx.session._connection  # pyright: ignore[reportPrivateUsage]
+
+
+async def _send(connection: Connection, method: str, params: Mapping[str, Any]) -> None:
+    with anyio.move_on_after(SEND_TIMEOUT_S):
+        await connection.notify(method, dict(params))

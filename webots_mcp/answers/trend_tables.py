@@ -65,7 +65,7 @@ def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTabl
 
 def _moving(run: RunTrends) -> list[Trend]:
     """Return those that changed, or lost their value: no constant is dead."""
-    return [trend for trend in run.numbers if trend.shape != "constant" or trend.is_lacking]
+    return [trend for trend in run.numbers if not trend.is_constant or trend.is_lacking]
 
 
 def _constants(run: RunTrends) -> list[str]:
@@ -73,7 +73,7 @@ def _constants(run: RunTrends) -> list[str]:
     numbers = [
         f"{trend.name or EMPTY} {figure(trend.summary.last):g} {trend.unit or ''}".rstrip()
         for trend in run.numbers
-        if trend.shape == "constant" and not trend.is_lacking
+        if trend.is_constant and not trend.is_lacking
     ]
     states = [
         f"{each.name or EMPTY} {compact_json(each.last)}" for each in run.states if not each.changes

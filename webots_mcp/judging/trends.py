@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Final, Literal
 
 from webots_mcp.analysis.arrays import Array, Indexes, np, weighted_mean
@@ -99,7 +100,6 @@ class Trend:
         is_turned: Its figures count turns and differ from the recorded values by whole turns.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
         fast: It varies so fast that the means of chunks do not show its course.
-        swings: Where it moved to and fro, as `find_events` reports it, but of any period.
         resolution_s: Length of the means in which swings were seen; None where rows were.
         flat_since_s: Since when it rests; None if it does not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
@@ -109,7 +109,7 @@ class Trend:
         too_large: Of the rows, those with a number beyond 1e100; None where rows were not read.
         change: How much it changed with time, 0 to 2: the share of its variance that is slow
             (`time_effect`) times its range in units of its largest magnitude. Free of units.
-        says: What a person would notice.
+        course: How it went: where it swung is looked for when it is asked for.
     """
 
     name: str
@@ -124,10 +124,8 @@ class Trend:
     is_turned: bool
     slope_per_s: float | None
     r2: float | None
-    shape: Shape
     monotonic: Monotonic | None
     fast: bool
-    swings: tuple[Swing, ...]
     resolution_s: float | None
     flat_since_s: float | None
     spikes: tuple[Spike, ...] | None
@@ -135,7 +133,29 @@ class Trend:
     missing: int
     too_large: int | None
     change: float
-    says: str
+    course: Course = field(repr=False, compare=False)
+
+    @cached_property
+    def swings(self) -> tuple[Swing, ...]:
+        """Where it moved to and fro, as `find_events` reports it, but of any period."""
+        if self.fast or self.monotonic:
+            return ()
+        return _swings(self.course.times, self.course.numbers, self.course.resolution_s)
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Its course as a whole, in a word."""
+        return "constant" if self.is_constant else _shape(self)
+
+    @cached_property
+    def says(self) -> str:
+        """What a person would notice."""
+        return "; ".join(_remarks(self))
+
+    @cached_property
+    def is_constant(self) -> bool:
+        """Whether it never changed."""
+        return _is_constant(self.summary)
 
     @property
     def is_lacking(self) -> bool:
@@ -307,7 +327,6 @@ def judge(
         else _of_all(fit_line(times, numbers, inner.mean or 0.0, course.weights), slow)
     )
     monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
-    swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
     counted = None if fast else course.counted
     recorded = summary
     deviation = summary.deviation_in(turn) if counted is None else counted.deviation_in(None)
@@ -316,8 +335,7 @@ def judge(
             first=counted.first, last=counted.last, sum=counted.sum, squares=counted.squares
         )
     mean = summary.mean if turn is None else summary.centre(turn)
-    shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
-    trend = Trend(
+    return Trend(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
@@ -330,10 +348,8 @@ def judge(
         is_turned=counted is not None and _counts_turns(recorded, course),
         slope_per_s=line.slope_per_s if line else None,
         r2=line.r2 if line else None,
-        shape=shape,
         monotonic=monotonic,
         fast=fast,
-        swings=swings,
         resolution_s=course.resolution_s,
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
@@ -343,9 +359,8 @@ def judge(
         change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0, course.weights)
         * slow
         * _relative_range(summary),
-        says="",
+        course=course,
     )
-    return replace(trend, says="; ".join(_remarks(trend)))
 
 
 def _counts_turns(recorded: Summary, course: Course) -> bool:
@@ -395,26 +410,20 @@ def _monotonic(values: Array) -> Monotonic | None:
     return "rising" if values[-1] > values[0] else "falling"
 
 
-def _shape(
-    summary: Summary,
-    line: FittedLine | None,
-    monotonic: Monotonic | None,
-    swings: Sequence[Swing],
-    rest_s: float | None,
-    whole_s: float,
-) -> Shape:
-    if _is_constant(summary):
-        return "constant"
-    wide = [each for each in swings if _is_wide(each, summary)]
+def _shape(trend: Trend) -> Shape:
+    """Of one that changed."""
+    whole_s = float(trend.course.times[-1] - trend.course.times[0])
+    wide = [each for each in trend.swings if _is_wide(each, trend.summary)]
     if wide and sum(each.end_s - each.start_s for each in wide) >= SWINGING_SHARE * whole_s:
         return "oscillating"
-    if monotonic is not None:
-        return monotonic
-    if line is not None and line.r2 >= STRAIGHT_R2:
-        return "rising" if line.slope_per_s > 0 else "falling"
+    if trend.monotonic is not None:
+        return trend.monotonic
+    if trend.slope_per_s is not None and (trend.r2 or 0.0) >= STRAIGHT_R2:
+        return "rising" if trend.slope_per_s > 0 else "falling"
+    summary = trend.summary
     if abs(net := (summary.last or 0.0) - (summary.first or 0.0)) >= NET_SHARE * _range(summary):
         return "rising" if net > 0 else "falling"
-    return "resting" if rest_s is not None else "varying"
+    return "resting" if trend.flat_since_s is not None else "varying"
 
 
 def _range(summary: Summary) -> float:
@@ -611,6 +620,7 @@ def trends(
     names: Sequence[str] = ("*",),
     *,
     limit: int = 100,
+    shown: int | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> Trends:
     """What each signal did over a range.
@@ -620,6 +630,7 @@ def trends(
         time_range: From `find_range`.
         names: Signals, with `*`.
         limit: The most numeric signals to return per run: those that changed most.
+        shown: Of those that changed, so many are described before the deadline; None for all.
         deadline_s: After it, what was read so far is the answer, and says so.
 
     Raises:
@@ -628,7 +639,7 @@ def trends(
     signals = signals_of(connection, time_range, names)
     deadline = Deadline(deadline_s)
     runs = [
-        _run_trends(connection, segment, signals, limit, deadline)
+        _run_trends(connection, segment, signals, limit, shown, deadline)
         for segment in time_range.segments
     ]
     notes = [_unseen_swings(run) for run in runs if run.resolution_s is not None]
@@ -652,6 +663,7 @@ def _run_trends(
     segment: Segment,
     signals: Sequence[RegisteredSignal],
     limit: int,
+    shown: int | None,
     deadline: Deadline,
 ) -> RunTrends:
     """The trends of signals in one run."""
@@ -671,6 +683,8 @@ def _run_trends(
         (trend for trend in found.values() if trend),
         key=lambda trend: (trend.is_clock, -round(trend.change, 9)),
     )
+    left = [each.name for each in numbers[len(found) :]] + _undescribed(held, shown, deadline)
+    held = [trend for trend in held if trend.name not in left]
     changes = changes.cut(frame.cut_at_s)
     kept_cut_s = None if kept is None else kept.cut_at_s
     cuts_s = [e for e in (frame.cut_at_s, kept_cut_s, changes.unread_from_s) if e is not None]
@@ -687,8 +701,18 @@ def _run_trends(
         without_value=tuple(_without_value(frame, found)),
         total=len(held),
         cut_at_s=min(cuts_s, default=None),
-        unread=(*map(str, frame.unread), *signals_left([e.name for e in numbers[len(found) :]])),
+        unread=(*map(str, frame.unread), *signals_left(left)),
     )
+
+
+def _undescribed(held: Sequence[Trend], shown: int | None, deadline: Deadline) -> list[str]:
+    """Describe those that are shown; return the names of those for which there was no time."""
+    changed = [trend for trend in held if not trend.is_constant or trend.is_lacking][:shown]
+    for at, trend in enumerate(changed):
+        if deadline.passed and at:
+            return [each.name for each in changed[at:]]
+        _ = trend.says
+    return []
 
 
 def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[str]:

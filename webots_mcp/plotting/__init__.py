@@ -75,7 +75,7 @@ def plot(
 
 def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:
     """Return the three numbers that changed most, which are drawn where none is named."""
-    found = trends(connection, time_range, limit=3).runs
+    found = trends(connection, time_range, limit=3, shown=0).runs
     return [trend.name for run in found for trend in run.numbers] or ["*"]
 
 

@@ -439,10 +439,11 @@ def webots_get_trends(
 def _trends(
     view: RobotView, asked: TimeRange, names: Sequence[str], limit: int | None
 ) -> dict[str, Any]:
-    found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
+    most = limit or _SIZES.trends
+    found = trends(view.connection, asked, names, limit=MOST_SIGNALS, shown=most)
     budget_tokens = room_tokens(limit) // max(len(found.runs), 1)
     recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
-    runs = [trend_tables(run, limit or _SIZES.trends, budget_tokens) for run in recorded]
+    runs = [trend_tables(run, most, budget_tokens) for run in recorded]
     return {
         "runs": runs or None,
         "notes": notes_of(found.notes),

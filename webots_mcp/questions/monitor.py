@@ -32,6 +32,7 @@ from webots_mcp.judging.trends import RunTrends, trends
 from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName
 from webots_mcp.questions.declaring import READS, Caller, question
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
+from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 USUAL_DURATION_S: Final = 10.0
@@ -137,16 +138,25 @@ def look_back(
 
 def _report(view: RobotView, wall_start_s: float, window_s: float) -> MonitorAnswer:
     return answer_about(
-        view, MonitorAnswer, lambda: {"window_s": round(window_s, 2), **_found(view, wall_start_s)}
+        view,
+        MonitorAnswer,
+        lambda: {
+            "window_s": round(window_s, 2),
+            **_found(view.connection, view, wall_start_s),
+        },
     )
 
 
-def _found(view: RobotView, wall_start_s: float) -> dict[str, Any]:
+@in_one_snapshot
+def _found(connection: sqlite3.Connection, view: RobotView, wall_start_s: float) -> dict[str, Any]:
     window = window_from(view, wall_start_s)
-    recorded = bool(window.rows.segments)
-    told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
+    recorded, shown = bool(window.rows.segments), _SIZES.signals
+    described = (
+        trends(connection, window.rows, limit=MOST_SIGNALS, shown=shown) if recorded else None
+    )
+    told = described.runs if described else ()
     newest = told[-_SIZES.runs :]
-    found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
+    found = search_events(connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
     verdicts = verdicts_of(in_window.verdicts if recorded else _unlooked(in_window.verdicts))

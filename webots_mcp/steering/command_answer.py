@@ -252,7 +252,7 @@ def _rows_before_end(view: RobotView, command: QueuedCommand, run_id: int, end_s
 
 
 def _trends_and_events(view: RobotView, command: QueuedCommand, asked: TimeRange) -> dict[str, Any]:
-    (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
+    (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS, shown=_SIZES.trends_signals).runs
     found = search_events(view.connection, asked)
     of_others = found.only([event for event in found.events if not _is_own(event, command)])
     shown_events, events = fitting_events(of_others, _SIZES.events, _SIZES.events_tokens, view)

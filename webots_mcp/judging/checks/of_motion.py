@@ -316,14 +316,16 @@ def _turned_apart(run: RunUnderCheck, one: str, other: str) -> Examined:
         return Coverage.lacking(f"{one} and {other} are never known at once", "absent")
     a, b = (each[there] for each in courses)
     cells = np.flatnonzero(np.diff(clock // _HEADING_CELL_S, prepend=-1))
-    off = min((_cells_apart(a - sense * b, cells) for sense in (1, -1)), key=lambda e: median(e))
+    one_turn, other_turn = ((np.cos(each), np.sin(each)) for each in (a, b))
+    both = [_cells_apart(one_turn, other_turn, sense, cells) for sense in (1, -1)]
+    off = min(both, key=median)
     apart = runs_of(off > _HEADING_WARNS_RAD, clock[cells])
     long = apart.only(apart.durations_s + _HEADING_CELL_S >= APART_S)
     evidence = f"{one} and {other}: {off.max():.3g} rad apart at most"
     if not len(long):
         limit = f"limit {_HEADING_WARNS_RAD:g} rad for {APART_S:g} s"
         return run.covered(evidence, signals=[one, other], judged="2 headings", limit=limit)
-    worst = max(float(np.median(off[each.start : each.stop])) for each in long.spans())
+    worst = max(median(off[each.start : each.stop]) for each in long.spans())
     evidence = f"{one} and {other}: {worst:.3g} rad apart, {times(len(long))} for 3 s or more"
     return Fault(
         "fail" if worst > _HEADING_FAILS_RAD else "warn",
@@ -335,10 +337,22 @@ def _turned_apart(run: RunUnderCheck, one: str, other: str) -> Examined:
     )
 
 
-def _cells_apart(difference: Array, cells: Indexes) -> Array:
-    """The mean angle of a difference in each cell, from that of the first cell on."""
-    turned = np.add.reduceat(np.exp(1j * difference), cells)
-    return np.abs(np.angle(turned * np.conj(turned[0])))
+def _cells_apart(
+    one: tuple[Array, Array], other: tuple[Array, Array], sense: int, cells: Indexes
+) -> Array:
+    """The mean angle of a difference in each cell, from that of the first cell on.
+
+    Args:
+        one: Cosine and sine of an angle.
+        other: The same of the angle that is subtracted.
+        sense: -1 where that one counts the other way round.
+        cells: Where each cell begins.
+    """
+    (a, b), (c, d) = one, other
+    along: Array = np.add.reduceat(a * c + sense * b * d, cells)
+    across: Array = np.add.reduceat(b * c - sense * a * d, cells)
+    along, across = along * along[0] + across * across[0], across * along[0] - along * across[0]
+    return np.abs(np.arctan2(across, along))
 
 
 def _same_positions(

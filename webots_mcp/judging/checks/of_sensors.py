@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from webots_mcp.analysis.arrays import Array, Runs, median, np, runs_of
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times
@@ -29,6 +29,10 @@ _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
 _CUT_OFF: Final = 5  # times at one extreme to the last digit: of values that never repeat none is
 _BRIEFLY: Final = 3  # rows: what is cut off comes back soon, what rests at a stop does not
+_SORTED_AT_ONCE: Final = 8_192  # values at first ...
+_MORE_SORTED: Final = 4  # ... and then so many times as many
+_HASH_BITS: Final = 25
+_MIXES: Final = 0x9E3779B97F4A7C15  # 2^64 by the golden ratio
 _UNIQUE: Final = 0.95  # of all values but the extreme: so many differ from all others
 
 
@@ -209,7 +213,7 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
         if zones.change_count.sum() < _MANY_VALUES or not _is_often_at_an_end(run.frame, name):
             continue
         clock, values = run.frame.usable(name)
-        if len(np.unique(values)) < _MANY_VALUES:
+        if not _has_many_values(values):
             continue
         for limit in (float(values.min()), float(values.max())):
             if limit == 0 and run.meanings[name].quantity in CAN_BE_OFF:
@@ -240,8 +244,33 @@ def _is_cut_off(others: Array, hits: Runs) -> bool:
     Those of a smooth course are as well, which may have one crest again and again.
     """
     brief = median((hits.stops - hits.starts).astype(np.float64)) <= _BRIEFLY
-    unique = len(np.unique(others)) >= _UNIQUE * len(others)
-    return bool(brief and unique and is_noisy(others))
+    return brief and _are_unique(others) and is_noisy(others)
+
+
+def _has_many_values(values: Array) -> bool:
+    """Return whether there are so many different ones; mostly the first rows show it."""
+    is_shown = len(np.unique(values[:_SORTED_AT_ONCE])) >= _MANY_VALUES
+    return is_shown or len(np.unique(values)) >= _MANY_VALUES
+
+
+def _are_unique(values: Array) -> bool:
+    """Return whether hardly any value occurs twice.
+
+    Values of different hashes differ, and what repeats within some rows repeats: mostly one of
+    both decides without sorting all of them.
+    """
+    whole: Any = values + 0.0  # 0 and -0 are one value
+    hashes = (whole.view(np.uint64) * np.uint64(_MIXES)) >> np.uint64(64 - _HASH_BITS)
+    is_there = np.zeros(2**_HASH_BITS, np.bool_)
+    is_there[hashes] = True
+    if np.count_nonzero(is_there) >= _UNIQUE * len(values):
+        return True
+    rows, most = _SORTED_AT_ONCE, (1 - _UNIQUE) * len(values)
+    while rows < len(values):
+        if rows - len(np.unique(values[:rows])) > most + 1:
+            return False
+        rows *= _MORE_SORTED
+    return len(np.unique(values)) >= _UNIQUE * len(values)
 
 
 def sensors_drop_nothing(run: RunUnderCheck) -> Examined:

@@ -44,6 +44,7 @@ from webots_mcp.store.reading.segment import (
     Deadline,
     Segment,
     full_rate_parts,
+    read_so_far,
 )
 from webots_mcp.store.reading.unchunked_rows import read_rows, rows_in_no_chunk
 from webots_mcp.store.reading.unread import Unread
@@ -344,6 +345,8 @@ class Frame:
 
     def _decoded(self, column: Column) -> Decoded:
         """All values; those of several chunks share their labels."""
+        if (part := self._part_of_whole(column)) is not None:
+            return part
         key = ("values", column, self._start, self._stop)
         return self._source.cached(key, lambda: self._decode(column))
 
@@ -376,6 +379,16 @@ class Frame:
             numbers, codes = numbers[rows], None if codes is None else codes[rows]
         numbers.flags.writeable = False  # others may hold the same
         return Decoded(numbers, codes, labels)
+
+    def _part_of_whole(self, column: Column) -> Decoded | None:
+        """The numbers out of those of all rows, where they are known already."""
+        first, stop = self._source.bounds
+        if (self._start, self._stop) == (first, stop):
+            return None
+        whole: Decoded | None = self._source.known(("values", column, *self._source.bounds))
+        if whole is None or whole.codes is not None:
+            return None
+        return Decoded(whole.numbers[self._start - first : self._stop - first], None, ())
 
     def _coded(self, name: str, *, numbers: bool) -> Coded:
         """Codes from 1 on; numbers get labels as well, where they are wanted."""
@@ -435,6 +448,28 @@ def read_frame(
         full_rate: Of a segment that is kept at full rate, each call of `publish` is a row.
         every_call: Of any segment each call is a row that is in a kept stretch.
     """
+    asked = (segment.run_id, segment.start_s, segment.end_s, segment.full_rate and full_rate)
+    memo = read_so_far(connection)
+    if (source := memo.get((*asked, every_call))) is not None:
+        return _framed(source.twin(), segment, None)
+    source, cut_at_s = _source_of(
+        connection, segment, deadline, full_rate=full_rate, every_call=every_call
+    )
+    frame = _framed(source, segment, _note_cut(source, segment, cut_at_s))
+    if cut_at_s is None:
+        memo[(*asked, every_call)] = source.twin()
+    return frame
+
+
+def _source_of(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    deadline: Deadline,
+    *,
+    full_rate: bool,
+    every_call: bool,
+) -> tuple[FrameSource, float | None]:
+    """Return what a segment is read from, and where the deadline cut it."""
     run_id, span = segment.run_id, (segment.start_s, segment.end_s)
     groups: Array = np.zeros((0, 5))
     if full_rate and segment.full_rate:
@@ -452,8 +487,8 @@ def read_frame(
     source = FrameSource(connection, run_id, groups, columns, names)
     source.derived = _observed_pose(connection, segment, columns, deadline)
     if lost := deleted_part(connection, segment):
-        source.unread[lost] = None
-    return _framed(source, segment, _note_cut(source, segment, cut_at_s))
+        source.note(lost, None)
+    return source, cut_at_s
 
 
 def _observed_pose(
@@ -472,7 +507,7 @@ def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> 
     if cut_at_s is None or cut_at_s >= segment.end_s:
         return None
     reached_s = max(cut_at_s, segment.start_s)
-    source.unread[Unread(reached_s, segment.end_s, "time limit reached")] = None
+    source.note(Unread(reached_s, segment.end_s, "time limit reached"), None)
     return reached_s
 
 
@@ -506,8 +541,9 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
 
 def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Frame:
     """The rows of a source that lie in a segment, in order."""
+    source.bounds = 0, source.rows
     whole = Frame(source, 0, source.rows, cut_at_s)
-    if not source.is_in_order:
+    if not source.is_in_order and source.order is None:
         ids = whole.ids
         order = np.lexsort((np.abs(ids), whole.wall_times if (ids < 0).any() else ids, whole.times))
         source.order = order
@@ -519,6 +555,7 @@ def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Fr
         inside = np.flatnonzero((walls >= segment.wall_start_s) & (walls < segment.wall_end_s))
         stop = start + int(inside[-1]) + 1 if len(inside) else start
         start += int(inside[0]) if len(inside) else 0
+    source.bounds = start, stop
     return Frame(source, start, stop, cut_at_s)
 
 

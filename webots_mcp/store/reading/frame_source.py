@@ -6,6 +6,7 @@ costs its part of the range, which is noted by the name of the signal.
 
 from __future__ import annotations
 
+import copy
 import sqlite3
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -65,6 +66,7 @@ class FrameSource:
         order: The rows in order of time; None if they are.
         unread: What could not be read so far, each with its column: None for all of them.
         derived: Signals that no row holds, by name: their values at some times.
+        bounds: The rows [start, stop) that were asked for.
     """
 
     def __init__(
@@ -82,7 +84,9 @@ class FrameSource:
         self.unread: dict[Unread, Column | None] = {}
         self.derived: Derived = {}
         self.order: Indexes | None = None
+        self.bounds: tuple[int, int] = (0, 0)
         self._cache = _ArrayCache()
+        self._noting: list[dict[Unread, Column | None]] = []
         groups = self._sound(groups)
         self._group_ids: Indexes = groups[:, 0].astype(np.intp)
         new = np.arange(0, len(columns), chunk_making.GROUP_ROWS)
@@ -107,7 +111,7 @@ class FrameSource:
         counts, starts_s, ends_s = groups[:, 3], groups[:, 1], groups[:, 2]
         sound = (counts >= 1) & (counts <= _MOST_GROUP_ROWS) & (starts_s <= ends_s)
         for _, start_s, end_s, *_ in groups[~sound].tolist():
-            self.unread[Unread(start_s, end_s, "its row group is damaged")] = None
+            self.note(Unread(start_s, end_s, "its row group is damaged"), None)
         return groups[sound]
 
     @property
@@ -188,13 +192,13 @@ class FrameSource:
         values = [found[row_id][0] if row_id in found else ABSENT for row_id in wanted]
         if gone := sum(row_id not in found for row_id in wanted):
             why = f"{gone} rows were deleted by retention, and single items of {array} with them"
-            self.unread[Unread(*span, f"{column}: {why}")] = column
+            self.note(Unread(*span, f"{column}: {why}"), column)
         longest = max((count for _, count in found.values() if count is not None), default=None)
         if found and (longest is None or longest <= at):
             why = (
                 f"there {array} is no array" if longest is None else f"{array} has {longest} items"
             )
-            self.unread[Unread(*span, f"{column}: {why}")] = column
+            self.note(Unread(*span, f"{column}: {why}"), column)
         return decoded_of(values)
 
     def _of_groups(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
@@ -227,7 +231,7 @@ class FrameSource:
         """Note a chunk that cannot be read; of times and ids return what keeps rows in order."""
         span = (float(self.starts_s[place]), float(self.ends_s[place]))
         why = f"the chunk of {_NAMES.get(column, column)} is {error}"
-        self.unread[Unread(*span, why)] = column
+        self.note(Unread(*span, why), column)
         chunk_making.report_damaged_group(self.connection, int(self._group_ids[place]))
         rows = int(self.first_rows[place + 1] - self.first_rows[place])
         evenly: Array = np.linspace(*span, rows)
@@ -312,30 +316,73 @@ class FrameSource:
         self._cache = _ArrayCache()
 
     def cached(self, key: object, make: Callable[[], T]) -> T:
-        """Return what was made under this key before, or make it now."""
-        return self._cache.get(key, make)
+        """Return what was made under this key before, or make it now.
+
+        What could not be read for it is noted in both cases.
+        """
+        if (known := self._cache.find(key)) is None:
+            self._noting.append({})
+            try:
+                made = make()
+            finally:
+                notes = self._noting.pop()
+            self._cache.put(key, made, notes)
+        else:
+            made, notes = known
+        for part, column in notes.items():
+            self.note(part, column)
+        return made
+
+    def known(self, key: object) -> Any:
+        """Return what was made under this key before, or None."""
+        found = self._cache.find(key)
+        if found is None:
+            return None
+        for part, column in found[1].items():
+            self.note(part, column)
+        return found[0]
+
+    def note(self, part: Unread, column: Column | None) -> None:
+        """Note what could not be read, of which column; None for all of them."""
+        self.unread[part] = column
+        for notes in self._noting[-1:]:
+            notes[part] = column
+
+    def twin(self) -> FrameSource:
+        """Return one that shares all arrays, and knows only of what itself could not read."""
+        other = copy.copy(self)
+        other.unread = {part: of for part, of in self.unread.items() if of is None}
+        other._noting = []
+        return other
 
 
 class _ArrayCache:
-    """Arrays by key, up to `MOST_CACHED_BYTES`; the least recently used are dropped."""
+    """Arrays by key, up to `MOST_CACHED_BYTES`; the least recently used are dropped.
+
+    Each with what could not be read for it.
+    """
 
     def __init__(self) -> None:
-        self._made: OrderedDict[object, tuple[Any, int]] = OrderedDict()
+        self._made: OrderedDict[object, tuple[Any, dict[Unread, Column | None], int]] = (
+            OrderedDict()
+        )
         self._bytes = 0
 
-    def get(self, key: object, make: Callable[[], T]) -> T:
-        """Return what is cached under a key, or make and cache it."""
-        if key in self._made:
-            self._made.move_to_end(key)
-            return self._made[key][0]
-        made = make()
+    def find(self, key: object) -> tuple[Any, dict[Unread, Column | None]] | None:
+        """Return what is cached under a key, or None."""
+        if key not in self._made:
+            return None
+        self._made.move_to_end(key)
+        return self._made[key][:2]
+
+    def put(self, key: object, made: object, notes: dict[Unread, Column | None]) -> None:
+        """Cache what was made."""
         size = _bytes_of(made)
-        self._made[key] = made, size
+        self._made[key] = made, notes, size
         self._bytes += size
         while self._bytes > MOST_CACHED_BYTES and len(self._made) > 1:
-            _, (_, freed) = self._made.popitem(last=False)
+            _, (_, _, freed) = self._made.popitem(last=False)
             self._bytes -= freed
-        return made
 
 
 def _bytes_of(made: object) -> int:

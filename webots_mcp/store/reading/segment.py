@@ -11,8 +11,9 @@ import math
 import sqlite3
 import time
 from collections.abc import Callable, Generator
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from typing import Concatenate, Final, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Concatenate, Final, NamedTuple, ParamSpec, TypeVar
 
 from webots_mcp.database.connection import keep_deadline
 from webots_mcp.errors import NothingRecordedError
@@ -171,15 +172,41 @@ def in_one_snapshot(
 
     @functools.wraps(question)
     def answer(connection: sqlite3.Connection, *args: P.args, **kwargs: P.kwargs) -> T:
-        if connection.in_transaction:
-            return question(connection, *args, **kwargs)
-        connection.execute("BEGIN")
-        try:
-            return question(connection, *args, **kwargs)
-        finally:
-            connection.execute("COMMIT")
+        with one_reading(connection):
+            if connection.in_transaction:
+                return question(connection, *args, **kwargs)
+            connection.execute("BEGIN")
+            try:
+                return question(connection, *args, **kwargs)
+            finally:
+                connection.execute("COMMIT")
 
     return answer
+
+
+_readings: ContextVar[tuple[sqlite3.Connection, dict[Any, Any]] | None] = ContextVar(
+    "readings", default=None
+)
+
+
+@contextlib.contextmanager
+def one_reading(connection: sqlite3.Connection) -> Generator[None]:
+    """Let the parts of a question share what they read; inside of another one, with all of it."""
+    known = _readings.get()
+    if known is not None and known[0] is connection:
+        yield
+        return
+    before = _readings.set((connection, {}))
+    try:
+        yield
+    finally:
+        _readings.reset(before)
+
+
+def read_so_far(connection: sqlite3.Connection) -> dict[Any, Any]:
+    """Return what the question that is being answered has read; outside of any, nothing."""
+    known = _readings.get()
+    return known[1] if known is not None and known[0] is connection else {}
 
 
 # -- kept stretches: seconds of a run of which each call of `publish` is a row ---------------------

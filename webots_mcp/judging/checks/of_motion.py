@@ -248,8 +248,8 @@ def estimates_agree(run: RunUnderCheck) -> Examined:
     made += [_values_apart(run, *each) for each in _same_values(run)]
     if not (examined := [each for each in made if each is not None]):
         raise NotSearchableError(
-            "no second heading, and no second position of the robot that goes along with the first"
-            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say, or declare same_as"
+            "needs two independent positions or headings of a robot that moves at least "
+            f"{_LEAST_WAY_M:g} m: publish, for example, gps and odometry, or declare same_as"
         )
     faults = [each for each in examined if isinstance(each, Fault)]
     return min(faults, key=lambda each: each.severity, default=examined[0])

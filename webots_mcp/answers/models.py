@@ -173,7 +173,7 @@ class CommandsAnswer(Answer):
     commands: AnswerTable | None = None
     cursor: int | None = said("Ask again with this cursor for older ones.")
     actions: dict[str, Any] | None = said("The controller's own actions with their docstrings.")
-    built_in: list[str] | None = None
+    built_in: str | None = said("Names of the actions that every bridge has.")
 
 
 class BreakpointAnswer(Answer):
@@ -337,7 +337,8 @@ class CheckAnswer(NotedAnswer):
     checks: AnswerTable | None = said(
         "Those that did not pass; more: the call that shows it in full."
     )
-    passed: list[str] | None = None
+    passed: list[str] | None = said("Names of the checks that passed.")
+    passed_on: dict[str, str] | None = said("What each check that passed rests on.")
 
 
 class TimelineAnswer(NotedAnswer):
@@ -428,7 +429,8 @@ class ComparisonAnswer(NotedAnswer):
     compared: dict[str, Any] | None = said("Rows that both have at the same simulation time.")
     parted: AnswerTable | None = said("In the order in which they part; beyond_s: the tolerance.")
     growth: dict[str, Any] | None = said("Largest difference of the signal that parts most.")
-    groups: AnswerTable | None = None
+    groups: AnswerTable | None = said("The groups of runs; the first is the reference.")
+    legend: str | None = said("What the columns of measures and differences mean.")
     compared_s: float | None = said(
         "All figures are about the first seconds of each run, this many."
     )

@@ -149,7 +149,8 @@ def _found(view: RobotView, wall_start_s: float) -> dict[str, Any]:
     found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
-    verdicts = verdicts_of(in_window.verdicts if recorded else _unlooked(in_window.verdicts))
+    known = in_window.verdicts if recorded else _unlooked(in_window.verdicts)
+    verdicts = verdicts_of(known, in_short=recorded)
     moved = movement(view, window.rows) if recorded else None
     notes = notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told)))))
     beside = [verdicts.model_dump(exclude_none=True), moved, notes]

@@ -508,4 +508,4 @@ def _finding(check: Check, made: Examined, sources: Mapping[str, Source]) -> Fin
     outcome, evidence = outcome_of(made, sources)
     name = made.subject or check.name
     since_s = made.since_s if isinstance(made, Fault) else None
-    return Finding(outcome, evidence, since_s, made.often, made.more, name)
+    return Finding(outcome, evidence, since_s, made.often, made.more, name, tuple(made.signals))

@@ -36,7 +36,7 @@ from webots_mcp.judging.detection.kinds import (
     EventOptions,
     NotSearchableError,
 )
-from webots_mcp.judging.detection.search import MOST_NAMED, EventKind, Search
+from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.naming import counted, in_snake_case
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.signals import RegisteredSignal
@@ -44,6 +44,7 @@ from webots_mcp.store.signals import RegisteredSignal
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
 GROWS: Final = 2.0  # times the amplitude at one end: then both are reported
 _ENDS_WITHIN: Final = 1.5  # periods
+_NAMED: Final = 3  # signals that were not searched
 _QUICK_S: Final = 1.0  # a period: how quickly the body of a robot goes to and fro
 # Sensors swing by nature while a robot drives.
 _SWINGING: Final = re.compile(
@@ -84,8 +85,8 @@ def oscillation_events(search: Search) -> Iterator[Event]:
 
 def _passed(names: Sequence[str]) -> str:
     """Return the first names as an argument is written, and how many more there are."""
-    more = f", ... {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"[{', '.join(map(repr, names[:MOST_NAMED]))}{more}]"
+    more = f", ... {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"[{', '.join(map(repr, names[:_NAMED]))}{more}]"
 
 
 def _note_periods(search: Search) -> None:

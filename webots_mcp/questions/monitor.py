@@ -53,7 +53,7 @@ class MonitorSizes:
 
     signals: int = 12
     events: int = 30
-    rows_tokens: int = 1_200
+    rows_tokens: int = 1_100
     events_share: float = 0.45
     runs: int = 2
 

@@ -80,7 +80,9 @@ def rests_when_commanded(run: RunUnderCheck) -> Examined:
     motion = run.motion
     commands = [*filter(None, (motion.commanded, motion.turn_command)), *motion.wheel_commands]
     if not commands:
-        raise NotSearchableError("no command is known")
+        raise NotSearchableError(
+            "no command is recorded: publish the commanded speed, such as commanded_m_s"
+        )
     frame = run.frame
     idle = np.ones(len(frame), np.bool_)
     for each in commands:
@@ -426,7 +428,7 @@ def _are_own(*positions: tuple[RegisteredSignal, RegisteredSignal]) -> bool:
 def stays_in_place(run: RunUnderCheck) -> Examined:
     """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
     if run.motion.position is None:
-        raise NotSearchableError("no position is published")
+        raise NotSearchableError("no position is recorded: publish gps or pose: [x, y], in metres")
     leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
     if not leaps:
         limit = f"limit {run.search.options.jump_m:g} m"

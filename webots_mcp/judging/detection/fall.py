@@ -26,7 +26,9 @@ MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
 _BY_WHEELS: Final = frozenset(("odom", "odometry"))
 _NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
 _FALLEN_DEG: Final = math.degrees(FALLEN_RAD)
-NO_ATTITUDE: Final = "publish roll and pitch (of an InertialUnit), in rad or deg"
+NO_ATTITUDE: Final = (
+    "no roll and pitch are recorded: publish them (of an InertialUnit), in rad or deg"
+)
 _OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
 
 

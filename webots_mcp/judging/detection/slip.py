@@ -60,7 +60,7 @@ def slip_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError(
             "its motors lift it"
             if wheels and flies(search)
-            else "publish the position and the speeds of its wheels"
+            else "no position, or no speeds of its wheels, are recorded: publish them"
         )
     if _Slip not in search.shared:
         search.shared[_Slip] = _slips_of(search, search.motion.position, wheels)

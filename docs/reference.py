@@ -12,6 +12,7 @@ import anyio
 
 import webots_mcp
 from webots_mcp import MemoryDatabase, testing
+from webots_mcp.answers.models import Answer, AnswerPart
 from webots_mcp.cli import described
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS
@@ -73,6 +74,46 @@ def _default(schema: dict[str, Any], required: bool) -> str:
     if required:
         return "required"
     return f"`{schema['default']}`" if schema.get("default") is not None else ""
+
+
+def fields(_page: str = "") -> str:
+    """Each field of each answer with its type and its meaning; shared ones stand once."""
+    parts = ["## Reference\n"]
+    for model in answer_models():
+        own = {name: each for name, each in model.model_fields.items() if _is_own(model, name)}
+        rows = [[f"`{n}`", _plain_type(each), each.description or ""] for n, each in own.items()]
+        table = _table(["field", "type", "meaning"], rows) if rows else ""
+        parts.append(
+            f"### {model.__name__}\n\n{inspect.getdoc(model)}{_based_on(model)}\n\n{table}"
+        )
+    return "\n".join(parts)
+
+
+def answer_models() -> list[type[AnswerPart]]:
+    """The models of all answers and of their parts, the header of every answer first."""
+    found: dict[type[AnswerPart], None] = {}
+    waiting: list[type[AnswerPart]] = [AnswerPart]
+    while waiting:
+        derived = waiting.pop().__subclasses__()
+        found |= dict.fromkeys(derived)
+        waiting += derived
+    return sorted(found, key=lambda model: (model is not Answer, model.__name__))
+
+
+def _is_own(model: type[AnswerPart], name: str) -> bool:
+    return not any(name in getattr(base, "model_fields", {}) for base in model.__mro__[1:])
+
+
+def _based_on(model: type[AnswerPart]) -> str:
+    base = model.__mro__[1].__name__
+    return f" Also has the fields of {base}." if base != AnswerPart.__name__ else ""
+
+
+def _plain_type(field: Any) -> str:
+    kind = field.annotation
+    text = kind.__name__ if inspect.isclass(kind) and not hasattr(kind, "__args__") else str(kind)
+    text = re.sub(r"\b(?:typing|webots_mcp\.answers\.models)\.", "", text)
+    return f"`{text.removesuffix(' | None')}`"
 
 
 def checks(_page: str = "") -> str:
@@ -217,6 +258,7 @@ ADDED: Final[dict[str, Callable[[str], str]]] = {
     "docs/index": navigation,
     "docs/check": checks,
     "docs/events": events,
+    "docs/fields": fields,
     "docs/meanings": meanings,
     "docs/tools": tools,
     "docs/command-line": commands,

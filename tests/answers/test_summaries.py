@@ -90,6 +90,23 @@ def test_an_undecided_comparison_does_not_say_that_nothing_differs() -> None:
     assert said == "No figure is known to differ; 1 cannot be decided."
 
 
+def test_too_few_runs_do_not_hide_the_largest_differences() -> None:
+    groups = AnswerTable(columns=["name", "runs"], rows=[["before", [1, 2]], ["after", [3]]])
+    measures = AnswerTable(
+        columns=["name", "median", "range", "runs_wanted"],
+        rows=[
+            ["distance_m", [5.98, 8.97], None, 7],
+            ["duration_s", [74.9, 59.9], [[29.9, 119.9], [59.9, 59.9]], None],
+        ],
+    )
+    differences = AnswerTable(columns=["signal", "mean"], rows=[["commanded_m_s", [0.1, 0.3]]])
+    said = summary_of(ComparisonAnswer(groups=groups, measures=measures, differences=differences))
+    assert said == (
+        "Largest differences, not certain: commanded_m_s 0.1 -> 0.3, distance_m 5.98 -> 8.97; "
+        "too few runs (2 and 1): 7 of each would do."
+    )
+
+
 @pytest.mark.parametrize(
     ("answer", "said"),
     [

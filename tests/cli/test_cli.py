@@ -146,7 +146,7 @@ def test_status_tells_what_runs_and_what_could_not_be_recorded(
         "Supervisor",
         "the controller's memory",
         "disk full",
-        "states 1.00 GB (default)",
+        "states 1.00 GB",
     ):
         assert words in text
     (head,) = (line.split() for line in text.splitlines() if "rows_waiting" in line)

@@ -116,7 +116,7 @@ DICE = random.Random(5)
 COURSES: dict[str, tuple[Course, int, str, str]] = {
     "swung and rests": (
         lambda t: 0.3 * math.sin(math.pi * t) if 70 <= t < 82 else 0.0, 1000, "resting",
-        "oscillated from 70.1 to 82 s: amplitude 0.302, period 2 s; flat at 0 since 82 s",
+        "oscillated from 70.1 to 82 s: amplitude 0.302, period 2 s; reaches 0 at 82 s, then flat",
     ),
     "falls, and lower in between": (
         approached, 1001, "falling", r"falls from 2.1 to 0.3 \(-0.0\S+; min 0.12 at 41.2 s",

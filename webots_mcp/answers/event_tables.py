@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from webots_mcp.answers.budget import (
@@ -16,7 +17,7 @@ from webots_mcp.answers.budget import (
 )
 from webots_mcp.answers.models import AnswerTable, KindVerdicts
 from webots_mcp.answers.shortening import tokens_of
-from webots_mcp.judging.coverage import Verdicts
+from webots_mcp.judging.coverage import Coverage, Verdicts
 from webots_mcp.judging.detection.events import (
     Events,
     Found,
@@ -28,6 +29,7 @@ EVENT_COLUMNS: Final = (
     "kind", "count", "run_id", "start_s", "time", "duration_s", "ongoing", "name", "details",
 )  # fmt: skip
 _GROUP_BUDGET_TOKENS: Final = 200
+_NO_DATA: Final = "no data is recorded for it"
 
 
 def fitting_events(
@@ -44,8 +46,20 @@ def fitting_events(
         limit = max(1, min(shown_now - 1, int(shown_now * budget_tokens / tokens)))
 
 
-def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
-    """Return what became of each kind, as it is shown."""
+def verdicts_of(verdicts: Verdicts, *, in_short: bool = False) -> KindVerdicts:
+    """Return what became of each kind, as it is shown.
+
+    Args:
+        verdicts: What became of each kind that was asked for.
+        in_short: The kinds that nothing is recorded for share one line without their reasons.
+    """
+    if in_short:
+        reasons = {
+            kind: (_NO_DATA,) if verdicts.unlooked(kind) and not each.lacks("unread") else said
+            for kind, said in verdicts.reasons.items()
+            for each in (verdicts.coverage.get(kind, Coverage()),)
+        }
+        verdicts = replace(verdicts, reasons=reasons)
     return KindVerdicts(
         found=verdicts.found or None,
         not_found=", ".join(verdicts.far) or None,

@@ -34,26 +34,34 @@ class AnswerPart(BaseModel):
 class AnswerTable(AnswerPart):
     """Rows under column names; a name says its unit."""
 
-    columns: list[str]
-    rows: list[list[Any]]
-    in_every_row: dict[str, Any] | None = said("Columns with the same value in all rows.")
+    columns: list[str] = Field(
+        description="Names of the columns; a name says its unit, as in start_s."
+    )
+    rows: list[list[Any]] = Field(
+        description="One list of values for each row, in the order of the columns."
+    )
+    in_every_row: dict[str, Any] | None = said("Columns that have the same value in all rows.")
 
 
 class Answer(AnswerPart):
     """The header of every answer: about what, as of when, and whether time is moving."""
 
-    summary: str | None = said("What this answer says, in one sentence.")
-    robot: str | None = None
-    run_id: int | None = None
-    sim_time_s: float | None = said("Simulation time of the newest data.")
-    age_s: float | None = said("Wall time since the newest data.")
-    status: str | None = said("running, paused, starting, 'stopped N s ago', 'never seen'.")
-    why: str | None = said("What the status rests on.")
-    quoted: str | None = said("Of answers with texts that controllers or others wrote.")
-    storage: str | None = said("Where the recording cannot be written: how it was read.")
-    position_by: str | None = said("Who saw the robot, where it publishes no position itself.")
+    summary: str | None = said("The answer in one sentence.")
+    robot: str | None = said("Name of the robot that the answer is about.")
+    run_id: int | None = said("Number of the run that the answer is about.")
+    sim_time_s: float | None = said("Simulation time of the newest data, in seconds.")
+    age_s: float | None = said("Wall-clock seconds since the newest data.")
+    status: str | None = said(
+        "Whether the robot is running, paused or starting, stopped N s ago or never seen."
+    )
+    why: str | None = said("The evidence for the status.")
+    quoted: str | None = said(
+        "Present if the answer quotes texts that controllers or others wrote."
+    )
+    storage: str | None = said("How the recording was read, if it cannot be written.")
+    position_by: str | None = said("Who saw the robot, if it publishes no position itself.")
     hint: str | None = said("What to do next.")
-    left_out: list[str] | None = said("Invalid rows and values, which are left out.")
+    left_out: list[str] | None = said("Invalid rows and values that the answer leaves out.")
     _pictures: list[ShownPicture] = PrivateAttr(default_factory=list[ShownPicture])
 
     @property
@@ -65,97 +73,116 @@ class Answer(AnswerPart):
 class StateAnswer(Answer):
     """The newest published state."""
 
-    state: Any = said("Data published by the controller.")
-    shortened: str | None = said("Rule by which parts were left out.")
-    kept_at_full_rate: str | None = said("The run's last kept stretch.")
-    pace: str | None = said("Whether controller or simulation sets the pace.")
+    state: Any = said("The newest data that the controller published.")
+    shortened: str | None = said("How long parts of the state were shortened.")
+    kept_at_full_rate: str | None = said(
+        "The last full-rate segment of the run, and why it was kept."
+    )
+    pace: str | None = said("Whether the controller or the simulation sets the pace.")
 
 
 class SensorsAnswer(Answer):
     """The newest sensor values."""
 
-    sensors: dict[str, Any] = Field(default_factory=dict[str, Any])
-    replaced: dict[str, str] | None = said("Values that JSON cannot hold: path to nan, inf, ...")
-    devices_not_named_in_state: str | None = said(
-        "Sensors that the state lacks, or names differently than Webots."
+    sensors: dict[str, Any] = Field(
+        default_factory=dict[str, Any],
+        description="The newest values of the signals that are sensors.",
     )
-    shortened: str | None = None
+    replaced: dict[str, str] | None = said(
+        "Values that JSON cannot hold: path to nan, inf and the like."
+    )
+    devices_not_named_in_state: str | None = said(
+        "Sensors that the state has not, or under another name than in Webots."
+    )
+    shortened: str | None = said("How long parts of the values were shortened.")
 
 
 class FullStateAnswer(Answer):
     """The newest state or a part of it, newest events, and the recorder's health."""
 
-    state: Any = None
-    path: str | None = None
-    total: int | None = said("How many members, items or characters it has.")
-    next_offset: int | None = said("Ask again with this offset for more.")
-    shortened: str | None = None
-    replaced: dict[str, str] | None = None
-    events: AnswerTable | None = None
+    state: Any = said("The newest state, or the part of it at the path, with exact values.")
+    path: str | None = said("Path of the part that is shown.")
+    total: int | None = said("Number of members, items or characters of that part.")
+    next_offset: int | None = said("Offset to ask with for the next page.")
+    shortened: str | None = said("How long parts of the state were shortened.")
+    replaced: dict[str, str] | None = said(
+        "Values that JSON cannot hold: path to nan, inf and the like."
+    )
+    events: AnswerTable | None = said("The newest events.")
     recorder: dict[str, Any] | None = said(
-        "Rows waiting and dropped, last kept stretch, error, controller."
+        "Rows that wait and that were dropped, last full-rate segment, error, controller."
     )
 
 
 class WorldAnswer(Answer):
     """The world, the run, and who is in it."""
 
-    world: str | None = None
-    title: str | None = None
-    basic_time_step_ms: float | None = None
-    observer: str | None = said("Its signals world.KEY.x_m and solid.KEY.x_m are places.")
-    in_world: AnswerTable | None = said("What the observer sees: robots, and solids with a DEF.")
-    real_time_factor: float | None = said(
-        "Simulation time per wall time over the last seconds recorded."
+    world: str | None = said("Path of the world file.")
+    title: str | None = said("Title of the world.")
+    basic_time_step_ms: float | None = said("Basic time step of the world, in milliseconds.")
+    observer: str | None = said(
+        "Name of the observer; its signals world.KEY.x_m and solid.KEY.x_m are positions."
     )
-    supervisor: bool | None = said("Whether it may control the simulation.")
-    run: dict[str, Any] | None = None
-    runs_recorded: int | None = None
-    controller: dict[str, Any] | None = None
-    devices: dict[str, str] | None = None
+    in_world: AnswerTable | None = said(
+        "What the observer sees: robots, and solids with a DEF name."
+    )
+    real_time_factor: float | None = said(
+        "Simulated seconds per wall-clock second, over the last seconds recorded."
+    )
+    supervisor: bool | None = said("Whether the robot may control the simulation.")
+    run: dict[str, Any] | None = said("The run: how it began and ended, its duration and its rows.")
+    runs_recorded: int | None = said("Number of recorded runs of the robot.")
+    controller: dict[str, Any] | None = said(
+        "The file, the code and the versions of the controller."
+    )
+    devices: dict[str, str] | None = said("Names of the devices with their types.")
     other_robots: AnswerTable | None = said("Other robots in the same simulation.")
-    database: str | None = None
-    retention: dict[str, Any] | None = said("How much is kept, set by whom; size of the database.")
-    data_dir: str | None = None
+    database: str | None = said("Path of the database file.")
+    retention: dict[str, Any] | None = said(
+        "How much is kept and who set that; size of the database."
+    )
+    data_dir: str | None = said("Folder of the recording.")
 
 
 class RobotsAnswer(Answer):
     """All robots ever seen."""
 
     robots: AnswerTable | None = said(
-        "rows_waiting, rows_dropped, last_error: where there are any."
+        "One row for each robot; rows_waiting, rows_dropped and last_error if there are any."
     )
-    database: str | None = None
-    retention: dict[str, Any] | None = None
+    database: str | None = said("Path of the database file.")
+    retention: dict[str, Any] | None = said(
+        "How much is kept and who set that; size of the database."
+    )
 
 
 class DiagnosisAnswer(Answer):
     """What is not well between the controllers and their asker."""
 
-    verdict: str | None = said("ok, warning or wrong: the worst.")
-    failed: list[dict[str, str]] | None = None
-    not_checked: dict[str, str] | None = said("Why, and which.")
-    passed: str | None = said("Checks that found nothing.")
+    verdict: str | None = said("The worst result: ok, warning or wrong.")
+    failed: list[dict[str, str]] | None = said("What is wrong, with the fix.")
+    not_checked: dict[str, str] | None = said("What could not be checked, with the reason.")
+    passed: str | None = said("Checks that found nothing wrong.")
 
 
 class LogsAnswer(Answer):
     """Log lines, oldest first."""
 
-    lines: AnswerTable | None = None
-    matching: int | None = said("How many lines match (with a cursor: how many older ones).")
-    cursor: int | None = said("Ask again with this cursor for older lines.")
+    lines: AnswerTable | None = said("Log lines, oldest first.")
+    matching: int | None = said("Number of matching lines; with a cursor, of the older ones.")
+    cursor: int | None = said("Cursor to ask with for older lines.")
 
 
 class CommandAnswer(Answer):
     """What became of a command."""
 
-    command_id: int | None = None
-    action: str | None = None
+    command_id: int | None = said("Number of the command.")
+    action: str | None = said("Name of the action that was asked for.")
     outcome: str | None = said("done, failed, expired, cancelled, lost, or claimed (under way).")
-    waited_s: float | None = None
-    result: Any = said("What the controller answered.")
-    error: str | None = said("What the controller or the bridge said.")
-    route: str | None = said("What steered: bridge, websocket (of Webots), keyboard, process.")
+    waited_s: float | None = said("Wall-clock seconds that the call waited.")
+    result: Any = said("What the controller returned.")
+    error: str | None = said("What the controller or the bridge reported.")
+    route: str | None = said("What steered: bridge, websocket (of Webots), keyboard or process.")
     evidence: str | None = said("What shows that it happened.")
     failed_routes: dict[str, str] | None = said("Why other routes did not work.")
 
@@ -163,33 +190,37 @@ class CommandAnswer(Answer):
 class ParametersAnswer(Answer):
     """The parameters of a run."""
 
-    parameters: AnswerTable | None = None
-    total: int | None = None
+    parameters: AnswerTable | None = said(
+        "One row for each parameter, with its value and its limits."
+    )
+    total: int | None = said("Number of parameters.")
 
 
 class CommandsAnswer(Answer):
     """Commands, newest first, and what can be asked for."""
 
-    commands: AnswerTable | None = None
-    cursor: int | None = said("Ask again with this cursor for older ones.")
-    actions: dict[str, Any] | None = said("The controller's own actions with their docstrings.")
-    built_in: list[str] | None = None
+    commands: AnswerTable | None = said("Commands, newest first.")
+    cursor: int | None = said("Cursor to ask with for older commands.")
+    actions: dict[str, Any] | None = said(
+        "Actions that the controller registered, with their docstrings."
+    )
+    built_in: str | None = said("Names of the actions that every bridge has.")
 
 
 class BreakpointAnswer(Answer):
     """A breakpoint that was set or removed."""
 
-    breakpoint_id: int | None = None
-    condition: str | None = None
-    action: str | None = None
-    armed: bool | None = said("Whether the controller asks it now; null where it did not say.")
-    notes: list[str] | None = None
+    breakpoint_id: int | None = said("Number of the breakpoint.")
+    condition: str | None = said("Condition that triggers it.")
+    action: str | None = said("What happens when it is hit.")
+    armed: bool | None = said("Whether the controller evaluates it now; null if it did not say.")
+    notes: list[str] | None = said("Remarks on its signals.")
 
 
 class BreakpointsAnswer(Answer):
     """The breakpoints of a robot."""
 
-    breakpoints: AnswerTable | None = None
+    breakpoints: AnswerTable | None = said("One row for each breakpoint.")
 
 
 class NotedAnswer(Answer):
@@ -201,119 +232,144 @@ class NotedAnswer(Answer):
 class SignalsAnswer(NotedAnswer):
     """The signals of a run."""
 
-    signals: AnswerTable | None = said("missing: rows of the run without a value of it.")
-    total: int | None = said("How many match.")
-    cursor: int | None = said("Ask again with this cursor for more.")
+    signals: AnswerTable | None = said(
+        "One row for each signal; missing counts the rows without a value."
+    )
+    total: int | None = said("Number of matching signals.")
+    cursor: int | None = said("Cursor to ask with for more signals.")
 
 
 class SignalMeaningsAnswer(NotedAnswer):
     """What signals mean."""
 
-    signals: AnswerTable | None = said("source: declared, device, named or unknown.")
-    total: int | None = said("How many signals match.")
+    signals: AnswerTable | None = said(
+        "One row for each signal; source is declared, device, named, behaviour or unknown."
+    )
+    total: int | None = said("Number of matching signals.")
     unknown: list[str] | None = said("Numeric signals of unknown meaning, which are not judged.")
-    changed: list[str] | None = said("The signals that were described, or the undone names.")
+    changed: list[str] | None = said(
+        "The signals that were described, or whose description was removed."
+    )
 
 
 class NumberSeries(AnswerPart):
     """A numeric signal: one item per bucket in each list, null where it has no value."""
 
-    unit: str | None = None
+    unit: str | None = said("Unit of the values.")
     value: list[float | None] | None = said(
-        "Where every bucket is one row; then there is nothing else."
+        "The values, if each bucket is one row; then there are no other lists."
     )
-    constant: float | None = said("The same in every bucket; then there is nothing else.")
-    min: list[float | None] | None = None
-    max: list[float | None] | None = None
-    mean: list[float | None] | None = None
-    last: list[float | None] | None = None
-    count: list[int] | None = said("Values per bucket, where they are not those of the run.")
-    whole: dict[str, float | None] | None = said("Over the range.")
-    without_value: bool | None = said("True: no value in the range.")
-    replaced: dict[str, int] | None = said(
-        "How often nan, inf, ... or too large a number stood there."
+    constant: float | None = said(
+        "The value, if it is the same in every bucket; then there are no lists."
     )
+    min: list[float | None] | None = said("Minimum of each bucket.")
+    max: list[float | None] | None = said("Maximum of each bucket.")
+    mean: list[float | None] | None = said("Mean of each bucket, weighted by time.")
+    last: list[float | None] | None = said("Last value of each bucket.")
+    count: list[int] | None = said("Values per bucket, if they differ from the count of the run.")
+    whole: dict[str, float | None] | None = said(
+        "Minimum, maximum and mean over the range, with the times of the extremes."
+    )
+    without_value: bool | None = said("True if the range holds no value.")
+    replaced: dict[str, int] | None = said("Number of values that were nan, inf or too large.")
 
 
 class ChangeSeries(AnswerPart):
     """A text or boolean signal: its values, each with the time from which on it had it."""
 
-    since_s: list[float | None] = Field(
-        description="First null: it began earlier; there was no time to find when."
+    since_s: list[float | None] = said(
+        "Simulation time in seconds at which each value began; null first: it began earlier."
     )
-    value: list[str | bool | None]
-    total: int | None = said("How many changes, if not all are shown.")
-    time_by_value_s: dict[str, float]
+    value: list[str | bool | None] = Field(description="The values in order.")
+    total: int | None = said("Number of changes, if not all are shown.")
+    time_by_value_s: dict[str, float] = Field(description="Seconds that the signal had each value.")
 
 
 class RunSeries(AnswerPart):
     """The part of an answer that is about one run."""
 
-    run_id: int
-    start_s: float | None
-    end_s: float | None
-    step_s: float | None = said("Length of a bucket, s; missing where each bucket is one row.")
-    sim_time_s: list[float | None] | None = said("Begin of each bucket.")
+    run_id: int = Field(description="Number of the run.")
+    start_s: float | None = Field(
+        description="Begin of the range in this run, in simulated seconds."
+    )
+    end_s: float | None = Field(description="End of the range in this run, in simulated seconds.")
+    step_s: float | None = said("Length of a bucket in seconds; missing if each bucket is one row.")
+    sim_time_s: list[float | None] | None = said(
+        "Simulation time at which each bucket begins, in seconds."
+    )
     count: list[int] | None = said("Values per bucket.")
-    numbers: dict[str, NumberSeries] | None = None
-    states: dict[str, ChangeSeries] | None = None
-    row_count: int | None = None
-    recording_gaps: list[list[float | None]] | None = said("[from, to] where no row was recorded.")
-    recording_gap_count: int | None = said("How many, if not all are shown.")
+    numbers: dict[str, NumberSeries] | None = said("Numeric signals by name.")
+    states: dict[str, ChangeSeries] | None = said("Text and boolean signals by name.")
+    row_count: int | None = said("Number of rows in the range.")
+    recording_gaps: list[list[float | None]] | None = said(
+        "[from, to] in simulated seconds where no row was recorded."
+    )
+    recording_gap_count: int | None = said("Number of gaps, if not all are shown.")
     rows_missing_from_s: float | None = said(
-        "Reading took too long: from here on rows are missing."
+        "Simulation time from which on rows are missing: reading took too long."
     )
 
 
 class RowColumns(AnswerPart):
     """Rows as they were recorded, as columns."""
 
-    run_id: list[int] | None = said("Where it is not the header's.")
-    sim_time_s: list[float | None]
-    signals: dict[str, list[Any]]
-    replaced: dict[str, dict[str, int]] | None = None
+    run_id: list[int] | None = said("Run of each row, if it is not that of the header.")
+    sim_time_s: list[float | None] = Field(description="Simulation time of each row, in seconds.")
+    signals: dict[str, list[Any]] = Field(
+        description="The values of each signal, one for each row."
+    )
+    replaced: dict[str, dict[str, int]] | None = said(
+        "Number of values of each signal that were nan, inf or too large."
+    )
 
 
 class HistoryAnswer(NotedAnswer):
     """Signals over a range."""
 
-    runs: list[RunSeries] | None = None
-    raw: RowColumns | None = None
-    cursor: int | None = said("With raw: ask again with this cursor for the next rows.")
+    runs: list[RunSeries] | None = said("The range, one part for each run.")
+    raw: RowColumns | None = said("Rows as they were recorded.")
+    cursor: int | None = said("Cursor to ask with for the next rows, with raw.")
 
 
 class RunTrendTables(AnswerPart):
     """The trends of one run."""
 
-    run_id: int
-    start_s: float | None
-    end_s: float | None
-    row_count: int
+    run_id: int = Field(description="Number of the run.")
+    start_s: float | None = Field(
+        description="Begin of the range in this run, in simulated seconds."
+    )
+    end_s: float | None = Field(description="End of the range in this run, in simulated seconds.")
+    row_count: int = Field(description="Number of rows in the range.")
     resolution_s: float | None = said("Shapes and slopes come from means over this many seconds.")
-    numbers: AnswerTable | None = said("What changed most is first.")
-    states: AnswerTable | None = said("Text and flags that changed.")
-    constant: str | None = said("What never changed, with its value.")
+    numbers: AnswerTable | None = said(
+        "Numeric signals that changed, the largest change first; deviation is the standard "
+        "deviation."
+    )
+    states: AnswerTable | None = said("Text and boolean signals that changed.")
+    constant: str | None = said("Signals that never changed, with their values.")
     without_value: str | None = said("Signals without a value in the range.")
-    not_shown: str | None = said("Of those that changed.")
+    not_shown: str | None = said("Number of changed signals that are not shown.")
     rows_missing_from_s: float | None = said(
-        "Reading took too long: from here on rows are missing."
+        "Simulation time from which on rows are missing: reading took too long."
     )
 
 
 class TrendsAnswer(NotedAnswer):
     """What each signal did over a range."""
 
-    runs: list[RunTrendTables] | None = None
+    runs: list[RunTrendTables] | None = said("The trends of each run in the range.")
 
 
 class KindVerdicts(AnswerPart):
     """What became of each kind that was asked for."""
 
-    found: dict[str, int] | None = said("How many there are in the range, shown or not.")
-    not_found: str | None = said("Searched for and not found.")
-    nearest: dict[str, str] | None = said("Not found either; what came nearest.")
+    found: dict[str, int] | None = said("Number of events of each kind in the range, shown or not.")
+    not_found: str | None = said("Kinds that were searched and not found.")
+    nearest: dict[str, str] | None = said(
+        "Kinds that were searched and not found, with what came nearest."
+    )
     not_searched: dict[str, str] | None = said(
-        "Not searched for, or only in part: why, and what to ask instead."
+        "Kinds that were not searched, or only in part: why, and what to do."
     )
 
 
@@ -321,134 +377,148 @@ class EventsAnswer(NotedAnswer):
     """What happened in a range, in order of time."""
 
     events: AnswerTable | None = said(
-        "Columns with @ hold that signal's value when the event began."
+        "Events in order of time; a column with @ holds that signal's value when the event began."
     )
-    verdicts: KindVerdicts | None = None
+    verdicts: KindVerdicts | None = said("What became of each kind that was searched for.")
     not_shown: dict[str, str] | None = said(
-        "How many of each kind there are beside these, and when they began."
+        "Number of events of each kind that are not shown, and when they began."
     )
-    cursor: str | None = said("Ask again with this cursor for those that are not shown.")
+    cursor: str | None = said("Cursor to ask with for the events that are not shown.")
 
 
 class CheckAnswer(NotedAnswer):
     """Whether a run is well."""
 
-    outcome: str | None = said("The worst: fail, not looked at, warn, pass, or not judged.")
-    checks: AnswerTable | None = said(
-        "Those that did not pass; more: the call that shows it in full."
+    outcome: str | None = said(
+        "The worst outcome: fail, not looked at, warn, pass, not judged or not applicable."
     )
-    passed: list[str] | None = None
+    checks: AnswerTable | None = said(
+        "Checks that did not pass; more is the call that shows one in full."
+    )
+    passed: list[str] | None = said("Names of the checks that passed.")
+    passed_on: dict[str, str] | None = said(
+        "What held in each check that passed, and the signals that were judged."
+    )
 
 
 class TimelineAnswer(NotedAnswer):
     """A page of what happened, in order of time."""
 
-    events: AnswerTable | None = None
-    verdicts: KindVerdicts | None = None
-    cursor: str | None = said("Ask again with this cursor for later ones.")
+    events: AnswerTable | None = said("What was recorded, in order of time.")
+    verdicts: KindVerdicts | None = said("Number of entries of each kind.")
+    cursor: str | None = said("Cursor to ask with for later entries.")
 
 
 class MonitorAnswer(NotedAnswer):
     """What was recorded in a window of wall time: of exactly those rows."""
 
-    window_s: float | None = said("Wall time that was looked at.")
-    row_count: int | None = said("States recorded in the window.")
-    movement: dict[str, Any] | None = None
-    trends: list[RunTrendTables] | None = said("More than one: time went back in between.")
-    events: AnswerTable | None = said(
-        "Columns with @ hold that signal's value when the event began."
+    window_s: float | None = said("Wall-clock seconds that were watched.")
+    row_count: int | None = said("Number of rows recorded in the window.")
+    movement: dict[str, Any] | None = said(
+        "From where to where the robot moved, with path and displacement in metres."
     )
-    verdicts: KindVerdicts | None = None
+    trends: list[RunTrendTables] | None = said(
+        "The trends of each run in the window; a reset in between makes two."
+    )
+    events: AnswerTable | None = said(
+        "Events in order of time; a column with @ holds that signal's value when the event began."
+    )
+    verdicts: KindVerdicts | None = said("What became of each kind that was searched for.")
     not_shown: dict[str, str] | None = said(
-        "How many of each kind there are beside these, and when they began."
+        "Number of events of each kind that are not shown, and when they began."
     )
 
 
 class TrialsAnswer(NotedAnswer):
     """How far a trial set is, and its parameters ranked."""
 
-    trial_set: int | None = None
-    state: str | None = said("under way, done, stopped and why, ...")
-    trials: int | None = None
-    over: int | None = None
-    pruned: int | None = said("Ended early, as the plan says.")
-    failed: int | None = None
-    score: str | None = None
+    trial_set: int | None = said("Number of the trial set.")
+    state: str | None = said("Whether the set is under way, done, or stopped and why.")
+    trials: int | None = said("Number of trials in the set.")
+    over: int | None = said("Number of trials that have ended.")
+    pruned: int | None = said("Number of trials that ended early, as the plan says.")
+    failed: int | None = said("Number of trials that failed.")
+    score: str | None = said("The score that is compared.")
     ranked: AnswerTable | None = said(
-        "The best first; score is the mean, range least and greatest of repeats."
+        "Sets of parameters, the best first; score is the mean of repeats, range their "
+        "minimum and maximum."
     )
-    noise: float | None = said("Standard deviation of the scores of like trials.")
-    is_best_confirmed: bool | None = said("By more than the spread of repeats; null: unknown.")
-    verdict: str | None = None
+    noise: float | None = said("Standard deviation of the scores of repeated trials.")
+    is_best_confirmed: bool | None = said(
+        "Whether the best leads by more than repeats scatter; null if that is unknown."
+    )
+    verdict: str | None = said("What the ranking shows.")
 
 
 class RunAnswer(CommandAnswer):
     """What came of a `run` command."""
 
     stopped: str | None = said(
-        "condition held, simulation time reached, run ended, interrupted, or "
-        "wall time limit reached."
+        "condition held, simulation time reached, run ended, interrupted, or wall time "
+        "limit reached."
     )
-    stop_reason: str | None = None
+    stop_reason: str | None = said("Why it stopped, in words.")
     ran: dict[str, Any] | None = said("How far simulation time came.")
-    values: dict[str, Any] | None = said("Of the condition's signals.")
-    mode: str | None = None
-    state: Any = said("As published at the step where it stopped.")
-    state_at_s: float | None = None
-    shortened: str | None = None
-    movement: dict[str, Any] | None = None
-    trends: RunTrendTables | None = None
-    events: AnswerTable | None = None
-    not_shown: dict[str, str] | None = None
-    rows: AnswerTable | None = said("The last rows, of its signals.")
-    picture: dict[str, Any] | None = None
+    values: dict[str, Any] | None = said("Values of the condition's signals when it stopped.")
+    mode: str | None = said("Mode of the simulation afterwards.")
+    state: Any = said("The state as published at the step where it stopped.")
+    state_at_s: float | None = said("Simulation time of that state, in seconds.")
+    shortened: str | None = said("How long parts of the state were shortened.")
+    movement: dict[str, Any] | None = said(
+        "From where to where the robot moved, with path and displacement in metres."
+    )
+    trends: RunTrendTables | None = said("What each signal did meanwhile.")
+    events: AnswerTable | None = said("What happened meanwhile, in order of time.")
+    not_shown: dict[str, str] | None = said(
+        "Number of events of each kind that are not shown, and when they began."
+    )
+    rows: AnswerTable | None = said("The last rows, of the condition's signals.")
+    picture: dict[str, Any] | None = said(
+        "The picture of the end: its kind, its time and its file."
+    )
 
 
 class SqlAnswer(Answer):
     """What a SELECT returned."""
 
-    result: AnswerTable | None = None
-    truncated: str | None = said("Why rows or parts are missing.")
+    result: AnswerTable | None = said("The rows that the SELECT returned.")
+    truncated: str | None = said("Why rows or parts of values are missing.")
 
 
 class RunsAnswer(Answer):
     """Runs, the newest first."""
 
-    runs: AnswerTable | None = None
-    run: dict[str, Any] | None = said("The one that was annotated.")
-    total: int | None = None
-    cursor: int | None = said("Ask again with this cursor for older ones.")
+    runs: AnswerTable | None = said("One row for each run, newest first.")
+    run: dict[str, Any] | None = said("The run that was annotated.")
+    total: int | None = said("Number of matching runs.")
+    cursor: int | None = said("Cursor to ask with for older runs.")
 
 
 class ComparisonAnswer(NotedAnswer):
     """Runs beside each other; the first group is the reference."""
 
-    verdict: str | None = said("With first_difference: where the two part.")
-    unlike: dict[str, list[Any]] | None = said("What was not the same of them to begin with.")
-    compared: dict[str, Any] | None = said("Rows that both have at the same simulation time.")
-    parted: AnswerTable | None = said("In the order in which they part; beyond_s: the tolerance.")
-    growth: dict[str, Any] | None = said("Largest difference of the signal that parts most.")
-    groups: AnswerTable | None = None
-    compared_s: float | None = said(
-        "All figures are about the first seconds of each run, this many."
+    verdict: str | None = said("Where the two runs diverge, with first_difference.")
+    unlike: dict[str, list[Any]] | None = said(
+        "Properties in which the two runs differed from the beginning."
     )
+    compared: dict[str, Any] | None = said("Rows that both runs have at the same simulation time.")
+    parted: AnswerTable | None = said(
+        "Signals in the order in which they diverge; beyond_s is when they exceed the tolerance."
+    )
+    growth: dict[str, Any] | None = said("Largest difference of the signal that diverges most.")
+    groups: AnswerTable | None = said("The groups of runs; the first is the reference.")
+    legend: str | None = said("What the columns of measures and differences mean.")
+    compared_s: float | None = said("All figures are about this many first seconds of each run.")
     measures: AnswerTable | None = said(
-        "Each run as a whole: median over the runs of each group, and their range. "
-        "Of each group but the first: different; null where it cannot be told, then runs_wanted: "
-        "this many runs of each would tell, if they went on like these. interval: of the "
-        "difference of the means, 90 %. compared: share of runs, where rare events are counted by "
-        "run; runs: those that have any. holds_for: null is compared_s."
+        "Figures of whole runs: the median over the runs of each group; different is null "
+        "if undecided."
     )
     unknown: dict[str, str] | None = said(
-        "Figures that are null, or not of everything: why; what to do."
+        "Figures that are null or incomplete, with the reason and what to do."
     )
-    undecided: dict[str, str] | None = said("Why different is null.")
+    undecided: dict[str, str] | None = said("Why different is null, by figure.")
     differences: AnswerTable | None = said(
-        "Signals, most different first; lists are in the order of the groups. Of each "
-        "group but the first (a list where there are several): effect, how far the mean is from "
-        "the first group's, in standard deviations (0.8 is large, null: unequal constants), "
-        "deviation_ratio, different and interval of the mean, deviation_different and "
-        "deviation_interval of the deviation. min and max where signals were named."
+        "Signals, most different first: the mean of each group; different is null if undecided."
     )
-    total: int | None = said("Numeric signals that all groups have.")
+    total: int | None = said("Number of numeric signals that all groups have.")
     only_in: dict[str, list[str]] | None = said("Signals that not every group has.")

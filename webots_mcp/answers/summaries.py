@@ -44,6 +44,7 @@ from webots_mcp.answers.models import (
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
+_MOST_DIFFERENCES: Final = 3
 _SERIOUS: Final = ("critical", "error", "warning")
 _OUTCOMES: Final = {"fail": "failed", "warn": "warned", "not judged": "could not be judged"}
 _ENDINGS: Final = {"finished": "finished", "crashed": "crashed"}  # others: "ended by reset"
@@ -231,7 +232,8 @@ def _(answer: EventsAnswer) -> str:
 def _(answer: TimelineAnswer) -> str:
     shown = list(_rows(answer.events))
     more = "; continue with cursor" if answer.cursor else ""
-    return f"{_count(len(shown), 'entry', 'entries')} in order of time{more}."
+    entries = _count(len(shown), "recorded entry", "recorded entries")
+    return f"{entries} in order of time, not searched for faults (webots_find_events){more}."
 
 
 @_summary.register
@@ -366,10 +368,42 @@ def _(answer: ComparisonAnswer) -> str | None:
     different = [_name(row) for row in rows if _is(row, True)]
     same = sum(_is(row, False) for row in rows)
     undecided = len(rows) - len(different) - same
+    apart = [] if different else _largest_differences(rows)
     parts = [f"Different: {_listed(different)}" if different else "No figure is known to differ"]
+    if apart:
+        parts = [f"Largest differences, not certain: {', '.join(apart)}", _too_few(answer, rows)]
     parts.append(f"{same} equal within what matters" if same else "")
-    parts.append(f"{undecided} cannot be decided" if undecided else "")
+    parts.append(f"{undecided} cannot be decided" if undecided and not apart else "")
     return f"{'; '.join(part for part in parts if part)}."
+
+
+def _largest_differences(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return undecided figures of two groups whose runs do not overlap, largest change first."""
+    found: list[tuple[float, str]] = []
+    for row in rows:
+        values = row.get("median") or row.get("mean")
+        if row.get("different") is not None or not isinstance(values, list) or len(values) != 2:
+            continue
+        first, second = values
+        if first is None or second is None or first == second:
+            continue
+        ranges = row.get("range") or row.get("mean_range") or [[first] * 2, [second] * 2]
+        if None in ranges or max(r[0] for r in ranges) <= min(r[1] for r in ranges):
+            continue
+        change = abs(second - first) / max(abs(first), abs(second))
+        found.append((change, f"{_name(row)} {first:.4g} -> {second:.4g}"))
+    return [text for _, text in sorted(found, key=lambda each: -each[0])[:_MOST_DIFFERENCES]]
+
+
+def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return how many runs there are of each group, and how many would decide."""
+    counts = [str(len(row.get("runs") or ())) for row in _rows(answer.groups)]
+    wanted: list[int] = []
+    for row in rows:
+        value = row.get("runs_wanted")
+        wanted += [each for each in (value if isinstance(value, list) else [value]) if each]
+    least = f"{max(wanted)} of each would do" if wanted else "repeat the runs"
+    return f"too few runs ({' and '.join(counts)}): {least}"
 
 
 def _is(row: Mapping[str, Any], outcome: bool) -> bool:

@@ -349,9 +349,7 @@ class RetentionOptions:
     state: Annotated[str | None, _option("state", "Keep so much of recorded states ({}).")] = None
     kept_state: Annotated[
         str | None,
-        _option(
-            "kept_state", "Keep so much of what is kept at full rate, the kept stretches ({})."
-        ),
+        _option("kept_state", "Size limit for full-rate segments ({})."),
     ] = None
     chunk: Annotated[
         str | None,

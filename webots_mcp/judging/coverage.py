@@ -233,23 +233,27 @@ class Verdicts:
 
     @property
     def gaps(self) -> dict[str, str]:
-        """What was not searched: each reason once, with the kinds that share it as the key."""
+        """What was not searched: each reason once, with the kinds that share it as the key.
+
+        That nothing was found in the rest is said with the reasons of a kind, not on its own.
+        """
         sharing: dict[str, list[str]] = {}
         for kind, reasons in self.reasons.items():
-            for reason in (*reasons, *self._in_what_was_searched(kind)):
+            for reason in reasons:
                 sharing.setdefault(reason, []).append(kind)
-        named: dict[str, list[str]] = {}
+        named: dict[tuple[str, ...], list[str]] = {}
         for reason, kinds in sharing.items():
-            named.setdefault(", ".join(kinds), []).append(reason)
-        return {kinds: "; ".join(reasons) for kinds, reasons in named.items()}
+            named.setdefault(tuple(kinds), []).append(reason)
+        left = {kind: self.not_found[kind] for kind in self.reasons if kind in self.not_found}
+        found: dict[str, str] = {}
+        for kinds, reasons in named.items():
+            absent = {kind: left.pop(kind) for kind in kinds if kind in left}
+            found[", ".join(kinds)] = "; ".join([*reasons, *_in_the_rest(absent, kinds)])
+        return found
 
     @property
     def _nowhere(self) -> list[str]:
         return [kind for kind in self.not_found if kind not in self.reasons]
-
-    def _in_what_was_searched(self, kind: str) -> list[str]:
-        near = self.not_found.get(kind)
-        return [] if near is None else [f"none in the searched part{near and f' ({near})'}"]
 
     def unlooked(self, kind: str) -> str | None:
         """Why a kind was not looked for anywhere; None if it was, at least in a part."""
@@ -263,6 +267,16 @@ class Verdicts:
     def unread(self, kind: str) -> list[str]:
         """What of the range could not be read for a kind: its count is that of the rest."""
         return [each for each in self.reasons.get(kind, ()) if each.startswith(NOT_READ)]
+
+
+def _in_the_rest(absent: Mapping[str, str], kinds: Sequence[str]) -> list[str]:
+    """Return that kinds were not found in what was searched, with what came nearest to each."""
+    if not absent:
+        return []
+    named = "none" if len(absent) == len(kinds) else f"no {', '.join(absent)}"
+    nearest = dict.fromkeys(near for near in absent.values() if near)
+    near = f" ({'; '.join(nearest)})" if nearest else ""
+    return [f"in the rest: {named}{near}"]
 
 
 @dataclass

@@ -107,7 +107,7 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
     for run_id in scored:
         kept = len(full_rate_parts(connection, run_id, -math.inf, math.inf))
         notes = [unrecorded(connection, run_id)]
-        notes += ["rows that only kept stretches have do not count"] if kept else []
+        notes += ["rows that only full-rate segments have do not count"] if kept else []
         if said := "; ".join(filter(None, notes)):
             alike.setdefault(said, []).append(str(run_id))
     return [

@@ -461,7 +461,8 @@ def _remarks(trend: Trend) -> Iterator[str]:
     if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
         yield f"also {_swinging(trend, unit)}"
     if trend.flat_since_s is not None and trend.shape != "constant" and summary.changes != 1:
-        yield f"flat at {_in_digits(summary.last, summary)} since {trend.flat_since_s:.6g} s"
+        value, since_s = _in_digits(summary.last, summary), trend.flat_since_s
+        yield f"reaches {value} at {since_s:.6g} s, then flat"
     if trend.spikes:
         largest = max(trend.spikes, key=lambda spike: abs(spike.value - (trend.mean or 0.0)))
         yield (
@@ -499,10 +500,22 @@ def _course(trend: Trend, unit: str) -> str:
             extreme_s = (summary.min_sim_time_s, summary.max_sim_time_s)[trend.shape == "rising"]
             return f"steps from {first} to {last}{unit} at {extreme_s:.6g} s"
         return f"{verb} from {first} to {last}{unit}{slope}"
-    low, high = _in_digits(summary.min, summary), _in_digits(summary.max, summary)
-    return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
-        f"(at {summary.max_sim_time_s:.6g} s)"
-    )
+    low = _extreme(trend, summary.min, summary.min_sim_time_s, "")
+    return f"between {low} and {_extreme(trend, summary.max, summary.max_sim_time_s, unit)}"
+
+
+def _extreme(trend: Trend, value: float | None, at_s: float | None, unit: str) -> str:
+    """Return an extreme with its time.
+
+    One in the flat end, where it differs from the last value by noise at most, has no time: since
+    when the signal is flat is said besides.
+    """
+    text = f"{_in_digits(value, trend.summary)}{unit}"
+    flat_s = trend.flat_since_s
+    is_end = text == f"{_in_digits(trend.summary.last, trend.summary)}{unit}"
+    if at_s is None or (flat_s is not None and at_s >= flat_s and is_end):
+        return text
+    return f"{text} (at {at_s:.6g} s)"
 
 
 def _mean_rate(trend: Trend) -> float:

@@ -83,6 +83,16 @@ DIFFERENCE_COLUMNS: Final = (
 )  # fmt: skip
 CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
 _GOING_ON: Final = "going on"
+_LEGEND: Final = {  # what columns of a comparison mean, where their names do not say it
+    "range": "range, mean_range: minimum and maximum over the runs of a group",
+    "deviation": "deviation: standard deviation within a run",
+    "effect": "effect: difference of the means, in standard deviations (0.8 is large)",
+    "deviation_ratio": "deviation_ratio: deviation divided by that of the first group",
+    "interval": "interval: 90 % confidence interval of the difference",
+    "runs_wanted": "runs_wanted: runs of each group that would decide",
+    "compared": "compared: how many runs have such events, not how many events",
+    "holds_for": "holds_for: what the figure covers; null: the first compared_s seconds",
+}
 
 
 @dataclass(frozen=True)
@@ -99,6 +109,9 @@ class ComparisonSizes:
             rest.
         evidence_characters: Characters of the evidence of a check.
         checks_tokens: Budget of the checks that did not pass.
+        passed_tokens: Budget of what those that passed rest on; for a person all is shown.
+        passed_characters: Characters of what held.
+        passed_signals: Names of the signals that were judged.
     """
 
     differences: int = 15
@@ -109,6 +122,9 @@ class ComparisonSizes:
     measures_share: float = 0.75
     evidence_characters: int = 250
     checks_tokens: int = 1_400
+    passed_tokens: int = 300
+    passed_characters: int = 100
+    passed_signals: int = 3
 
 
 _SIZES: Final = ComparisonSizes()
@@ -357,7 +373,8 @@ def _compared(
     found = compare_runs(view.connection, run_ids or None, **asked)
     differing = [each for each in found.differences if _differs(each)]
     undecided = _undecided(found.measures, differing)
-    groups, notes, only_in = _groups(found), notes_of(found.notes), list(found.only_in.items())
+    groups, only_in = _groups(found), list(found.only_in.items())
+    notes = notes_of([*_edit_note(found.groups), *found.notes])
     most = len(only_in) if is_for_a_person() else _SIZES.only_in
     beside: list[Any] = [groups and groups.rows, found.unknown, undecided, notes]
     of_measures = int(_SIZES.measures_share * room_tokens(limit, beside))
@@ -365,18 +382,47 @@ def _compared(
     beside.append(measures)
     rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
     rows = fitting(rows, room_tokens(limit, [*beside, only_in[:most]]))
+    tables = [without_empty(MEASURE_COLUMNS, measures), without_empty(DIFFERENCE_COLUMNS, rows)]
     return {
         "groups": groups,
+        "legend": _legend(found, tables),
         "compared_s": seconds(found.compared_s),
-        "measures": without_empty(MEASURE_COLUMNS, measures),
+        "measures": tables[0],
         "unknown": found.unknown or None,
         "undecided": undecided,
-        "differences": without_empty(DIFFERENCE_COLUMNS, rows),
+        "differences": tables[1],
         "total": found.total,
         "only_in": {name: list(groups) for name, groups in only_in[:most]} or None,
         "notes": notes,
         "hint": _hint(found, len(measures), len(rows), len(differing), len(only_in) - most),
     }
+
+
+def _legend(found: Comparison, tables: Sequence[AnswerTable | None]) -> str | None:
+    """Return what the columns of the tables mean, in the words of one line."""
+    columns = {column for table in tables if table for column in table.columns}
+    if len(found.groups) < 2 or not columns:
+        return None
+    lists = f"lists: {', '.join(group.name for group in found.groups)}"
+    return "; ".join([lists, *(text for name, text in _LEGEND.items() if name in columns)])
+
+
+def _edit_note(groups: Sequence[Group]) -> list[str]:
+    """Return what makes before and after, where runs around an edit are compared."""
+    if [group.name for group in groups] != ["before", "after"]:
+        return []
+    sides = [f"{group.name}: {_runs_and_code(group)}" for group in groups]
+    return [f"around the last edit of the controller; {', '.join(sides)}"]
+
+
+def _runs_and_code(group: Group) -> str:
+    numbers = ", ".join(str(run.run_id) for run in group.runs)
+    code = dict.fromkeys(
+        (run.git_commit or run.controller_sha256 or "")[: _SIZES.hash_characters]
+        for run in group.runs
+    )
+    named = ", ".join(filter(None, code))
+    return f"run{'s' * (len(group.runs) > 1)} {numbers}{f' with code {named}' if named else ''}"
 
 
 def _undecided(
@@ -553,13 +599,29 @@ def _checked(
         [_check_row(each) for each in others], None if is_for_a_person() else _SIZES.checks_tokens
     )
     left = Counter(each.outcome for each in others[len(rows) :])
+    passed = checked.of("pass")
     counts = ", ".join(f"{count} {outcome}" for outcome, count in left.items())
     return {
         "outcome": checked.outcome,
         "checks": without_empty(CHECK_COLUMNS, rows),
-        "passed": [each.name for each in checked.of("pass")] or None,
+        "passed": [each.name for each in passed] or None,
+        "passed_on": _bases(passed),
         "notes": [f"not shown: {counts}; webots-mcp check shows all"] if left else None,
     }
+
+
+def _bases(passed: Sequence[Finding]) -> dict[str, str] | None:
+    """Return what each check that passed rests on, of the first ones that fit."""
+    found = [(each.name, _basis(each)) for each in passed]
+    return dict(fitting(found, None if is_for_a_person() else _SIZES.passed_tokens)) or None
+
+
+def _basis(finding: Finding) -> str:
+    """Return what a check that passed rests on: what held, and the signals that were judged."""
+    most = len(finding.signals) if is_for_a_person() else _SIZES.passed_signals
+    names = listed([short_name(name) or "" for name in finding.signals], most)
+    held = cut_for_a_model(finding.evidence, _SIZES.passed_characters)
+    return f"{held} ({names})" if names else held
 
 
 def _check_row(finding: Finding) -> list[Any]:

@@ -12,7 +12,14 @@ from webots_mcp.answers.models import SignalMeaningsAnswer
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import LONGEST_NAME, AnyNames, RobotName
 from webots_mcp.questions.declaring import CHANGES, READS, question
-from webots_mcp.signals.meaning import Meaning, Quantity, Role, declare_meaning
+from webots_mcp.signals.meaning import (
+    DECLARED_WORDS,
+    Meaning,
+    Quantity,
+    Role,
+    declaration_of,
+    declare_meaning,
+)
 from webots_mcp.store.meanings import meanings_of, set_meanings, undo_meanings
 from webots_mcp.store.reading.catalogue import catalogue, resolve_signals
 from webots_mcp.store.recording import RecordingAccess, RobotView
@@ -24,8 +31,7 @@ MEANING_COLUMNS: Final = (
 )  # fmt: skip
 _NOT_YET: Final = "no signal has been recorded yet: run the simulation first, then describe them"
 _DECLARE: Final = (
-    "signals of unknown meaning are not judged: declare them, such as "
-    "webots_describe_signals(signals=[{!r}], quantity='speed', role='commanded')"
+    "signals of unknown meaning are not judged: declare them with {}; " + DECLARED_WORDS
 )
 
 _Name = Annotated[str, Field(max_length=LONGEST_NAME)]
@@ -152,7 +158,7 @@ def _listed(
         shown = sorted(each.name for each in resolve_signals(known, names)) if known else []
     rows = fitting([_meaning_row(name, meanings[name]) for name in shown]) if shown else []
     unknown = [n for n in shown if known[n].is_number and meanings[n].quantity is None]
-    hints = [_DECLARE.format(name) for name in unknown[:1]]
+    hints = [_DECLARE.format(declaration_of(name)) for name in unknown[:1]]
     if len(rows) < len(shown):
         hints.append(f"{len(rows)} of {len(shown)} are shown: narrow signals, such as ['motors.*']")
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
@@ -29,7 +30,7 @@ from webots_mcp.questions.arguments import (
     TimeOfDay,
 )
 from webots_mcp.questions.declaring import READS, question
-from webots_mcp.store.reading.ranges import Scope, TimeRange
+from webots_mcp.store.reading.ranges import USE_EVERY_ROW, Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 DEFAULT_LIMIT: Final = 50
@@ -138,7 +139,7 @@ def _found(
     time_of_day: bool,
 ) -> dict[str, Any]:
     found = search_events(view.connection, asked, options, group=group, after=cursor or None)
-    verdicts, notes = verdicts_of(found.verdicts), notes_of(found.notes)
+    verdicts, notes = verdicts_of(found.verdicts), notes_of(_notes(found.notes, options))
     budget_tokens = room_tokens(limit, [verdicts.model_dump(exclude_none=True), notes])
     told, events = fitting_events(
         found, limit or DEFAULT_LIMIT, budget_tokens, view, time_of_day=time_of_day
@@ -158,6 +159,12 @@ def _found(
         "notes": notes,
         "hint": "; ".join(hints) or None,
     }
+
+
+def _notes(notes: Sequence[str], options: EventOptions) -> list[str]:
+    """Return the notes without those on the rate of rows, where no values were searched."""
+    are_stored = bool(options.kinds) and {*options.kinds} <= {*stored_kinds()}
+    return [each for each in notes if not (are_stored and each.endswith(USE_EVERY_ROW))]
 
 
 # -- what was noted, in order, page by page --
@@ -208,6 +215,6 @@ def _timeline(
         "events": events,
         "verdicts": verdicts_of(page.verdicts),
         "cursor": page.cursor,
-        "notes": notes_of(page.notes),
+        "notes": notes_of(_notes(page.notes, options)),
         "hint": "nothing after that cursor" if cursor and not events else None,
     }

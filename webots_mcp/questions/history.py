@@ -130,13 +130,13 @@ def _value(info: SignalInfo, value: Any) -> Any:
 
 
 def _missing(info: SignalInfo, rows: int) -> str | None:
-    """In how many rows it has no value, and between which times it has some."""
+    """Return how many rows have no value of it, and when it had the first and the last."""
     if not info.missing:
         return None
     if info.first_s is None:
-        return f"in all {rows} rows"
-    told = f"in {info.missing} of {rows} rows; values"
-    return f"{told} from {seconds(info.first_s)} to {seconds(info.last_s)} s"
+        return f"all {rows} rows without a value"
+    span = f"first value at {seconds(info.first_s)} s, last at {seconds(info.last_s)} s"
+    return f"{info.missing} of {rows} rows without a value; {span}"
 
 
 def _found(view: RobotView, pattern: str, limit: int, start: int) -> dict[str, Any]:

@@ -231,10 +231,18 @@ def _retention(recording: RecordingAccess, connection: sqlite3.Connection) -> di
     """Return the limits of the recording, its size, and which of our limits do not apply."""
     notes = unheeded(connection, recording.limits)
     return {
-        "kept": described(connection),
+        "kept": _limits(described(connection)),
         **file_sizes(connection),
         **({"not_in_force": notes} if notes else {}),
     }
+
+
+def _limits(limits: dict[str, str]) -> dict[str, str]:
+    """Return the limits that somebody set, and all defaults as one text."""
+    ends = " (default)"
+    kept = {kind: text for kind, text in limits.items() if not text.endswith(ends)}
+    defaults = [f"{kind} {t.removesuffix(ends)}" for kind, t in limits.items() if kind not in kept]
+    return {**kept, **({"defaults": ", ".join(defaults)} if defaults else {})}
 
 
 def _liveliest(robots: list[Any]) -> list[Any]:

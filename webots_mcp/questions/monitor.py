@@ -54,7 +54,7 @@ class MonitorSizes:
 
     signals: int = 12
     events: int = 30
-    rows_tokens: int = 1_200
+    rows_tokens: int = 1_100
     events_share: float = 0.45
     runs: int = 2
 
@@ -159,7 +159,8 @@ def _found(connection: sqlite3.Connection, view: RobotView, wall_start_s: float)
     found = search_events(connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
-    verdicts = verdicts_of(in_window.verdicts if recorded else _unlooked(in_window.verdicts))
+    known = in_window.verdicts if recorded else _unlooked(in_window.verdicts)
+    verdicts = verdicts_of(known, in_short=recorded)
     moved = movement(view, window.rows) if recorded else None
     notes = notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told)))))
     beside = [verdicts.model_dump(exclude_none=True), moved, notes]

@@ -350,10 +350,12 @@ def _kept(view: RobotView) -> str | None:
     newest = newest_kept(view.connection, view.run.id) if view.run else None
     if newest is None or view.run is None:
         return None
-    span = f"{newest.start_s:.3f}-{newest.end_s:.3f} s"
-    if newest.end_s > view.run.last_sim_time_s:
-        span = f"{newest.start_s:.3f} s on, until {newest.end_s:.3f} s"
-    return f"{span}: {cut_text(newest.reason, _SIZES.error_characters)}"
+    span = f"{newest.start_s:.3f} to {newest.end_s:.3f} s"
+    if (last_s := view.run.last_sim_time_s) < newest.end_s:
+        span = f"since {newest.start_s:.3f} s, planned to {newest.end_s:.3f} s"
+        if view.run.end_reason is not None:
+            span = f"{newest.start_s:.3f} to {last_s:.3f} s, where the run ended"
+    return f"full-rate segment {span}: {cut_text(newest.reason, _SIZES.error_characters)}"
 
 
 def _replaced_in(state: StateRecord, part: dict[str, Any]) -> dict[str, str] | None:

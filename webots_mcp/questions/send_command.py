@@ -180,7 +180,7 @@ def _answer(view: RobotView, commands: list[QueuedCommand], limit: int) -> Comma
         commands=condensed(COMMAND_COLUMNS, rows),
         cursor=commands[len(rows) - 1].id if more else None,
         actions=shown,
-        built_in=list(BUILT_IN_ACTIONS) if has_bridge else [],
+        built_in=", ".join(BUILT_IN_ACTIONS) if has_bridge else None,
         hint="; ".join(hints) or None,
     )
 

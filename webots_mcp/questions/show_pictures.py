@@ -212,7 +212,7 @@ def _no_frame(view: RobotView, camera: str) -> str:
         if known
         else "no camera frame was saved: fresh=true takes one of an enabled camera now, "
         "bridge.save_camera_frame(camera) in the controller's loop records them, "
-        "bridge.keep_camera(camera) those of kept stretches"
+        "bridge.keep_camera(camera) those of full-rate segments"
     )
     return _caption(view.header() | {"camera": camera, "hint": hint})
 

@@ -29,6 +29,10 @@ Source = Literal["declared", "device", "named", "behaviour", "unknown"]
 
 QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
 ROLES: Final[tuple[Role, ...]] = get_args(Role)
+DECLARED_WORDS: Final = (  # for those who declare a meaning: likely ones, none of them a guess
+    "quantity is distance, speed, wheel speed, joint position, force or another; role is "
+    "measured, commanded, target or limit"
+)
 SOURCES: Final[tuple[Source, ...]] = get_args(Source)  # the strongest first
 FIRM: Final = frozenset[Source](("declared", "device", "named"))  # a failure may rest on these
 _OF_OTHERS: Final = (f"{WORLD}.", f"{SOLIDS}.")
@@ -169,6 +173,11 @@ def understood_words() -> dict[str, list[str]]:
         "moved by hand, no position": INPUTS,
     }
     return {meaning: sorted(words) for meaning, words in groups.items()}
+
+
+def declaration_of(name: str) -> str:
+    """Return the call that declares a signal, with its quantity and its role left open."""
+    return f"webots_describe_signals(signals={[name]}, quantity='...', role='...')"
 
 
 def short_forms() -> dict[str, str]:

@@ -77,7 +77,7 @@ FOOLING: list[tuple[State, float, str, str]] = [
     ),
     (
         lambda row: {"arm": {"target": 0.0, "position": 0.2}}, 1.0,
-        "follows its targets", "not applicable: no target, other than always 0",
+        "follows its targets", "not applicable: no signal is known to be the target",
     ),
     (
         lambda row: {"arm": {"target": 1.0, "position": 0.2}}, 1.0,

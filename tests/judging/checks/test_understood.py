@@ -12,6 +12,7 @@ from tests.store.test_meanings import state
 from webots_mcp.cli.judging import _as_typed  # pyright: ignore[reportPrivateUsage]
 from webots_mcp.judging.checks import UNDERSTOOD, check_run
 from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.signals.meaning import DECLARED_WORDS
 
 
 @pytest.fixture
@@ -37,11 +38,10 @@ def test_signals_of_unknown_meaning_are_counted_and_those_that_change_most_come_
     found = last_of(empty)
     assert (found.name, found.outcome, found.often) == (UNDERSTOOD, "not judged", 4)
     assert found.evidence == (
-        "4 signals of unknown meaning: w.*, u, k; declare them with webots_describe_signals(...)"
+        f"4 signals of unknown meaning: w.*, u, k; "
+        f"declare them with webots_describe_signals(...): {DECLARED_WORDS}"
     )
-    assert found.more == (
-        "webots_describe_signals(signals=['w.*'], quantity='speed', role='measured')"
-    )
+    assert found.more == ("webots_describe_signals(signals=['w.*'], quantity='...', role='...')")
 
 
 def test_once_they_are_declared_it_passes_for_the_same_run(
@@ -94,6 +94,7 @@ def test_a_person_reads_the_command_that_declares_them(
     table = {"columns": ["evidence", "more"], "rows": [[found.evidence, found.more]]}
     (row,) = _as_typed({"checks": table})["checks"]["rows"]
     assert row == [
-        "1 signal of unknown meaning: u; declare them with webots-mcp signals --describe",
-        "webots-mcp signals --describe u quantity=speed role=measured",
+        "1 signal of unknown meaning: u; declare them with webots-mcp signals --describe: "
+        f"{DECLARED_WORDS}",
+        "webots-mcp signals --describe u quantity=... role=...",
     ]

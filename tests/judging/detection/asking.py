@@ -30,7 +30,9 @@ _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
     "gap": ("gap",),
 }
 # Signals that are never searched, and periods that are not drawn.
-_OTHERS: Final = re.compile(r"not in \d+ of |not with a period of more than 5 s ")
+_OTHERS: Final = re.compile(
+    r"\d+ of \d+ numeric signals? (was|were) not searched|not with a period of more than 5 s "
+)
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 

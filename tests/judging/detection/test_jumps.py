@@ -88,7 +88,7 @@ def test_a_signal_that_the_asker_names_is_searched_for_swings(empty: sqlite3.Con
     unasked = find_events(empty, whole, EventOptions(kinds=("oscillation",)))
     asked = EventOptions(kinds=("oscillation",), signals=("sensors.front",))
     assert unasked.events == ()
-    assert "not in 1 of 1 signals" in unasked.verdicts.not_searched["oscillation"]
+    assert "1 of 1 numeric signal was not searched" in unasked.verdicts.not_searched["oscillation"]
     (swing,) = find_events(empty, whole, asked).events
     assert swing.details["period_s"] == pytest.approx(2.0, rel=0.02)
 

@@ -65,7 +65,9 @@ def test_a_drone_that_hovers_with_noise_and_a_little_drift_in_its_height_stands(
 
 def test_who_only_climbs_is_said_to_have_climbed(empty: sqlite3.Connection) -> None:
     found = ask(empty, lambda time_s: {"gps": [0.0, 0.0, 0.5 * time_s]})
-    assert found.verdicts.not_found["standstill"].endswith("but its height changed")
+    assert found.verdicts.not_found["standstill"].endswith(
+        "but its height changed; 3 s within 0.05 m count"
+    )
 
 
 @pytest.mark.parametrize("turns", [0.2, 5.0])  # beyond half a turn it is counted on
@@ -89,7 +91,9 @@ def test_an_altitude_is_a_height(empty: sqlite3.Connection, name: str) -> None:
 
     found = ask(empty, climbs)
     assert not found.events
-    assert found.verdicts.not_found["stuck"].endswith("but its height changed")
+    assert found.verdicts.not_found["stuck"].endswith(
+        "but its height changed; 3 s within 0.05 m count"
+    )
 
 
 def test_a_slow_drift_in_much_noise_is_not_called_a_standstill(empty: sqlite3.Connection) -> None:

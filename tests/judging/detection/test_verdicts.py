@@ -12,6 +12,7 @@ from tests.recordings.rover import start_run
 from webots_mcp.judging.checks import check_run
 from webots_mcp.judging.coverage import Verdicts
 from webots_mcp.judging.detection.events import find_events
+from webots_mcp.judging.detection.fall import NO_ATTITUDE
 from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
@@ -40,8 +41,8 @@ def test_what_was_searched_in_some_signals_is_named_once_with_the_others(
 ) -> None:
     told = ask(empty, 400, "oscillation", "gap")
     (why,) = told.gaps.values()
-    assert why.startswith("not in 1 of 4 signals")
-    assert "(temp_c)" in why and why.endswith("; none in the searched part")
+    assert why.startswith("1 of 4 numeric signals was not searched, because its name does not ")
+    assert why.endswith("motion: pass signals=['temp_c']; in the rest: none")
     assert (told.far, told.nearest) == (["gap"], {})
 
 
@@ -49,7 +50,7 @@ def test_of_a_short_run_it_is_said_which_swings_do_not_fit_in(empty: sqlite3.Con
     (why,) = ask(empty, 76, "oscillation").gaps.values()
     too_short = "run 1 lasted only 7.5 s, too short for 6 half periods where a period is over 2.5 s"
     assert too_short in why
-    assert why.endswith("; none in the searched part")
+    assert why.endswith("; in the rest: none")
 
 
 def test_where_no_signal_is_searched_for_swings_nothing_is_absent(
@@ -71,8 +72,33 @@ def test_a_sensor_too_noisy_for_its_dropouts_says_from_which_size_on_it_has_jump
         recorder.publish(row / 10, state)
     told = find_events(empty, find_range(empty, Scope()), EventOptions(kinds=("jump",))).verdicts
     assert re.fullmatch(
-        r"front_m: steps up to 0\.\d+ m, a jump is one over (0\.[89]|1)\d* m", told.nearest["jump"]
+        r"front_m: largest step was 0\.\d+ m, one over (0\.[89]|1)\d* m counts",
+        told.nearest["jump"],
     )
     recorder.end_run("finished")
     drops = {each.name: each for each in check_run(empty, 1).findings}["sensors drop nothing"]
     assert told.nearest["jump"] in drops.evidence
+
+
+def test_kinds_that_the_recording_has_no_data_for_are_not_passed_over(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    for row in range(300):
+        recorder.publish(row / 10, {"gripper_m": math.sin(row / 20)})
+    told = find_events(empty, find_range(empty, Scope()), EventOptions()).verdicts
+    assert told.reasons["fall"] == (NO_ATTITUDE,)
+    assert "publish them" in told.reasons["slip"][0]
+    assert {"off_target", "degradation", "stuck", "standstill"} <= told.reasons.keys()
+
+
+def test_a_reason_stands_under_one_key_together_with_what_was_found_in_the_rest() -> None:
+    few, short, near = "a was not searched", "run 1 lasted only 8 s", "b: largest step was 1 m"
+    verdicts = Verdicts(
+        not_found={"jump": near, "oscillation": ""},
+        reasons={"jump": (few,), "oscillation": (few, short), "flat": (short,)},
+    )
+    assert verdicts.gaps == {
+        "jump, oscillation": f"{few}; in the rest: none ({near})",
+        "oscillation, flat": short,
+    }

@@ -43,3 +43,31 @@ async def test_a_plot_is_a_caption_and_a_picture(story: Path, arguments: dict[st
     assert picture.mime_type == "image/png"
     assert '"robot":"rover"' in text_of(result)
     assert '"shows":' in text_of(result)
+
+
+async def test_a_comparison_explains_its_columns_and_what_makes_before_and_after(
+    story: Path,
+) -> None:
+    answer = await tell(story, "webots_compare_runs")
+    assert answer["legend"].startswith("lists: before, after; range, mean_range: minimum and ")
+    assert answer["notes"][0] == (
+        "around the last edit of the controller; before: runs 1, 2 with code c0ffee, "
+        "after: run 3 with code beef"
+    )
+
+
+async def test_a_check_that_passed_says_what_it_rests_on(story: Path) -> None:
+    answer = await tell(story, "webots_check_run", run_id=STORY)
+    assert [*answer["passed_on"]] == answer["passed"]
+    assert "limit" in answer["passed_on"]["sensors live"]
+    assert "(pose.0, pose.1, heading and " in answer["passed_on"]["sensors live"]
+
+
+async def test_a_timeline_says_that_it_does_not_search_for_faults(story: Path) -> None:
+    answer = await tell(story, "webots_get_timeline", run_id=STORY)
+    assert "not searched for faults (webots_find_events)" in answer["summary"]
+
+
+async def test_limits_that_nobody_set_are_one_line(story: Path) -> None:
+    kept = (await tell(story, "webots_get_world_info"))["retention"]["kept"]
+    assert [*kept] == ["defaults"] and "states 1.00 GB" in kept["defaults"]

@@ -44,7 +44,7 @@ from webots_mcp.judging.detection.events import Found, asked_kinds, search_event
 from webots_mcp.judging.detection.kinds import EventOptions, NotSearchableError
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.signals.conditions.compiler import Expectation
-from webots_mcp.signals.meaning import Source
+from webots_mcp.signals.meaning import DECLARED_WORDS, Source, declaration_of
 from webots_mcp.signals.naming import counted, listed
 from webots_mcp.store.project_file import ALL, Expected
 from webots_mcp.store.reading.catalogue import catalogue
@@ -176,8 +176,11 @@ def misses_no_steps(run: RunUnderCheck) -> Examined:
             "rows came as evenly as usual", of="gap", judged=counted(len(run.frame), "row")
         )
     gone_s, length_s = total_s(gaps), max(run.search.length_s, 1e-9)
-    longest_s = max(each.duration_s for each in gaps)
-    evidence = f"no rows {times(len(gaps))}, up to {longest_s:.3g} s, {gone_s:.3g} s in total"
+    longest = max(gaps, key=lambda each: each.duration_s)
+    span = f"{longest.duration_s:.3g} s ({longest.start_s:.6g} to {longest.end_s:.6g} s)"
+    evidence = f"one gap of {span}"
+    if len(gaps) > 1:
+        evidence = f"{len(gaps)} gaps, {gone_s:.3g} s in total; the longest {span}"
     is_habit = len(gaps) > _MUCH * len(run.frame) and len(gaps) >= _HABIT
     between_s = total_s(each for each in gaps if "until" not in each.details)  # then it may be done
     severity = "fail" if between_s > _MUCH * length_s and not is_habit else "warn"
@@ -352,8 +355,8 @@ def understands_signals(run: RunUnderCheck) -> Examined:
     branches = list(dict.fromkeys(_whole_array(name) for name, _ in changes.most_common()))
     named = listed(branches, _MOST_UNKNOWN)
     evidence = f"{counted(len(changes), 'signal')} of unknown meaning: {named}"
-    evidence += "; declare them with webots_describe_signals(...)"
-    more = f"webots_describe_signals(signals={branches[:1]}, quantity='speed', role='measured')"
+    evidence += f"; declare them with webots_describe_signals(...): {DECLARED_WORDS}"
+    more = declaration_of(branches[0])
     unknown = Coverage.lacking(evidence, "undecided")
     return replace(unknown, often=len(changes), more=more)
 
@@ -505,4 +508,4 @@ def _finding(check: Check, made: Examined, sources: Mapping[str, Source]) -> Fin
     outcome, evidence = outcome_of(made, sources)
     name = made.subject or check.name
     since_s = made.since_s if isinstance(made, Fault) else None
-    return Finding(outcome, evidence, since_s, made.often, made.more, name)
+    return Finding(outcome, evidence, since_s, made.often, made.more, name, tuple(made.signals))

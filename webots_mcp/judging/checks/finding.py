@@ -30,6 +30,7 @@ class Finding(NamedTuple):
         often: How many times it was so.
         more: The call that shows it in full.
         name: Of what was checked, where a check is about several things.
+        signals: Those that were judged, or that a fault was found in.
     """
 
     outcome: Outcome
@@ -38,6 +39,7 @@ class Finding(NamedTuple):
     often: int | None = None
     more: str = ""
     name: str = ""
+    signals: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,9 @@ def rests_when_commanded(run: RunUnderCheck) -> Examined:
     motion = run.motion
     commands = [*filter(None, (motion.commanded, motion.turn_command)), *motion.wheel_commands]
     if not commands:
-        raise NotSearchableError("no command is known")
+        raise NotSearchableError(
+            "no command is recorded: publish the commanded speed, such as commanded_m_s"
+        )
     frame = run.frame
     idle = np.ones(len(frame), np.bool_)
     for each in commands:
@@ -248,8 +250,8 @@ def estimates_agree(run: RunUnderCheck) -> Examined:
     made += [_values_apart(run, *each) for each in _same_values(run)]
     if not (examined := [each for each in made if each is not None]):
         raise NotSearchableError(
-            "no second heading, and no second position of the robot that goes along with the first"
-            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say, or declare same_as"
+            "needs two independent positions or headings of a robot that moves at least "
+            f"{_LEAST_WAY_M:g} m: publish, for example, gps and odometry, or declare same_as"
         )
     faults = [each for each in examined if isinstance(each, Fault)]
     return min(faults, key=lambda each: each.severity, default=examined[0])
@@ -440,7 +442,7 @@ def _are_own(*positions: tuple[RegisteredSignal, RegisteredSignal]) -> bool:
 def stays_in_place(run: RunUnderCheck) -> Examined:
     """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
     if run.motion.position is None:
-        raise NotSearchableError("no position is published")
+        raise NotSearchableError("no position is recorded: publish gps or pose: [x, y], in metres")
     leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
     if not leaps:
         limit = f"limit {run.search.options.jump_m:g} m"

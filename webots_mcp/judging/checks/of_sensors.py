@@ -66,12 +66,18 @@ def sensors_speak(run: RunUnderCheck) -> Examined:
     firm = run.firmest([*never, *(each.name or "" for each in silent)])
     silent = by_array(silent)
     longest_s = max((each.duration_s for each in silent), default=0.0)
-    evidence = f"{_names(silent)}: {times(len(silent))}, up to {longest_s:.4g} s without a value"
+    evidence = f"{_names(silent)} had no value for {longest_s:.4g} s"
+    if len(silent) == 1:
+        evidence += f" ({silent[0].start_s:.6g} to {silent[0].end_s:.6g} s)"
+    elif silent:
+        evidence = (
+            f"{_names(silent)} had no value {times(len(silent))}, for up to {longest_s:.4g} s"
+        )
     evidence = f"{listed(never, MOST_NAMED)}: NaN in every row" if never else evidence
     since_s = silent[0].start_s if silent and not never else run.search.began_s
     outcome = "fail" if nan or never else "warn"
-    often, more = len(silent) + len(never), run.more("missing")
-    return Fault(outcome, evidence, since_s, often, more, signals=firm)
+    count, more = len(silent) + len(never), run.more("missing")
+    return Fault(outcome, evidence, since_s, count, more, signals=firm)
 
 
 def _missing_items(run: RunUnderCheck, silent: list[Event]) -> Fault:
@@ -287,11 +293,18 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Examined:
     to = Counter((each.name, float(each.details["after"])) for each in gone)
     ((name, value), most) = to.most_common(1)[0]
     gone = by_array(gone)
-    evidence = f"{_names(gone)}: away and back {times(len(gone))}"
-    evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
+    evidence = f"{_names(gone)} spiked {times(len(gone))}"
+    evidence += f", {name} {times(most)} to {value:.6g}" if most > 1 else ""
+    evidence += f"{'; the first' if len(gone) > 1 else ''}: {_spike(gone[0])}"
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
     more = run.more(JUMP.name)
     return Fault(outcome, evidence, gone[0].start_s, len(gone), more, signals=(name or "",))
+
+
+def _spike(jump: Event) -> str:
+    """Return the values before, during and after a spike, and when it was."""
+    values = (float(jump.details[name]) for name in ("before", "after", "back"))
+    return f"{' -> '.join(f'{value:.4g}' for value in values)} at {jump.start_s:.6g} s"
 
 
 def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:

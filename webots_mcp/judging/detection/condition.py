@@ -105,7 +105,7 @@ def condition_events(search: Search) -> Iterator[Event]:
     if not len(runs):
         _require_values(condition, frame, position)
     rows = search.coverage.rows = search.coverage.rows + int(np.count_nonzero(read))
-    search.coverage.note_nearest("condition", rows, f"true in none of {rows} rows")
+    search.coverage.note_nearest("condition", rows, f"never true in {rows} rows")
     also = _also_asked(search, condition)
     if len(runs):
         in_all = _figures_in_all(frame, [*condition.signals, *also], runs)

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, noise_of, np
-from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
+from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, places_in
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.reading.frame import Frame
@@ -42,8 +42,6 @@ def degradation_events(search: Search) -> Iterator[Event]:
     wanted = {each.name for each in search.signals}
     signals = [each for each in signals if each.name in wanted and not each.is_index]
     if not signals:
-        if "degradation" not in search.options.kinds:
-            raise NotAskedError
         raise NotSearchableError("no sensor is known whose noise does not depend on motion")
     found_any = False
     for signal in search.in_time("degradation", signals):
@@ -56,7 +54,9 @@ def degradation_events(search: Search) -> Iterator[Event]:
         details = {"noise_before": float(f"{before:.3g}"), "noise_after": float(f"{after:.3g}")}
         yield search.event("degradation", start_s, end_s, signal.name, **details)
     if not found_any and search.frame.times[:1].tolist() > [search.began_s]:
-        search.not_searched("degradation", "noise that grew before the range: ask the whole run")
+        search.not_searched(
+            "degradation", "noise that grew earlier is not seen: ask for the whole run"
+        )
 
 
 def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, float] | None:

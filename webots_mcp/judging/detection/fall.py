@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
-from webots_mcp.judging.detection.kinds import Event, NotAskedError, NotSearchableError
+from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, in_metres
 from webots_mcp.signals.naming import SOLIDS, WORLD, words_of
 from webots_mcp.store.reading.frame import Frame
@@ -25,7 +25,10 @@ SETTLED_S: Final = 1.0  # for so long each of them has to last
 MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
 _BY_WHEELS: Final = frozenset(("odom", "odometry"))
 _NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
-NO_ATTITUDE: Final = "publish roll and pitch (of an InertialUnit), in rad or deg"
+_FALLEN_DEG: Final = math.degrees(FALLEN_RAD)
+NO_ATTITUDE: Final = (
+    "no roll and pitch are recorded: publish them (of an InertialUnit), in rad or deg"
+)
 _OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
 
 
@@ -49,8 +52,6 @@ def fall_events(search: Search) -> Iterator[Event]:
     """
     attitudes = attitudes_in(search)
     if not attitudes:
-        if "fall" not in search.options.kinds:
-            raise NotAskedError
         raise NotSearchableError(NO_ATTITUDE)
     are_known = False
     for attitude in attitudes:
@@ -66,7 +67,7 @@ def fall_events(search: Search) -> Iterator[Event]:
         yield from _falls_of(search, attitude.body, times, tilt)
         largest_deg = math.degrees(float(tilt.max()))
         of_body = "" if attitude.body is None else f" of {attitude.body}"
-        what = f"largest tilt{of_body} {largest_deg:.0f}°"
+        what = f"largest tilt{of_body} was {largest_deg:.0f}°; {_FALLEN_DEG:.0f}° count"
         search.note_nearest("fall", float(tilt.max()) / FALLEN_RAD, what)
     if not are_known:
         raise NotSearchableError("roll and pitch have no value in that range")

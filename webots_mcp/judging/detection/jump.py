@@ -26,9 +26,9 @@ from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
 )
-from webots_mcp.judging.detection.search import MOST_NAMED, EventKind, Search
+from webots_mcp.judging.detection.search import EventKind, Search, were_not_searched
 from webots_mcp.signals.meaning import ANGLES, Meaning
-from webots_mcp.signals.naming import listed, metres_in
+from webots_mcp.signals.naming import metres_in
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
@@ -76,22 +76,22 @@ def jump_events(search: Search) -> Iterator[Event]:
         jumps = _above_resolution(jumps, frame, signal.name)
         if not jumps and largest < least < math.inf:
             unit = f" {signal.unit}" if signal.unit else ""
-            near = f"{signal.name}: steps up to {largest:.2g}{unit}, a jump is one over {least:.2g}"
-            search.note_nearest("jump", largest / least, near + unit)
+            near = f"{signal.name}: largest step was {largest:.2g}{unit}, one over {least:.2g}"
+            search.note_nearest("jump", largest / least, f"{near}{unit} counts")
         rows = int(frame.zone_map(signal.name).value_count.sum())
         if len(jumps) > max(3, MOST_JUMPS_SHARE * rows):
             dropouts = _to_one_end(jumps, frame, signal.name)
             yield from (_event(search, signal.name, each) for each in dropouts)
             if dropouts:
                 continue
-            many = f"not in {signal.name}: large steps are normal for it ({len(jumps)} found)"
+            many = f"{were_not_searched([signal.name])}: its {len(jumps)} large steps are normal"
             search.not_searched("jump", many)
             continue
         if not jumps and largest and least == math.inf and not (meaning.sets or _steps(meaning)):
             seldom.append(signal.name)
         yield from (_event(search, signal.name, each) for each in jumps)
     if seldom:
-        few = f"not in {listed(seldom, MOST_NAMED)}: changed too seldom to tell what is usual"
+        few = f"{were_not_searched(seldom)}: changed too seldom to tell what is usual"
         search.not_searched("jump", few)
     if position:
         x, y = (each.name for each in position)

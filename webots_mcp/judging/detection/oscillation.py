@@ -36,14 +36,15 @@ from webots_mcp.judging.detection.kinds import (
     EventOptions,
     NotSearchableError,
 )
-from webots_mcp.judging.detection.search import MOST_NAMED, EventKind, Search
-from webots_mcp.signals.naming import in_snake_case, listed
+from webots_mcp.judging.detection.search import EventKind, Search
+from webots_mcp.signals.naming import counted, in_snake_case
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.signals import RegisteredSignal
 
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
 GROWS: Final = 2.0  # times the amplitude at one end: then both are reported
 _ENDS_WITHIN: Final = 1.5  # periods
+_NAMED: Final = 3  # signals that were not searched
 _QUICK_S: Final = 1.0  # a period: how quickly the body of a robot goes to and fro
 # Sensors swing by nature while a robot drives.
 _SWINGING: Final = re.compile(
@@ -59,9 +60,11 @@ def oscillation_events(search: Search) -> Iterator[Event]:
     if search.options.signals == EventOptions.signals:
         signals = [each for each in signals if _SWINGING.search(in_snake_case(each.name))]
     if left := [each.name for each in search.numbers if each not in signals]:
+        their = "its name does" if len(left) == 1 else "their names do"
         why = (
-            f"not in {len(left)} of {len(search.numbers)} signals, whose names do not suggest "
-            f"motion: name them in signals ({listed(left, MOST_NAMED)})"
+            f"{len(left)} of {counted(len(search.numbers), 'numeric signal')} "
+            f"{'was' if len(left) == 1 else 'were'} not searched, because {their} not suggest "
+            f"motion: pass signals={_passed(left)}"
         )
         if not signals:
             raise NotSearchableError(why)
@@ -78,6 +81,12 @@ def oscillation_events(search: Search) -> Iterator[Event]:
         event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
         goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
         yield replace(event, ongoing=goes_on)
+
+
+def _passed(names: Sequence[str]) -> str:
+    """Return the first names as an argument is written, and how many more there are."""
+    more = f", ... {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"[{', '.join(map(repr, names[:_NAMED]))}{more}]"
 
 
 def _note_periods(search: Search) -> None:

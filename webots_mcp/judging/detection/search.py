@@ -680,7 +680,7 @@ class Search:
             self.coverage.of(kind).signals[signal.name] = None
             yield signal
         if large:
-            why = f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
+            why = f"{were_not_searched(large)}: numbers beyond {LARGEST:g}"
             self.not_searched(kind, why)
 
     def _is_large(self, signal: RegisteredSignal) -> bool:
@@ -736,6 +736,11 @@ class EventKind:
     drawn: int | None = None
     alike: Alike | None = None
     severity: int = 0
+
+
+def were_not_searched(names: Sequence[str]) -> str:
+    """Return the first names of signals, and that they were not searched."""
+    return f"{listed(names, MOST_NAMED)} {'was' if len(names) == 1 else 'were'} not searched"
 
 
 def events_touching(search: Search) -> list[Event]:

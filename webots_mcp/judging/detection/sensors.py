@@ -164,7 +164,8 @@ class _Resting:
     def note_near(self, rest: RowSpan) -> None:
         """It came near to an event."""
         lasted = f"for {rest.duration_s:.3g} s from {rest.start_s:.6g} s"
-        what = f"{self.signal.name} stayed at {rest.value:.4g} {lasted}"
+        least = f"{self.search.options.flat_s:g} s count"
+        what = f"{self.signal.name} stayed at {rest.value:.4g} {lasted}; {least}"
         self.search.note_nearest("flat", rest.duration_s / self.search.options.flat_s, what)
 
     def is_limit(self, rest: RowSpan) -> bool:
@@ -345,7 +346,8 @@ def missing_events(search: Search) -> Iterator[Event]:
             longest = max(short.spans(), key=lambda run: run.duration_s)
             span = f"for {longest.duration_s:.3g} s from {longest.start_s:.6g} s"
             share = longest.duration_s / least_s
-            search.note_nearest("missing", share, f"{signal.name} had no value {span}")
+            what = f"{signal.name} had no value {span}; {least_s:.3g} s count"
+            search.note_nearest("missing", share, what)
         if least_s == search.options.missing_s:
             asked, array = search.asked or search.segment, _INDEX.sub(".*", signal.name)
             inside = (short.starts_s < asked.end_s) & (short.ends_s >= asked.start_s)

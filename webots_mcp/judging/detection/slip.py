@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
-from webots_mcp.judging.detection.kinds import Alike, Event, NotAskedError, NotSearchableError
+from webots_mcp.judging.detection.kinds import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, in_metres, places_in
 from webots_mcp.judging.detection.standstill import ON_THE_SPOT
 from webots_mcp.signals.meaning import words_in
@@ -57,12 +57,10 @@ def slip_events(search: Search) -> Iterator[Event]:
         if each.name in search.whole
     ]
     if search.motion.position is None or not wheels or flies(search):
-        if "slip" not in search.options.kinds:
-            raise NotAskedError
         raise NotSearchableError(
             "its motors lift it"
             if wheels and flies(search)
-            else "publish the position and the speeds of its wheels"
+            else "no position, or no speeds of its wheels, are recorded: publish them"
         )
     if _Slip not in search.shared:
         search.shared[_Slip] = _slips_of(search, search.motion.position, wheels)
@@ -119,7 +117,8 @@ def _slips_of(
         slips.append(_Slip(run.start_s, end_s, None, f"{rolls}, then {least:.3g}"))
     slips.sort()
     kept = float(np.min(rolled)) / usual
-    return slips, f"{rolls}, over {np.count_nonzero(known) * lasts_s:.3g} s", kept
+    lasts_s *= np.count_nonzero(known)
+    return slips, f"{rolls} for {lasts_s:.3g} s; under {100 * SLIPS:g} % of it counts", kept
 
 
 def _turns_though_straight(search: Search, wheels: list[RegisteredSignal]) -> Iterator[_Slip]:

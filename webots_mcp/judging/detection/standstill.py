@@ -662,7 +662,10 @@ def _nearest(tracks: Sequence[SmoothedTrack], search: Search) -> tuple[float, st
     if short:
         lasts_s, start_s = max(short)
         climbed = ", but its height changed" if lasts_s >= least_s else ""
-        stood = f"longest standstill: {lasts_s:.2g} s, from {start_s:.1f} s on{climbed}"
+        stood = (
+            f"longest standstill was {lasts_s:.2g} s, from {start_s:.1f} s on{climbed}; "
+            f"{least_s:g} s within {search.options.stuck_m:g} m count"
+        )
         return lasts_s / least_s, stood
     ways: list[tuple[float, float]] = []
     for track in tracks:
@@ -673,7 +676,10 @@ def _nearest(tracks: Sequence[SmoothedTrack], search: Search) -> tuple[float, st
     if not ways:
         return None
     way_m, start_s = min(ways)
-    return 0.0, f"smallest movement in {least_s:g} s: {way_m:.2g} m, from {start_s:.1f} s on"
+    return 0.0, (
+        f"smallest movement in {least_s:g} s was {way_m:.2g} m, from {start_s:.1f} s on; "
+        f"less than {search.options.stuck_m:g} m counts"
+    )
 
 
 def _standstills(search: Search) -> Iterator[Event]:

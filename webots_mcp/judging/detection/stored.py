@@ -373,7 +373,8 @@ KEPT: Final = EventKind(
     routine=True,
     counted=False,
     alike=Alike(
-        lambda events, unit: "kept stretches", sort=lambda e: but_for_numbers(e.details["reason"])
+        lambda events, unit: "full-rate segments",
+        sort=lambda e: but_for_numbers(e.details["reason"]),
     ),
 )
 IMAGE: Final = EventKind(  # no news, and there may be thousands

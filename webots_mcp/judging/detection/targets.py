@@ -14,7 +14,6 @@ from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
-    NotAskedError,
     NotSearchableError,
 )
 from webots_mcp.judging.detection.search import EventKind, Search
@@ -65,10 +64,9 @@ def off_target_events(search: Search) -> Iterator[Event]:
     """Where the median of each second is off the target, and not on its way to it, for 3 s."""
     pursuits = pursuits_in(search)
     if not pursuits:
-        if "off_target" not in search.options.kinds:
-            raise NotAskedError
         raise NotSearchableError(
-            "no target, other than always 0, is published next to what it is the target of"
+            "no signal is known to be the target of another, or it is always 0: declare one with "
+            "target_of"
         )
     targets = {each.measured.name: each for each in pursuits}
     search.judged("off_target", [each.target for each in pursuits])

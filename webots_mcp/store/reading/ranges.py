@@ -99,7 +99,7 @@ _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
         )
     )
 )
-USE_EVERY_ROW: Final = "; ask for such a stretch alone to use every row"
+USE_EVERY_ROW: Final = "; ask for such a segment alone to use every row"
 MOST_RUNS: Final = 1000  # that one range in wall time may hold
 _IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
 _LONGEST_SHOWN: Final = 80

@@ -84,7 +84,7 @@ def test_what_cannot_be_drawn_is_refused(tried: Tried) -> None:
         plot_trials(connection, 1, ["kq"])
     with pytest.raises(InvalidInputError, match="one or two parameters to draw over, not 3"):
         plot_trials(connection, 1, ["kp", "ki", "kd"])
-    with pytest.raises(InvalidInputError, match="no trial set 7: the newest is 1"):
+    with pytest.raises(InvalidInputError, match="No trial set 7 is recorded: the newest is 1"):
         plot_trials(connection, 7)
     tried(({"kp": 1.0}, None))
     with pytest.raises(NothingRecordedError, match="no trial of set 2 has a score"):

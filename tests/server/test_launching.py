@@ -78,7 +78,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         assert answer["result"]["world"] == str(project / "worlds" / "arena.wbt")
         family = _family(answer)
         text = await fail(client, "webots_launch_world", world="field.wbt")
-        assert "still running with arena.wbt: action=load opens another world in it" in text
+        assert "still running with arena.wbt. webots_load_world opens another world in it" in text
 
         loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_wall_s=60)
         assert (loaded["outcome"], loaded["route"]) == ("done", "bridge")

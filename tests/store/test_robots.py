@@ -23,8 +23,8 @@ from webots_mcp.store.run_rows import count_runs, current_run, fetch_run, runs_o
         (["rover"], ["old"], None, "rover"),
         ([], ["rover"], None, "rover"),
         (["rover", "rover#2"], [], None, r"'rover' \(Supervisor, live\), 'rover#2'"),
-        ([], ["a", "b"], None, "none is live: .*; start the simulation, or"),
-        (["rover", "crane"], [], "rovr", "did you mean 'rover'"),
+        ([], ["a", "b"], None, "none is live: .*. Start the simulation, or"),
+        (["rover", "crane"], [], "rovr", "Did you mean 'rover'"),
     ],
 )
 def test_which_robot_is_meant_and_what_is_said_where_it_could_be_several(

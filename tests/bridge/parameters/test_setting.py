@@ -60,7 +60,7 @@ def test_a_command_sets_several_at_once_and_each_is_recorded_with_its_time(
         ({"on": 1}, "'on' is true or false, not 1 (int)"),
         ({"gait": "fly"}, "'gait' is one of 'trot', 'walk', not 'fly'"),
         ({"gait": 1}, "not 1 (int)"),
-        ({"kpp": 1.0}, "no parameter 'kpp'; of the 4 that the controller declares the nearest are"),
+        ({"kpp": 1.0}, "No parameter 'kpp'. The nearest of 4 that the controller declares:"),
         ({}, "give values"),
         ([1], "give values"),
     ],

@@ -166,8 +166,8 @@ async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
         ("../outside.wbt", "lies outside of the project"),
         ("arna.wbt", "/worlds there is arena.wbt, field.wbt"),
         ("controllers/rover/rover.py", "its name does not end with .wbt"),
-        ("a\0b.wbt", "'a\\x00b.wbt' is no name of a world: "),
-        ("x" * 900, "is no name of a world: File name too long"),
+        ("a\0b.wbt", "'a\\x00b.wbt' is not the name of a world: "),
+        ("x" * 900, "is not the name of a world: File name too long"),
     ],
 )
 @pytest.mark.parametrize("tool", ["webots_launch_world", "webots_load_world"])

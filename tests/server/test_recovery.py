@@ -107,7 +107,7 @@ PAST: Final = [
     Case("query_sql", {"sql": "SELECT id, time FROM state"}, ("sim_time_s", "wall_time_s"),
          {"sql": "SELECT id, sim_time_s FROM state"}),
     Case("query_sql", {"sql": "SELECT 1; SELECT 2"}, ("Only one statement",), {"sql": "SELECT 1"}),
-    Case("list_runs", {"parameters": "kp=2"}, ('{"kp": 3.0}',), {"parameters": {"kp": 2}}),
+    Case("list_runs", {"limit": 9_999}, ("limit", "500"), {"limit": 500}),
     Case("get_logs", {"source": "robot"}, ("'controller'",), {"source": "controller"}),
     Case("check_run", {"expect": ["fornt_m > 0"]}, ("front_m",), {"expect": ["front_m > 0"]}),
     Case("annotate_run", {}, ("label='baseline'",), {"label": "baseline"}),

@@ -102,7 +102,7 @@ def _chosen(trials: Sequence[TrialRecord], names: Sequence[str]) -> list[str]:
             raise InvalidInputError(f"These trials did not try {name!r:.80}. They tried {near}.")
     if len(names) > 2:
         raise InvalidInputError(
-            f"{len(names)} parameters are named, but only one or two can be drawn"
+            f"{len(names)} parameters are named, but only one or two can be drawn. Leave some out."
         )
     return list(names)
 

@@ -75,7 +75,7 @@ class Declaration(NamedTuple):
         found = _as_kind(self.kind, as_plain(value))
         if found is None or not self._is_allowed(found):
             raise InvalidInputError(
-                f"Parameter {self.name!r} must be {self.expected}, not {_shown(value)}."
+                f"Parameter {self.name!r} must be {self.expected}, not {_shown(value)}"
             )
         return found
 
@@ -131,7 +131,7 @@ def declare(
         chosen = bounded._replace(choices=listed, doc=_doc(name, doc), unit=_unit(name, unit))
         return chosen._replace(default=chosen.checked(plain))
     except InvalidInputError as error:
-        raise ValueError(f"{error} Correct its declaration.") from None
+        raise ValueError(f"{error}. Correct its declaration.") from None
 
 
 def require_known(names: Sequence[str], known: Sequence[str]) -> None:

@@ -87,5 +87,5 @@ def test_what_cannot_be_drawn_is_refused(tried: Tried) -> None:
     with pytest.raises(InvalidInputError, match="No trial set 7 is recorded: the newest is 1"):
         plot_trials(connection, 7)
     tried(({"kp": 1.0}, None))
-    with pytest.raises(NothingRecordedError, match="no trial of set 2 has a score"):
+    with pytest.raises(NothingRecordedError, match="No trial of set 2 has a score"):
         plot_trials(connection, 2)

@@ -71,7 +71,7 @@ async def test_one_that_would_go_off_at_once_says_so(connect: Connect, driver: D
         answer = await ask(client, "webots_breakpoint", condition="mode > 1", action="log")
         (note,) = answer["notes"]
         assert note.startswith("it will be turned off by the next state like the last ones")
-        assert "> the number 1?" in note
+        assert "with the number 1 by >" in note
 
 
 async def test_where_no_controller_runs_it_is_said_that_none_is_asked_and_which_come_back(

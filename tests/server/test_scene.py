@@ -214,4 +214,4 @@ async def test_after_the_end_of_the_simulation_it_is_said_that_no_controller_is_
         for robot_name in (None, "rover"):
             told = await fail(client, "webots_edit_scene", robot=robot_name, **asked)
             assert "No controller of " in told and " is live (robot '" in told
-            assert "its controller finished" in told and "start the simulation" in told
+            assert "its controller finished" in told and "Start the simulation" in told

@@ -138,7 +138,7 @@ def test_what_is_over_so_far_is_ranked_and_who_leads_is_told(
         ('score = "last(x)"\nfors = 1\n[grid]\nspeed = [1.0]', "unknown 'fors'; there is for_s"),
         ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = [1.0, 1.0]', "To repeat them, use repeats"),
         ('score = "last(x)"\nfor_s = 1\nbest = "most"\n[grid]\nspeed = [1]', "highest, lowest"),
-        ("score = ", "is not TOML"),
+        ("score = ", "is not valid TOML"),
     ],
 )  # fmt: skip
 def test_a_plan_that_is_none_is_refused_before_anything_is_written(

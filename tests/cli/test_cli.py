@@ -233,7 +233,7 @@ def test_the_tail_of_one_robot_leaves_out_the_others(
     assert main([*arguments, "--robot", rover.name]) == 0
     assert "not mine" not in capsys.readouterr().out
     assert main([*arguments, "--robot", "rovr"]) == 2
-    assert "did you mean 'rover'" in capsys.readouterr().err
+    assert "Did you mean 'rover'" in capsys.readouterr().err
     assert main([*arguments, "-n", "0"]) == 0
     assert capsys.readouterr().out == ""
     assert main([*arguments, "--interval", "0"]) == 2

@@ -62,7 +62,7 @@ def test_the_list_names_the_command_that_describes_what_is_unknown(
         (("--describe", "u", "kind=speed"), "unknown field 'kind'. Fields: quantity, role"),
         (("--describe", "u", "low=a"), "low"),
         (("--undo", "u", "v"), "--undo takes one name"),
-        (("--undo", "u"), "nothing is declared of signal 'u'"),
+        (("--undo", "u"), "No meaning is declared for signal 'u'"),
         (("a", "b"), "give one pattern, in quotes"),
     ],
 )

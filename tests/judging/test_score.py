@@ -113,9 +113,14 @@ def test_what_scores_do_not_see_of_their_runs_is_told_once_for_runs_that_are_ali
 @pytest.mark.parametrize(
     ("error", "run_id", "text", "said"),
     [
-        (UnknownRunError, 9, "duration", "no run 9"),
+        (UnknownRunError, 9, "duration", "No run 9"),
         (UnknownSignalError, 2, "mean(batery_v)", "column 6: no signal 'batery_v'.*battery_v"),
-        (InvalidInputError, 2, "1 + count(stuk)", "column 11: .*'stuk'; there is stuck"),
+        (
+            InvalidInputError,
+            2,
+            "1 + count(stuk)",
+            "column 11: .*'stuk'. Kinds, the nearest first: stuck",
+        ),
     ],
 )
 def test_what_cannot_be_asked_is_refused_with_the_place(

@@ -82,16 +82,20 @@ HUGE = 2**63
             {"for_s": 2.0},
             "Unknown argument 'for_s'. webots_find_events takes start_s, ",
         ),
-        ("query_history", {"signals": ["x"], "cursor": 3}, "only rows go on with cursor"),
+        (
+            "query_history",
+            {"signals": ["x"], "cursor": 3},
+            "cursor continues only the rows of raw=true. Add raw=true",
+        ),
         (
             "monitor",
             {"duration_wall_s": 2, "lookback_wall_s": 9},
-            "duration_wall_s and lookback_wall_s exclude each other: give ",
+            "duration_wall_s and lookback_wall_s exclude each other. Give ",
         ),
         (
             "monitor",
             {"duration_wall_s": 2, "duration": 9},
-            "duration and duration_wall_s exclude each other: give ",
+            "duration and duration_wall_s exclude each other. Give ",
         ),
         (
             "send_command",
@@ -122,7 +126,11 @@ HUGE = 2**63
             {"seconds": 5, "until": "x > 1"},
             "Unknown argument 'seconds'. webots_run takes for_s, ",
         ),
-        ("simulation_control", {"command": "pause", "steps": 2}, "steps is for command='step'"),
+        (
+            "simulation_control",
+            {"command": "pause", "steps": 2},
+            "steps is possible only with command='step'",
+        ),
         ("get_trends", {"robot": "r" * 201}, "robot must have at most 200 characters, not"),
     ],
 )
@@ -142,14 +150,14 @@ async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
         (
             "get_timeline",
             {"cursor": "x"},
-            ": 'x' is not a cursor: give the `cursor` of",
+            ": 'x' is not a cursor of this tool. Give the `cursor` of",
         ),
         (
             "get_trends",
             {"since_wall_time": "n" * 10**5},
-            "nnn' is no time: give Unix seconds or ISO 8601",
+            "nnn' is not a time. Give Unix seconds or ISO 8601",
         ),
-        ("get_trends", {"signals": ["n" * 10**5]}, "no signal 'nnn"),
+        ("get_trends", {"signals": ["n" * 10**5]}, "No signal 'nnn"),
     ],
 )
 async def test_what_a_question_refuses_is_told_briefly_in_the_words_of_the_tool(
@@ -233,7 +241,7 @@ async def test_a_misspelt_signal_is_answered_with_the_nearest_names(
             ("batery", names[1]),
         ):
             told = await fail(client, "webots_get_trends", signals=[wrong])
-            assert f"no signal {wrong!r} is recorded; there is {near}" in told
+            assert f"No signal {wrong!r} is recorded. The nearest of 5 signals: {near}" in told
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ async def test_it_says_what_is_not_there_and_refuses_what_is_no_condition(
             client, "webots_breakpoint", condition="stesp > 5 and pose[0] > 1e9", action="log"
         )
         (note,) = answer["notes"]
-        assert note.startswith("stesp is missing as long as it is not published; there is steps")
+        assert note.startswith("No signal 'stesp' is published. The nearest of ")
         assert "write ==" in await fail(client, "webots_breakpoint", condition="steps = 5")
         known = answer["breakpoint_id"]
         wrong = await fail(client, "webots_remove_breakpoint", breakpoint_id=known + 7)
@@ -71,7 +71,7 @@ async def test_one_that_would_go_off_at_once_says_so(connect: Connect, driver: D
         answer = await ask(client, "webots_breakpoint", condition="mode > 1", action="log")
         (note,) = answer["notes"]
         assert note.startswith("it will be turned off by the next state like the last ones")
-        assert "> the number 1?" in note
+        assert "with the number 1 by >" in note
 
 
 async def test_where_no_controller_runs_it_is_said_that_none_is_asked_and_which_come_back(

@@ -102,20 +102,23 @@ async def test_undo_brings_back_what_the_code_declares_and_then_what_the_name_sa
             assert rows_of(answer)["front_m"]["quantity"] == quantity
         assert stored(file) == []
         refused = await fail(client, "webots_describe_signals", **asked, undo=True)
-        assert "nothing is declared of signal 'front_m'" in refused
+        assert "No meaning is declared for signal 'front_m'" in refused
         state(rover.connection, None, "u", quantity="force", set_by="project", robot_name="*")
         refused = await fail(client, "webots_describe_signals", signals=["u"], undo=True)
-        assert "declared in webots-mcp.toml: change its table [signals]" in refused
+        assert (
+            "declared in webots-mcp.toml, which this tool does not change. Edit its table [signals]"
+            in refused
+        )
 
 
 @pytest.mark.usefixtures("rover")
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"quantity": "speed"}, "signals is missing: name the signals to describe"),
-        ({"signals": ["u"], "quantity": "speed", "undo": True}, "undo=true or a description"),
-        ({"signals": ["nope"], "quantity": "speed"}, "no signal 'nope' is recorded"),
-        ({"signals": ["u"], "target_of": "nope"}, "no signal 'nope' is recorded"),
+        ({"quantity": "speed"}, "signals is missing. Name the signals to describe"),
+        ({"signals": ["u"], "quantity": "speed", "undo": True}, "undo=true removes a description"),
+        ({"signals": ["nope"], "quantity": "speed"}, "No signal 'nope' is recorded"),
+        ({"signals": ["u"], "target_of": "nope"}, "No signal 'nope' is recorded"),
         ({"signals": ["u"], "target_of": "u"}, "must be the name of one other signal"),
         ({"signals": ["u"], "quantity": "velocity"}, "quantity must be"),
         ({"signals": ["u"], "side": "up"}, "Use one of left, right"),
@@ -159,4 +162,4 @@ async def test_before_anything_is_recorded_the_answer_says_what_to_do(
     recorded.robot()
     async with connect() as client:
         refused = await fail(client, "webots_describe_signals", signals=["u"], quantity="speed")
-        assert "no signal has been recorded yet" in refused
+        assert "No signal has been recorded yet" in refused

@@ -50,7 +50,7 @@ async def test_several_live_robots_are_listed_until_one_is_named(
         assert "'rover' (Supervisor, live)" in await fail(client, "webots_get_robot_state")
         answer = await ask(client, "webots_get_robot_state", robot="crane")
         assert answer["state"] == {"i am": "crane"}
-        assert "did you mean 'crane'" in await fail(client, "webots_get_robot_state", robot="crne")
+        assert "Did you mean 'crane'" in await fail(client, "webots_get_robot_state", robot="crne")
         rows = (await ask(client, "webots_list_robots"))["robots"]["rows"]
         assert [row[0] for row in rows] == ["rover", "crane"]
 

@@ -78,7 +78,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         assert answer["result"]["world"] == str(project / "worlds" / "arena.wbt")
         family = _family(answer)
         text = await fail(client, "webots_launch_world", world="field.wbt")
-        assert "still running with arena.wbt: action=load opens another world in it" in text
+        assert "still running with arena.wbt. webots_load_world opens another world in it" in text
 
         loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_wall_s=60)
         assert (loaded["outcome"], loaded["route"]) == ("done", "bridge")
@@ -166,8 +166,8 @@ async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
         ("../outside.wbt", "lies outside of the project"),
         ("arna.wbt", "/worlds there is arena.wbt, field.wbt"),
         ("controllers/rover/rover.py", "its name does not end with .wbt"),
-        ("a\0b.wbt", "'a\\x00b.wbt' is no name of a world: "),
-        ("x" * 900, "is no name of a world: File name too long"),
+        ("a\0b.wbt", "'a\\x00b.wbt' is not the name of a world: "),
+        ("x" * 900, "is not the name of a world: File name too long"),
     ],
 )
 @pytest.mark.parametrize("tool", ["webots_launch_world", "webots_load_world"])

@@ -52,7 +52,7 @@ async def test_the_parameters_are_shown_with_all_that_one_has_to_know(connect: C
         named = await ask(client, "webots_get_parameters", names=["k*", "laps"])
         assert [each["name"] for each in table(named)] == ["kp", "laps"]
         said = await fail(client, "webots_get_parameters", names=["kpp"])
-        assert "no parameter 'kpp'; the nearest are: kp" in said
+        assert "No parameter 'kpp'. The nearest of 3 that the controller declares: kp" in said
 
 
 async def test_several_are_set_at_once_and_the_answer_says_since_when(
@@ -92,11 +92,11 @@ async def test_values_for_the_next_reset_are_shown_as_such_and_come_with_it(
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"kp": 11}, "'kp' is a number from 0 up to 10, not 11"),
-        ({"kp": True}, "'kp' is a number from 0 up to 10, not True (bool)"),
-        ({"laps": 1.5}, "'laps' is a whole number"),
+        ({"kp": 11}, "'kp' must be a number from 0 up to 10, not 11"),
+        ({"kp": True}, "'kp' must be a number from 0 up to 10, not True (bool)"),
+        ({"laps": 1.5}, "'laps' must be a whole number"),
         ({"gait": "fly"}, "one of 'trot', 'walk', not 'fly'"),
-        ({"kp": 3, "gain": 1}, "no parameter 'gain'"),
+        ({"kp": 3, "gain": 1}, "No parameter 'gain'"),
         ({}, "values"),
     ],
 )

@@ -52,7 +52,7 @@ async def test_a_big_picture_is_scaled_and_the_original_named(
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("gone.png", "the file is gone"),
+        ("gone.png", "its file is gone"),
         ("", "is not a regular file"),
         ("text.png", "is not a usable PNG or JPEG"),
         ("../../etc/passwd", "outside the data folder"),

@@ -217,7 +217,7 @@ async def test_forced_keys_without_a_window_say_so(
         )
         async with connect() as client:
             text = await fail(client, "webots_world_reset", force=True, timeout_wall_s=1)
-    assert "keyboard: no Webots of this machine listens at" in text
+    assert "keyboard: No Webots of this machine listens at" in text
     assert json.dumps(text).count("keyboard: ") == 1
 
 
@@ -232,4 +232,4 @@ async def test_a_webots_of_another_machine_is_not_taken_for_one_here_on_the_same
     recorded.connection.execute("UPDATE session SET instance = ?", (f"127.0.0.2:{port}",))
     async with connect() as client:
         text = await fail(client, "webots_world_reset", force=True, timeout_wall_s=1)
-    assert f"keyboard: no Webots of this machine listens at 127.0.0.2:{port}" in text
+    assert f"keyboard: No Webots of this machine listens at 127.0.0.2:{port}" in text

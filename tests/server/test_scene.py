@@ -125,7 +125,7 @@ async def test_a_robot_that_is_no_supervisor_is_looked_at_by_one_that_is(
     crowd.add(InProcessRobot, "rover")
     async with connect() as client:
         said = await fail(client, "webots_get_scene", robot="rover")
-        assert "no live controller can read the scene of the simulation of robot 'rover'" in said
+        assert "No live controller can read the scene of the simulation of robot 'rover'" in said
         assert "'supervisor' of a Robot node to TRUE" in said
         assert "webots-mcp init --observer" in said
         crowd.add(InProcessSupervisor, "referee")
@@ -213,5 +213,5 @@ async def test_after_the_end_of_the_simulation_it_is_said_that_no_controller_is_
     async with connect() as client:
         for robot_name in (None, "rover"):
             told = await fail(client, "webots_edit_scene", robot=robot_name, **asked)
-            assert "no controller of " in told and " is live (robot '" in told
-            assert "its controller finished" in told and "start the simulation" in told
+            assert "No controller of " in told and " is live (robot '" in told
+            assert "its controller finished" in told and "Start the simulation" in told

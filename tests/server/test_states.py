@@ -102,7 +102,7 @@ async def test_a_value_that_is_null_is_told_from_a_path_that_leads_nowhere(
     async with connect() as client:
         answer = await ask(client, "webots_get_full_state", path="gps.x")
         assert answer["hint"] == "the value at this path is null"
-        assert "there is no 'y'" in await fail(client, "webots_get_full_state", path="gps.y")
+        assert "no member 'y'" in await fail(client, "webots_get_full_state", path="gps.y")
 
 
 async def test_a_large_state_comes_in_pages_that_say_what_is_not_on_them(

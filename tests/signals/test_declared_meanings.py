@@ -26,7 +26,7 @@ def stated(source: Source = "declared", **said: Any) -> StatedMeaning:
 @pytest.mark.parametrize(
     ("given", "allowed"),
     [
-        ({}, "nothing is said of signal 's'. Give one or more of quantity, role"),
+        ({}, "Nothing is declared for signal 's'. Give one or more of quantity, role"),
         ({"quantity": "velocity"}, "quantity cannot be 'velocity'. Use one of x, y, height"),
         ({"quantity": []}, "quantity cannot be []"),
         ({"role": "actual"}, "Use one of measured, commanded, target, limit"),
@@ -51,7 +51,7 @@ def stated(source: Source = "declared", **said: Any) -> StatedMeaning:
 def test_a_wrong_declaration_is_refused_with_what_is_allowed(
     given: dict[str, Any], allowed: str
 ) -> None:
-    with pytest.raises(ValueError, match=r"signal|name") as raised:
+    with pytest.raises(ValueError, match=r"[Ss]ignal|name") as raised:
         declare_meaning(given.pop("name", "s"), **given)
     assert allowed in str(raised.value)
 

@@ -82,7 +82,7 @@ def test_what_the_file_does_not_say_any_more_does_not_count(
         ('[signals]\na = {unit = "m"}\nu = {quantity = "velocity"}', 3, "Use one of x, y"),
         ('[signals]\nu = "speed"', 2, "must be a table such as {quantity"),
         ('[signals.rover]\nu = {speed = "m/s"}', 2, "unknown field 'speed' of signal 'u'"),
-        ("[signals]\nu = {}", 2, "nothing is said of signal 'u'"),
+        ("[signals]\nu = {}", 2, "Nothing is declared for signal 'u'"),
         ("[signals]\nu = {name = 3}", 2, "unknown field 'name' of signal 'u'"),
         ("signals = 3", 1, "signals must be a table: [signals]"),
         ('[signals.rover]\n"a b" = {unit = 3}', 2, "unit must be a text"),

@@ -23,8 +23,8 @@ from webots_mcp.store.run_rows import count_runs, current_run, fetch_run, runs_o
         (["rover"], ["old"], None, "rover"),
         ([], ["rover"], None, "rover"),
         (["rover", "rover#2"], [], None, r"'rover' \(Supervisor, live\), 'rover#2'"),
-        ([], ["a", "b"], None, "none is live: .*; start the simulation, or"),
-        (["rover", "crane"], [], "rovr", "did you mean 'rover'"),
+        ([], ["a", "b"], None, "none is live: .*. Start the simulation, or"),
+        (["rover", "crane"], [], "rovr", "Did you mean 'rover'"),
     ],
 )
 def test_which_robot_is_meant_and_what_is_said_where_it_could_be_several(
@@ -61,11 +61,11 @@ def test_the_newest_run_is_the_current_one(recorded: Recorded) -> None:
 
 def test_an_unknown_run_is_answered_with_the_newest_ones(recorded: Recorded) -> None:
     robot = recorded.robot()
-    with pytest.raises(UnknownRunError, match=rf"no run 99.*\[{robot.run_id}\]"):
+    with pytest.raises(UnknownRunError, match=rf"No run 99 .*: {robot.run_id}\."):
         fetch_run(recorded.connection, 99)
 
 
 def test_a_run_of_another_robot_is_not_taken(recorded: Recorded) -> None:
     rover, crane = recorded.robot("rover"), recorded.robot("crane")
-    with pytest.raises(UnknownRunError, match=rf"no run {crane.run_id} of this robot"):
+    with pytest.raises(UnknownRunError, match=rf"Run {crane.run_id} belongs to another robot"):
         fetch_run(recorded.connection, crane.run_id, rover.id)

@@ -108,7 +108,7 @@ def test_an_unknown_name_is_answered_with_near_ones(rover: sqlite3.Connection) -
         resolve_signals(known, ["batery"])
     with pytest.raises(UnknownSignalError, match=r"sensors\.front"):
         resolve_signals(known, ["front"])
-    with pytest.raises(InvalidInputError, match="no signal is named"):
+    with pytest.raises(InvalidInputError, match="No signal is named"):
         resolve_signals(known, [])
 
 
@@ -182,5 +182,5 @@ def test_who_asks_for_a_name_beyond_the_limit_is_told_of_the_limit(
     recorder.publish(0.0, {f"s{number}": number for number in range(MAX_SIGNALS + 1)})
     recorder.end_run("finished")
     chunk_whole_run(empty, 1)
-    with pytest.raises(UnknownSignalError, match=f"only the first {MAX_SIGNALS} names of a robot"):
+    with pytest.raises(UnknownSignalError, match=f"Only the first {MAX_SIGNALS} names of a robot"):
         trends(empty, find_range(empty, Scope(run_id=1)), [f"s{MAX_SIGNALS}"])

@@ -120,14 +120,14 @@ def test_a_value_of_gigabytes_is_refused(rover: sqlite3.Connection) -> None:
 @pytest.mark.parametrize(
     ("statement", "offer"),
     [
-        ("SELECT sim_time FROM state", "sim_time_s, wall_time_s in state"),
+        ("SELECT sim_time FROM state", "Columns of state, the nearest first: sim_time_s"),
         ("SELECT s.walltime_s FROM state s", "wall_time_s"),
         ("SELECT * FROM states", "state"),
         ("SELECT battery_v FROM state", "json_extract"),
         ("SELEC 1", "begins with 'SELEC'"),
-        (" ", "the statement is empty: give one"),
+        (" ", "The statement is empty. Give one"),
         ("SELECT FROM", "syntax error"),
-        ("SELECT * FROM state WHERE run_id = :run", "write values in the SELECT"),
+        ("SELECT * FROM state WHERE run_id = :run", "Write the values into the SELECT"),
     ],
 )
 def test_an_error_offers_what_was_perhaps_meant(

@@ -72,7 +72,7 @@ def test_a_part_of_a_state_is_found_by_its_path() -> None:
 
 @pytest.mark.parametrize(
     ("path", "said"),
-    [("sensor", "there are"), ("sensors.7", "no index"), ("sensors.0.x", "single value")],
+    [("sensor", "Use one of"), ("sensors.7", "no index"), ("sensors.0.x", "has no members")],
 )
 def test_a_wrong_path_is_answered_with_what_there_is(path: str, said: str) -> None:
     with pytest.raises(InvalidInputError, match=said):

@@ -197,7 +197,7 @@ def range_in(view: RobotView, scope: Scope) -> TimeRange:
     found = find_range(view.connection, scope, view.subject)
     if not found.segments:
         raise NothingRecordedError(
-            f"{'; '.join(found.notes)}: webots_list_runs tells when each run was"
+            f"{'; '.join(found.notes)}. webots_list_runs shows when each run was."
         )
     return newest_runs(found)
 

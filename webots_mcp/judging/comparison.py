@@ -365,7 +365,7 @@ def compare_runs(
             run with a score.
     """
     if not 0 < min_effect_sd < math.inf:
-        raise InvalidInputError(f"min_effect_sd={min_effect_sd} must be a number above 0")
+        raise InvalidInputError(f"min_effect_sd={min_effect_sd} must be a number above 0.")
     notes: list[str] = []
     if run_ids is not None:
         groups = _repeats(connection, run_ids)
@@ -532,7 +532,10 @@ class _Runs:
 def _whole_run(connection: sqlite3.Connection, run_id: int) -> Segment:
     segment = whole_run(connection, run_id)
     if segment is None:
-        raise NothingRecordedError(f"run {run_id} has no state row: there is nothing to compare")
+        raise NothingRecordedError(
+            f"Run {run_id} has no state row, so there is nothing to compare. Choose "
+            "another run from webots_list_runs."
+        )
     return segment
 
 
@@ -552,7 +555,10 @@ def _repeats(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str
     """Runs by robot, code and parameters, if that makes groups; by themselves where it does not."""
     if not 1 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
         found = len(run_ids) if len(run_ids) > MOST_COMPARED else list(run_ids)
-        raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {found}")
+        raise InvalidInputError(
+            f"run_ids must be 1 to {MOST_COMPARED} different runs, not {found}. "
+            "webots_list_runs shows the runs."
+        )
     had = parameters_of(connection, run_ids)
     groups: dict[object, list[int]] = {}
     for run_id, run in zip(run_ids, run_infos(connection, run_ids), strict=True):
@@ -575,8 +581,8 @@ def _around_last_edit(connection: sqlite3.Connection, robot: str | None) -> dict
     blocks = [[run_id for run_id, _ in each] for _, each in groupby(runs, lambda run: run[1])][:2]
     if len(blocks) < 2:
         raise NothingRecordedError(
-            "every recorded run had the same controller file: there is no edit to compare across; "
-            "give two or more run_ids (webots_list_runs has them)"
+            "Every recorded run had the same controller file, so there is no edit to compare. "
+            "Give two or more run_ids; webots_list_runs shows them."
         )
     after, before = (each[:MOST_OF_EDIT][::-1] for each in blocks)
     return {"before": before, "after": after}

@@ -167,7 +167,10 @@ def compare_rows(
         NothingRecordedError: A run has no state row.
     """
     if len(run_ids) != 2 or run_ids[0] == run_ids[1]:
-        raise InvalidInputError(f"give two different runs, not {list(run_ids)}")
+        raise InvalidInputError(
+            f"run_ids must be two different runs, not {list(run_ids)}. "
+            "webots_list_runs shows the runs."
+        )
     deadline = Deadline(deadline_s)
     # Half of the time is for rows that are in no chunk yet.
     one, in_one = _read(connection, run_ids[0], until_s, deadline.part(0.25))
@@ -212,7 +215,10 @@ def _read(
     subject = Subject(fetch_run(connection, run_id).robot_id, "", run_id)
     segment = whole_run(connection, run_id)
     if segment is None:
-        raise NothingRecordedError(f"run {run_id} has no state row: there is nothing to compare")
+        raise NothingRecordedError(
+            f"Run {run_id} has no state row, so there is nothing to compare. Choose "
+            "another run from webots_list_runs."
+        )
     if until_s < segment.end_s:
         segment = segment.through(until_s)
     frame = read_frame(connection, segment, deadline)

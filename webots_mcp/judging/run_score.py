@@ -145,7 +145,8 @@ def require_kinds(connection: sqlite3.Connection, score: Score, run_id: int) -> 
         if kind not in known:
             offer = ", ".join(nearest_first(kind, list(dict.fromkeys(known)))[:5])
             raise InvalidInputError(
-                f"{score.place(column)}: there is no kind of event {kind!r}; there is {offer}"
+                f"{score.place(column)}: unknown kind of event {kind!r}. Kinds, the "
+                f"nearest first: {offer}"
             )
 
 

@@ -68,7 +68,7 @@ def plot(
         names = signals or changed_most(connection, ranges[-1])
         return plot_signals(connection, ranges, names, bands=bands, sheet=sheet)
     if kind != "trajectory":
-        raise InvalidInputError(f"kind={kind!r}: there is {', '.join(get_args(PlotKind))}")
+        raise InvalidInputError(f"Unknown kind={kind!r}. Kinds: {', '.join(get_args(PlotKind))}.")
     position = _position(signals)
     return plot_trajectory(connection, ranges, position, bands=bands, sheet=sheet)
 
@@ -84,6 +84,8 @@ def _position(signals: Sequence[str]) -> tuple[str, str] | None:
         return None
     if len(signals) != 2:
         raise InvalidInputError(
-            f"a trajectory takes two signals, x and y, or none: {len(signals)} are named"
+            f"A trajectory takes two signals, x and y, or none; {len(signals)} are "
+            "named. Give both, as in signals=['pose.0', 'pose.1'], or leave signals "
+            "out."
         )
     return signals[0], signals[1]

@@ -110,7 +110,7 @@ class Sheet:
         _require_size("height_px", self.height_px, LEAST_HEIGHT_PX)
         if self.image_format not in get_args(ImageFormat):
             known = " or ".join(get_args(ImageFormat))
-            raise InvalidInputError(f"a picture can be {known}, not {self.image_format!r}")
+            raise InvalidInputError(f"A picture can be {known}, not {self.image_format!r}.")
 
     @property
     def room(self) -> Room:
@@ -127,7 +127,7 @@ class Sheet:
 
 def _require_size(name: str, value: int, least: int) -> None:
     if not least <= value <= MOST_PX:
-        raise InvalidInputError(f"{name}={value} must be from {least} to {MOST_PX}")
+        raise InvalidInputError(f"{name}={value} must be from {least} to {MOST_PX}.")
 
 
 def image_format_of(file: Path) -> ImageFormat:
@@ -140,7 +140,7 @@ def image_format_of(file: Path) -> ImageFormat:
     for known in get_args(ImageFormat):
         if suffix == known:
             return known
-    raise InvalidInputError(f"{file.name!r} is not the name of a picture: end it in .png or .svg")
+    raise InvalidInputError(f"{file.name!r} is not the name of a picture. End it in .png or .svg.")
 
 
 class Canvas:

@@ -101,8 +101,8 @@ def plotted_runs(
     count = sum(len(each.segments) for each in ranges)
     if count > MOST_RUNS:
         raise InvalidInputError(
-            f"the range holds {count} runs, and at most {MOST_RUNS} can be laid over each other: "
-            "name them by their ids"
+            f"The range holds {count} runs, and at most {MOST_RUNS} can be drawn over each other. "
+            "Name them, as in run_ids=[1, 2]; webots_list_runs shows the runs."
         )
     parts: list[PlottedRun] = []
     histories = _histories(connection, ranges, names, points, deadline_s)
@@ -209,7 +209,9 @@ def known_signals(connection: sqlite3.Connection, ranges: Sequence[TimeRange]) -
         UnknownSignalError: No signal has been recorded.
     """
     if not ranges:
-        raise NothingRecordedError("no run is given: there is nothing to draw")
+        raise NothingRecordedError(
+            "No run is given, so there is nothing to draw. webots_list_runs shows the runs."
+        )
     return {signal.name: signal for signal in signals_of(connection, ranges[-1], ["*"])}
 
 
@@ -227,7 +229,9 @@ def mode_signal(known: Known, wanted: str | None) -> str | None:
         return mode.name if mode else None
     signal = one_signal(known, wanted)
     if signal.is_number and not signal.is_choice:
-        raise InvalidInputError(f"{wanted!r} holds numbers: a text or a flag colours a picture")
+        raise InvalidInputError(
+            f"{wanted!r} holds numbers, but only a text or a flag can colour a picture. Name one."
+        )
     return signal.name
 
 

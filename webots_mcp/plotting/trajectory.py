@@ -51,7 +51,7 @@ from webots_mcp.plotting.robot_path import (
     thinned,
 )
 from webots_mcp.plotting.signal_plot import line_through
-from webots_mcp.signals.naming import listed, spelled_out
+from webots_mcp.signals.naming import listed, nearest_first, spelled_out
 from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
@@ -157,7 +157,7 @@ def compose_trajectory(
     if not any(track.path.places for track in tracks):
         if not all(track.path.is_whole for track in tracks):
             raise NothingRecordedError(
-                f"no position was read in time in {title_of(parts)}: ask for less time"
+                f"No position could be read in time in {title_of(parts)}. Ask for a shorter range."
             )
         none = f"{x.name} and {y.name} have no values in {title_of(parts)}"
         raise NothingRecordedError(
@@ -189,8 +189,8 @@ def position_of(
     if position is None:
         numbers = [name for name, signal in known.items() if signal.is_number]
         raise InvalidInputError(
-            f"no position was found among the {len(known)} signals: name its two, x and y; "
-            f"numbers are {listed(numbers) or 'none of them'}"
+            f"No position was found among the {len(known)} signals. Name x and y in signals; "
+            f"signals of numbers: {listed(numbers) or 'none'}"
         )
     return position
 
@@ -198,7 +198,11 @@ def position_of(
 def _number(known: Known, name: str) -> RegisteredSignal:
     signal = one_signal(known, name)
     if not signal.is_number:
-        raise InvalidInputError(f"{name!r} holds no numbers: it cannot be a position")
+        numbers = nearest_first(name, [each for each in known if known[each].is_number])
+        raise InvalidInputError(
+            f"{name!r} holds no numbers, so it cannot be a position. "
+            f"Signals of numbers: {listed(numbers) or 'none'}"
+        )
     return signal
 
 

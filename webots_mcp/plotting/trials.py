@@ -73,7 +73,10 @@ def compose_trials(
     """Return what `plot_trials` paints, and its notes; arguments and errors as there."""
     over = [each for each in trials_of(connection, set_id) if each.is_over]
     if not any(each.score is not None for each in over):
-        raise NothingRecordedError(f"no trial of set {set_id} has a score yet: nothing to draw")
+        raise NothingRecordedError(
+            f"No trial of set {set_id} has a score yet, so there is nothing to draw. "
+            f"webots_get_trials(trial_set={set_id}) shows how far it is."
+        )
     plan = json.loads(fetch_trial_set(connection, set_id).plan)
     varied = _varied(over)
     chosen = _chosen(over, names) or varied[:2] or list(over[0].values)[:1]
@@ -96,9 +99,11 @@ def _chosen(trials: Sequence[TrialRecord], names: Sequence[str]) -> list[str]:
     for name in names:
         if name not in known:
             near = ", ".join(nearest_first(name, known)[:5])
-            raise InvalidInputError(f"these trials did not try {name!r:.80}; they tried {near}")
+            raise InvalidInputError(f"These trials did not try {name!r:.80}. They tried {near}.")
     if len(names) > 2:
-        raise InvalidInputError(f"name one or two parameters to draw over, not {len(names)}")
+        raise InvalidInputError(
+            f"{len(names)} parameters are named, but only one or two can be drawn. Leave some out."
+        )
     return list(names)
 
 

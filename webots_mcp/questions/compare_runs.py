@@ -214,11 +214,14 @@ def webots_compare_runs(
     run_ids.
     """
     if run_ids and trial_set:
-        raise InvalidInputError("give run_ids or trial_set, not both")
+        raise InvalidInputError(
+            "run_ids and trial_set exclude each other. Give run_ids to compare these runs, or "
+            "trial_set to compare all of that set."
+        )
     if first_difference and (not run_ids or len(run_ids) != 2 or position or mode):
         raise InvalidInputError(
-            f"first_difference compares two runs, not {run_ids or 'none'}: run_ids=[3, 4]; "
-            "besides it takes signals only"
+            f"first_difference=true compares exactly two runs, not {run_ids or 'none'}, and takes "
+            "only signals besides them. Give two, as in run_ids=[3, 4], without position and mode."
         )
     options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None

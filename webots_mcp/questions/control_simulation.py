@@ -85,7 +85,9 @@ async def webots_simulation_control(
     was used.
     """
     if steps is not None and command != "step":
-        raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
+        raise InvalidInputError(
+            f"steps is possible only with command='step', not with {command!r}. Leave steps out."
+        )
     steps = steps or 1
     params = {"steps": steps} if command == "step" else {}
     waiting_s = timeout_wall_s or {"reload": _TIMES.reload_s, "step": MAX_WAIT_S}.get(

@@ -29,7 +29,9 @@ MEANING_COLUMNS: Final = (
     "signal", "quantity", "role", "unit", "side", "target_of", "same_as", "low", "high", "source",
     "why",
 )  # fmt: skip
-_NOT_YET: Final = "no signal has been recorded yet: run the simulation first, then describe them"
+_NOT_YET: Final = (
+    "No signal has been recorded yet. Run the simulation first, then describe its signals."
+)
 _DECLARE: Final = (
     "signals of unknown meaning are not judged: declare them with {}; " + DECLARED_WORDS
 )
@@ -97,10 +99,13 @@ def webots_describe_signals(
     declares = any(value is not None for value in said.values())
     if (declares or undo) and not signals:
         raise InvalidInputError(
-            "signals is missing: name the signals to describe, for example signals=['motors.left']"
+            "signals is missing. Name the signals to describe, for example signals=['motors.left']."
         )
     if declares and undo:
-        raise InvalidInputError("give undo=true or a description, not both")
+        raise InvalidInputError(
+            "undo=true removes a description, so it excludes quantity, role, unit and the others. "
+            "Leave either undo or those out."
+        )
     changed: list[str] | None = None
     if declares:
         changed = _declare(recording, robot, signals or [], said)

@@ -27,13 +27,13 @@ Path = Annotated[
     ),
 ]
 _NO_SUPERVISOR: Final = (
-    "no live controller can read the scene of {}: set the field 'supervisor' of a Robot node to "
+    "No live controller can read the scene of {}. Set the field 'supervisor' of a Robot node to "
     "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
-    "by webots-mcp init --observer WORLD"
+    "by 'webots-mcp init --observer WORLD'."
 )
 _NONE_LIVE: Final = (
-    "no controller of {} is live (robot {!r}: {}): start the simulation, then ask again; "
-    "webots_get_world_info has what was recorded"
+    "No controller of {} is live (robot {!r}: {}). Start the simulation, then call again. "
+    "webots_get_world_info has what was recorded."
 )
 
 
@@ -171,8 +171,8 @@ async def _ask(
     """
     if recording.read_only:
         raise InvalidInputError(
-            "reading the scene needs a command to a controller, and a --read-only server sends "
-            "none; webots_get_world_info has what was recorded"
+            "Reading the scene needs a command to a controller, and a --read-only server sends "
+            "none. webots_get_world_info has what was recorded."
         )
     name = await to_thread.run_sync(_find_supervisor, recording, robot)
     given = {key: value for key, value in params.items() if value is not None}
@@ -207,8 +207,8 @@ def _find_supervisor(recording: RecordingAccess, robot: str | None) -> str:
         if len({session.instance for _, session in found}) > 1:
             listed = ", ".join(repr(each.name) for each, _ in found)
             raise AmbiguousRobotError(
-                f"Supervisors of several simulations are live: {listed}; choose a simulation with "
-                "robot=..."
+                f"Supervisors of several simulations are live: {listed}. Choose a simulation, for "
+                f"example with robot={found[0][0].name!r}."
             )
         holder = find_holder(connection, found[0][1], now_s)
     ranked = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
@@ -107,8 +108,8 @@ def webots_find_events(
     """
     if kinds and where is not None and "condition" not in kinds:
         raise InvalidInputError(
-            f"where={where!r} is looked for as the kind 'condition', which kinds lacks: "
-            "leave kinds out, or name 'condition' among them"
+            f"where={where!r} is searched only as the kind 'condition', which kinds does not name. "
+            f"Leave kinds out, or give kinds={json.dumps([*kinds, 'condition'])}"
         )
     options = EventOptions(
         kinds=tuple(kinds or (("condition",) if where is not None else ())),

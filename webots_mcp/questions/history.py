@@ -198,7 +198,9 @@ def webots_query_history(
     webots_plot.
     """
     if cursor is not None and not raw:
-        raise InvalidInputError("only rows go on with cursor: ask for them with raw=true")
+        raise InvalidInputError(
+            "cursor continues only the rows of raw=true. Add raw=true, or leave cursor out."
+        )
     with recording.view(scope.robot, scope.run_id) as view:
 
         def find() -> dict[str, Any]:

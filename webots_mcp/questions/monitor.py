@@ -93,8 +93,8 @@ async def webots_monitor(
     given = [name for name, value in asked.items() if value is not None]
     if len(given) > 1:
         raise InvalidInputError(
-            f"{' and '.join(given)} exclude each other: give duration_wall_s alone to watch from "
-            "now on, or lookback_wall_s alone to look back at once"
+            f"{' and '.join(given)} exclude each other. Give duration_wall_s alone to watch from "
+            "now on, or lookback_wall_s alone to read the past at once."
         )
     duration_wall_s = duration_wall_s or duration or USUAL_DURATION_S
     if lookback_wall_s is not None:

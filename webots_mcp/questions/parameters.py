@@ -23,13 +23,11 @@ from webots_mcp.answers.models import (
     ParametersAnswer,
 )
 from webots_mcp.answers.shortening import WHOLE, shorten
-from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import RobotName, RunId, TimeoutS, Value
 from webots_mcp.questions.declaring import READS, SETS, Caller, question
 from webots_mcp.questions.send_command import (
     NO_BRIDGE,
 )
-from webots_mcp.signals.naming import nearest_first
 from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
 from webots_mcp.steering.dispatch import Dispatcher, ProgressReport
 from webots_mcp.steering.target import find_target
@@ -165,7 +163,6 @@ def _meant(patterns: list[str] | None, known: list[str]) -> set[str]:
     for pattern in patterns or ():
         found = {name for name in known if fnmatchcase(name, pattern)}
         if not found:
-            near = ", ".join(nearest_first(pattern, known)[:5]) or "none"
-            raise InvalidInputError(f"no parameter {pattern!r:.80}; the nearest are: {near}")
+            require_known([pattern], known)
         meant |= found
     return meant

@@ -145,7 +145,8 @@ async def _run(recording: RecordingAccess, sql: str, max_rows: int, max_bytes: i
                 )
                 return decode(ended.stdout, ended.returncode, asked)
     raise InvalidInputError(
-        f"no process answered within {_SIZES.process_s:g} s: this machine is overloaded"
+        f"No process answered within {_SIZES.process_s:g} s, because this machine "
+        "is overloaded. Try again later."
     )
 
 
@@ -159,7 +160,8 @@ async def _turn() -> AsyncGenerator[None]:
         await turns.acquire()
     if waiting.cancelled_caught:
         raise InvalidInputError(
-            f"other statements were running for {_SIZES.wait_s:g} s: ask again, one at a time"
+            f"Other statements were running for {_SIZES.wait_s:g} s. Send one at a "
+            "time, and try again."
         )
     try:
         yield

@@ -174,7 +174,10 @@ def webots_get_full_state(
             return FullStateAnswer(**view.header(), hint=hint, recorder=recorder)
         part = select(_with_observed_pose(view, view.state), path)
         if offset and not isinstance(part, (dict, list, str)):
-            raise InvalidInputError(f"offset: {path!r:.80} is a single value, not in pages")
+            raise InvalidInputError(
+                f"offset is possible only with a list, a text or a branch, and {path!r:.80} is a "
+                "single value. Leave offset out."
+            )
         beside: dict[str, Any] = view.header()
         if not (path or offset):
             beside |= {"replaced": _some_replaced(view.state.replaced_paths())}

@@ -171,14 +171,23 @@ async def webots_run_trials(
     webots_set_parameters.
     """
     given = parameters is not None or score is not None
-    if (trial_set is None) != given:
-        raise InvalidInputError("give parameters and score for a new set, or trial_set, not both")
+    if trial_set is not None and given:
+        raise InvalidInputError(
+            f"trial_set={trial_set} names a set that was started before, so it excludes parameters "
+            "and score. Give trial_set alone to go on with it, or leave it out for a new set."
+        )
     workers: TrialWorkers = caller.companions.trials
     if trial_set is None:
-        if parameters is None or score is None:
-            raise InvalidInputError("give both: parameters to try, and a score to rank them by")
         if cancel:
-            raise InvalidInputError("cancel needs trial_set: which one is to stop?")
+            raise InvalidInputError(
+                "cancel=true needs the set that is to stop. Add trial_set; webots_get_trials() "
+                "shows the newest."
+            )
+        if parameters is None or score is None:
+            raise InvalidInputError(
+                "A new set needs parameters to try and a score to rank them by. Give both, for "
+                """example parameters=[{"kp": 1.0}, {"kp": 2.0}], score='mean(abs(error))'."""
+            )
         asked = {"score": score, "best": best, "for_s": for_s, "until": until, "repeats": repeats}
         asked |= {"timeout_s": trial_timeout_wall_s, "prune": prune}
         number = await to_thread.run_sync(
@@ -268,8 +277,8 @@ def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, can
         at_work = is_at_work(connection, found)
     if found.robot_id is None and not at_work:
         raise InvalidInputError(
-            f"trial set {set_id} {_goes_on(found)}; webots_get_trials("
-            f"trial_set={set_id}) has its trials"
+            f"Trial set {set_id} {_goes_on(found)}. webots_get_trials("
+            f"trial_set={set_id}) shows its trials."
         )
     if cancel:
         _stop(recording, set_id, CANCELLED)

@@ -69,6 +69,16 @@ class PictureLimits:
 _LIMITS: Final = PictureLimits()
 
 
+_ONE_FRESH: Final = (
+    "fresh=true takes one picture now, so it excludes at_s, frames and run_id. Leave those out, or "
+    "leave fresh out to show recorded pictures."
+)
+_READ_ONLY: Final = (
+    "fresh=true needs a command to the controller, and a --read-only server sends none. Leave "
+    "fresh out to show recorded pictures."
+)
+
+
 @question("Get the camera picture", READS)
 async def webots_get_camera(
     recording: RecordingAccess,
@@ -97,10 +107,7 @@ async def webots_get_camera(
         past = partial(_show_recorded, recording, camera, at_s, frames, robot, run_id)
         return await to_thread.run_sync(past)
     if recording.read_only or at_s is not None or run_id is not None or frames != 1:
-        raise InvalidInputError(
-            "fresh=true has the controller take one frame now: without at_s, frames and run_id, "
-            "and not from a server that is --read-only"
-        )
+        raise InvalidInputError(_READ_ONLY if recording.read_only else _ONE_FRESH)
     dispatcher = Dispatcher(recording, caller.report)
     answer = await dispatcher.ask(robot, "take_frame", _LIMITS.wait_s, {"camera": camera})
     return await to_thread.run_sync(_show, recording, answer)
@@ -192,7 +199,8 @@ def _show(recording: RecordingAccess, answer: CommandAnswer) -> list[str | Shown
     said = answer.model_dump(mode="json", exclude_none=True)
     path = cast("dict[str, Any]", answer.result or {}).get("path")
     if answer.outcome != "done" or path is None:
-        raise CommandRefusedError(f"no picture: {compact_json(said)}")
+        why = f"{answer.error}. " if answer.error else ""
+        raise CommandRefusedError(f"No picture was taken. {why}{compact_json(said)}")
     file = inside(recording.data_dir, str(path))
     picture, note = _load_picture(file)
     return [_caption(said | {"note": note, "file": str(file)}), picture]

@@ -406,11 +406,13 @@ def declare_meaning(name: object, /, **said: object) -> DeclaredMeaning:
         raise ValueError(f"unknown field {unknown[0]!r} of signal {name!r}. Fields: {fields}")
     if not given:
         fields = ", ".join(MEANING_FIELDS)
-        raise ValueError(f"nothing is said of signal {name!r}. Give one or more of {fields}")
+        raise ValueError(f"Nothing is declared for signal {name!r}. Give one or more of {fields}")
     checked = {field: _checked(name, field, value) for field, value in given.items()}
     low, high = checked.get("low"), checked.get("high")
     if low is not None and high is not None and low > high:
-        raise ValueError(f"signal {name!r}: low={low:g} is greater than high={high:g}")
+        raise ValueError(
+            f"Signal {name!r}: low={low:g} is greater than high={high:g}. Swap the two."
+        )
     return DeclaredMeaning(name, **checked)
 
 

@@ -75,7 +75,7 @@ class Declaration(NamedTuple):
         found = _as_kind(self.kind, as_plain(value))
         if found is None or not self._is_allowed(found):
             raise InvalidInputError(
-                f"parameter {self.name!r} is {self.expected}, not {_shown(value)}"
+                f"Parameter {self.name!r} must be {self.expected}, not {_shown(value)}"
             )
         return found
 
@@ -131,7 +131,7 @@ def declare(
         chosen = bounded._replace(choices=listed, doc=_doc(name, doc), unit=_unit(name, unit))
         return chosen._replace(default=chosen.checked(plain))
     except InvalidInputError as error:
-        raise ValueError(f"{error}: correct its declaration") from None
+        raise ValueError(f"{error}. Correct its declaration.") from None
 
 
 def require_known(names: Sequence[str], known: Sequence[str]) -> None:
@@ -145,14 +145,15 @@ def require_known(names: Sequence[str], known: Sequence[str]) -> None:
         return
     if not known:
         raise InvalidInputError(
-            "this robot's controller declares no parameters: write "
-            'kp = bridge.parameter("kp", 2.0, low=0.0, high=10.0) in it, and kp.value in its loop'
+            "This robot's controller declares no parameters, so none can be read or "
+            "set. In it, write "
+            'kp = bridge.parameter("kp", 2.0, low=0.0, high=10.0) and use kp.value in its loop'
         )
     near = nearest_first(unknown[0], known)[:_MOST_NEAR]
     more = f", nor {', '.join(repr(name[:_SHOWN]) for name in unknown[1:4])}" if unknown[1:] else ""
     raise InvalidInputError(
-        f"no parameter {unknown[0][:_SHOWN]!r}{more}; of the {len(known)} that the controller "
-        f"declares the nearest are {', '.join(near)}"
+        f"No parameter {unknown[0][:_SHOWN]!r}{more}. The nearest of {len(known)} that the "
+        f"controller declares: {', '.join(near)}"
     )
 
 

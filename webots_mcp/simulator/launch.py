@@ -48,7 +48,9 @@ def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, 
         world = _found(Path(path), project)
     except OSError as error:  # of the name: too long, a NUL, links in a circle
         why = error.strerror or str(error)
-        raise InvalidInputError(f"{str(path)[:100]!r} is no name of a world: {why}") from error
+        raise InvalidInputError(
+            f"{str(path)[:100]!r} is not the name of a world: {why}."
+        ) from error
     return world, require_world_of(project, world)
 
 

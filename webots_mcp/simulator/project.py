@@ -86,14 +86,14 @@ def project_of(folder: str | None) -> Path:
     """
     start = full_path(folder or ".")
     if not start.is_dir():
-        raise InvalidInputError(f"{start} is no folder: give that of a Webots project")
+        raise InvalidInputError(f"{start} is not a folder. Give the folder of a Webots project.")
     if project := find_project(start):
         return project
     below = [each for each in sorted(start.iterdir()) if find_project(each) == each]
     hint = f" (one lies below: {below[0]})" if below else ""
     raise InvalidInputError(
-        f"no Webots project at or above {start}: that is {PROJECT_IS}"
-        f"{hint}; give its folder, as 'webots-mcp init PROJECT'"
+        f"No Webots project at or above {start}: that is {PROJECT_IS}"
+        f"{hint}. Give its folder, as in 'webots-mcp init PROJECT'"
     )
 
 

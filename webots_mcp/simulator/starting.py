@@ -95,7 +95,7 @@ def free_port(first: int = DEFAULT_PORT) -> int:
     for port in range(first, 1 << 16):
         if _is_free(port):
             return port
-    raise CommandRefusedError(f"no port from {first} on is free")
+    raise CommandRefusedError(f"No port from {first} on is free. End another Webots first.")
 
 
 def any_port() -> int:

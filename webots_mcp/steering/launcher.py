@@ -47,9 +47,9 @@ class Launcher:
         with self._lock:
             if self.running is not None:
                 raise CommandRefusedError(
-                    f"the Webots that this server started is still running with "
-                    f"{self.running.world.name}: action=load opens another world in it, "
-                    "action=quit ends it"
+                    f"The Webots that this server started is still running with "
+                    f"{self.running.world.name}. webots_load_world opens another world in it, and "
+                    "webots_quit ends it."
                 )
             permit(self._recording, LAUNCH, {"world": str(start.world)}, create=True)
             self.launched = WebotsLaunch(self._recording, start, self._environment(), _ignore)
@@ -91,8 +91,8 @@ def project_of(recording: RecordingAccess) -> Path:
     project = find_project(recording.data_dir) or find_project(Path.cwd())
     if project is None:
         raise InvalidInputError(
-            f"this server has no Webots project: neither its data folder {recording.data_dir} nor "
-            "its current folder is in one; start it with --data-dir PROJECT/mcp_data"
+            f"This server has no Webots project: neither its data folder {recording.data_dir} nor "
+            "its current folder is in one. Start it with --data-dir PROJECT/mcp_data."
         )
     return project.resolve()
 

@@ -70,11 +70,12 @@ def require_possible(
     """
     if until is None and for_s is None:
         raise InvalidInputError(
-            "give until=... (a condition), for_s=... (simulated seconds), or both"
+            "It is not said when to stop. Give for_s=10 (simulated seconds), until='x > 1' (a "
+            "condition), or both."
         )
     if for_s is not None and not 0 < for_s <= MAX_RUN_S:
         raise InvalidInputError(
-            f"for_s must be simulated seconds above 0 and at most {MAX_RUN_S:.0f}, not {for_s}"
+            f"for_s must be simulated seconds above 0 and at most {MAX_RUN_S:.0f}, not {for_s}."
         )
     condition = None if until is None else parse_condition(until)
     with recording.reader() as connection:
@@ -115,7 +116,7 @@ def holds_since(connection: sqlite3.Connection, run_id: int, condition: Conditio
             elif since_s is None:
                 since_s = float(sim_time_s)
     except ConditionFailedError as error:
-        raise InvalidInputError(f"{error} (in the values published so far)") from error
+        raise InvalidInputError(f"{error} (Checked with the values published so far.)") from error
     return since_s
 
 
@@ -177,9 +178,9 @@ def _require_known(view: RobotView, condition: Condition) -> None:
     known = known_names(view)  # empty before the first row, when nothing can be said
     if known and (unknown := condition.describe_unknown(known)):
         raise UnknownSignalError(
-            "; ".join(unknown)
-            + f": {'it was' if len(unknown) == 1 else 'they were'} never published by robot "
-            f"{view.robot.name!r}, so the condition could never hold"
+            f"{'. '.join(unknown)}. Robot {view.robot.name!r} never published it, so "
+            f"until={condition.text!r} "
+            "could never become true."
         )
 
 
@@ -194,9 +195,9 @@ def _require_open(view: RobotView, condition: Condition) -> None:
     if since_s is None:
         return
     raise CommandRefusedError(
-        f"{condition.text!r} already holds, at the newest row since {since_s:.3f} s of simulation "
-        f"time: run until 'not ({condition.text})' first, give for_s alone, or give reset=true, so "
-        "that it is evaluated after the reset"
+        f"{condition.text!r} already holds: at the newest row, since {since_s:.3f} s of simulation "
+        f"time. Run until 'not ({condition.text})' first, give for_s alone, or give reset=true to "
+        "begin a new run and evaluate it there."
     )
 
 

@@ -132,7 +132,7 @@ def find_instance(recording: RecordingAccess, situation: Situation) -> Instance:
     found = instance_at(address.port)
     if found is not None and found.address == address:  # another machine may use the same port
         return found
-    raise CommandRefusedError(f"no Webots of this machine listens at {address}")
+    raise CommandRefusedError(f"No Webots of this machine listens at {address}")
 
 
 def _require_not_held_elsewhere(view: RobotView, error: CommandRefusedError) -> None:

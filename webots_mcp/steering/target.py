@@ -80,11 +80,11 @@ def _require_action(view: RobotView, action: str) -> None:
     if not known or action in known or action in BUILT_IN_ACTIONS:
         return
     near = perhaps_meant(action, [*known, *BUILT_IN_ACTIONS])
-    offer = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
+    offer = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
     listed = known[:30]
     raise UnknownActionError(
-        f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its own actions "
-        f"are {listed}, the built-in ones {list(BUILT_IN_ACTIONS)}"
+        f"Robot {view.robot.name!r} has no action {action!r}. {offer}Its own actions are {listed}; "
+        f"the built-in ones are {list(BUILT_IN_ACTIONS)}."
     )
 
 
@@ -96,8 +96,9 @@ def _require_live(view: RobotView) -> SessionRecord:
     if session is not None and (view.robot.live or may_return(session, view.now_s)):
         return session
     raise CommandRefusedError(
-        f"robot {view.robot.name!r} has no live controller: "
-        f"{view.status.why or 'it was never seen'}; start it, then ask again"
+        f"Robot {view.robot.name!r} has no live controller: "
+        f"{view.status.why or 'it was never seen'}. Start its simulation (webots_launch_world, or "
+        "by hand), then call again"
     )
 
 
@@ -111,8 +112,8 @@ def _no_bridge_text(view: RobotView, session: SessionRecord) -> str:
         else "'webots-mcp init --observer WORLD' adds one to a world"
     )
     return (
-        f"robot {view.robot.name!r} takes no commands: it has no bridge, {how}. In Python give its "
-        f"controller MCPBridge.attach(robot); the simulation is steered by an observer ({by})"
+        f"Robot {view.robot.name!r} takes no commands: it has no bridge, {how}. In Python give its "
+        f"controller MCPBridge.attach(robot). To steer the simulation, use an observer ({by})"
     )
 
 
@@ -127,7 +128,7 @@ def _no_supervisor_text(view: RobotView, session: SessionRecord, action: str) ->
     next_step = make_one
     if others:
         name = robot_name(view.connection, others[0].robot_id)
-        next_step = f"robot {name!r} is a Supervisor of this simulation: ask it (robot={name!r})"
+        next_step = f"robot {name!r} is a Supervisor of this simulation: give robot={name!r}"
         if action == "run":
             next_step += f"; for conditions and parameters of {view.robot.name!r}, {make_one}"
     return f"{action} needs a Supervisor and robot {view.robot.name!r} is not one: {next_step}"
@@ -140,6 +141,7 @@ def _require_not_paused_elsewhere(view: RobotView, session: SessionRecord, actio
         return
     name = robot_name(view.connection, holder.robot_id)
     raise CommandRefusedError(
-        f"robot {view.robot.name!r} cannot run {action!r} now: the bridge of robot {name!r} has "
-        f"paused their simulation; resume or step it there first (robot={name!r})"
+        f"Robot {view.robot.name!r} cannot run {action!r} now: the bridge of robot {name!r} has "
+        f"paused their simulation. Resume it first: "
+        f"webots_simulation_control(command='resume', robot={name!r})"
     )

@@ -77,7 +77,7 @@ class ParameterRange:
         if not choices or not all(isinstance(each, (int, float, str)) for each in choices):
             raise InvalidInputError("choices must be an array of numbers, flags or texts")
         if len({repr(each) for each in choices}) < len(choices):
-            raise InvalidInputError("the same choice is given twice")
+            raise InvalidInputError("the same choice is given twice: remove one")
 
     def _require_steps(self, low: float, high: float, step: float) -> None:
         if not 0 < step < math.inf:
@@ -129,7 +129,7 @@ class TrialPlan:
             if condition is not None:
                 parse_condition(condition)
         if self.for_s is None and self.until is None:
-            raise InvalidInputError("give for_s, until or both: when does a trial end?")
+            raise InvalidInputError("It is not said when a trial ends. Give for_s, until or both.")
         if self.best not in get_args(Best):
             raise InvalidInputError(
                 f"best={self.best!r} must be one of {', '.join(get_args(Best))}"
@@ -156,7 +156,9 @@ class TrialPlan:
                 "[grid] nor [[parameters]]"
             )
         if self.sets < 1:
-            raise InvalidInputError("sets is missing: how many sets are to be searched for?")
+            raise InvalidInputError(
+                "sets is missing. Give the number of sets to try, such as sets = 40."
+            )
         if not 0 <= self.seed < (2**63):
             raise InvalidInputError(f"seed={self.seed} must be 0 or more, and less than 2**63")
 
@@ -192,7 +194,7 @@ class WorldPlan(TrialPlan):
 
     def __post_init__(self) -> None:
         if not Path(self.world).is_file():
-            raise InvalidInputError(f"world: there is no file {self.world}")
+            raise InvalidInputError(f"world: no file {self.world}. Give the path of a .wbt file.")
         super().__post_init__()
 
 
@@ -207,7 +209,7 @@ def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
     try:
         found = cast("dict[str, Any]", toml.loads(file.read_text("utf-8")))
     except ValueError as error:  # also what is not UTF-8
-        raise InvalidInputError(f"{file} is not TOML: {error}") from error
+        raise InvalidInputError(f"{file} is not valid TOML: {error}.") from error
     except OSError as error:
         raise InvalidInputError(f"the plan {file} cannot be read: {error.strerror}") from error
     try:
@@ -251,7 +253,9 @@ def combinations(grid: dict[str, Any], where: str = "") -> list[dict[str, Any]]:
         if not isinstance(values, list) or not values:
             raise InvalidInputError(f"{where}{name} must be a list of values, such as [1.0, 2.0]")
     if math.prod(len(values) for values in grid.values()) > MOST_TRIALS:
-        raise InvalidInputError(f"the grid has more than {MOST_TRIALS} combinations")
+        raise InvalidInputError(
+            f"The grid has more than {MOST_TRIALS} combinations. Give fewer values."
+        )
     return [dict(zip(grid, each, strict=True)) for each in itertools.product(*grid.values())]
 
 
@@ -263,7 +267,7 @@ def _require_tables(parameters: list[Any]) -> None:
             if not isinstance(value, (int, float, str)) or value in (math.inf, -math.inf):
                 raise InvalidInputError(f"{name}={value!r} must be a number, a flag or a text")
     if len({repr(each) for each in parameters}) < len(parameters):
-        raise InvalidInputError("the same parameters are given twice: use repeats")
+        raise InvalidInputError("The same parameters are given twice. To repeat them, use repeats.")
 
 
 def _read_ranges(tables: dict[str, Any]) -> dict[str, ParameterRange]:
@@ -297,7 +301,7 @@ def _require_kinds(table: dict[str, Any], kinds: Mapping[str, Any]) -> None:
     for key, value in table.items():
         if key not in kinds:
             near = ", ".join(harmless_first(key, list(kinds))[:3])
-            raise InvalidInputError(f"unknown {key!r}; there is {near}")
+            raise InvalidInputError(f"Unknown key {key!r}. Keys, the nearest first: {near}.")
         if not isinstance(value, kinds[key]) or (
             isinstance(value, bool) and kinds[key] is not bool
         ):

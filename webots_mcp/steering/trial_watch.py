@@ -103,8 +103,8 @@ class TrialWatch:
             if name not in taken:
                 known = ", ".join(sorted(declared)) or "none"
                 raise InvalidInputError(
-                    f"the controller declares no parameter {name!r}: it declares {known}; see "
-                    "bridge.parameter() in docs/trials.md"
+                    f"The controller declares no parameter {name!r}. It declares {known}; see "
+                    "bridge.parameter() in docs/trials.md."
                 )
             if json.loads(taken[name]) != value:
                 low, high, choices = declared.get(name, (None, None, None))
@@ -125,7 +125,9 @@ class TrialWatch:
         chosen = [row for row in robots if wanted in (None, row[1])]
         if wanted is None and len(robots) > 1:
             names = ", ".join(name for _, name in robots)
-            raise InvalidInputError(f"several robots record ({names}): name one as robot = '...'")
+            raise InvalidInputError(
+                f"Several robots record ({names}). Name one of them as robot = '...'."
+            )
         for robot_id, _ in chosen:
             row = connection.execute(
                 "SELECT id, started_sim_time_s FROM run WHERE robot_id = ? ORDER BY id LIMIT 1",

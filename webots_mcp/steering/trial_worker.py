@@ -156,8 +156,8 @@ class TrialWorker(threading.Thread):
             finish_trial(connection, trial, result)
         if not command.is_final:
             raise CommandRefusedError(
-                f"the loop of robot {self._robot!r} does not call bridge.get_command() any more: "
-                "check what it is waiting for, or restart its controller"
+                f"The loop of robot {self._robot!r} no longer calls bridge.get_command(). "
+                "Check what it is waiting for, or restart its controller."
             )
 
     def _sent(self, trial: TrialRecord) -> QueuedCommand:

@@ -625,7 +625,7 @@ def export(
     """
     chosen = FORMATS.get(form)
     if chosen is None:
-        raise InvalidInputError(f"no format {form!r}: choose one of {', '.join(FORMATS)}")
+        raise InvalidInputError(f"Unknown format {form!r}. Choose one of {', '.join(FORMATS)}.")
     if isinstance(wanted, TrialTable):
         source = wanted
     else:
@@ -699,8 +699,9 @@ def format_of(file: Path) -> str:
             return each.name
     endings = ", ".join(f".{each.name}" for each in _ALL)
     raise InvalidInputError(
-        f"{file.name} does not tell its format: end it in {endings} or .{BUNDLE}, or say it "
-        "with --format"
+        f"The name {file.name} does not show the format. End it in {endings} or "
+        f".{BUNDLE}, "
+        "or give --format."
     )
 
 

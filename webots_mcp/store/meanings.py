@@ -175,7 +175,7 @@ def undo_meanings(connection: sqlite3.Connection, robot_id: int, names: Iterable
             if not found:
                 near = ", ".join(nearest_first(asked, known)[:_MOST_NEAR]) or "none"
                 raise InvalidInputError(
-                    f"nothing is declared of signal {asked!r:.80}. Declared signals: {near}"
+                    f"No meaning is declared for signal {asked!r:.80}. Declared signals: {near}"
                 )
             wanted |= dict.fromkeys(found)
         for name in wanted:
@@ -188,7 +188,8 @@ def _forget(connection: sqlite3.Connection, robot_id: int, name: str) -> None:
         if connection.execute(_FORGET.format(whose), (robot_id, name)).rowcount:
             return
     raise InvalidInputError(
-        f"signal {name!r:.80} is declared in webots-mcp.toml: change its table [signals]"
+        f"Signal {name!r:.80} is declared in webots-mcp.toml, which this tool "
+        "does not change. Edit its table [signals]."
     )
 
 

@@ -206,7 +206,7 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
     ]
     if versions[0] != versions[1]:
         raise InvalidInputError(
-            f"{source} has schema {versions[1]}, this webots-mcp needs {versions[0]}"
+            f"{source} has schema {versions[1]}, but this webots-mcp needs {versions[0]}"
         )
     require_shipped(connection, schema="source")
     recording, nameless = connection.execute(
@@ -219,7 +219,9 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
     subject = f"{source}" if run_id is None else f"run {run_id}"
     if recording:
         where = subject if run_id else f"in {subject}"
-        raise InvalidInputError(f"a controller still records {where}: merge it when that has ended")
+        raise InvalidInputError(
+            f"A controller still records {where}. Merge it after that has ended."
+        )
     if nameless:
         raise InvalidInputError(
             f"{subject} has no UUID, so it is unknown whether it was merged before"
@@ -449,9 +451,9 @@ def _copy_pictures(
             continue  # deleted since: its row stays as it was there, and says so when asked
         target = data_dir / _path_here(path, run_uuid)
         if not target.resolve().is_relative_to(data_dir.resolve()):
-            raise InvalidInputError(f"{path!r} lies outside the data folder and is not copied")
+            raise InvalidInputError(f"{path!r} lies outside the data folder and is not copied.")
         if target.suffix.lower() not in PICTURES:
-            raise InvalidInputError(f"{path!r} is not the name of a picture and is not copied")
+            raise InvalidInputError(f"{path!r} is not the name of a picture and is not copied.")
         if target.exists():
             continue  # a whole one, from an import that was killed
         make_folder(target.parent)
@@ -577,9 +579,9 @@ def unpack(file: Path, folder: Path) -> None:
                     shutil.copyfileobj(source, sink, _PIECE_BYTES)
         aside.replace(folder / DATABASE_NAME)
     except _DAMAGED as error:
-        raise InvalidInputError(f"{file} is damaged, or no ZIP archive: {error}") from error
+        raise InvalidInputError(f"{file} is damaged or not a ZIP archive: {error}.") from error
     except OSError as error:
-        raise InvalidInputError(f"{file} cannot be unpacked in {folder}: {error}") from error
+        raise InvalidInputError(f"{file} cannot be unpacked in {folder}: {error}.") from error
 
 
 def _require_ours(file: Path, archive: zipfile.ZipFile) -> None:

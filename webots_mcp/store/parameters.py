@@ -188,7 +188,7 @@ def as_filter(connection: sqlite3.Connection, values: Mapping[str, Value]) -> st
     try:
         return json.dumps(dict(values), allow_nan=False)
     except ValueError as error:
-        raise InvalidInputError(f"no run has such a value of a parameter: {error}") from error
+        raise InvalidInputError(f"No run has such a value of a parameter: {error}.") from error
 
 
 def _described(name: str, values: RunParameter | None, declared: Declared | None) -> dict[str, Any]:
@@ -360,14 +360,14 @@ def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
         found = fetch_trial_set(connection, set_id)
         if is_at_work(connection, found):
             raise CommandRefusedError(
-                f"trial set {set_id} of this robot is under way: wait for it with "
+                f"Trial set {set_id} of this robot is under way. Wait for it with "
                 f"webots_run_trials(trial_set={set_id}), or end it with cancel=true"
             )
         is_left = found.stop_reason is None and next_trial(connection, set_id) is not None
         if is_left or found.former_values is not None:
             why = found.stop_reason or "its server ended"
             raise CommandRefusedError(
-                f"trial set {set_id} of this robot is not over ({why}): "
+                f"Trial set {set_id} of this robot is not over ({why}). "
                 f"webots_run_trials(trial_set={set_id}) continues it, cancel=true ends it"
             )
 
@@ -390,8 +390,11 @@ def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetReco
     ).fetchone()
     if row is None:
         newest = find_trial_set(connection)
-        there = "none was begun" if newest is None else f"the newest is {newest}"
-        raise InvalidInputError(f"there is no trial set {set_id}: {there}")
+        there = "none was started yet" if newest is None else f"the newest is {newest}"
+        raise InvalidInputError(
+            f"No trial set {set_id} is recorded: {there}. webots_run_trials starts one, and "
+            "webots_get_trials() shows the newest."
+        )
     return TrialSetRecord(*row)
 
 
@@ -453,8 +456,8 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> JobLease:
         lease = lease_of(found.job)
         if not take(connection, lease, forced=found.is_left):
             raise CommandRefusedError(
-                f"process {found.pid} on {found.host} works on trial set {set_id}: wait for it, "
-                "or end it"
+                f"Process {found.pid} on {found.host} works on trial set {set_id}. Wait for it, "
+                "or end that process."
             )
         if found.host not in (None, host_name()):  # its simulators run on that host
             connection.execute(
@@ -529,7 +532,10 @@ def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[i
         if each.score is not None and each.run_id is not None:
             runs.setdefault(spelled(each.values), []).append(each.run_id)
     if not runs:
-        raise NothingRecordedError(f"no run of trial set {set_id} is recorded that has a score")
+        raise NothingRecordedError(
+            f"No run of trial set {set_id} has a score yet. "
+            f"webots_get_trials(trial_set={set_id}) shows why."
+        )
     ranked = [spelled(each.parameters) for each in ranking_of(trials, best_of(plan)).sets]
     return {name: runs[name] for name in ranked if name in runs}
 

@@ -129,16 +129,16 @@ class Policy:
         if action == LAUNCH:
             rule = self.allow.get(LAUNCH, True)
             if rule == ASKS:
-                self._require_consent(LAUNCH, "starting Webots is not allowed")
+                self._require_consent(LAUNCH, "Starting Webots is not allowed")
             elif not rule:
-                raise self._refusal(LAUNCH, "starting Webots is not allowed")
+                raise self._refusal(LAUNCH, "Starting Webots is not allowed")
         # This action only has a controller read its stored breakpoints again. It is sent along with
         # every action that is allowed.
         elif action != "arm_breakpoints":
-            self._require("actions", [action], f"the action {action!r:.100} is not allowed")
+            self._require("actions", [action], f"The action {action!r:.100} is not allowed")
         if action == "run" and params.get("reset"):
             self._require_route("reset", asked)
-            self._require("actions", ["reset"], "the action 'reset' is not allowed")
+            self._require("actions", ["reset"], "The action 'reset' is not allowed")
         for brought_about in _brought_about(action, params):
             self._require_route(brought_about, asked)
             self._require_not_forbidden(brought_about, action)
@@ -146,10 +146,10 @@ class Policy:
             self._require_world(params.get("world"))
         if action == "set_field":
             path = str(params.get("path"))
-            self._require("fields", [path.strip()], f"setting {path!r:.100} is not allowed")
+            self._require("fields", [path.strip()], f"Setting {path!r:.100} is not allowed")
         if action in ("add_node", "remove_node"):
             path = str(params.get("path") or "root")
-            doing = "adding to" if action == "add_node" else "removing"
+            doing = "Adding to" if action == "add_node" else "Removing"
             self._require("nodes", [path.strip()], f"{doing} {path!r:.100} is not allowed")
         if (values := params.get("values" if action == "set_parameters" else "parameters")) and (
             action in ("set_parameters", "run", LAUNCH)
@@ -187,19 +187,19 @@ class Policy:
         project = (find_project(self.file.parent) or self.file.parent).resolve()
         folders = [project / "worlds", project]
         names = [file.relative_to(each).as_posix() for each in folders if file.is_relative_to(each)]
-        self._require("worlds", [*names, file.as_posix()], f"the world {file} is not allowed")
+        self._require("worlds", [*names, file.as_posix()], f"The world {file} is not allowed")
 
     def _require_values(self, values: object) -> None:
         rules = cast("dict[str, Any] | None", self.allow.get("parameters"))
         if rules is None:
             return
         if not isinstance(values, Mapping):
-            raise self._refusal("parameters", "parameters without names are not allowed")
+            raise self._refusal("parameters", "Parameters without names are not allowed")
         for name, value in cast("Mapping[str, object]", values).items():
             key = name if name in rules else next((k for k in rules if fits_pattern(k, name)), None)
             if key is None:
-                raise self._refusal("parameters", f"the parameter {name!r:.100} is not allowed")
-            said = f"the parameter {name!r:.100} = {value!r:.100} is not allowed"
+                raise self._refusal("parameters", f"The parameter {name!r:.100} is not allowed")
+            said = f"The value {value!r:.100} of parameter {name!r:.100} is not allowed"
             if rules[key] == ASKS:
                 self._require_consent("parameters", said, key)
             elif not _is_within(value, rules[key]):
@@ -314,7 +314,7 @@ def read_policy(file: Path) -> Policy | None:
         text, content = load_toml(file)
         if unknown := sorted(set(content) - {ALLOW, "expect", "signals"}):
             raise InvalidInputError(
-                f"{file}: {unknown[0]!r} is unknown; there is allow, expect and signals"
+                f"{file}: unknown table {unknown[0]!r}. Tables: allow, expect, signals"
             )
         if ALLOW not in content:
             return None
@@ -323,8 +323,9 @@ def read_policy(file: Path) -> Policy | None:
             raise InvalidInputError(f"{file}, line {line_of(text, key)}: {why}")
     except InvalidInputError as error:
         raise NotAllowedError(
-            f"{error}. As long as that file is invalid, nothing that changes anything is allowed; "
-            "recording and reading go on",
+            f"{error}. While that file is invalid, nothing may be changed; recording "
+            "and reading go on. "
+            "The person whose project it is has to correct it.",
             str(error),
         ) from error
     return Policy(file, text, content[ALLOW])

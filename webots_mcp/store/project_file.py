@@ -150,7 +150,7 @@ def load_toml(file: Path) -> tuple[str, dict[str, Any]]:
         text = file.read_text("utf-8-sig")  # with the mark that editors of Windows put before it
         return text, cast("dict[str, Any]", toml.loads(text))
     except (ValueError, RecursionError) as error:  # also what is not UTF-8
-        raise InvalidInputError(f"{file} is not TOML: {error}") from error
+        raise InvalidInputError(f"{file} is not valid TOML: {error}") from error
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be read: {error.strerror}") from error
 
@@ -159,7 +159,7 @@ def _entry(file: Path, text: str, number: int, table: dict[str, Any]) -> Expecte
     try:
         for key, value in table.items():
             if key not in _KEYS:
-                raise InvalidInputError(f"{key!r} is unknown; there is {', '.join(_KEYS)}")
+                raise InvalidInputError(f"unknown key {key!r}. Keys: {', '.join(_KEYS)}")
             if not isinstance(value, str):
                 raise InvalidInputError(f"{key} must be a text, not {value!r:.80}")
         if "condition" not in table:

@@ -393,8 +393,8 @@ class _Purge:
             self._failures += 1
             if self._failures > _MOST_FAILURES:
                 raise DatabaseError(
-                    f"another process held the write lock in {_MOST_FAILURES} attempts: end it "
-                    "and try again"
+                    f"Another process held the write lock in {_MOST_FAILURES} attempts. End it "
+                    "and try again."
                 ) from error
             return 0
         self._failures = 0

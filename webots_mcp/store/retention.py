@@ -59,7 +59,7 @@ class Limit:
         for field in fields(self):
             value = getattr(self, field.name)
             if value is not None and not 0 <= value < math.inf:
-                raise InvalidInputError(f"{field.name}={value} must be 0 or more, and finite")
+                raise InvalidInputError(f"{field.name}={value} must be a finite number, 0 or more.")
 
     @property
     def limits(self) -> bool:
@@ -107,7 +107,9 @@ class Retention:
 
     def __post_init__(self) -> None:
         if not (self.outlive == 0 or 1 <= self.outlive < math.inf):
-            raise InvalidInputError(f"outlive={self.outlive} must be 1 or more, or 0 for ever")
+            raise InvalidInputError(
+                f"outlive={self.outlive} must be 1 or more, or 0 to keep forever."
+            )
 
 
 DEFAULT: Final = Retention()
@@ -271,7 +273,9 @@ def parse_limit(text: str, default: Limit) -> Limit:
     for part in [] if text.strip().lower() == NO_LIMIT else text.split(","):
         name, value = _parse_part(part.strip(), text)
         if limit[name] is not None:
-            raise InvalidInputError(f"{text!r} limits the same thing twice")
+            raise InvalidInputError(
+                f"{text!r} limits the same thing twice. Give one limit of each kind."
+            )
         limit[name] = value
     return replace(default, **limit)
 
@@ -287,8 +291,9 @@ def _parse_part(part: str, text: str) -> tuple[str, float]:
         if unit in {"row": 1, "rows": 1}:
             return "rows", round(number)
     raise InvalidInputError(
-        f"{part!r} in {text!r} is not a limit: write a size (500MB), an age (30d), a number of "
-        f"rows (100000rows), several of them with commas between, or {NO_LIMIT} to keep everything"
+        f"{part!r} in {text!r} is not a limit. Write a size (500MB), an age "
+        "(30d), a number of rows "
+        f"(100000rows), several of them separated by commas, or {NO_LIMIT} to keep everything."
     )
 
 

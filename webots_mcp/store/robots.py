@@ -88,7 +88,7 @@ def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
 
 def nothing_recorded(connection: sqlite3.Connection) -> str:
     """Return that no robot was ever seen, with what Webots' console says about it."""
-    text = "no robot has been recorded in this database yet"
+    text = "No robot has been recorded in this database yet"
     trouble = console_trouble(connection)
     return f"{text}. {trouble}" if trouble else text
 
@@ -128,10 +128,11 @@ def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float
     if len(candidates) == 1:
         return candidates[0]
     state = "are live" if live else "were recorded and none is live"
-    start = "" if live else "start the simulation, or for what was recorded "
+    start = "" if live else "Start the simulation, or to read what was recorded "
+    name_one = "Name" if live else "name"
     raise AmbiguousRobotError(
-        f"{len(candidates)} robots {state}: {_listed(candidates)}; "
-        f"{start}say which one with robot=..."
+        f"{len(candidates)} robots {state}: {_listed(candidates)}. "
+        f"{start}{name_one} one of them, for example robot={candidates[0].name!r}."
     )
 
 
@@ -145,8 +146,10 @@ def _named(robots: list[RobotRecord], name: str) -> RobotRecord:
         if robot.name in (name, recorded_name(name)):
             return robot
     near = difflib.get_close_matches(name, [robot.name for robot in robots], n=3, cutoff=0.5)
-    offer = f"did you mean {' or '.join(map(repr, near))}?" if near else "they are"
-    raise UnknownRobotError(f"no robot named {name!r} was recorded; {offer} {_listed(robots)}")
+    offer = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
+    raise UnknownRobotError(
+        f"No robot named {name!r} was recorded. {offer}Recorded robots: {_listed(robots)}."
+    )
 
 
 def _listed(robots: list[RobotRecord]) -> str:

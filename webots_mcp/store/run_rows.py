@@ -199,6 +199,9 @@ def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
     )
 
 
+_NO_RUN: Final = "No run {} is recorded, because no controller has recorded a run yet."
+
+
 def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None) -> str:
     ids = [
         row[0]
@@ -208,9 +211,24 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
             {"robot_id": robot_id},
         ).fetchall()
     ]
-    whose = "" if robot_id is None else " of this robot"
-    known = f"the newest runs{whose} are {ids}" if ids else f"no run{whose} was recorded"
-    return f"no run {run_id}{whose}: {known}"
+    known = ", ".join(map(str, ids))
+    if robot_id is None:
+        return (
+            f"No run {run_id} is recorded. Use one of the newest runs: {known}."
+            if ids
+            else _NO_RUN.format(run_id)
+        )
+    query = "SELECT name FROM robot JOIN run ON run.robot_id = robot.id WHERE run.id = ?"
+    owner = connection.execute(query, (run_id,)).fetchone()
+    if owner is None:
+        said = f"No run {run_id} of this robot is recorded."
+    else:
+        said = f"Run {run_id} belongs to another robot: to read it, give robot={owner[0]!r}."
+    return (
+        f"{said} Newest runs of this robot: {known}."
+        if ids
+        else f"{said} This robot has no run yet."
+    )
 
 
 def newest_state(connection: sqlite3.Connection, run_id: int) -> StateRecord | None:
@@ -296,13 +314,22 @@ def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
                 return key, taken
         near = nearest_first(parts[0], itertools.islice(members, _SEARCHED_KEYS))[:_SHOWN_KEYS]
         known = [key[:_SHOWN_KEY_CHARACTERS] for key in near]
-        raise InvalidInputError(f"path {path!r}: there is no {parts[0]!r}; there are {known}")
+        raise InvalidInputError(
+            f"path={path!r}: no member {parts[0]!r} in this part of the state. Use one of {known}."
+        )
     if isinstance(value, list):
         items = cast("list[Any]", value)
         if parts[0].isdecimal() and int(parts[0]) < len(items):
             return int(parts[0]), 1
-        raise InvalidInputError(f"path {path!r}: {len(items)} items have no index {parts[0]!r}")
-    raise InvalidInputError(f"path {path!r}: {parts[0]!r} is below a single value")
+        above = path[: len(path) - len(".".join(parts))]
+        use = f"Use {above}0 to {above}{len(items) - 1}." if items else "The list is empty."
+        raise InvalidInputError(
+            f"path={path!r}: {parts[0]!r} is no index of this list of {len(items)}. {use}"
+        )
+    whole = path[: len(path) - len(".".join(parts))].rstrip(".")
+    raise InvalidInputError(
+        f"path={path!r}: the value above {parts[0]!r} has no members. Use path={whole!r}."
+    )
 
 
 def put_back(value: Any, parts: list[str], replaced: object) -> None:
@@ -374,15 +401,18 @@ def inside(data_dir: Path, path: str) -> Path:
     try:
         file = (data_dir / path).resolve()
         if not file.is_relative_to(data_dir.resolve()):
-            raise InvalidInputError(f"{path!r} lies outside the data folder and is not opened")
+            raise InvalidInputError(
+                f"The path {path!r} lies outside the data folder and is not opened."
+            )
         mode = file.stat().st_mode
     except FileNotFoundError as error:
         raise NothingRecordedError(
-            f"{data_dir / path} was recorded, but the file is gone: only the newest pictures are "
-            "kept; or this is not the data folder that the controller records into"
+            f"The picture {data_dir / path} was recorded, but its file is gone: only the newest "
+            "pictures are kept, or the controller records into another data folder. "
+            "webots_get_camera() shows the newest picture."
         ) from error
     except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, a loop of links
-        raise InvalidInputError(f"{path[:_SHOWN_PATH]!r} is not a usable path: {error}") from error
+        raise InvalidInputError(f"{path[:_SHOWN_PATH]!r} is not a usable path: {error}.") from error
     if not stat.S_ISREG(mode):
         raise InvalidInputError(f"{file} is not a regular file and is not opened")
     return file

@@ -125,7 +125,7 @@ def list_runs(
         InvalidInputError: `limit` is out of bounds, or no parameter was ever called so.
     """
     if not 1 <= limit <= MOST_RUNS:
-        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_RUNS}")
+        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_RUNS}.")
     robot_id = None if robot is None else resolve_robot(connection, robot, time.time()).id
     asked = {"robot": robot_id, "parameters": as_filter(connection, parameters or {})}
     page = {**asked, "before": before_id, "limit": limit + 1}
@@ -185,11 +185,14 @@ def annotate_run(
         InvalidInputError: Neither is given, or one is too long.
     """
     if label is None and note is None:
-        raise InvalidInputError("give a label or a note")
+        raise InvalidInputError(
+            "Nothing to store. Give a label, a note or both, for example label='baseline'."
+        )
     for name, text, longest in (("label", label, MAX_LABEL), ("note", note, MAX_NOTE)):
         if text is not None and len(text) > longest:
             raise InvalidInputError(
-                f"the {name} has {len(text)} characters; at most {longest} are kept"
+                f"The {name} has {len(text)} characters, and at most {longest} are kept. "
+                "Shorten it."
             )
     values = {"run": run_id, "label": label, "note": note}
     with transaction(connection):  # it waits for the lock, and Ctrl-C ends that

@@ -174,7 +174,7 @@ def query_history(
         UnknownSignalError, InvalidInputError: A name meets nothing; `max_points` is out of bounds.
     """
     if not 1 <= max_points <= MOST_POINTS:
-        raise InvalidInputError(f"max_points={max_points} must be from 1 to {MOST_POINTS}")
+        raise InvalidInputError(f"max_points={max_points} must be from 1 to {MOST_POINTS}.")
     signals = signals_of(connection, time_range, names)
     total_s = sum(segment.end_s - segment.start_s for segment in time_range.segments)
     deadline = Deadline(deadline_s)
@@ -373,7 +373,7 @@ def query_rows(
         UnknownSignalError, InvalidInputError: A name meets nothing; `limit` is out of bounds.
     """
     if not 1 <= limit <= MOST_ROWS:
-        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ROWS}")
+        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ROWS}.")
     signals = signals_of(connection, time_range, names)
     deadline = Deadline(deadline_s)
     parts: list[Frame] = []

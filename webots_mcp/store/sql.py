@@ -29,6 +29,7 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect, shipped_objects
 from webots_mcp.database.location import Database
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
+from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.run_rows import reading_texts
 
@@ -46,6 +47,8 @@ _REFUSED_FUNCTIONS: Final = frozenset(
 )
 TOO_LARGE: Final = "it needs too much memory: read fewer or shorter values at a time"
 _LONGEST_ERROR: Final = 300
+_MOST_COLUMNS: Final = 20  # are offered instead of an unknown one
+_MOST_NAMED: Final = 2  # tables whose columns are offered, even if none is like it
 
 Cell = int | float | str | None
 LINE: Final = (sys.executable, "-m", __name__)
@@ -157,7 +160,7 @@ def require_max_rows(max_rows: int) -> None:
         InvalidInputError: The text says how many those are.
     """
     if not 1 <= max_rows <= MOST_ROWS:
-        raise InvalidInputError(f"max_rows={max_rows} must be from 1 to {MOST_ROWS}")
+        raise InvalidInputError(f"max_rows={max_rows} must be from 1 to {MOST_ROWS}.")
 
 
 def require_select(statement: str) -> None:
@@ -167,13 +170,16 @@ def require_select(statement: str) -> None:
         InvalidInputError: The text says with what it begins.
     """
     if not statement.strip():
-        raise InvalidInputError("the statement is empty: give one such as SELECT count(*) FROM run")
+        raise InvalidInputError(
+            "The statement is empty. Give one such as SELECT count(*) FROM run."
+        )
     begin = re.match(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(\w*)", statement, flags=re.DOTALL)
     word = begin.group(1).upper() if begin else ""
     if word not in ("SELECT", "WITH", "VALUES", "EXPLAIN"):
+        begins = f"begins with {word!r}" if word else "begins with no word"
         raise InvalidInputError(
-            "only one reading statement is allowed (SELECT, WITH ... SELECT, EXPLAIN QUERY PLAN), "
-            + (f"this begins with {word!r}" if word else "this begins with no word")
+            f"The statement {begins}, but only one reading statement is allowed. "
+            "Use SELECT, WITH ... SELECT or EXPLAIN QUERY PLAN."
         )
 
 
@@ -272,34 +278,44 @@ def too_slow(deadline_s: float) -> str:
 def _explain(connection: sqlite3.Connection, statement: str, error: Exception) -> str:
     text = str(error)[:_LONGEST_ERROR]
     if "one statement" in text:
-        return "only one statement is allowed"
+        return "Only one statement is allowed in a call. Send each in a call of its own."
     if "not authorized" in text or "prohibited" in text or "readonly" in text:
-        return f"only reading is allowed ({text}): no writing, no ATTACH, no PRAGMA"
+        return f"Only reading is allowed ({text}): no writing, no ATTACH, no PRAGMA. Use SELECT."
     if "number of bindings" in text:
         return (
-            "?, :name, @name and $name are placeholders without values: write values in the SELECT"
+            "The placeholders ?, :name, @name and $name have no values. "
+            "Write the values into the SELECT itself."
         )
     if missing := re.search(r"no such (column|table): (\S+)", text):
-        return f"{text}; {_near(connection, statement, *missing.groups())}"
-    return f"SQLite says: {text}"
+        return _near(connection, statement, *missing.groups())
+    return f"SQLite reports: {text}."
 
 
 def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) -> str:
-    """Names that were perhaps meant: columns of the tables that the statement names."""
+    """Say that it is missing, and which tables or columns there are, the nearest first."""
     tables = columns_by_table(connection)
     wanted = name.rpartition(".")[2]
     if what == "table":
-        return f"there is {', '.join(difflib.get_close_matches(wanted, tables, 3, 0.4) or tables)}"
+        return (
+            f"No table {name!r}. Tables, the nearest first: "
+            f"{', '.join(_by_likeness(wanted, tables))}."
+        )
     words = set(re.findall(r"\w+", statement))
     named = [table for table in tables if table in words] or list(tables)
     columns = dict.fromkeys(column for table in named for column in tables[table])
-    near = difflib.get_close_matches(wanted, columns, 4, 0.5)
-    if near:
-        return f"there is {', '.join(near)} in {', '.join(named)}"
+    said = f"No column {name!r}."
+    if len(named) <= _MOST_NAMED or difflib.get_close_matches(wanted, columns, 1, 0.5):
+        offer = listed(_by_likeness(wanted, columns), _MOST_COLUMNS)
+        whose = ", ".join(named[:_MOST_NAMED])
+        said += f" Columns of {whose}, the nearest first: {offer}."
     return (
-        "a published value is inside state.data: json_extract(data, '$.name'); "
-        "the signal table has the paths"
+        f"{said} A published value is in state.data: json_extract(data, '$.name'); "
+        "the table signal has the paths."
     )
+
+
+def _by_likeness(wanted: str, names: Iterable[str]) -> list[str]:
+    return [*dict.fromkeys([*difflib.get_close_matches(wanted, names, 4, 0.4), *names])]
 
 
 # -- a process of its own, which the deadline ends whatever the engine is doing --------------------

@@ -39,7 +39,7 @@ def test_the_environment_wins_over_the_code(
         ("kp=3", "it is not JSON"),
         ("[3]", "it is a list, not an object"),
         ("[" * 100_000, "it is not JSON"),
-        ('{"kp": 11}', "'kp' is a number up to 10, not 11 (int); it begins with 2.0"),
+        ('{"kp": 11}', "'kp' must be a number up to 10, not 11 (int); it begins with 2.0"),
         ('{"kp": "3"}', "not '3' (str)"),
         ('{"kp": NaN}', "not nan"),
         ('{"kp": {"deep": 1}}', "not {'deep': 1} (dict)"),

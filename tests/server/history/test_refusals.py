@@ -47,7 +47,7 @@ async def test_the_schema_of_a_refused_recording_is_refused_by_name(tmp_path: Pa
     ("tool", "arguments", "words"),
     [
         ("webots_find_events", {"start_s": 3, "end_s": 3}, "empty"),
-        ("webots_find_events", {"where": "x > 1", "kinds": ["jump"]}, "which kinds lacks"),
+        ("webots_find_events", {"where": "x > 1", "kinds": ["jump"]}, "which kinds does not name"),
         ("webots_get_trends", {"since_wall_time": "yesterday"}, "ISO 8601"),
         (
             "webots_get_trends",
@@ -55,9 +55,9 @@ async def test_the_schema_of_a_refused_recording_is_refused_by_name(tmp_path: Pa
             "until_wall_time=1700000000",
         ),
         ("webots_get_timeline", {"cursor": "xyz"}, "is not a cursor"),
-        ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),
-        ("webots_plot", {"signals": ["nope"]}, "no signal 'nope'"),
-        ("webots_query_sql", {"sql": "SELECT 1; SELECT 2"}, "only one statement"),
+        ("webots_compare_runs", {"run_ids": [1, 99]}, "No run 99"),
+        ("webots_plot", {"signals": ["nope"]}, "No signal 'nope'"),
+        ("webots_query_sql", {"sql": "SELECT 1; SELECT 2"}, "Only one statement"),
         ("webots_query_sql", {"sql": "SELECT sim_time FROM state"}, "sim_time_s"),
         ("webots_query_sql", {"sql": "SELECT * FROM stat"}, "state"),
     ],

@@ -29,7 +29,7 @@ async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
             asked = {"parameters": {"kp": [1.0]}, "score": "last(distance)", "for_s": 1} | changed
             return await fail(client, "webots_run_trials", **asked)
 
-        assert "the nearest are kp" in await refused(parameters={"k": [1.0]})
+        assert "that the controller declares: kp" in await refused(parameters={"k": [1.0]})
         assert "up to 100, not 101" in await refused(parameters={"kp": [1, 101]})
         assert "one of 'trot', 'walk'" in await refused(parameters=[{"gait": "hop"}])
         assert "given twice" in await refused(parameters=[{"kp": 1}, {"kp": 1.0}])
@@ -45,7 +45,7 @@ async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
         assert "give until" in await refused(for_s=None)
         assert "give both" in await refused(score=None)
         assert "not both" in await refused(trial_set=1)
-        assert "no trial set 1: none was begun" in await fail(
+        assert "No trial set 1 is recorded: none was started yet" in await fail(
             client, "webots_run_trials", trial_set=1
         )
         assert "commands" not in await ask(client, "webots_list_commands")
@@ -83,7 +83,7 @@ async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
         answer = await trials(client, parameters={"kp": [HANGS_AT]}, trial_timeout_wall_s=1)
         (row,) = rows_of(answer["ranked"])
         assert row["why"].startswith("did not reach its end, only 0.112 s: it took longer than 1 s")
-        assert "does not call bridge.get_command() any more" in answer["state"]
+        assert "no longer calls bridge.get_command()" in answer["state"]
 
 
 async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(

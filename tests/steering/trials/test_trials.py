@@ -74,7 +74,7 @@ def test_what_no_trial_can_have_ends_all_of_them_with_a_sentence(plan: Plan, run
     plan('score = "last(x)"\nfor_s = 0.2\n[grid]\nsped = [1.0, 2.0]')
     refused = run()
     assert refused.returncode == 2
-    assert "the controller declares no parameter 'sped': it declares speed" in refused.stderr
+    assert "The controller declares no parameter 'sped'. It declares speed" in refused.stderr
 
     plan('score = "1 + last(y)"\nfor_s = 0.2\n[grid]\nspeed = [1.0, 2.0]')
     refused = run()
@@ -127,7 +127,7 @@ def test_what_is_over_so_far_is_ranked_and_who_leads_is_told(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('score = "last(x)"\n[grid]\nspeed = [1.0]', "give for_s, until or both"),
+        ('score = "last(x)"\n[grid]\nspeed = [1.0]', "Give for_s, until or both"),
         ('for_s = 1\n[grid]\nspeed = [1.0]', "score is missing"),
         ('score = "last(x)"\nfor_s = 1', "give a .grid., as in speed"),
         ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = 1.0', "must be a list of values"),
@@ -136,9 +136,9 @@ def test_what_is_over_so_far_is_ranked_and_who_leads_is_told(
         ('score = "last(x)"\nfor_s = -1\n[grid]\nspeed = [1.0]', "for_s=-1 must be a number"),
         ('score = "last(x)"\nfor_s = "1"\n[grid]\nspeed = [1.0]', "for_s='1' is a str"),
         ('score = "last(x)"\nfors = 1\n[grid]\nspeed = [1.0]', "unknown 'fors'; there is for_s"),
-        ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = [1.0, 1.0]', "given twice: use repeats"),
+        ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = [1.0, 1.0]', "To repeat them, use repeats"),
         ('score = "last(x)"\nfor_s = 1\nbest = "most"\n[grid]\nspeed = [1]', "highest, lowest"),
-        ("score = ", "is not TOML"),
+        ("score = ", "is not valid TOML"),
     ],
 )  # fmt: skip
 def test_a_plan_that_is_none_is_refused_before_anything_is_written(

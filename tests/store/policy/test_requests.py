@@ -165,8 +165,8 @@ async def test_a_change_holds_from_the_next_request_on_and_an_invalid_file_allow
         await ask(client, "webots_set_parameters", values={"kp": 3})
         for text, why in (
             ("[allow]\nactoins = []\n", "line 2: allow.actoins is unknown"),
-            ("[alow]\nactions = []\n", "'alow' is unknown"),
-            ("[allow\n", "is not TOML"),
+            ("[alow]\nactions = []\n", "unknown table 'alow'"),
+            ("[allow\n", "is not valid TOML"),
             ("[allow]\nfields = ['*', '!a.b']\n", "line 2: fields cannot forbid"),
             ("[allow.parameters]\nkp = [3.0, 1.0]\n", "line 1: kp must be [lowest, highest]"),
         ):

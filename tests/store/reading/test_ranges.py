@@ -86,7 +86,7 @@ def test_more_seconds_back_than_a_run_has_lasted_name_the_run_before(
     [
         ({"start_s": 5.0, "end_s": 5.0}, "empty"),
         ({"start_s": 5.0, "end_s": 1.0}, "reversed"),
-        ({"end_s": 0.0}, "no row before end_s=0: its first is at 0 s"),
+        ({"end_s": 0.0}, "no row before end_s=0: it reaches from 0 s to"),
         ({"start_s": 0.0, "last_s": 1.0}, "two ways"),
         ({"last_s": 1.0, "since_wall_time": 5.0}, "two ways"),
         ({"last_s": 0.0}, "above 0"),

@@ -204,7 +204,12 @@ def values_at(
 def _require_known(condition: Condition, search: Search) -> None:
     known = search.known
     unknown = [e for e in condition.signals if e not in known and item_signal(known, e) is None]
-    said = [say_unknown(search.known, name) for name in unknown]
+    said = [
+        f"{condition.quoted_text(name)}. {say_unknown(known, name)}"
+        if condition.quoted_text(name)
+        else say_unknown(known, name)
+        for name in unknown
+    ]
     if said := [*said, *condition.describe_lost(search.known)]:
         raise UnknownSignalError("; ".join(said))
 

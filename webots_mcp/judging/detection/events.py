@@ -60,7 +60,10 @@ _ROW_AT: Final = (  # of a run of which the table has all rows
 # those of one kind and moment. Pages and cursors go on from it.
 Place = tuple[float, int, float, str, int]
 MOST_ENTRIES: Final = 500
-_NO_CURSOR: Final = "{!r} is not a cursor: give the `cursor` of an answer unchanged"
+_NO_CURSOR: Final = (
+    "{!r} is not a cursor of this tool. Give the `cursor` of this tool's previous answer "
+    "unchanged, or leave cursor out to begin at the start."
+)
 KINDS: Final[list[EventKind]] = [
     stored.RUN,
     stored.GAP,
@@ -418,7 +421,7 @@ def timeline(
         InvalidInputError: `limit` is out of bounds, or `after` is no cursor.
     """
     if not 1 <= limit <= MOST_ENTRIES:
-        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ENTRIES}")
+        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ENTRIES}.")
     options = options or EventOptions(kinds=stored_kinds(), log_level="info")
     found = search_events(
         connection, time_range, options, around=(), group=False, deadline_s=deadline_s
@@ -451,7 +454,7 @@ def kind_named(name: str) -> EventKind:
     """
     found = next((kind for kind in KINDS if kind.name == name), None)
     if found is None:
-        raise InvalidInputError(f"unknown kind {name!r}; there is {', '.join(kind_names())}")
+        raise InvalidInputError(f"Unknown kind {name!r}. Kinds: {', '.join(kind_names())}.")
     return found
 
 

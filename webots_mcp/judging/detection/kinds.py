@@ -63,7 +63,7 @@ def both_of(names: Sequence[str] | None) -> tuple[str, str] | None:
     if names is None:
         return None
     if len(names) != 2:
-        raise InvalidInputError(f"position={list(names)} must name two signals, of x and of y")
+        raise InvalidInputError(f"position={list(names)} must name two signals, of x and of y.")
     return names[0], names[1]
 
 
@@ -120,12 +120,12 @@ class EventOptions:
     def __post_init__(self) -> None:
         if self.log_level not in LEVELS:
             raise InvalidInputError(
-                f"unknown log level {self.log_level!r}; there is {', '.join(LEVELS)}"
+                f"Unknown log level {self.log_level!r}. Levels: {', '.join(LEVELS)}."
             )
         for name in ("stuck_m", "stuck_s", "missing_s", "flat_s", "jump_min_score", "jump_m"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
-                raise InvalidInputError(f"{name}={value} must be a number above 0")
+                raise InvalidInputError(f"{name}={value} must be a number above 0.")
 
 
 # -- what a kind of event is: how it is found, reported, counted and drawn -------------------------

@@ -72,6 +72,11 @@ _SIGNS: Final[dict[type[ast.operator], str]] = {
 OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max": max}
 GIVING_FLAGS: Final = ("changed", "missing")
 _ALWAYS_OR_NEVER: Final = "it would always be true or always be false"
+_NO_COMPARISON: Final = (ast.LShift, ast.RShift, ast.BitAnd, ast.BitOr, ast.BitXor)
+_COMPARE: Final = (
+    "compare with < <= > >= == or !=; instead of `in` write mode == 'a' or mode == 'b'"
+)
+_OF_A_RUN: Final = ("mean", "avg", "average", "first", "last")
 FUNCTIONS: Final = (*OF_NUMBERS, *GIVING_FLAGS, "rate", "displacement", "signal")
 MOST_CHARACTERS: Final = 100  # of a name
 _DURING: Final = re.compile(r"""(?:[^'"]|'[^']*'|"[^"]*")*?(?<=[\s)])(during)(?=[\s(])""")
@@ -113,12 +118,26 @@ class Condition:
 
     def describe_unknown(self, known: Collection[str]) -> list[str]:
         """A sentence for each of its signals, and the position, not among the known ones."""
-        missing = "is missing as long as it is not published; there is"
         unknown = [name for name in self.signals if name not in known]
         return [
-            *(f"{name} {missing} {_nearest(name, known)}" for name in unknown),
+            *(f"No signal {name!r} is published. {self._instead(name, known)}" for name in unknown),
             *self.describe_lost(known),
         ]
+
+    def _instead(self, name: str, known: Collection[str]) -> str:
+        quoted = self.quoted_text(name)
+        return f"{quoted}. {_nearest(name, known)}" if quoted else _nearest(name, known)
+
+    def quoted_text(self, name: str) -> str:
+        """Return how to compare with a text, if a name may be meant as one; else nothing."""
+        for node in ast.walk(self.tree):
+            if isinstance(node, ast.Compare) and isinstance(node.ops[0], (ast.Eq, ast.NotEq)):
+                sign, sides = COMPARISONS[type(node.ops[0])][0], [node.left, *node.comparators]
+                words = [side.id if isinstance(side, ast.Name) else "" for side in sides]
+                if name in words and len(sides) == 2 and is_signal(sides[1 - words.index(name)]):
+                    other = ast.unparse(sides[1 - words.index(name)])
+                    return f"To compare with a text, quote it: {other} {sign} {name!r}"
+        return ""
 
     def describe_lost(self, known: Collection[str]) -> list[str]:
         """That it asks where the robot is, and none of the known names is a place."""
@@ -208,8 +227,10 @@ def parse_condition(text: str) -> Condition:
 
 
 def _nearest(name: str, known: Collection[str]) -> str:
-    near = ", ".join(nearest_first(name, known)[:_MOST_OFFERED]) or "nothing yet"
-    return near + (f" (the nearest of {len(known)})" if len(known) > _MOST_OFFERED else "")
+    if not known:
+        return "Nothing is published yet"
+    near = ", ".join(nearest_first(name, known)[:_MOST_OFFERED])
+    return f"The nearest of {len(known)} signals: {near}"
 
 
 class Compiler(Nodes):
@@ -240,7 +261,11 @@ class Compiler(Nodes):
         write = self._number if number else self._condition
         self.root: Callable[[State], Any] = self._code.function(lambda: write(tree))
         for place in self._durations:
-            self._refuse_at(place, "`for` follows a condition: put parentheses around both")
+            self._refuse_at(
+                place,
+                "`for` follows a condition; put both in parentheses, as in (x < 1 for "
+                "0.5) and y > 2",
+            )
         if not self.readers and self.position is None:
             same = "it would be the same in every state"
             self._refuse(tree, f"no signal is named: {same if number else _ALWAYS_OR_NEVER}")
@@ -263,7 +288,9 @@ class Compiler(Nodes):
             return self._flag(node)
         if isinstance(node, ast.Call) and function_of(node) not in FUNCTIONS:
             self._refuse(node, self._unknown_function(node))
-        self._refuse(node, "this is a value; a condition compares it, as in `x < 1`")
+        if isinstance(node, ast.BinOp) and type(node.op) in _NO_COMPARISON:
+            self._refuse_at(self._operator_column(node), _COMPARE)
+        self._refuse(node, "this is a value; a condition compares it, as in x < 1")
 
     def _combination(self, node: ast.BoolOp) -> str:
         """`and` and `or`: what follows is evaluated only where it decides."""
@@ -280,7 +307,7 @@ class Compiler(Nodes):
         code, sides = self._code, [node.left, *node.comparators]
         for op in node.ops:
             if type(op) not in COMPARISONS:
-                self._refuse(node, "compare with < <= > >= == !=; there is no `in` and no `is`")
+                self._refuse(node, _COMPARE)
         left, right = self._value(sides[0]), self._value(sides[1])
         holds = code.assign("False")
         self._compare(holds, left, node.ops[0], right, sides[0])
@@ -297,7 +324,11 @@ class Compiler(Nodes):
         (sign, _), column = COMPARISONS[type(op)], self._column(left_node)
 
         def fail(a: Value, b: Value) -> ConditionFailedError:
-            return self._failure(column, f"{_shown(a)} {sign} {_shown(b)}?")
+            return self._failure(
+                column,
+                f"cannot compare {_shown(a)} with {_shown(b)} by {sign}; "
+                "compare texts with == or != and a text in quotes, numbers with numbers",
+            )
 
         code = self._code
         with code.block(f"if {self._are_there(left, right)}:"):
@@ -310,9 +341,11 @@ class Compiler(Nodes):
         """A pair whose comma is a `for`; no other comma stands outside a call."""
         places = self._durations_between(node)
         if not places:
-            self._refuse(node, "commas stand between the values of a function only")
+            self._refuse(
+                node, "commas are possible only within a function; join conditions with and"
+            )
         if len(node.elts) != 2:
-            self._refuse_at(places[-1], "`for` takes one number of seconds; use parentheses")
+            self._refuse_at(places[-1], "`for` takes one number of seconds, as in x < 1 for 0.5")
         self._durations.difference_update(places)
         condition, seconds = node.elts
         holds = self._code.function(lambda: self._condition(condition))
@@ -326,7 +359,7 @@ class Compiler(Nodes):
 
     def _flag(self, node: ast.expr) -> str:
         """A signal by itself: a flag that is true, or a number other than 0."""
-        value = self._text_refused(node, "{} by itself is no condition")
+        value = self._text_refused(node, "{} is not a condition; compare it, as in mode == 'turn'")
         return f"({value} is not None and {value} != 0)"
 
     def _text_refused(self, node: ast.expr, why: str) -> str:
@@ -357,7 +390,7 @@ class Compiler(Nodes):
                 self._refuse(node, "a number is needed here")
             return self._constant_name(node)
         if is_signal(node):
-            return self._text_refused(node, "{} is no number")
+            return self._text_refused(node, "{} is not a number; name a signal of numbers")
         if isinstance(node, ast.BinOp):
             return self._arithmetic(node)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
@@ -371,7 +404,9 @@ class Compiler(Nodes):
 
     def _arithmetic(self, node: ast.BinOp) -> str:
         if type(node.op) not in ARITHMETIC:
-            self._refuse_at(self._operator_column(node), "only + - * / are possible")
+            self._refuse_at(
+                self._operator_column(node), "only + - * / are possible; for a square write x * x"
+            )
         code, sign = self._code, _SIGNS[type(node.op)]
         left, right = self._number(node.left), self._number(node.right)
         result = code.assign("None")
@@ -451,16 +486,21 @@ class Compiler(Nodes):
             self._refuse(node, f"`{of}` takes a plain number of seconds, such as 0.5")
         seconds = cast("int | float", value)
         if not 0 < seconds <= MAX_DURATION_S:
-            self._refuse(node, f"seconds are above 0 and at most {MAX_DURATION_S:g}")
+            self._refuse(node, f"seconds must be above 0 and at most {MAX_DURATION_S:g}")
         self.remembers_s += _MOST_TIMES_AS_OLD * seconds
         return float(seconds)
 
     def _unknown_function(self, node: ast.Call) -> str:
         name = function_of(node)
         if name is None:
-            return "only functions can be called: " + ", ".join(FUNCTIONS)
+            return "only these functions can be called: " + ", ".join(f"{f}()" for f in FUNCTIONS)
         offer = ", ".join(f"{each}()" for each in nearest_first(name, FUNCTIONS))
-        return f"there is no {name}(); there are {offer}"
+        if name in _OF_A_RUN:
+            return (
+                f"{name}() is possible only in a score; webots_get_trends has the mean, minimum "
+                f"and maximum of a signal. Functions of a condition: {offer}"
+            )
+        return f"unknown function {name}(). Functions: {offer}"
 
 
 def _shown(value: Value) -> str:

@@ -107,7 +107,8 @@ class Score:
             if name not in signals:
                 offer = ", ".join(nearest_first(name, signals)[:_MOST_OFFERED]) or "nothing yet"
                 raise UnknownSignalError(
-                    f"{self.place(column)}: no signal {name!r} is recorded; there is {offer}"
+                    f"{self.place(column)}: no signal {name!r} is recorded. Nearest signals: "
+                    f"{offer}"
                 )
 
     def place(self, column: int) -> str:
@@ -242,6 +243,6 @@ class _Compiler(Nodes):
 
     def _unknown(self, name: str | None) -> str:
         if name is None:
-            return "only functions can be called: " + ", ".join(_FUNCTIONS)
+            return "only these functions can be called: " + ", ".join(_FUNCTIONS)
         offer = ", ".join(f"{each}()" for each in nearest_first(name, _FUNCTIONS))
         return f"there is no {name}() of a run; there are {offer}"

@@ -42,7 +42,7 @@ _INSTEAD: Final = {
     "=": "to compare, write ==",
     "&": "write `and`",
     "|": "write `or`",
-    "!": "write `not`, or != for unlike",
+    "!": "write `not`, or != to compare",
     "~": "write `not`",
     "^": "there is no power operator: write x * x",
     "%": "there is no remainder operator",
@@ -106,7 +106,7 @@ def scan(text: str, what: str = "condition") -> Scanned:
         if kind == "number" and token[0] == "." and (before in _NAMES or text[place - 1] in ")]"):
             kind = "item"
         if (before, kind) in _NEVER_TOGETHER:
-            raise refusal(unread, place, "a space or an operator is missing before it")
+            raise refusal(unread, place, _missing_before(before, token))
         if kind == last == "text":  # which Python would join to one
             raise refusal(unread, place, "an operator is missing between two texts; " + _NO_ESCAPES)
         if token == "for":
@@ -130,21 +130,32 @@ def _as_item(unread: Scanned, place: int, token: str) -> str:
 def _stripped(text: object, what: str) -> str:
     """The text without the spaces around it, if it is one of a possible length."""
     if not isinstance(text, str):
-        raise InvalidConditionError(f"a {what} is a text such as {_SUCH_AS[what]!r}, not {text!r}")
+        raise InvalidConditionError(
+            f"A {what} must be a text such as {_SUCH_AS[what]!r}, not {text!r}."
+        )
     stripped = text.strip(" ")
     if not stripped:
-        raise InvalidConditionError(f"the {what} is empty: give one such as {_SUCH_AS[what]!r}")
+        raise InvalidConditionError(f"The {what} is empty. Give one such as {_SUCH_AS[what]!r}.")
     if len(stripped) > MAX_CHARACTERS:
         raise InvalidConditionError(
-            f"the {what} has {len(stripped)} characters; at most {MAX_CHARACTERS} are possible"
+            f"The {what} has {len(stripped)} characters, and at most {MAX_CHARACTERS} "
+            "are possible. Shorten it."
         )
     return stripped
 
 
+def _missing_before(before: str, token: str) -> str:
+    if before == "number" and token[0].isalpha():
+        return f"a number has no unit; write it in the signal's own unit, without {token!r}"
+    return f"a space or an operator is missing before {token!r}, as in x < 1 and y > 2"
+
+
 def _why_unknown(sign: str) -> str:
     if sign in "\n\r\t":
-        return "a condition is one line, with spaces between its words"
-    hint = _INSTEAD.get(sign, "it has no meaning in a condition; texts stand in quotes")
+        return "a condition is one line; use spaces between its words"
+    hint = _INSTEAD.get(
+        sign, "it has no meaning in a condition; remove it, or quote a text, as in mode == 'turn'"
+    )
     return f"{sign!r}: {hint}"
 
 
@@ -169,11 +180,17 @@ def parse(scanned: Scanned) -> ast.expr:
 
 def _why_unread(scanned: Scanned, place: int, error: SyntaxError) -> str:
     if "never closed" in str(error.msg) or "unmatched" in str(error.msg):
-        return str(error.msg)
+        return f"{error.msg}; add or remove a parenthesis"
     if reserved := _reserved_name(scanned.original, dotted=False):
         return _instead_of(reserved)
     rest = scanned.original[scanned.columns[place] :].strip()
-    return f"not understood from {rest[:20]!r} on" if rest else "something is missing at the end"
+    if not rest:
+        return "it ends too early; add a value or a condition, as in x < 1 and y > 2"
+    if re.search(r"\b(if|else)\b", scanned.original):
+        return "if and else have no meaning here; join conditions with and, or, not"
+    if re.search(r"\bfor\b", scanned.original[: scanned.columns[place]]):
+        return f"cannot read {rest[:20]!r}; after `for` give seconds without a unit, as in for 0.5"
+    return f"cannot read {rest[:20]!r}; join conditions with and, or; quote texts, as in 'turn'"
 
 
 def _reserved_name(text: str, *, dotted: bool) -> re.Match[str] | None:

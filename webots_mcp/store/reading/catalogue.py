@@ -32,7 +32,7 @@ from webots_mcp.store.signals import RegisteredSignal, cleaned, registered, seen
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
 _MOST_OFFERED: Final = 5
-_ONLY_FIRST: Final = f"only the first {MAX_SIGNALS} names of a robot are kept"
+_ONLY_FIRST: Final = f"Only the first {MAX_SIGNALS} names of a robot are kept"
 
 _NEW_ROWS: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
@@ -180,7 +180,9 @@ def resolve_signals(
         InvalidInputError: No name is given.
     """
     if not names:
-        raise InvalidInputError("no signal is named; give names or patterns such as 'pose.*'")
+        raise InvalidInputError(
+            "No signal is named. Give names or patterns, for example signals=['pose.*']."
+        )
     found: dict[str, RegisteredSignal] = {}
     for name in names:
         meant = list(_meant(known, name))
@@ -210,7 +212,11 @@ def one_signal(known: dict[str, RegisteredSignal], name: str) -> RegisteredSigna
     """
     signal, *more = resolve_signals(known, [name])
     if more:
-        raise InvalidInputError(f"{name!r} matches {len(more) + 1} signals: name one of them")
+        names = ", ".join(each.name for each in (signal, *more[: _MOST_OFFERED - 1]))
+        raise InvalidInputError(
+            f"{name!r} matches {len(more) + 1} signals, but only one is possible. "
+            f"Name one of them: {names}."
+        )
     return signal
 
 
@@ -243,10 +249,13 @@ def _meant(known: dict[str, RegisteredSignal], name: str) -> Iterable[Registered
 def say_unknown(known: dict[str, RegisteredSignal], name: str) -> str:
     """That there is no such signal, and which are near."""
     if not known:
-        return f"no signal {name!r}: no state row with values has been recorded yet"
+        return (
+            f"No signal {name!r} is recorded, because no values have been published yet. "
+            "Run the simulation first"
+        )
     offer = ", ".join(nearest_first(name.replace("*", ""), known)[:_MOST_OFFERED])
-    said = f"no signal {name!r} is recorded; there is {offer} (the nearest of {len(known)})"
-    return f"{said}, and {_ONLY_FIRST}" if len(known) >= MAX_SIGNALS else said
+    said = f"No signal {name!r} is recorded. The nearest of {len(known)} signals: {offer}"
+    return f"{said}. {_ONLY_FIRST}" if len(known) >= MAX_SIGNALS else said
 
 
 @in_one_snapshot

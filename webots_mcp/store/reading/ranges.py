@@ -234,14 +234,14 @@ class Scope:
     def __post_init__(self) -> None:
         if (self.in_simulation_time + self.in_wall_time + (self.last_s is not None)) > 1:
             raise InvalidRangeError(
-                "the range is given in two ways: use start_s and end_s (simulation time), or "
-                "last_s, or since_wall_time and until_wall_time"
+                "The range is given in two ways, which exclude each other. Use start_s and end_s "
+                "(simulated seconds), or last_s, or since_wall_time and until_wall_time."
             )
         if self.last_s is not None and not 0 < self.last_s < math.inf:
-            raise InvalidRangeError(f"last_s={self.last_s} must be a number of seconds above 0")
+            raise InvalidRangeError(f"last_s={self.last_s} must be a number of seconds above 0.")
         for name, value in (("start_s", self.start_s), ("end_s", self.end_s)):
             if value is not None and not math.isfinite(value):
-                raise InvalidRangeError(f"{name}={value} must be a finite number of seconds")
+                raise InvalidRangeError(f"{name}={value} must be a finite number of seconds.")
         if self.start_s is not None and self.end_s is not None:
             _require_order(self.start_s, self.end_s, "start_s", "end_s")
 
@@ -291,9 +291,10 @@ def find_range(
 def _require_order(start_s: float, end_s: float, start_name: str, end_name: str) -> None:
     if start_s >= end_s:
         what = "empty" if start_s == end_s else "reversed"
+        fix = f"Give a greater {end_name}." if start_s == end_s else "Swap the two."
         raise InvalidRangeError(
-            f"the range is {what}: {start_name}={_seconds(start_s)} must be less than "
-            f"{end_name}={_seconds(end_s)}"
+            f"The range is {what}: {start_name}={_seconds(start_s)} must be less than "
+            f"{end_name}={_seconds(end_s)}. {fix}"
         )
 
 
@@ -362,8 +363,9 @@ def _in_simulation_time(
     bounds = recorded_bounds(connection, run_id)
     if bounds is None:
         raise NothingRecordedError(
-            f"run {run_id} of robot {subject.robot!r} has no state row yet: its controller has "
-            "not published, or not often enough to be recorded"
+            f"Run {run_id} of robot {subject.robot!r} has no state row yet: its controller has "
+            "not published, or not often enough to be recorded. Let the simulation run, or choose "
+            "another run from webots_list_runs"
         )
     first_s, newest_s = bounds
     if last_s is not None:
@@ -373,8 +375,9 @@ def _in_simulation_time(
     end = just_after(max(newest_s, start)) if end_s is None else _bound(connection, subject, end_s)
     if start_s is None and end <= first_s:
         raise InvalidRangeError(
-            f"run {run_id} has no row before end_s={_seconds(end)}: "
-            f"its first is at {_seconds(first_s)} s"
+            f"Run {run_id} has no row before end_s={_seconds(end)}: "
+            f"it reaches from {_seconds(first_s)} s to {_seconds(newest_s)} s. "
+            f"Choose a range within that."
         )
     _require_order(start, end, "start_s", "end_s")
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
@@ -476,7 +479,7 @@ def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> f
     except ValueError:
         seconds = _iso_seconds(str(value))
     if not math.isfinite(seconds):
-        raise InvalidRangeError(f"{value!r} is not a finite time in Unix seconds")
+        raise InvalidRangeError(f"{value!r} is not a finite time in Unix seconds.")
     return seconds
 
 
@@ -485,8 +488,8 @@ def _iso_seconds(text: str) -> float:
         return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
     except (ValueError, OverflowError, OSError) as error:
         raise InvalidRangeError(
-            f"{text[:_LONGEST_SHOWN]!r} is no time: give Unix seconds or ISO 8601 such as "
-            "2026-05-04T13:30:00+02:00"
+            f"{text[:_LONGEST_SHOWN]!r} is not a time. Give Unix seconds or ISO 8601 such as "
+            "2026-05-04T13:30:00+02:00."
         ) from error
 
 

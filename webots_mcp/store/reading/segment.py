@@ -333,6 +333,7 @@ def require_run(robot: RobotRecord, run: RunRecord | None) -> RunRecord:
     """
     if run is None:
         raise NothingRecordedError(
-            f"robot {robot.name!r} has no run yet: its controller never recorded"
+            f"Robot {robot.name!r} has no run yet: its controller never recorded. "
+            "Start its simulation"
         )
     return run

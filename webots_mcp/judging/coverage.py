@@ -20,6 +20,7 @@ Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at", "no
 WORST_FIRST: Final[tuple[Outcome, ...]] = (
     "fail", "not looked at", "warn", "pass", "not judged", "not applicable",
 )  # fmt: skip
+AS_STUCK: Final = "reported as stuck"  # of standstills, where both kinds are asked for
 _TIMED_OUT: Final = "time limit reached"
 _WITHOUT: Final[dict[Cause, Outcome]] = {
     "absent": "not applicable", "undecided": "not judged", "unread": "not looked at",
@@ -244,11 +245,18 @@ class Verdicts:
         return {kinds: "; ".join(reasons) for kinds, reasons in named.items()}
 
     @property
+    def none_in_part(self) -> list[str]:
+        """Kinds that were searched for in a part of the range, and not found there."""
+        return [kind for kind in self.not_found if kind in self.reasons]
+
+    @property
     def _nowhere(self) -> list[str]:
         return [kind for kind in self.not_found if kind not in self.reasons]
 
     def _in_what_was_searched(self, kind: str) -> list[str]:
         near = self.not_found.get(kind)
+        if near == AS_STUCK:
+            return [f"in the searched part {AS_STUCK}"]
         return [] if near is None else [f"none in the searched part{near and f' ({near})'}"]
 
     def unlooked(self, kind: str) -> str | None:

@@ -307,6 +307,10 @@ def judge(
     )
     monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
     swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
+    if course.resolution_s is None:
+        swings = tuple(_within_range(each, times, numbers, spikes or ()) for each in swings)
+    if rest_s is not None and any(swing.end_s - rest_s > swing.period_s for swing in swings):
+        rest_s = None  # what swings does not rest, however little it swings
     counted = None if fast else course.counted
     recorded = summary
     deviation = summary.deviation_in(turn) if counted is None else counted.deviation_in(None)
@@ -378,6 +382,15 @@ def _swings(times: Array, course: Array, resolution_s: float | None) -> tuple[Sw
         replace(swing, amplitude=swing.amplitude / float(np.sinc(resolution_s / swing.period_s)))
         for swing in found
     )
+
+
+def _within_range(swing: Swing, times: Array, numbers: Array, spikes: Sequence[Spike]) -> Swing:
+    """A swing no larger than half of the range of its values: a fitted sine may reach farther."""
+    there = (times >= swing.start_s) & (times <= swing.end_s)
+    there &= ~np.isin(times, [spike.sim_time_s for spike in spikes])
+    if not there.any():
+        return swing
+    return replace(swing, amplitude=min(swing.amplitude, float(np.ptp(numbers[there])) / 2))
 
 
 def _rounded(mean: float | None, inner: Summary) -> float | None:
@@ -712,6 +725,7 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
             course = in_means(course, chunk_making.GROUP_ROWS)
         else:
             spikes = find_spikes(times, numbers, signal.turn)
+            course = _without_spikes(course, spikes)
         too_large = int(np.count_nonzero(np.abs(frame.numbers(name)) > LARGEST))
     else:
         course = course_of_means(frame, name, frame.zone_map(name))
@@ -720,6 +734,18 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
         summary = with_extremes(summary, summary_of(kept, signal))
         course = _with_kept(course, summary, signal.turn, *kept.usable(name))
     return judge(signal, summary, course, spikes, too_large)
+
+
+def _without_spikes(course: Course, spikes: Sequence[Spike]) -> Course:
+    """A course whose rest is judged by the range of what lies between single values that stand out.
+
+    Beside one spike, whatever else a signal does is small.
+    """
+    if not spikes or course.rest_s is None:
+        return course
+    usual = ~np.isin(course.times, [spike.sim_time_s for spike in spikes])
+    times, numbers = course.times[usual], course.numbers[usual]
+    return replace(course, rest_s=flat_since(times, numbers) if len(times) else None)
 
 
 def _with_kept(

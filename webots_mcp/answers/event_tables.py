@@ -46,7 +46,8 @@ def fitting_events(
 
 def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
     """Return what became of each kind, as it is shown."""
-    return KindVerdicts(
+    return KindVerdicts.with_parts(
+        verdicts.none_in_part,
         found=verdicts.found or None,
         not_found=", ".join(verdicts.far) or None,
         nearest=verdicts.nearest or None,

@@ -315,6 +315,19 @@ class KindVerdicts(AnswerPart):
     not_searched: dict[str, str] | None = said(
         "Not searched for, or only in part: why, and what to ask instead."
     )
+    _none_in_part: list[str] = PrivateAttr(default_factory=list[str])
+
+    @property
+    def none_in_part(self) -> list[str]:
+        """Kinds that stand in `not_searched`, and of which the searched part has none."""
+        return self._none_in_part
+
+    @classmethod
+    def with_parts(cls, none_in_part: list[str], **verdicts: Any) -> KindVerdicts:
+        """Return verdicts of which those kinds were searched for in a part and not found."""
+        made = cls(**verdicts)
+        made._none_in_part = none_in_part
+        return made
 
 
 class EventsAnswer(NotedAnswer):
@@ -324,6 +337,7 @@ class EventsAnswer(NotedAnswer):
         "Columns with @ hold that signal's value when the event began."
     )
     verdicts: KindVerdicts | None = None
+    from_s: float | None = said("Begin of the range, where that is not the begin of the run.")
     not_shown: dict[str, str] | None = said(
         "How many of each kind there are beside these, and when they began."
     )
@@ -338,6 +352,8 @@ class CheckAnswer(NotedAnswer):
         "Those that did not pass; more: the call that shows it in full."
     )
     passed: list[str] | None = None
+    counts: dict[str, int] | None = said("How many checks came to each outcome, shown or not.")
+    expected: dict[str, str] | None = said("What became of each condition of `expect`.")
 
 
 class TimelineAnswer(NotedAnswer):

@@ -116,7 +116,7 @@ DICE = random.Random(5)
 COURSES: dict[str, tuple[Course, int, str, str]] = {
     "swung and rests": (
         lambda t: 0.3 * math.sin(math.pi * t) if 70 <= t < 82 else 0.0, 1000, "resting",
-        "oscillated from 70.1 to 82 s: amplitude 0.302, period 2 s; reaches 0 at 82 s, then flat",
+        "oscillated from 70.1 to 82 s: amplitude 0.3, period 2 s; reaches 0 at 82 s, then flat",
     ),
     "falls, and lower in between": (
         approached, 1001, "falling", r"falls from 2.1 to 0.3 \(-0.0\S+; min 0.12 at 41.2 s",
@@ -321,3 +321,25 @@ def test_nothing_rests_before_a_number_elsewhere_in_a_kept_stretch(
     trend = one(empty, name)
     assert trend.flat_since_s == pytest.approx(10.2 if name == "yaw" else 10.3)
     assert trend.says.startswith("between 1 (at 10.05 s) and 3.142")
+
+
+def test_what_swings_beside_one_spike_is_not_called_flat(empty: sqlite3.Connection) -> None:
+    record(
+        empty, rows=1200, interval_s=0.1,
+        ir=lambda time_s: 5.0 if time_s == 70.0 else 0.01 * math.sin(3 * time_s),
+        rest=lambda time_s: 5.0 if time_s == 30.0 else 0.01 * math.sin(3 * min(time_s, 62.8)),
+    )  # fmt: skip
+    told = {each.name: each for each in ask(empty).numbers}
+    assert "oscillated" in told["ir"].says
+    assert told["ir"].flat_since_s is None
+    assert "flat" not in told["ir"].says
+    assert told["rest"].flat_since_s == pytest.approx(62.8, abs=0.5)
+
+
+def test_an_amplitude_is_never_more_than_half_of_the_range(empty: sqlite3.Connection) -> None:
+    record(
+        empty, rows=600, interval_s=0.1, heading_rad=lambda s: math.pi + 0.5 * math.sin(s * 3.14)
+    )
+    told = one(empty, "heading_rad")
+    said = float(re.findall(r"amplitude ([\d.]+)", told.says)[0])
+    assert said <= (told.summary.max - told.summary.min) / 2 + 5e-4  # as it is rounded

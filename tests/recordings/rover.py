@@ -150,7 +150,7 @@ def _record_incidents(recorder: Recorder, robot_id: int, session_id: int) -> Non
         source = "controller"
         recorder.insert("log", **recorder.at(time_s), level=level, source=source, message=message)
     recorder.insert("event", **recorder.at(0.0), kind="start")
-    recorder.insert("event", **recorder.at(61.0), kind="dropped", data='{"rows": 3}')
+    recorder.insert("event", **recorder.at(61.0), kind="dropped", data='{"row_count": 3}')
     recorder.insert(
         "image", **recorder.at(30.0), kind="camera", device="cam", path="camera/1.png",
         width=160, height=120, size_bytes=999,

@@ -60,7 +60,8 @@ def verdicts_of(verdicts: Verdicts, *, in_short: bool = False) -> KindVerdicts:
             for each in (verdicts.coverage.get(kind, Coverage()),)
         }
         verdicts = replace(verdicts, reasons=reasons)
-    return KindVerdicts(
+    return KindVerdicts.with_parts(
+        verdicts.none_in_part,
         found=verdicts.found or None,
         not_found=", ".join(verdicts.far) or None,
         nearest=verdicts.nearest or None,

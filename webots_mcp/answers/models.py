@@ -371,6 +371,19 @@ class KindVerdicts(AnswerPart):
     not_searched: dict[str, str] | None = said(
         "Kinds that were not searched, or only in part: why, and what to do."
     )
+    _none_in_part: list[str] = PrivateAttr(default_factory=list[str])
+
+    @property
+    def none_in_part(self) -> list[str]:
+        """Kinds that stand in `not_searched`, and of which the searched part has none."""
+        return self._none_in_part
+
+    @classmethod
+    def with_parts(cls, none_in_part: list[str], **verdicts: Any) -> KindVerdicts:
+        """Return verdicts of which those kinds were searched for in a part and not found."""
+        made = cls(**verdicts)
+        made._none_in_part = none_in_part
+        return made
 
 
 class EventsAnswer(NotedAnswer):
@@ -380,6 +393,7 @@ class EventsAnswer(NotedAnswer):
         "Events in order of time; a column with @ holds that signal's value when the event began."
     )
     verdicts: KindVerdicts | None = said("What became of each kind that was searched for.")
+    from_s: float | None = said("Begin of the range, where that is not the begin of the run.")
     not_shown: dict[str, str] | None = said(
         "Number of events of each kind that are not shown, and when they began."
     )
@@ -399,6 +413,8 @@ class CheckAnswer(NotedAnswer):
     passed_on: dict[str, str] | None = said(
         "What held in each check that passed, and the signals that were judged."
     )
+    counts: dict[str, int] | None = said("How many checks came to each outcome, shown or not.")
+    expected: dict[str, str] | None = said("What became of each condition of `expect`.")
 
 
 class TimelineAnswer(NotedAnswer):

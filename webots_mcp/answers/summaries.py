@@ -41,13 +41,25 @@ from webots_mcp.answers.models import (
     TrialsAnswer,
     WorldAnswer,
 )
+from webots_mcp.judging.coverage import AS_STUCK
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
 _MOST_DIFFERENCES: Final = 3
 _SERIOUS: Final = ("critical", "error", "warning")
+_NOTED_FIRST: Final = ("change", "command", "log", "bridge_event", "kept_stretch", "image", "run")
+_SERIOUS_LOG: Final = {"critical": 1, "error": 1}
 _OUTCOMES: Final = {"fail": "failed", "warn": "warned", "not judged": "could not be judged"}
-_ENDINGS: Final = {"finished": "finished", "crashed": "crashed"}  # others: "ended by reset"
+_ENDINGS: Final = {  # others: "ended by reset"
+    "finished": "finished", "crashed": "crashed", "going on": "goes on",
+}  # fmt: skip
+_BAD_NOTABLE: Final = ("log critical", "log error", "command failed", "dropped")
+_HELD: Final = {"pass": "held", "fail": "did not hold", "warn": "did not always hold"}
+TRIAL_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
+_PLURALS: Final = {
+    "change": "changes", "command": "commands", "log": "log lines", "bridge_event": "bridge events",
+    "kept_stretch": "kept stretches", "image": "images", "run": "beginnings and ends of runs",
+}  # fmt: skip
 
 
 def summary_of(answer: Answer) -> str | None:
@@ -70,10 +82,7 @@ def _summary(answer: Answer) -> str | None:
 
 @_summary.register
 def _(answer: StateAnswer) -> str:
-    state: dict[str, Any] = {}
-    if isinstance(answer.state, dict):
-        state = cast("dict[str, Any]", answer.state)
-    mode = state.get("mode")
+    mode = cast("dict[str, Any]", answer.state or {}).get("mode")
     doing = f", mode {mode!r}" if isinstance(mode, str) and len(mode) <= 40 else ""
     return f"{_subject(answer)} {_when(answer)}{doing}."
 
@@ -161,10 +170,17 @@ def _(answer: ParametersAnswer) -> str:
 def _(answer: CommandsAnswer) -> str:
     actions = list(answer.actions or ())
     commands = list(_rows(answer.commands))
-    own = _count(len(actions), "action") if actions else "no action"
     newest = "no command was sent"
     if commands:
-        newest = f"newest command: {commands[0].get('action')}, {commands[0].get('outcome')}"
+        first = commands[0]
+        where = f" (run {first['run_id']}" if first.get("run_id") is not None else ""
+        if where and first.get("sim_time_s") is not None:
+            where += f", {first['sim_time_s']:.12g} s"
+        where += ")" if where else ""
+        newest = f"newest command: {first.get('action')}{where}, {first.get('outcome')}"
+    if not actions and (answer.status or "").startswith("stopped"):
+        return f"What {_subject(answer)} can do is unknown while no controller runs; {newest}."
+    own = _count(len(actions), "action") if actions else "no action"
     return f"{_subject(answer)} has {own} of its own; {newest}."
 
 
@@ -192,7 +208,8 @@ def _(answer: SignalsAnswer) -> str:
 @_summary.register
 def _(answer: SignalMeaningsAnswer) -> str:
     if answer.changed:
-        return f"Changed the meaning of {_listed(answer.changed)}."
+        doubts = f" But {answer.notes[0]}." if answer.notes else ""
+        return f"Changed the meaning of {_listed(answer.changed)}.{doubts}"
     unknown = answer.unknown or []
     said = f"; unknown, so never judged: {_listed(unknown)}" if unknown else "; all are known"
     return f"{_count(answer.total or 0, 'signal')}{said}."
@@ -218,14 +235,29 @@ def _(answer: TrendsAnswer) -> str:
     if not runs:
         return "No row is in this range."
     first = runs[0]
-    changed = [f"{row.get('signal')} {row.get('says')}" for row in _rows(first.numbers)]
-    lead = _listed(changed, 2) or "no number changed"
+    states = [_changes_of(row) for row in _rows(first.states)]
+    numbers = [f"{row.get('signal')} {_clause(row.get('says'))}" for row in _rows(first.numbers)]
+    named = [*states[:1], *numbers][:2]
+    left = len(states) + len(numbers) - len(named)
+    lead = "; ".join([*named, *[f"{left} more changed"] * bool(left)]) or "nothing changed"
     return f"{_span(first.start_s, first.end_s)} of run {first.run_id}: {lead}."
+
+
+def _changes_of(state: Mapping[str, Any]) -> str:
+    count, since_s = state.get("changes"), state.get("since_s")
+    times = "once" if count == 1 else f"{count} times"
+    since = f" since {since_s:.12g} s" if isinstance(since_s, float | int) else ""
+    return f"{state.get('signal')} changed {times}, {state.get('last')!r}{since}"
+
+
+def _clause(says: Any) -> str:
+    """Return the first clause of what a signal did: the others stand in the table."""
+    return str(says).split("; ")[0]
 
 
 @_summary.register
 def _(answer: EventsAnswer) -> str:
-    return _events(answer.verdicts, answer.events)
+    return _events(answer.verdicts, answer.events, answer.run_id, answer.from_s)
 
 
 @_summary.register
@@ -239,40 +271,127 @@ def _(answer: TimelineAnswer) -> str:
 @_summary.register
 def _(answer: MonitorAnswer) -> str:
     window = f"{answer.window_s or 0:.3g} s of wall-clock time"
+    if (answer.status or "").startswith("stopped"):
+        window = f"the last {window} recorded"
     if not answer.row_count:
         return f"No row was recorded in {window}."
+    ranges = [f"run {run.run_id}, {_span(run.start_s, run.end_s)}" for run in answer.trends or ()]
+    when = f" ({'; '.join(ranges)})" if ranges else ""
     moved_m = (answer.movement or {}).get("distance_m")
     path = f" it moved {moved_m:.3g} m" if isinstance(moved_m, float | int) else ""
-    return f"In {window}{path}. {_events(answer.verdicts, answer.events)}"
+    return (
+        f"In {window}{when}{path}. {_events(answer.verdicts, answer.events, answer.run_id, most=2)}"
+    )
 
 
-def _events(verdicts: KindVerdicts | None, events: AnswerTable | None) -> str:
+def _events(
+    verdicts: KindVerdicts | None,
+    events: AnswerTable | None,
+    run_id: int | None = None,
+    from_s: float | None = None,
+    most: int = _MOST_NAMED,
+) -> str:
     """Return what was found, since when, what was not found, and what could not be searched."""
     if verdicts is None:
         return "Nothing was searched."
+    kinds = verdict_of_kinds(verdicts)
     found = dict(verdicts.found or {})
     first_s = _first_begins(events)
     faults = _worst_first(filter(_is_fault, found))
-    said = [_occurrences(kind, found[kind], first_s.get(kind)) for kind in faults]
-    noted = [f"{found[kind]} {kind}" for kind in found if not _is_fault(kind)]
-    searched = _kinds_in([*(verdicts.nearest or ()), verdicts.not_found or ""])
-    absent = _worst_first([*filter(_is_fault, searched)] or searched)
-    unsearched = _kinds_in(verdicts.not_searched or ())
-    partly = [kind for kind in unsearched if kind in found or kind in searched]
-    unknown = [kind for kind in unsearched if kind not in partly]
+    partly = set(_kinds_in(verdicts.not_searched or ()))
+    before, said = list[str](), list[str]()
+    for kind in faults:
+        start_s, count = first_s.get(kind), found[kind]
+        in_part = " (searched in part)" if kind in partly else ""
+        if from_s is not None and start_s is not None and start_s < from_s and count == 1:
+            before.append(f"{kind} since {start_s:.12g} s{in_part}")
+        else:
+            said.append(f"{_occurrences(kind, count, start_s)}{in_part}")
+    noted = _noted(found, list(_rows(events)), run_id, with_ordinary=not faults)
+    shown = {
+        verdict: _worst_first(kind for kind in kinds if kinds[kind] == verdict)
+        for verdict in ("not found", "none in the searched part", "cannot tell")
+    }
+    absent = [*filter(_is_fault, shown["not found"])] or shown["not found"]
+    nearest = (verdicts.nearest or {}).get("condition")
+    if nearest and "condition" in absent:
+        absent.remove("condition")
     parts = [
-        f"Found {_listed(said)}" if said else "",
-        f"Noted {_listed(noted)}" if noted and not said else "",
-        f"not found: {_listed(absent)}" if absent else "",
-        f"cannot tell: {_listed(unknown)}" if unknown else "",
-        f"searched only in part: {_listed(partly)}" if partly else "",
+        nearest or "",
+        f"already going on at {from_s:.12g} s: {_listed(before, most)}"
+        if before and from_s
+        else "",
+        f"found {_listed(said, most)}" if said else "",
+        f"noted {_listed(noted, 2)}" if noted else "",
+        f"not found: {_listed(absent, most)}" if absent else "",
+        *(
+            f"{verdict}: {_listed(shown[verdict], most)}"
+            for verdict in ("none in the searched part", "cannot tell")
+            if shown[verdict]
+        ),
     ]
     text = "; ".join(part for part in parts if part) or "nothing in this range"
     return f"{text[0].upper()}{text[1:]}."
 
 
+def verdict_of_kinds(verdicts: KindVerdicts) -> dict[str, str]:
+    """Return the one verdict of each kind that was asked for."""
+    made = dict.fromkeys(_kinds_in(verdicts.not_searched or ()), "cannot tell")
+    in_part = [kind for kind in made if kind in verdicts.none_in_part]
+    absent = _kinds_in([*(verdicts.nearest or ()), verdicts.not_found or ""])
+    in_part += [kind for kind in absent if kind in made]
+    made |= dict.fromkeys(absent, "not found") | dict.fromkeys(in_part, "none in the searched part")
+    as_stuck = [kind for kind, why in (verdicts.nearest or {}).items() if why == AS_STUCK]
+    made |= dict.fromkeys(as_stuck, AS_STUCK)
+    return made | dict.fromkeys(verdicts.found or (), "found")
+
+
+def _noted(
+    found: Mapping[str, int],
+    rows: Sequence[Mapping[str, Any]],
+    run_id: int | None,
+    *,
+    with_ordinary: bool,
+) -> list[str]:
+    """Return what was noted: errors and failed commands first, and the rest if there is room."""
+    logs = [row for row in rows if row.get("kind") == "log"]
+    errors = sum(_SERIOUS_LOG.get(str(row.get("name")), 0) * _times(row) for row in logs)
+    failed = sum(
+        _times(row) for row in rows
+        if row.get("kind") == "command" and _detail(row, "status") in ("failed", "refused", "lost")
+    )  # fmt: skip
+    said = [_count(errors, "log error")] * bool(errors)
+    said += [_count(failed, "failed command")] * bool(failed)
+    if not with_ordinary:
+        return said
+    counts = {kind: found[kind] for kind in found if not _is_fault(kind)}
+    if "log" in counts:
+        counts["log"] -= errors
+    if "command" in counts:
+        counts["command"] -= failed
+    for kind in sorted(counts, key=_NOTED_FIRST.index):
+        if kind == "run":
+            ends = [row for row in rows if row.get("kind") == "run"]
+            if len(ends) == counts["run"]:
+                runs = {row.get("run_id", run_id) for row in ends}
+                said.append(f"{_count(len(runs), 'run')} that began or ended")
+                continue
+        if counts[kind] > 0:
+            said.append(_count(counts[kind], kind.replace("_", " "), _PLURALS[kind]))
+    return said
+
+
+def _times(row: Mapping[str, Any]) -> int:
+    return row.get("count") or 1
+
+
+def _detail(row: Mapping[str, Any], name: str) -> Any:
+    details = row.get("details")
+    return cast("dict[str, Any]", details).get(name) if isinstance(details, dict) else None
+
+
 def _kinds_in(texts: Iterable[str]) -> list[str]:
-    return [kind for text in texts for kind in text.split(", ") if kind]
+    return list(dict.fromkeys(kind for text in texts for kind in text.split(", ") if kind))
 
 
 @cache
@@ -313,15 +432,30 @@ def _(answer: CheckAnswer) -> str:
     names: dict[str, list[str]] = {}
     for row in _rows(answer.checks):
         names.setdefault(str(row.get("outcome")), []).append(str(row.get("check")))
+    counts = {outcome: len(each) for outcome, each in names.items()}
+    counts = answer.counts or counts | {"pass": len(answer.passed or ())}
     parts = [
-        f"{len(names[outcome])} {words} ({_listed(names[outcome], 2)})"
+        f"{counts[outcome]} {words}" + _in_brackets(names.get(outcome, []), counts[outcome])
         for outcome, words in _OUTCOMES.items()
-        if outcome in names
+        if counts.get(outcome)
     ]
-    parts.append(f"{len(answer.passed or ())} passed")
-    others = len(names.get("not applicable", ()))
+    parts.append(f"{counts.get('pass', 0)} passed")
+    others = counts.get("not applicable", 0)
     parts.append(f"{others} not applicable" if others else "")
-    return f"Of the checks {', '.join(part for part in parts if part)}."
+    said = f"Of the checks {', '.join(part for part in parts if part)}."
+    expected = [
+        f"{name} {_HELD.get(made.partition(':')[0], 'was not judged')}"
+        for name, made in (answer.expected or {}).items()
+    ]
+    return f"{_listed(expected, 2)}. {said}" if expected else said
+
+
+def _in_brackets(names: Sequence[str], count: int) -> str:
+    """Name two of so many, of which some may not be shown."""
+    if not names:
+        return ""
+    left = count - len(names[:2])
+    return f" ({', '.join(names[:2])}{f' and {left} more' if left else ''})"
 
 
 @_summary.register
@@ -333,8 +467,15 @@ def _(answer: TrialsAnswer) -> str:
     best = ""
     if ranked and ranked[0].get("score") is not None:
         sure = "confirmed" if answer.is_best_confirmed else "not confirmed"
-        best = f"; best score {ranked[0]['score']} ({sure})"
-    return f"Trial set {answer.trial_set}: {over}, {answer.state}{best}."
+        best = f"; best: {_parameters(ranked[0])}, score {ranked[0]['score']} ({sure})"
+    failed = [_parameters(row) for row in ranked if row.get("failed")]
+    bad = f"; {answer.failed} failed ({_listed(failed, 2)})" if answer.failed else ""
+    return f"Trial set {answer.trial_set}: {over}, {answer.state}{best}{bad}."
+
+
+def _parameters(trial: Mapping[str, Any]) -> str:
+    named = [f"{name} {value}" for name, value in trial.items() if name not in TRIAL_FIGURES]
+    return _listed(named) or "no parameters"
 
 
 @_summary.register
@@ -346,16 +487,40 @@ def _(answer: SqlAnswer) -> str:
 @_summary.register
 def _(answer: RunsAnswer) -> str:
     if answer.run is not None:
-        return f"Run {answer.run.get('run_id', answer.run_id)} is annotated and will be kept."
+        replaced = f" The {answer.hint}." if answer.hint else ""
+        number = answer.run.get("run_id", answer.run_id)
+        return f"Run {number} is annotated and will be kept.{replaced}"
     runs = list(_rows(answer.runs))
     if not runs:
         return "No run matches."
     newest = runs[0]
-    lasted_s, ended = newest.get("duration_s"), newest.get("ended_by")
-    lasts = f"lasted {lasted_s:.12g} s" if isinstance(lasted_s, float | int) else "began"
-    end = _ENDINGS.get(ended, f"ended by {ended}") if ended else "goes on"
     total = _count(answer.total or len(runs), "run")
-    return f"{total}; the first shown, run {newest.get('run_id')}, {lasts} and {end}."
+    bad = [_ended_badly(run) for run in runs[1:]]
+    others = _listed([each for each in bad if each], 3)
+    which = "newest" if answer.total in (None, len(runs)) else "first shown"
+    of_newest = _ended_badly(newest) or f"run {newest.get('run_id')} {_end_of(newest)}"
+    lasted_s = newest.get("duration_s")
+    lasts = f" after {lasted_s:.12g} s" if isinstance(lasted_s, float | int) else ""
+    return f"{total}; {which}: {of_newest}{lasts}{f'; {others}' if others else ''}."
+
+
+def _end_of(run: Mapping[str, Any]) -> str:
+    ended = run.get("ended_by")
+    return _ENDINGS.get(ended, f"ended by {ended}") if ended else "goes on"
+
+
+def _ended_badly(run: Mapping[str, Any]) -> str:
+    """Return what needs attention in a run; empty if nothing does."""
+    notable = run.get("notable")
+    counted: dict[str, int] = {}
+    if isinstance(notable, dict):
+        counted = cast("dict[str, int]", notable)
+    bad = [f"{count} {name}" for name, count in counted.items() if name in _BAD_NOTABLE]
+    crashed = run.get("ended_by") == "crashed"
+    if not crashed and not bad:
+        return ""
+    said = f"run {run.get('run_id')} {_end_of(run)}"
+    return f"{said} ({', '.join(bad)})" if bad else said
 
 
 @_summary.register
@@ -381,14 +546,18 @@ def _largest_differences(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return undecided figures of two groups whose runs do not overlap, largest change first."""
     found: list[tuple[float, str]] = []
     for row in rows:
-        values = row.get("median") or row.get("mean")
-        if row.get("different") is not None or not isinstance(values, list) or len(values) != 2:
+        values = cast("list[float | None]", row.get("median") or row.get("mean"))
+        if row.get("different") is not None or not isinstance(values, list) or len(values) != 2:  # pyright: ignore[reportUnnecessaryIsInstance]
             continue
         first, second = values
         if first is None or second is None or first == second:
             continue
-        ranges = row.get("range") or row.get("mean_range") or [[first] * 2, [second] * 2]
-        if None in ranges or max(r[0] for r in ranges) <= min(r[1] for r in ranges):
+        ranges = cast(
+            "list[list[float] | None]",
+            row.get("range") or row.get("mean_range") or [[first] * 2, [second] * 2],
+        )
+        known = [each for each in ranges if each is not None]
+        if len(known) < len(ranges) or max(r[0] for r in known) <= min(r[1] for r in known):
             continue
         change = abs(second - first) / max(abs(first), abs(second))
         found.append((change, f"{_name(row)} {first:.4g} -> {second:.4g}"))
@@ -401,7 +570,8 @@ def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str
     wanted: list[int] = []
     for row in rows:
         value = row.get("runs_wanted")
-        wanted += [each for each in (value if isinstance(value, list) else [value]) if each]
+        values = cast("list[int | None]", value if isinstance(value, list) else [value])
+        wanted += [each for each in values if each]
     least = f"{max(wanted)} of each would do" if wanted else "repeat the runs"
     return f"too few runs ({' and '.join(counts)}): {least}"
 

@@ -54,7 +54,11 @@ SET: Final = (
     "created_wall_time_s, created_by, name, expects, during) "
     "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id"
 )
-_REMOVE: Final = "DELETE FROM breakpoint WHERE id = ? AND robot_id = ? RETURNING id"
+# What is not listed is not removed either: of a controller that ended its expectations stay.
+_REMOVE: Final = (
+    "DELETE FROM breakpoint WHERE id = :id AND robot_id = :robot AND id IN "
+    f"(SELECT b.id {_OF_ROBOT.replace('?', ':robot')}) RETURNING id"
+)
 _NEWEST_HIT: Final = (
     "SELECT e.run_id, e.sim_time_s FROM event e JOIN run u ON u.id = e.run_id "
     "WHERE u.robot_id = ? AND e.kind IN ('breakpoint', 'violation') "
@@ -119,7 +123,7 @@ def remove_breakpoint(connection: sqlite3.Connection, robot_id: int, breakpoint_
         InvalidInputError: If the robot has none with that id.
     """
     with transaction(connection):
-        removed = connection.execute(_REMOVE, (breakpoint_id, robot_id)).fetchall()
+        removed = connection.execute(_REMOVE, {"id": breakpoint_id, "robot": robot_id}).fetchall()
     if removed:
         return
     there = [str(number) for (number,) in connection.execute(_IDS, (robot_id,)).fetchall()]

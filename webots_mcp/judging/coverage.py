@@ -20,6 +20,7 @@ Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at", "no
 WORST_FIRST: Final[tuple[Outcome, ...]] = (
     "fail", "not looked at", "warn", "pass", "not judged", "not applicable",
 )  # fmt: skip
+AS_STUCK: Final = "reported as stuck"  # of standstills, where both kinds are asked for
 _TIMED_OUT: Final = "time limit reached"
 _WITHOUT: Final[dict[Cause, Outcome]] = {
     "absent": "not applicable", "undecided": "not judged", "unread": "not looked at",
@@ -250,6 +251,11 @@ class Verdicts:
             absent = {kind: left.pop(kind) for kind in kinds if kind in left}
             found[", ".join(kinds)] = "; ".join([*reasons, *_in_the_rest(absent, kinds)])
         return found
+
+    @property
+    def none_in_part(self) -> list[str]:
+        """Kinds that were searched for in a part of the range, and not found there."""
+        return [kind for kind in self.not_found if kind in self.reasons]
 
     @property
     def _nowhere(self) -> list[str]:

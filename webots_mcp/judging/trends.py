@@ -101,7 +101,7 @@ class Trend:
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
         fast: It varies so fast that the means of chunks do not show its course.
         resolution_s: Length of the means in which swings were seen; None where rows were.
-        flat_since_s: Since when it rests; None if it does not.
+        rest_s: Since when its values rest; None if they do not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
         step: The one change that makes most of its range; None where rows were not looked at, and
             of an angle.
@@ -127,7 +127,7 @@ class Trend:
     monotonic: Monotonic | None
     fast: bool
     resolution_s: float | None
-    flat_since_s: float | None
+    rest_s: float | None
     spikes: tuple[Spike, ...] | None
     step: LevelStep | None
     missing: int
@@ -140,7 +140,20 @@ class Trend:
         """Where it moved to and fro, as `find_events` reports it, but of any period."""
         if self.fast or self.monotonic:
             return ()
-        return _swings(self.course.times, self.course.numbers, self.course.resolution_s)
+        course = self.course
+        found = _swings(course.times, course.numbers, course.resolution_s)
+        if course.resolution_s is not None:
+            return found
+        times, numbers, spikes = course.times, course.numbers, self.spikes or ()
+        return tuple(_within_range(each, times, numbers, spikes) for each in found)
+
+    @cached_property
+    def flat_since_s(self) -> float | None:
+        """Since when it rests; None if it does not, or still oscillates, however little."""
+        rest_s = self.rest_s
+        if rest_s is None or any(each.end_s - rest_s > each.period_s for each in self.swings):
+            return None
+        return rest_s
 
     @cached_property
     def shape(self) -> Shape:
@@ -351,7 +364,7 @@ def judge(
         monotonic=monotonic,
         fast=fast,
         resolution_s=course.resolution_s,
-        flat_since_s=rest_s,
+        rest_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
         step=None if spikes is None or turn is not None else find_step(times, numbers),
         missing=summary.rows - summary.present - (too_large or 0),
@@ -394,6 +407,15 @@ def _swings(times: Array, course: Array, resolution_s: float | None) -> tuple[Sw
         replace(swing, amplitude=swing.amplitude / float(np.sinc(resolution_s / swing.period_s)))
         for swing in found
     )
+
+
+def _within_range(swing: Swing, times: Array, numbers: Array, spikes: Sequence[Spike]) -> Swing:
+    """A swing no larger than half of the range of its values: a fitted sine may reach farther."""
+    there = (times >= swing.start_s) & (times <= swing.end_s)
+    there &= ~np.isin(times, [spike.sim_time_s for spike in spikes])
+    if not there.any():
+        return swing
+    return replace(swing, amplitude=min(swing.amplitude, float(np.ptp(numbers[there])) / 2))
 
 
 def _rounded(mean: float | None, inner: Summary) -> float | None:
@@ -756,6 +778,7 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
             course = in_means(course, chunk_making.GROUP_ROWS)
         else:
             spikes = find_spikes(times, numbers, signal.turn)
+            course = _without_spikes(course, spikes)
         too_large = int(np.count_nonzero(np.abs(frame.numbers(name)) > LARGEST))
     else:
         course = course_of_means(frame, name, frame.zone_map(name))
@@ -764,6 +787,18 @@ def _trend(frame: Frame, signal: RegisteredSignal, kept: Frame | None) -> Trend 
         summary = with_extremes(summary, summary_of(kept, signal))
         course = _with_kept(course, summary, signal.turn, *kept.usable(name))
     return judge(signal, summary, course, spikes, too_large)
+
+
+def _without_spikes(course: Course, spikes: Sequence[Spike]) -> Course:
+    """A course whose rest is judged by the range of what lies between single values that stand out.
+
+    Beside one spike, whatever else a signal does is small.
+    """
+    if not spikes or course.rest_s is None:
+        return course
+    usual = ~np.isin(course.times, [spike.sim_time_s for spike in spikes])
+    times, numbers = course.times[usual], course.numbers[usual]
+    return replace(course, rest_s=flat_since(times, numbers) if len(times) else None)
 
 
 def _with_kept(

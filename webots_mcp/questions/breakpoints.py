@@ -41,6 +41,7 @@ _NOT_ASKED: Final = (
     "no controller of this robot runs to ask any: those that its code had set ended with it, those "
     "of webots_breakpoint stay and are armed when it starts again"
 )
+_ASKED_NO_MORE: Final = "no controller of this robot runs, so none asks it any more"
 _LONGEST_CONDITION: Final = 300
 
 
@@ -138,11 +139,14 @@ async def webots_remove_breakpoint(
     """
     name = await to_thread.run_sync(_remove, recording, robot, breakpoint_id)
     reply, why_not = await _arm(recording, caller, name)
+    hint = f"its controller may ask it until then: {why_not}" if why_not else None
+    if not await to_thread.run_sync(_is_live, recording, name):
+        hint = _ASKED_NO_MORE
     return BreakpointAnswer(
         **await to_thread.run_sync(header_of, recording, name),
         breakpoint_id=breakpoint_id,
         armed=breakpoint_id in reply.get("armed", ()),
-        hint=f"removed; {why_not}" if why_not else None,
+        hint=hint,
     )
 
 
@@ -174,6 +178,11 @@ def _remove(recording: RecordingAccess, robot: str | None, breakpoint_id: int) -
     with recording.writer() as connection:
         stored.remove_breakpoint(connection, robot_id, breakpoint_id)
     return name
+
+
+def _is_live(recording: RecordingAccess, robot: str) -> bool:
+    with recording.view(robot) as view:
+        return view.robot.live
 
 
 async def _arm(

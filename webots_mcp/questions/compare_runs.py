@@ -268,12 +268,23 @@ def webots_annotate_run(
     """
     with recording.view(robot, run_id) as view:
         run = view.require_run()
+        before = run_info(view.connection, run.id)
     with recording.writer() as connection:
         annotate_run(connection, run.id, label=_change(label), note=_change(note))
     with recording.view(robot, run.id) as view:
         told = run_info(view.connection, run.id)
         named = zip(RUN_COLUMNS, _run_row(told), strict=True)
-        return RunsAnswer(**view.header(), run={k: v for k, v in named if v is not None})
+        pairs = (("label", before.label, told.label), ("note", before.note, told.note))
+        replaced = [
+            f"{what} {short_name(old)!r} was {'replaced' if new else 'removed'}"
+            for what, old, new in pairs
+            if old and old != new
+        ]
+        return RunsAnswer(
+            **view.header(),
+            run={k: v for k, v in named if v is not None},
+            hint="; ".join(replaced) or None,
+        )
 
 
 def _change(text: str) -> str | None:
@@ -604,7 +615,15 @@ def _checked(
     left = Counter(each.outcome for each in others[len(rows) :])
     passed = checked.of("pass")
     counts = ", ".join(f"{count} {outcome}" for outcome, count in left.items())
+    asked = {f"expects: {each.name}": each.name for each in expected}
     return {
+        "expected": {
+            asked[each.name]: f"{each.outcome}: {each.evidence}"
+            for each in checked.findings
+            if each.name in asked
+        }
+        or None,
+        "counts": dict(Counter(each.outcome for each in checked.findings)),
         "outcome": checked.outcome,
         "checks": without_empty(CHECK_COLUMNS, rows),
         "passed": [each.name for each in passed] or None,

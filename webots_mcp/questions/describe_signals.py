@@ -36,6 +36,15 @@ _DECLARE: Final = (
     "signals of unknown meaning are not judged: declare them with {}; " + DECLARED_WORDS
 )
 
+_UNITS_OF: Final[dict[tuple[Quantity, ...], tuple[str, ...]]] = {
+    ("x", "y", "height", "distance"): ("m", "cm", "mm", "km"),
+    ("heading", "roll", "pitch", "angle"): ("rad", "deg"),
+    ("speed",): ("m/s", "km/h", "mm/s", "cm/s"),
+    ("turn rate", "angular velocity"): ("rad/s", "deg/s", "rpm"),
+    ("voltage",): ("V", "mV"),
+    ("current",): ("A", "mA"),
+    ("temperature",): ("degC", "K"),
+}
 _Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 
 
@@ -171,8 +180,25 @@ def _listed(
         "total": len(shown),
         "unknown": [some(unknown)] if unknown else None,
         "changed": [some(changed)] if changed else None,
+        "notes": None
+        if is_undone or not changed
+        else _unlike_units(known, meanings, shown) or None,
         "hint": "; ".join(hints) or (None if known else _NOT_YET),
     }
+
+
+def _unlike_units(
+    known: Mapping[str, RegisteredSignal], meanings: Mapping[str, Meaning], names: Sequence[str]
+) -> list[str]:
+    """Return of each signal with a unit of something else than its quantity that this is so."""
+    found: list[str] = []
+    for name in names:
+        quantity, unit = meanings[name].quantity, meanings[name].unit or known[name].unit
+        fitting_units = next((units for of, units in _UNITS_OF.items() if quantity in of), None)
+        others = {each for units in _UNITS_OF.values() for each in units}
+        if fitting_units is not None and unit in others - set(fitting_units):
+            found.append(f"{name} is in {unit}, which is no unit of {quantity}")
+    return found
 
 
 def _meaning_row(name: str, meaning: Meaning) -> list[Any]:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
-from webots_mcp.answers.budget import answer_about, notes_of, range_in, room_tokens
+from webots_mcp.answers.budget import answer_about, notes_of, range_in, room_tokens, seconds
 from webots_mcp.answers.event_tables import events_table, fitting_events, not_shown_of, verdicts_of
 from webots_mcp.answers.models import EventsAnswer, TimelineAnswer
 from webots_mcp.answers.shortening import tokens_of
@@ -31,7 +31,12 @@ from webots_mcp.questions.arguments import (
     TimeOfDay,
 )
 from webots_mcp.questions.declaring import READS, question
-from webots_mcp.store.reading.ranges import USE_EVERY_ROW, Scope, TimeRange
+from webots_mcp.store.reading.ranges import (
+    USE_EVERY_ROW,
+    Scope,
+    TimeRange,
+    recorded_bounds,
+)
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 DEFAULT_LIMIT: Final = 50
@@ -155,6 +160,7 @@ def _found(
     return {
         "events": events,
         "verdicts": verdicts,
+        "from_s": _begin_of(view, asked),
         "not_shown": not_shown_of(told),
         "cursor": told.cursor,
         "notes": notes,
@@ -166,6 +172,15 @@ def _notes(notes: Sequence[str], options: EventOptions) -> list[str]:
     """Return the notes without those on the rate of rows, where no values were searched."""
     are_stored = bool(options.kinds) and {*options.kinds} <= {*stored_kinds()}
     return [each for each in notes if not (are_stored and each.endswith(USE_EVERY_ROW))]
+
+
+def _begin_of(view: RobotView, asked: TimeRange) -> float | None:
+    """Return where the range begins; None where its run does, or there are several runs."""
+    if len(asked.segments) != 1:
+        return None
+    (segment,) = asked.segments
+    bounds = recorded_bounds(view.connection, segment.run_id)
+    return seconds(segment.start_s) if bounds and segment.start_s > bounds[0] else None
 
 
 # -- what was noted, in order, page by page --

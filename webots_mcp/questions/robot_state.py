@@ -48,6 +48,7 @@ from webots_mcp.store.reading.segment import Deadline, Segment, just_after, newe
 from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.run_rows import (
     StateRecord,
+    count_dropped,
     newest_events,
     pace_of,
     select,
@@ -336,7 +337,7 @@ def _health(view: RobotView) -> dict[str, Any] | None:
         "rows_recorded": view.run.row_count if view.run else 0,
         **({"kept_at_full_rate": kept} if (kept := _kept(view)) else {}),
         **rows_waiting(view.connection, session),
-        "rows_dropped": session.rows_dropped,
+        "rows_dropped": _dropped(view, session.rows_dropped),
         "last_error": error,
         "heartbeat_age_s": round(session.silent_s(view.now_s), 2),
         "polls_commands": session.last_poll_wall_time_s is not None,
@@ -346,6 +347,12 @@ def _health(view: RobotView) -> dict[str, Any] | None:
         "git_commit": session.git_commit,
         "versions": session.versions,
     }
+
+
+def _dropped(view: RobotView, of_session: int) -> int:
+    """Return how many rows of the run were dropped; without a run, of the session."""
+    run = view.run
+    return of_session if run is None else count_dropped(view.connection, run, of_session)
 
 
 def _kept(view: RobotView) -> str | None:

@@ -26,6 +26,7 @@ from webots_mcp.answers.budget import (
 )
 from webots_mcp.answers.models import TrialsAnswer
 from webots_mcp.answers.shortening import cut_text
+from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.divergence import repeats_noted
@@ -66,7 +67,6 @@ _IN_SIMULATORS: Final = (
 )
 _FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
 _RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
-_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 
 
 @dataclass(frozen=True)
@@ -369,7 +369,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
         "pruned": sum(each.status == "pruned" for each in trials) or None,
         "failed": sum(each.status == "failed" for each in trials) or None,
         "score": f"{cut_text(str(plan.get('score')), 500)} ({best} is best)",
-        "ranked": condensed((*_names(ranking), *_FIGURES), rows),
+        "ranked": condensed((*_names(ranking), *TRIAL_FIGURES), rows),
         "noise": figure(ranking.noise.deviation) if ranking.noise.freedom else None,
         "is_best_confirmed": ranking.better,
         "verdict": ranking.verdict if over else None,
@@ -404,7 +404,7 @@ def _state(found: TrialSetRecord, left: int, *, at_work: bool) -> tuple[str, str
 def _names(ranking: Ranking) -> list[str]:
     """Return the parameters as columns, renamed where a column of figures has the same name."""
     names = dict.fromkeys(name for each in ranking.sets for name in each.parameters)
-    return [f"parameter {name}" if name in _FIGURES else name for name in names]
+    return [f"parameter {name}" if name in TRIAL_FIGURES else name for name in names]
 
 
 def _rows(ranking: Ranking, trials: Sequence[TrialRecord]) -> list[list[Any]]:

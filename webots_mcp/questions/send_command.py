@@ -6,6 +6,7 @@ A command runs at most once; its outcome can be waited for later.
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
@@ -16,6 +17,7 @@ from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     condensed,
     fitting,
+    seconds,
     short_name,
 )
 from webots_mcp.answers.models import (
@@ -32,7 +34,8 @@ from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 COMMAND_COLUMNS: Final = (
-    "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
+    "id", "action", "params", "outcome", "run_id", "sim_time_s", "asked_ago_s", "took_s", "result",
+    "error",
 )  # fmt: skip
 _WAIT_S: Final = 10.0
 _MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
@@ -147,7 +150,20 @@ def webots_list_commands(
         return _answer(view, commands, limit)
 
 
-def _command_row(command: QueuedCommand, now_s: float) -> list[Any]:
+_RUN_OF: Final = (
+    "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s <= ? "
+    "ORDER BY started_wall_time_s DESC, id DESC LIMIT 1"
+)
+
+
+def _run_of(connection: sqlite3.Connection, command: QueuedCommand) -> int | None:
+    """Return the run that went on when a command was claimed, else created."""
+    at_s = command.claimed_wall_time_s or command.created_wall_time_s
+    found = connection.execute(_RUN_OF, (command.robot_id, at_s)).fetchone()
+    return found[0] if found else None
+
+
+def _command_row(connection: sqlite3.Connection, command: QueuedCommand, now_s: float) -> list[Any]:
     """Return a command as a row under `COMMAND_COLUMNS`."""
     took_s = None
     if command.finished_wall_time_s is not None:
@@ -157,6 +173,8 @@ def _command_row(command: QueuedCommand, now_s: float) -> list[Any]:
         command.action,
         shorten(json.loads(command.params), DETAIL_BUDGET_TOKENS).value or None,
         command.status,
+        _run_of(connection, command),
+        seconds(command.claimed_sim_time_s),
         round(now_s - command.created_wall_time_s, 1),
         took_s,
         shown_result(command, DETAIL_BUDGET_TOKENS),
@@ -165,7 +183,7 @@ def _command_row(command: QueuedCommand, now_s: float) -> list[Any]:
 
 
 def _answer(view: RobotView, commands: list[QueuedCommand], limit: int) -> CommandsAnswer:
-    rows = [_command_row(command, view.now_s) for command in commands]
+    rows = [_command_row(view.connection, command, view.now_s) for command in commands]
     rows = fitting(rows, _SIZES.commands_tokens)
     more = len(rows) < len(commands) or len(commands) == limit
     actions = view.session.actions if view.session else {}

@@ -331,10 +331,14 @@ def _why_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | 
             "it was recorded by the observer from its customData: the observer ended, or the "
             "robot is gone"
         )
+    if session.end_reason is None and (ended := _run_ended(connection, session)) == "finished":
+        return _ENDED[ended]  # it noted that of its run, and had no time left to note it of itself
     if session.end_reason == "reload" and session.extern:
         return f"the world was reloaded, which ended its controller; {EXTERN}"
     if session.end_reason == "finished" and (unseen := _unseen(session)):
         return unseen
+    if session.end_reason == "finished" and _run_ended(connection, session) == "reset":
+        return "a reset ended its last run, then its controller finished before another began"
     if session.end_reason == "crashed" and (error := ended_by(connection, session.id)):
         return f"its controller ended by {error}"
     why = _ENDED.get(session.end_reason or "crashed")
@@ -348,6 +352,14 @@ def _why_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | 
         said = hung[0] if hung else _left_stacks(connection, session)
         why = f"{why}; it was {said.partition(chr(10))[0]}" if said else why
     return why
+
+
+def _run_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
+    """Return how the last run of a session ended; None where that is not known."""
+    found = connection.execute(
+        "SELECT end_reason FROM run WHERE session_id = ? ORDER BY id DESC LIMIT 1", (session.id,)
+    ).fetchone()
+    return found[0] if found else None
 
 
 def _left_stacks(connection: sqlite3.Connection, session: SessionRecord) -> str | None:

@@ -350,6 +350,25 @@ def put_back(value: Any, parts: list[str], replaced: object) -> None:
         value[key] = replaced
 
 
+def count_dropped(connection: sqlite3.Connection, run: RunRecord, of_session: int) -> int:
+    """How many rows of a run were dropped; of its session's last run also those not noted yet.
+
+    Args:
+        connection: Any.
+        run: The run.
+        of_session: Rows of all its session's runs that were dropped, as the session counts them.
+    """
+    runs = connection.execute(
+        "SELECT r.id, coalesce(sum(coalesce(json_extract(e.data, '$.row_count'), "
+        "json_extract(e.data, '$.rows'))), 0) FROM run r LEFT JOIN event e ON e.run_id = r.id "
+        "AND e.kind = 'dropped' AND json_valid(e.data) WHERE r.session_id = ? GROUP BY r.id",
+        (run.session_id,),
+    )
+    noted = {run_id: int(rows) for run_id, rows in runs}
+    unnoted = max(of_session - sum(noted.values()), 0) if run.id == max(noted, default=0) else 0
+    return noted.get(run.id, 0) + unnoted
+
+
 def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[EventRecord]:
     """The latest events of a run, oldest first; with a limit of -1 all of them."""
     rows = connection.execute(

@@ -64,6 +64,17 @@ State = Callable[[int], dict[str, Any]]
 # A state of each row, the pace, a check, and what it says.
 FOOLING: list[tuple[State, float, str, str]] = [
     (
+        lambda row: {"pose": [0.02 * row, 0.0], "commanded_m_s": 0.2}, 1.0,
+        "rests when commanded",
+        "not applicable: it was never commanded to rest: commanded_m_s was never 0",
+    ),
+    (
+        lambda row: {"pose": [0.01 * row, 0.0], "commanded_m_s": 0.0}, 1.0,
+        "rests when commanded",
+        "warn: moved 2.4 m from 3.95 to 27.45 s (medians of 50 rows) although commanded_m_s was 0 "
+        "from 0 to 29.9 s",
+    ),
+    (
         lambda row: {"front": math.nan if row % 2 else row}, 1.0,
         "sensors speak", "warn: front: NaN in 50 % of the rows",
     ),

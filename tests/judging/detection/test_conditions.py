@@ -85,7 +85,9 @@ def test_where_it_never_held_the_answer_says_how_many_rows_were_looked_at(
 ) -> None:
     found = ask(rover, "pose.0 > 1e6")
 
-    assert found.verdicts.not_found["condition"] == "never true in 1150 rows"
+    assert found.verdicts.not_found["condition"] == (
+        "'pose.0 > 1e6' was true in none of 1150 rows; nearest: pose.0 12.78 at 119.9 s"
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,7 +109,7 @@ def test_what_never_had_a_value_was_not_looked_for(
     assert verdicts.not_searched["condition"].startswith(named)
     assert "had no value in any row" in verdicts.not_searched["condition"]
     assert ask(counting.connection, "n > 9 and missing(blind)").verdicts.not_found == {
-        "condition": "never true in 50 rows"
+        "condition": "'n > 9 and missing(blind)' was true in none of 50 rows"
     }
 
 
@@ -116,7 +118,9 @@ def test_of_several_runs_all_rows_are_counted_and_the_same_is_said_once(
 ) -> None:
     found = ask(rover, "target > 1e6", since_wall_time=0.0, until_wall_time=2e9)
 
-    assert found.verdicts.not_found["condition"] == "never true in 2050 rows"
+    assert found.verdicts.not_found["condition"] == (
+        "'target > 1e6' was true in none of 2050 rows; nearest: target 3 at 0 s"
+    )
     dropped, others = (note for note in found.notes if "row" in note)
     assert dropped.startswith("run 1: ") and "some were dropped" in dropped
     assert others.startswith("run 2, 3: ")
@@ -188,8 +192,22 @@ def test_where_a_condition_could_not_be_asked_of_a_damaged_chunk_is_said(
 
     assert spans(ask(connection, "n < m + 1")) == [(0.0, 9.9), (20.0, 39.9)]
     never = ask(connection, "missing(m)").verdicts
-    assert never.not_found["condition"] == "never true in 300 rows"
+    assert never.not_found["condition"] == ("'missing(m)' was true in none of 300 rows")
     assert "from 10.000 to 19.900 s: the chunk of m is damaged" in never.not_searched["condition"]
 
     connection.execute(f"UPDATE chunk SET numbers = x'00' WHERE {of_m}")
     assert "condition" not in ask(connection, "missing(m)").verdicts.not_found
+
+
+def test_a_gap_is_no_time_in_which_it_held_and_a_lasting_one_says_since_when(
+    counting: Recorder,
+) -> None:
+    for step in [*range(200), *range(260, 400)]:
+        counting.publish(step * 0.1, {"n": step})
+    found = ask(counting.connection, "n > 9 for 0.5")
+
+    (event,) = found.events
+    assert (event.details["true_from_s"], event.details["fulfilled_s"]) == (1.0, 1.5)
+    assert event.details["not_recorded_s"] == pytest.approx(6.1)
+    assert event.start_s == pytest.approx(1.5)
+    assert any("32.3 s; " in note and "6.1 s in between" in note for note in found.notes)

@@ -241,7 +241,7 @@ def loses_no_rows(run: RunUnderCheck) -> Examined:
     dropped = [each for each in noticed if each.details["what"] == "dropped"]
     if found := dropped or [each for each in noticed if each.details["what"] == "storage"]:
         data: list[dict[str, Any]] = [each.details.get("data") or {} for each in found]
-        rows = sum(each.get("row_count", 0) for each in data)
+        rows = sum(each.get("row_count", each.get("rows", 0)) for each in data)
         lost = "1 row was dropped" if rows == 1 else f"{rows or 'some'} rows were dropped"
         evidence = lost if dropped else "trouble with the database"
         evidence += f": {data[0].get('why', 'no reason was noted')}"

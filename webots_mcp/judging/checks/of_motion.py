@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, cast
 
-from webots_mcp.analysis.arrays import Array, Indexes, median, np, runs_of
+from webots_mcp.analysis.arrays import Array, Indexes, RowSpan, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times, total_s
 from webots_mcp.judging.coverage import Coverage, Fault
@@ -87,41 +87,64 @@ def rests_when_commanded(run: RunUnderCheck) -> Examined:
     idle = np.ones(len(frame), np.bool_)
     for each in commands:
         idle &= np.abs(frame.numbers(each.name)) <= COMMAND_NOISE * run.noise.of(each.name)
-    moved: list[tuple[float, str]] = []
-    for rest in runs_of(idle, frame.times).spans():
-        if rest.end_s - rest.start_s >= ROLLS_OUT_S + APART_S:
-            part = frame.between(rest.start_s + ROLLS_OUT_S, just_after(rest.end_s))
-            moved += ((rest.start_s, each) for each in _moved_in(run, part))
+    least_s = ROLLS_OUT_S + APART_S
+    rests = [
+        rest for rest in runs_of(idle, frame.times).spans() if rest.end_s - rest.start_s >= least_s
+    ]
+    names = listed([each.name for each in commands], 3)
+    was = "was" if len(commands) == 1 else "were"
+    if not rests:
+        never = f"{names} {was} never 0" + f" for {least_s:g} s" * bool(idle.any())
+        raise NotSearchableError(f"it was never commanded to rest: {never}")
+    moved: list[tuple[RowSpan, str]] = []
+    for rest in rests:
+        part = frame.between(rest.start_s + ROLLS_OUT_S, just_after(rest.end_s))
+        moved += ((rest, each) for each in _moved_in(run, part))
     if not moved:
         rested = "it rested whenever every command was 0"
         judged = counted(len(commands), "command")
-        return run.covered(rested, judged=judged, limit=f"limit {TURNED_RAD:g} rad or 5 cm")
-    names = listed([each.name for each in commands], 3)
-    evidence = f"{moved[0][1]} although {names} {'was' if len(commands) == 1 else 'were'} 0"
-    shown = run.shows(*(each.name for each in commands[:2]))
-    return Fault("warn", evidence, moved[0][0], len(moved), shown)
+        lasts_s = sum(rest.end_s - rest.start_s for rest in rests)
+        limit = f"limit {TURNED_RAD:g} rad or 5 cm"
+        return run.covered(rested, judged=judged, limit=limit, lasts_s=lasts_s)
+    first, how = moved[0]
+    while_0 = f"{names} {was} 0 from {first.start_s:.6g} to {first.end_s:.6g} s"
+    evidence = f"{how} although {while_0}"
+    seen = [*(run.motion.position or ()), *filter(None, [run.motion.heading])]
+    shown = run.shows(*(each.name for each in [*commands[:2], *seen]))
+    return Fault("warn", evidence, first.start_s, len(moved), shown)
 
 
 def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
-    """How it moved in some rows, beyond the noise of its heading and position."""
+    """How it moved in some rows, beyond the noise of its heading and position.
+
+    Compared are the medians of the first and of the last rows, of as many as half of them hold.
+    """
     ends = max(1, min(len(part) // 4, 50))
     motion = run.motion
     may_turn = motion.turn_command is None and not motion.wheel_commands  # by a command unknown
     if (heading := motion.heading) is not None and not may_turn:
         turn = heading.turn or math.tau
         course = part.numbers(heading.name)
+        times_s = part.times[np.isfinite(course)]
         course = unwrap(course[np.isfinite(course)], turn) * math.tau / turn
         if len(course) > 2 * ends:
             turned = median(course[-ends:]) - median(course[:ends])
             noise = run.noise.of(heading.name) * math.tau / turn
             if abs(turned) > max(TURNED_RAD, _NOISE * noise):
-                yield f"turned by {turned:.2g} rad in {part.bounds_s[1] - part.bounds_s[0]:.3g} s"
+                yield f"turned by {turned:.2g} rad {_between(times_s, ends)}"
     if motion.position is not None and (motion.commanded or motion.wheel_commands):
         rows, x, y = places_in(part, motion.position)
         if len(rows) > 2 * ends:
             way_m = math.hypot(*(median(each[-ends:]) - median(each[:ends]) for each in (x, y)))
             if way_m > max(run.search.options.stuck_m, _NOISE * run.noise.position_m):
-                yield f"moved {way_m:.2g} m in {part.bounds_s[1] - part.bounds_s[0]:.3g} s"
+                yield f"moved {way_m:.2g} m {_between(part.times[rows], ends)}"
+
+
+def _between(times_s: Array, ends: int) -> str:
+    """From when to when a way was measured: between the middles of the rows at both ends."""
+    first_s, last_s = (median(each) for each in (times_s[:ends], times_s[-ends:]))
+    of = f" (medians of {ends} rows)" if ends > 1 else ""
+    return f"from {first_s:.4g} to {last_s:.4g} s{of}"
 
 
 def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:

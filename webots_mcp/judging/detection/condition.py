@@ -18,9 +18,11 @@ from typing import Any, Final, NamedTuple, cast
 from webots_mcp.analysis.arrays import (
     Array,
     Flags,
+    Gap,
     Indexes,
     RowSpan,
     Runs,
+    find_gaps,
     median,
     np,
     runs_of,
@@ -105,16 +107,54 @@ def condition_events(search: Search) -> Iterator[Event]:
     if not len(runs):
         _require_values(condition, frame, position)
     rows = search.coverage.rows = search.coverage.rows + int(np.count_nonzero(read))
-    search.coverage.note_nearest("condition", rows, f"never true in {rows} rows")
-    also = _also_asked(search, condition)
+    never = f"{condition.text!r} was true in none of {rows} rows"
+    nearest = _nearest(condition, frame, position, first)
+    search.coverage.note_nearest("condition", rows, f"{never}{nearest}")
+    also, gaps = _also_asked(search, condition), find_gaps(frame.times) if len(runs) else ()
     if len(runs):
-        in_all = _figures_in_all(frame, [*condition.signals, *also], runs)
+        in_all = _figures_in_all(frame, [*condition.signals, *also], runs, gaps)
         search.coverage.notes.append(WEIGHTED)
         search.coverage.note_of_run(search.segment.run_id, in_all)
     for run, values in zip(runs.spans(), values_at(condition, frame, position, runs), strict=True):
         details = dict(list(values.items())[:_MOST_VALUES])
         details |= _extremes_in(frame, [*values, *also], run)
+        details |= _when_true(condition, frame, position, run)
+        if missing_s := _not_recorded_s(gaps, run):
+            details["not_recorded_s"] = round(missing_s, 3)
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)
+
+
+def _nearest(
+    condition: Condition, frame: Frame, position: tuple[str, str] | None, first: int
+) -> str:
+    """The value that came nearest to what a comparison of one value with a number asks for."""
+    rows = frame.was_read() & (np.arange(len(frame)) >= first)
+    tree = condition.tree.elts[0] if isinstance(condition.tree, ast.Tuple) else condition.tree
+    found = _worst(condition, frame, position, rows, tree, nearest=True)
+    if found is None:
+        return ""
+    name, value, time_s = found
+    return f"; nearest: {name} {value:.4g} at {time_s:.6g} s"
+
+
+def _when_true(
+    condition: Condition, frame: Frame, position: tuple[str, str] | None, run: RowSpan
+) -> dict[str, float]:
+    """Of what has to hold for some time: from when it was true, and when it had held so long."""
+    if not isinstance(condition.tree, ast.Tuple):
+        return {}
+    inner = holds_in(condition.scanned, condition.tree.elts[0], frame, position)
+    before = np.flatnonzero(~inner[: run.start])
+    begin = int(before[-1]) + 1 if len(before) else 0
+    return {
+        "true_from_s": round(float(frame.times[begin]), 3), "fulfilled_s": round(run.start_s, 3),
+    }  # fmt: skip
+
+
+def _not_recorded_s(gaps: Sequence[Gap], run: RowSpan) -> float:
+    """For how long no row was recorded in a stretch: nobody knows whether it held."""
+    inside = (each for each in gaps if each.start_s >= run.start_s and each.end_s <= run.end_s)
+    return sum(each.end_s - each.start_s for each in inside)
 
 
 def _also_asked(search: Search, condition: Condition) -> list[str]:
@@ -138,12 +178,14 @@ def _extremes_in(frame: Frame, names: Sequence[str], run: RowSpan) -> dict[str, 
     return found
 
 
-def _figures_in_all(frame: Frame, names: Sequence[str], runs: Runs) -> str:
+def _figures_in_all(frame: Frame, names: Sequence[str], runs: Runs, gaps: Sequence[Gap]) -> str:
     """What numbers came to in all the rows in which a condition held, in words."""
     held: Flags = np.zeros(len(frame), np.bool_)
     for start, stop in zip(runs.starts.tolist(), runs.stops.tolist(), strict=True):
         held[start:stop] = True
     lasted_s = float((np.append(np.diff(frame.times), 0.0))[held].sum())
+    missing_s = sum(_not_recorded_s(gaps, run) for run in runs.spans()) if gaps else 0.0
+    lasted_s -= missing_s
     said = [f"true in {counted(int(np.count_nonzero(held)), 'row')}, {lasted_s:.4g} s"]
     for name in names:
         if len(said) > _MOST_IN_ALL or name not in frame:
@@ -154,6 +196,7 @@ def _figures_in_all(frame: Frame, names: Sequence[str], runs: Runs) -> str:
             weights = None if frame.weights is None else frame.weights[rows]
             of = _figures_of(numbers[rows], weights)
             said.append(f"{name} mean {of['mean']:g}, min {of['min']:g}, max {of['max']:g}")
+    said += [f"{missing_s:.4g} s in between were not recorded"] * bool(missing_s)
     return "; ".join(said)
 
 
@@ -732,17 +775,33 @@ def judge_expectation(
     steps_s = np.diff(frame.times)
     lasts_s = np.append(steps_s, median(steps_s) if len(steps_s) else 0.0)[: len(frame)]
     meant_s, bad_s = (float(lasts_s[each].sum()) for each in (asked, violated))
-    worst, runs = _worst(expected, frame, position, violated), runs_of(violated, frame.times)
+    runs = runs_of(violated, frame.times)
+    worst = found[:2] if (found := _worst(expected, frame, position, violated)) else None
     rows, lacking = (int(np.count_nonzero(each)) for each in (asked, meant & lacks))
     return Adherence(runs, rows, meant_s, meant_s - bad_s, lacking, after_s, worst)
 
 
 def _worst(
-    expected: Condition, frame: Frame, position: tuple[str, str] | None, violated: Flags
-) -> tuple[str, float] | None:
-    """Of a comparison of one value with a number: the value that is farthest from holding."""
-    tree = expected.tree
-    if not isinstance(tree, ast.Compare) or len(tree.ops) != 1 or not violated.any():
+    expected: Condition,
+    frame: Frame,
+    position: tuple[str, str] | None,
+    rows: Flags,
+    tree: ast.expr | None = None,
+    *,
+    nearest: bool = False,
+) -> tuple[str, float, float] | None:
+    """Of a comparison of one value with a number: the value farthest from holding, and when.
+
+    Args:
+        expected: What should hold.
+        frame: The rows.
+        position: The names of x and y.
+        rows: Those that are looked at.
+        tree: The comparison, where it is a part of the condition.
+        nearest: The value nearest to holding instead.
+    """
+    tree = expected.tree if tree is None else tree
+    if not isinstance(tree, ast.Compare) or len(tree.ops) != 1 or not rows.any():
         return None
     left, right, op = tree.left, tree.comparators[0], tree.ops[0]
     flipped = isinstance(left, ast.Constant)
@@ -751,17 +810,19 @@ def _worst(
     if not is_fit or isinstance(op, ast.Eq | ast.NotEq):
         return None
     try:
-        values = numbers_in(expected.scanned, side, frame, position)[violated]
+        values = np.array(numbers_in(expected.scanned, side, frame, position))
     except ConditionFailedError:
         return None
-    values = values[~np.isnan(values)]
-    if not len(values):
+    there = np.flatnonzero(rows & ~np.isnan(values))
+    if not len(there):
         return None
     wants_more = isinstance(op, ast.Gt | ast.GtE) is not flipped
+    takes_least = wants_more is not nearest
+    row = there[values[there].argmin() if takes_least else values[there].argmax()]
     start, end = side.col_offset, side.end_col_offset or 0
     columns = expected.scanned.columns
     text = expected.scanned.original[columns[start] : columns[end]]
-    return text.strip(), float(values.min() if wants_more else values.max())
+    return text.strip(), float(values[row]), float(frame.times[row])
 
 
 def violation_events(search: Search) -> Iterator[Event]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 from webots_mcp.analysis.arrays import (
     Array,
@@ -39,6 +40,7 @@ from webots_mcp.judging.detection.kinds import (
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.naming import counted, in_snake_case
 from webots_mcp.store.reading.frame import Frame, ZoneMap
+from webots_mcp.store.reading.segment import just_after
 from webots_mcp.store.signals import RegisteredSignal
 
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
@@ -71,11 +73,15 @@ def oscillation_events(search: Search) -> Iterator[Event]:
         search.not_searched("oscillation", why)
     _note_periods(search)
     for name, (swing, at_start, at_end) in _found(search, signals):
-        details = {
+        largest = _half_range(search, name, swing)
+        at_start, at_end = min(at_start, largest), min(at_end, largest)
+        details: dict[str, Any] = {
             "half_periods": swing.half_swings,
             "period_s": swing.period_s,
-            "amplitude": swing.amplitude,
+            "amplitude": min(swing.amplitude, largest),
         }
+        if unit := search.known[name].unit:
+            details["unit"] = unit
         if max(at_start, at_end) > GROWS * min(at_start, at_end):
             details |= {"amplitude_at_start": at_start, "amplitude_at_end": at_end}
         event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
@@ -87,6 +93,18 @@ def _passed(names: Sequence[str]) -> str:
     """Return the first names as an argument is written, and how many more there are."""
     more = f", ... {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return f"[{', '.join(map(repr, names[:_NAMED]))}{more}]"
+
+
+def _half_range(search: Search, name: str, swing: Swing) -> float:
+    """Half of the range that the values had in a stretch: a fitted sine may reach farther."""
+    signal = search.known[name]
+    part = search.frame.between(swing.start_s, just_after(swing.end_s))
+    numbers = part.usable(name)[1]
+    if len(numbers) < 2:
+        return math.inf
+    if signal.turn is not None:
+        numbers = unwrap(numbers, signal.turn)
+    return float(np.ptp(numbers)) / 2
 
 
 def _note_periods(search: Search) -> None:

@@ -16,6 +16,7 @@ from webots_mcp.analysis.standstill import (
     shortest_seen_s,
 )
 from webots_mcp.analysis.track import SmoothedTrack, track_of
+from webots_mcp.judging.coverage import AS_STUCK
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
@@ -685,6 +686,8 @@ def _nearest(tracks: Sequence[SmoothedTrack], search: Search) -> tuple[float, st
 def _standstills(search: Search) -> Iterator[Event]:
     """It stayed where it was; beside `stuck`, where that is asked for as well."""
     with_stuck = any(kind.name == "stuck" for kind in search.kinds)
+    if with_stuck and any(each.kind == "stuck" for each in standstills_in(search).events):
+        search.note_nearest("standstill", math.inf, AS_STUCK)
     return _events(search, "standstill", "apart" if with_stuck else "standstill")
 
 

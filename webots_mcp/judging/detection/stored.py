@@ -237,7 +237,8 @@ def kept_events(search: Search) -> Iterator[Event]:
         end_s = max(each.start_s, min(each.end_s, search.ended_s))
         frames = count_kept_frames(search.connection, segment.run_id, each.start_s, each.end_s)
         details = {"reason": each.reason} | ({"frames": frames} if frames else {})  # of cameras
-        place = (segment.run_id, each.start_s, end_s, each.wall_time_s)
+        # It was stored when it was asked for, which may be long after it began.
+        place = (segment.run_id, each.start_s, end_s, search.wall_time_at(each.start_s))
         yield Event("kept_stretch", *place, None, details, ongoing=each.end_s > search.ended_s)
 
 

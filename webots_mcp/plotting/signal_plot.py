@@ -435,8 +435,9 @@ class _SignalPainter:
             LegendEntry(named[curve.name], line_sample(*self._pen(panel, index)), self._part(curve))
             for index, curve in enumerate(panel.curves)
         ]
-        title = " ".join([panel.shared_name, *unit]).strip()
-        return [LegendEntry(fitted(title, room))] * bool(title) + entries
+        if not panel.shared_name:
+            return [*entries, *map(LegendEntry, unit)]
+        return [LegendEntry(fitted(" ".join([panel.shared_name, *unit]), room)), *entries]
 
     def _part(self, curve: Curve) -> str:
         """By which a page finds it: of several runs all curves of one are hidden together."""

@@ -20,7 +20,7 @@ from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.chunks import decoded_of, statistics_of
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
-from webots_mcp.store.reading.segment import Deadline
+from webots_mcp.store.reading.segment import Deadline, one_reading
 
 VALUES = st.one_of(
     st.floats(-1e6, 1e6), st.integers(-1000, 1000), st.booleans(), st.none(), st.sampled_from("abc")
@@ -221,3 +221,23 @@ def test_rows_in_no_chunk_are_in_order_whatever_came_late_or_was_deleted(tmp_pat
         writer.execute("DELETE FROM state")
         recorder.publish(1.4, {"a": 14})
         assert framed(writer).rows(0, 99).values("a")[-1] == 14
+
+
+def test_frames_of_one_question_share_columns_and_each_notes_only_what_it_asked_for(
+    short_groups: None, empty: sqlite3.Connection
+) -> None:
+    recorded(empty, [{"a": float(step), "b": 2.0 * step} for step in range(16)])
+    make_chunks(empty, 100)
+    empty.execute(
+        "UPDATE chunk SET numbers = x'00', codes = x'00' WHERE group_id = 1 AND signal_id = "
+        "(SELECT id FROM signal WHERE name = 'a')"
+    )
+    with one_reading(empty):
+        one, other = framed(empty), framed(empty)
+        assert np.isnan(one.numbers("a")[:8]).all() and len(one.unread) == 1
+        assert other.numbers("b").tolist() == [2.0 * step for step in range(16)]
+        assert other.unread == (), "it did not ask for the damaged signal"
+        assert other.numbers("a") is one.numbers("a")
+        assert other.unread == one.unread
+        assert framed(empty).rows(8, 16).numbers("a").tolist() == list(map(float, range(8, 16)))
+    assert framed(empty).numbers("b") is not other.numbers("b")

@@ -402,7 +402,7 @@ def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str
     wanted: list[int] = []
     for row in rows:
         value: Any = row.get("runs_wanted")
-        several: list[int | None] = value if isinstance(value, list) else [value]
+        several: Any = value if isinstance(value, list) else [value]
         wanted += [each for each in several if each]
     least = f"{max(wanted)} of each would do" if wanted else "repeat the runs"
     return f"too few runs ({' and '.join(counts)}): {least}"

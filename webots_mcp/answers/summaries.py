@@ -401,9 +401,8 @@ def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str
     counts = [str(len(row.get("runs") or ())) for row in _rows(answer.groups)]
     wanted: list[int] = []
     for row in rows:
-        value: Any = row.get("runs_wanted")
-        several: Any = value if isinstance(value, list) else [value]
-        wanted += [each for each in several if each]
+        value: list[int | None] | int | None = row.get("runs_wanted")
+        wanted += [each for each in (value if isinstance(value, list) else [value]) if each]
     least = f"{max(wanted)} of each would do" if wanted else "repeat the runs"
     return f"too few runs ({' and '.join(counts)}): {least}"
 

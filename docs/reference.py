@@ -97,7 +97,8 @@ def answer_models() -> list[type[AnswerPart]]:
         derived = waiting.pop().__subclasses__()
         found |= dict.fromkeys(derived)
         waiting += derived
-    return sorted(found, key=lambda model: (model is not Answer, model.__name__))
+    of_tools = (model for model in found if model.__module__ == Answer.__module__)
+    return sorted(of_tools, key=lambda model: (model is not Answer, model.__name__))
 
 
 def _is_own(model: type[AnswerPart], name: str) -> bool:

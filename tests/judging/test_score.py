@@ -105,7 +105,7 @@ def test_what_scores_do_not_see_of_their_runs_is_told_once_for_runs_that_are_ali
     assert unseen(empty, [1, 2, 3, 4]) == [
         "scores of run 1: rows were dropped, so their values are missing",
         f"scores of run 2, 3: {between}",
-        f"scores of run 4: {between}; rows that only kept stretches have do not count",
+        f"scores of run 4: {between}; rows that only full-rate segments have do not count",
     ]
     assert unseen(empty, [2, 3]) == [f"scores: {between}"]
 

@@ -45,7 +45,6 @@ from webots_mcp.judging.coverage import AS_STUCK
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
-_MOST_DIFFERENCES: Final = 3
 _SERIOUS: Final = ("critical", "error", "warning")
 _NOTED_FIRST: Final = ("change", "command", "log", "bridge_event", "kept_stretch", "image", "run")
 _SERIOUS_LOG: Final = {"critical": 1, "error": 1}
@@ -543,25 +542,26 @@ def _(answer: ComparisonAnswer) -> str | None:
 
 
 def _largest_differences(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return undecided figures of two groups whose runs do not overlap, largest change first."""
-    found: list[tuple[float, str]] = []
+    """Return undecided figures of two groups whose runs do not overlap, largest change first.
+
+    Of changes that are equally large, those of signals that are constant in each run come first.
+    """
+    found: list[tuple[float, bool, str]] = []
     for row in rows:
-        values = cast("list[float | None]", row.get("median") or row.get("mean"))
-        if row.get("different") is not None or not isinstance(values, list) or len(values) != 2:  # pyright: ignore[reportUnnecessaryIsInstance]
+        values: list[float | None] = row.get("median") or row.get("mean") or []
+        if row.get("different") is not None or len(values) != 2:
             continue
         first, second = values
         if first is None or second is None or first == second:
             continue
-        ranges = cast(
-            "list[list[float] | None]",
-            row.get("range") or row.get("mean_range") or [[first] * 2, [second] * 2],
-        )
-        known = [each for each in ranges if each is not None]
-        if len(known) < len(ranges) or max(r[0] for r in known) <= min(r[1] for r in known):
+        ranges: list[list[float] | None] = row.get("range") or row.get("mean_range") or []
+        known = [each for each in ranges if each is not None] or [[first] * 2, [second] * 2]
+        if len(known) < 2 or max(each[0] for each in known) <= min(each[1] for each in known):
             continue
         change = abs(second - first) / max(abs(first), abs(second))
-        found.append((change, f"{_name(row)} {first:.4g} -> {second:.4g}"))
-    return [text for _, text in sorted(found, key=lambda each: -each[0])[:_MOST_DIFFERENCES]]
+        varies = row.get("deviation") != [0.0, 0.0]
+        found.append((-round(change, 2), varies, f"{_name(row)} {first:.4g} -> {second:.4g}"))
+    return [text for *_, text in sorted(found, key=lambda each: each[:2])[:_MOST_NAMED]]
 
 
 def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str:
@@ -569,9 +569,8 @@ def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str
     counts = [str(len(row.get("runs") or ())) for row in _rows(answer.groups)]
     wanted: list[int] = []
     for row in rows:
-        value = row.get("runs_wanted")
-        values = cast("list[int | None]", value if isinstance(value, list) else [value])
-        wanted += [each for each in values if each]
+        value: list[int | None] | int | None = row.get("runs_wanted")
+        wanted += [each for each in (value if isinstance(value, list) else [value]) if each]
     least = f"{max(wanted)} of each would do" if wanted else "repeat the runs"
     return f"too few runs ({' and '.join(counts)}): {least}"
 

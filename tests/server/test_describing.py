@@ -162,4 +162,18 @@ async def test_before_anything_is_recorded_the_answer_says_what_to_do(
     recorded.robot()
     async with connect() as client:
         refused = await fail(client, "webots_describe_signals", signals=["u"], quantity="speed")
-        assert "No signal has been recorded yet" in refused
+        assert "no signal has been recorded yet" in refused
+
+
+async def test_a_unit_of_something_else_than_the_quantity_is_warned_of(
+    recorded: Recorded, connect: Connect
+) -> None:
+    robot = recorded.robot()
+    for step in range(20):
+        robot.state(step * 0.1, {"arm": {"angle_rad": 0.1 * step}})
+    async with connect() as client:
+        asked = {"signals": ["arm.angle_rad"], "role": "measured"}
+        wrong = await ask(client, "webots_describe_signals", quantity="x", **asked)
+        right = await ask(client, "webots_describe_signals", quantity="angle", **asked)
+    assert wrong["notes"] == ["arm.angle_rad is in rad, which is no unit of x"]
+    assert "notes" not in right

@@ -49,7 +49,7 @@ ANSWERED = [
 REFUSED = [
     ("history moed", "mode"),
     ("history mode --points 9999", "--points must be less than or equal to 500, not 9999"),
-    ("history mode --run 99", "newest runs are [3, 2, 1]"),
+    ("history mode --run 99", "newest runs: 3, 2, 1"),
     ("history mode --after 3", "Add --raw, or leave cursor out"),
     ("trends --robot rovr", "Did you mean 'rover'"),
     ("trends --start 9 --end 3", "--start 9 must be less than --end 3"),

@@ -142,7 +142,7 @@ def _is_at_rest(run: RunUnderCheck, flat: Event) -> bool:
         for each in _names_in(run).sensors
         if run.meanings[each].quantity in ("speed", "joint speed", "motor speed")
     ]
-    return any(len(each) > 0 and bool(np.mean(each == 0) > MOSTLY) for each in speeds)
+    return any(np.count_nonzero(each == 0) > MOSTLY * len(each) for each in speeds)
 
 
 def _rests_so_often(run: RunUnderCheck, flat: Event, before: Array, after: Array) -> bool:

@@ -162,7 +162,7 @@ async def test_before_anything_is_recorded_the_answer_says_what_to_do(
     recorded.robot()
     async with connect() as client:
         refused = await fail(client, "webots_describe_signals", signals=["u"], quantity="speed")
-        assert "no signal has been recorded yet" in refused
+        assert "No signal has been recorded yet" in refused
 
 
 async def test_a_unit_of_something_else_than_the_quantity_is_warned_of(

@@ -15,7 +15,7 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Final, Literal, NamedTuple, get_args
 
-from webots_mcp.signals.naming import SOLIDS, WORLD, angle_unit, unit_in, words_of
+from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, angle_unit, unit_in, words_of
 
 Quantity = Literal[
     "x", "y", "height", "heading", "roll", "pitch", "speed", "turn rate", "wheel speed",
@@ -96,6 +96,11 @@ INPUTS: Final = frozenset((  # what a person moves by hand
     "joystick", "stick", "gamepad", "joypad", "pad", "axis", "axe", "mouse", "touch", "cursor",
     "keyboard", "key", "button", "input",
 ))  # fmt: skip
+_HEADINGS: Final = frozenset(("heading", "yaw"))
+_OF_HEADINGS: Final = frozenset((  # who measures a heading, and what else may stand beside it
+    "compass", "gyro", "gyroscope", "imu", "gps", "gnss", "odometry", "estimate", "estimated",
+    "fused", "ekf", "true", "robot", "body", "base", "raw", "rad", "deg", "value", "angle",
+)) | _MEASURED | _TARGET | _COMMAND  # fmt: skip
 _TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
 _HEIGHTS: Final = frozenset(("height", "altitude"))
 _GYROS: Final = frozenset(("gyro", "imu", "gyroscope"))
@@ -279,14 +284,37 @@ def meaning_by_name(
         return _named("text", _role_in(name), name, "it is a text")
     if kind == "null":
         return UNKNOWN
+    names = frozenset(names)
+    if (array := _array_reduced_to(name, names)) is not None:
+        return _of_reduction(name, array, names)
     if base in _OF_POSES:
         return _named(
             _OF_POSES[base], _role_in(name) or "measured", name, "its name is one of a pose"
         )
-    quantity = _quantity_in(name, kind, base, frozenset(names))
+    quantity = _quantity_in(name, kind, base, names)
     if quantity is None:
         return UNKNOWN
     return _named(quantity, _role_of(name, quantity, base), name, f"its name says {quantity}")
+
+
+def _array_reduced_to(name: str, names: frozenset[str]) -> str | None:
+    """The array that a number sums up: of one that is reduced each of the reductions is there."""
+    array, _, last = name.rpartition(".")
+    if not array or last not in REDUCTIONS:
+        return None
+    return array if all(f"{array}.{each}" in names for each in REDUCTIONS) else None
+
+
+def _of_reduction(name: str, array: str, names: Iterable[str]) -> Meaning:
+    """What sums up an array: the least, the greatest and the mean are values of its quantity."""
+    last = name.rpartition(".")[2]
+    if last in ("count", "argmin"):
+        why = "how many items an array has" if last == "count" else "which item is the least"
+        return _named("count", "measured", name, why)
+    of_array = meaning_by_name(array, "num", None, names)
+    if of_array.quantity is None:
+        return of_array
+    return of_array._replace(why=f"{of_array.why}; it is the {last} of an array")
 
 
 def meanings_by_name(
@@ -548,7 +576,13 @@ def targets_in(meanings: Mapping[str, Meaning]) -> list[tuple[str, str]]:
 @lru_cache(maxsize=_REMEMBERED)
 def _subject_of(name: str) -> tuple[frozenset[str], tuple[str, ...]]:
     """The words of a name without those of its role and quantity, and its numbers of items."""
-    items = tuple(part for part in name.split(".") if part.isdigit())
+    words = (word for part in name.split(".") for word in words_of(part))
+    items = tuple(
+        word[len(stem) :]
+        for word in words
+        for stem in [word.rstrip("0123456789")]
+        if stem != word and stem not in _NOT_OF_SUBJECT  # the 2 of m/s2 is of a unit
+    )
     return frozenset(words_in(name)) - _NOT_OF_SUBJECT, items
 
 
@@ -598,6 +632,8 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
     if kind == "angle" or angle_unit(name) is not None or unit in ("rad", "deg"):
         if said & _JOINTS:
             return "joint position"
+        if said & _HEADINGS and said <= _HEADINGS | _OF_HEADINGS:
+            return "heading"
         if "roll" in said:
             return "roll"
         return "pitch" if "pitch" in said else None

@@ -7,14 +7,14 @@ from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any, Final, Literal
 
-from webots_mcp.analysis.arrays import Array, Runs, median, np, runs_of
+from webots_mcp.analysis.arrays import MOSTLY, Array, Runs, median, np, runs_of
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times
 from webots_mcp.judging.coverage import Fault
 from webots_mcp.judging.detection.degradation import DEGRADATION, TIMES
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
-from webots_mcp.judging.detection.sensors import FLAT, OTHER_ROWS, is_noisy
-from webots_mcp.signals.meaning import CAN_BE_OFF, INERT
+from webots_mcp.judging.detection.sensors import FLAT, MOST_REPEATED, OTHER_ROWS, is_noisy
+from webots_mcp.signals.meaning import CAN_BE_OFF, INERT, Meaning
 from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, find_targets, listed
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals import RegisteredSignal, stored_roles
@@ -33,6 +33,7 @@ _SORTED_AT_ONCE: Final = 8_192  # values at first ...
 _MORE_SORTED: Final = 4  # ... and then so many times as many
 _HASH_BITS: Final = 25
 _MIXES: Final = 0x9E3779B97F4A7C15  # 2^64 by the golden ratio
+_NEAR_LIMIT: Final = 0.01  # of the range
 _UNIQUE: Final = 0.95  # of all values but the extreme: so many differ from all others
 
 
@@ -131,12 +132,40 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
         return None
     if names.target(name) is not None:  # which rests as well
         return None
+    if _is_at_rest(run, flat) or _rests_so_often(run, flat, before, after):
+        return None
     others = run.events("standstill") + run.events("stuck")
     if run.motion.position is None:
         branch = name.partition(".")[0]
         others = [e for e in run.events(FLAT.name) if (e.name or "").partition(".")[0] != branch]
     rests_s = (min(flat.end_s, e.end_s) - max(flat.start_s, e.start_s) for e in others)
     return None if sum(max(0.0, each) for each in rests_s) > flat.duration_s / 2 else "warn"
+
+
+def _is_at_rest(run: RunUnderCheck, flat: Event) -> bool:
+    """Whether a place stays because a measured speed is exactly 0: what froze has any value."""
+    if run.meanings[flat.name or ""].quantity not in ("x", "y", "height", "joint position"):
+        return False
+    part = run.frame.between(flat.start_s, flat.end_s)
+    speeds = [
+        part.usable(each)[1]
+        for each in _names_in(run).sensors
+        if run.meanings[each].quantity in ("speed", "joint speed", "motor speed")
+    ]
+    return any(np.count_nonzero(each == 0) > MOSTLY * len(each) for each in speeds)
+
+
+def _rests_so_often(run: RunUnderCheck, flat: Event, before: Array, after: Array) -> bool:
+    """Whether a rounded signal that repeats itself anyway rests about as long at other times."""
+    others = np.concatenate([before, after])
+    if len(others) < 2 or np.mean(np.diff(others) == 0) <= MOST_REPEATED:
+        return False
+    alike = [
+        each
+        for each in run.events(FLAT.name)
+        if each.name == flat.name and each is not flat and 2 * each.duration_s >= flat.duration_s
+    ]
+    return len(alike) >= _OFTEN
 
 
 class _NamesIn:
@@ -208,12 +237,8 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
     for name, signal in names.sensors.items():
         if run.search.deadline.passed:
             return
-        if (
-            name in names.place
-            or signal.turn
-            or names.target(name)
-            or run.meanings[name].quantity == "distance"
-        ):
+        quantity = run.meanings[name].quantity
+        if name in names.place or signal.turn or names.target(name) or quantity == "distance":
             continue
         zones = run.frame.zone_map(name)
         if zones.change_count.sum() < _MANY_VALUES or not _is_often_at_an_end(run.frame, name):
@@ -222,6 +247,8 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
         if not _has_many_values(values):
             continue
         for limit in (float(values.min()), float(values.max())):
+            if quantity == "joint position" and not _is_known_limit(run.meanings[name], limit):
+                continue  # where a joint rests, again and again, is a posture
             if limit == 0 and run.meanings[name].quantity in CAN_BE_OFF:
                 continue
             at = values == limit
@@ -231,6 +258,14 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
                 yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
             elif limit != 0 and len(rests) >= _CUT_OFF and _is_cut_off(values[~at], rests):
                 yield name, limit, float(at.mean()), float(rests.starts_s[0]), len(rests)
+
+
+def _is_known_limit(meaning: Meaning, limit: float) -> bool:
+    """Return whether a device or a person says that a signal ends there, to a hundredth."""
+    if meaning.low is None or meaning.high is None:
+        return False
+    near = _NEAR_LIMIT * (meaning.high - meaning.low)
+    return limit <= meaning.low + near or limit >= meaning.high - near
 
 
 def _is_often_at_an_end(frame: Frame, name: str) -> bool:
@@ -309,14 +344,28 @@ def _spike(jump: Event) -> str:
 
 def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
     """Whether no motion and no switch explains that a reading went away and came back at once."""
-    quantity = run.meanings[jump.name or ""].quantity
+    name = jump.name or ""
+    quantity = run.meanings[name].quantity
     if quantity in INERT:
-        return True
+        return _stays_away(run.frame, name, jump)
     if quantity == "distance":  # other things may pass a sensor, but not at its very ends
-        zones = run.frame.zone_map(jump.name or "")
+        if run.search.known[name].reduction in ("min", "max"):  # whatever passes is the least
+            return float(jump.details["after"]) == 0
+        zones = run.frame.zone_map(name)
         ends = (0.0, float(np.nanmin(zones.min)), float(np.nanmax(zones.max)))
         return float(jump.details["after"]) in ends
     return False
+
+
+def _stays_away(frame: Frame, name: str, jump: Event) -> bool:
+    """Whether most values in between are nearer to where it went than to where it was.
+
+    What swings meanwhile, or moves, measures.
+    """
+    before, after = float(jump.details["before"]), float(jump.details["after"])
+    _, values = frame.between(jump.start_s, jump.end_s).usable(name)
+    away = np.abs(values - after) < np.abs(values - before)
+    return not len(values) or bool(np.mean(away) > MOSTLY)
 
 
 def sensors_keep_noise(run: RunUnderCheck) -> Examined:

@@ -8,7 +8,7 @@ by chance that happens once in `comb(before + after, before)` orders, at most on
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Final
 
@@ -26,6 +26,7 @@ _LEAST_ROWS: Final = 40  # of a block: its noise is known to about 15 % then
 _LEAST_SIDE: Final = 6  # blocks before, and after
 _MOST_CHANCE: Final = 1 / 12_870
 _SAME_MOTION: Final = 2.0  # times as fast: then the motion may explain the noise
+_SHAKEN: Final[frozenset[Quantity | None]] = frozenset(("angular velocity", "acceleration"))
 # Quantities whose noise does not depend on how the robot moves.
 _STEADY: Final[frozenset[Quantity | None]] = frozenset(
     ("distance", "x", "y", "height", "heading", "temperature", "voltage", "pressure", "light")
@@ -41,6 +42,17 @@ def degradation_events(search: Search) -> Iterator[Event]:
     ]
     wanted = {each.name for each in search.signals}
     signals = [each for each in signals if each.name in wanted and not each.is_index]
+    shaken = [
+        search.known[name]
+        for name in wanted
+        if search.meanings[name].quantity in _SHAKEN
+        and search.meanings[name].is_sensed
+        and search.known[name].is_number
+    ]
+    undecided = sorted(_shaken_more(search, shaken))
+    search.not_searched("degradation", *undecided, cause="undecided")
+    if undecided and not signals:
+        raise NotSearchableError("; ".join(undecided), "undecided")
     if not signals:
         raise NotSearchableError("no sensor is known whose noise does not depend on motion")
     found_any = False
@@ -56,6 +68,20 @@ def degradation_events(search: Search) -> Iterator[Event]:
     if not found_any and search.frame.times[:1].tolist() > [search.began_s]:
         search.not_searched(
             "degradation", "noise that grew earlier is not seen: ask for the whole run"
+        )
+
+
+def _shaken_more(search: Search, signals: Sequence[RegisteredSignal]) -> Iterator[str]:
+    """Of gyros and accelerometers the noise that grew: motors and the ground shake them as well."""
+    grown: dict[str, tuple[float, float, float]] = {}
+    for signal in search.in_time("degradation", signals, judged=False):
+        if (found := _change_of(search, signal)) is not None:
+            branch, _, item = signal.name.rpartition(".")
+            grown.setdefault(f"{branch}.*" if item.isdigit() else signal.name, found)
+    for name, (start_s, before, after) in grown.items():
+        yield (
+            f"noise of {name} grew from {before:.3g} to {after:.3g} at {start_s:.4g} s: nothing "
+            "recorded says whether the sensor or what shakes it did so"
         )
 
 

@@ -212,11 +212,13 @@ class Standings:
     def _cells(self) -> tuple[Indexes, Indexes, Flags]:
         """Where parts of about two seconds of each standstill begin, how many rows each has, and
         whether it is of the same standstill as the next one.
+
+        The shortest has two: in a single one nothing can be seen to turn or to sway.
         """
         begins: list[Array] = [
             np.linspace(place.times[0], place.times[-1], parts, endpoint=False)
             for place in self.places
-            for parts in [max(1, round(place.lasts_s / CELL_S))]
+            for parts in [max(2, round(place.lasts_s / CELL_S))]
         ]
         found = np.searchsorted(self.times, np.concatenate(begins))
         cells: Indexes = np.unique(np.append(found, self.starts[:-1]))

@@ -1,15 +1,17 @@
 """`off_target`: what should follow a target stayed away from it and came no nearer.
 
 Judged is by medians of cells of a second, whose error is known from the noise of both signals, so
-that neither noise nor the rate of rows decides.
+that neither noise nor the rate of rows decides. A height takes as long as it takes: it is off only
+where it never came to a target that stayed, nor any nearer in the second half of its stay.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, constant_runs, np, runs_of
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.kinds import (
     Alike,
@@ -17,7 +19,8 @@ from webots_mcp.judging.detection.kinds import (
     NotSearchableError,
 )
 from webots_mcp.judging.detection.search import EventKind, Search
-from webots_mcp.signals.meaning import HOLDING, targets_in, words_in
+from webots_mcp.signals.meaning import HOLDING, Meaning, targets_in, words_in
+from webots_mcp.signals.naming import METRES
 from webots_mcp.store.signals import RegisteredSignal
 
 OFF_S: Final = 3.0  # away for so long, without coming nearer
@@ -28,18 +31,32 @@ _MEDIAN_ERROR: Final = 1.2533  # of a median, times the standard error of a mean
 _NEARER_SHARE: Final = 0.05  # of the distance, from one cell to the next: it is on its way ...
 _ON_ITS_WAY: Final = 0.01  # ... and so is what comes nearer by this share of the target's size
 _LEAST_ROWS: Final = 3  # of a cell
-_PLACES: Final = ("x", "y", "height", "heading")  # where a robot goes takes as long as it takes
+_PLACES: Final = ("x", "y", "heading")  # where a robot goes takes as long as it takes
+_STAYS_S: Final = 2 * OFF_S  # a target of a height for so long, to judge by the half of it
+_TURNS: Final = {"rad": 1.0, "deg": math.pi / 180}
+_SPEEDS: Final = {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6}
+_TURN_SPEEDS: Final = {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": math.pi / 30}
+_SCALES: Final = (METRES, _TURNS, _SPEEDS, _TURN_SPEEDS)
 
 
 class Pursuit(NamedTuple):
-    """A measured signal and its target."""
+    """A measured signal and its target.
+
+    Attributes:
+        measured: What follows.
+        target: What it shall come to.
+        scale: What one unit of the target is in the unit of what follows.
+        is_height: It takes as long as it takes.
+    """
 
     measured: RegisteredSignal
     target: RegisteredSignal
+    scale: float = 1.0
+    is_height: bool = False
 
 
 def pursuits_in(search: Search) -> list[Pursuit]:
-    """Return what follows a target in a run.
+    """Return what follows a target in a run, where the units of both can be compared.
 
     Places where a robot shall go are no targets of this kind, and grippers close on things. A
     target that is always 0 has no size to judge by.
@@ -55,9 +72,24 @@ def pursuits_in(search: Search) -> list[Pursuit]:
         zones = frame.zone_map(target)
         is_set = (zones.min < 0).any() or (zones.max > 0).any()
         follows = there[measured].quantity not in _PLACES
-        if is_set and follows and HOLDING.isdisjoint(words_in(measured)):
-            found.append(Pursuit(known[measured], known[target]))
+        scale = _scale_between(there[target], there[measured])
+        if is_set and follows and scale and HOLDING.isdisjoint(words_in(measured)):
+            is_height = there[measured].quantity == "height"
+            found.append(Pursuit(known[measured], known[target], scale, is_height))
     return found
+
+
+def _scale_between(target: Meaning, measured: Meaning) -> float | None:
+    """What one unit of a target is in the other unit; None where they cannot be compared.
+
+    Without a unit of one of them nothing says that they differ.
+    """
+    if target.unit == measured.unit or target.unit is None or measured.unit is None:
+        return 1.0
+    for units in _SCALES:
+        if target.unit in units and measured.unit in units:
+            return units[target.unit] / units[measured.unit]
+    return None
 
 
 def off_target_events(search: Search) -> Iterator[Event]:
@@ -71,12 +103,13 @@ def off_target_events(search: Search) -> Iterator[Event]:
     targets = {each.measured.name: each for each in pursuits}
     search.judged("off_target", [each.target for each in pursuits])
     for signal in search.in_time("off_target", [each.measured for each in pursuits]):
-        yield from _apart(search, targets[signal.name])
+        pursuit = targets[signal.name]
+        yield from (_never_reached if pursuit.is_height else _apart)(search, pursuit)
 
 
 def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
     frame, measured, target = search.frame, pursuit.measured, pursuit.target
-    values, aims = frame.numbers(measured.name), frame.numbers(target.name)
+    values, aims = frame.numbers(measured.name), pursuit.scale * frame.numbers(target.name)
     there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
     if len(there) < 2:
         return
@@ -89,10 +122,9 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
         values = aims + np.remainder(values - aims + turn / 2, turn) - turn / 2
     off = np.maximum(values - high, 0.0) - np.maximum(low - values, 0.0)
     error = cells.medians(off)
-    noise = max(search.noise.of(measured.name), search.noise.of(target.name))
+    noise = max(search.noise.of(measured.name), pursuit.scale * search.noise.of(target.name))
     margin = _ERRORS * _MEDIAN_ERROR * noise / np.sqrt(cells.counts)
-    all_aims = search.whole.usable(target.name)[1]
-    size = float(np.ptp(all_aims)) or float(np.abs(all_aims).max())
+    size = _size_of(search, pursuit)
     is_off = (np.abs(error) > np.maximum(OFF_SHARE * size, margin)) & cells.is_full
     before = np.append(np.nan, error[:-1])
     nearer = np.abs(before) - np.abs(error)
@@ -114,6 +146,44 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
             continue
         part = error[run.start : run.stop]
         middle = float(np.median(part))
+        yield search.event(
+            "off_target",
+            start_s,
+            end_s,
+            measured.name,
+            target=target.name,
+            off_by=round(middle, 6),
+            off_percent=round(100 * abs(middle) / size, 1),
+        )
+
+
+def _size_of(search: Search, pursuit: Pursuit) -> float:
+    """The range of a target in the whole run, or its size where it stays, in the other's unit."""
+    aims = pursuit.scale * search.whole.usable(pursuit.target.name)[1]
+    return float(np.ptp(aims)) or float(np.abs(aims).max())
+
+
+def _never_reached(search: Search, pursuit: Pursuit) -> Iterator[Event]:
+    """Where a target stayed, was never reached, and came no nearer in the second half of that."""
+    frame, measured, target = search.frame, pursuit.measured, pursuit.target
+    values, aims = frame.numbers(measured.name), pursuit.scale * frame.numbers(target.name)
+    there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
+    times, values, aims = frame.times[there], values[there], aims[there]
+    size, noise = _size_of(search, pursuit), search.noise.of(measured.name)
+    stays = constant_runs(aims, times)
+    for stay in stays.only(stays.durations_s >= _STAYS_S).spans():
+        cells = _cells_of(times[stay.start : stay.stop])
+        error = cells.medians((values - aims)[stay.start : stay.stop])[cells.is_full]
+        margin = _ERRORS * _MEDIAN_ERROR * noise / math.sqrt(float(np.median(cells.counts)))
+        away, half = np.abs(error), len(error) // 2
+        nearest = max(OFF_SHARE * size, margin)
+        nearer = max(_ON_ITS_WAY * size, 2 * margin)
+        crosses = np.any(np.sign(error) != np.sign(error[0]))
+        if crosses or away.min() <= nearest or away[half:].max() - away[-1] > nearer:
+            continue
+        first = int(np.flatnonzero(np.append(True, away[:-1] > away[-1] + nearer))[-1])
+        start_s, end_s = float(cells.starts_s[cells.is_full][first]), stay.end_s
+        middle = float(np.median(error[first:]))
         yield search.event(
             "off_target",
             start_s,

@@ -204,7 +204,7 @@ class CommandsAnswer(Answer):
     actions: dict[str, Any] | None = said(
         "Actions that the controller registered, with their docstrings."
     )
-    built_in: str | None = said("Names of the actions that every bridge has.")
+    built_in: list[str] | None = said("Names of the actions that every bridge has.")
 
 
 class BreakpointAnswer(Answer):

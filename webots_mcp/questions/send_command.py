@@ -198,7 +198,7 @@ def _answer(view: RobotView, commands: list[QueuedCommand], limit: int) -> Comma
         commands=condensed(COMMAND_COLUMNS, rows),
         cursor=commands[len(rows) - 1].id if more else None,
         actions=shown,
-        built_in=", ".join(BUILT_IN_ACTIONS) if has_bridge else None,
+        built_in=[*BUILT_IN_ACTIONS] if has_bridge else None,
         hint="; ".join(hints) or None,
     )
 

@@ -217,7 +217,9 @@ def decide_roles(
     # A path in SQL does not reach all names, whatever the version of SQLite.
     known: dict[str, Kind] = {name: kind for name, kind in kinds.items() if is_reachable(name)}
     roles: dict[str, str] = {}
-    measured = {name: kind for name, kind in known.items() if not is_asked_for(name)}
+    measured: dict[str, Kind] = {
+        name: kind for name, kind in known.items() if not is_asked_for(name)
+    }
     pairs = _positions(measured)
     if position is not None:
         pairs = [position, *(pair for pair in pairs if pair != position)]

@@ -342,4 +342,5 @@ def test_an_amplitude_is_never_more_than_half_of_the_range(empty: sqlite3.Connec
     )
     told = one(empty, "heading_rad")
     said = float(re.findall(r"amplitude ([\d.]+)", told.says)[0])
-    assert said <= ((told.summary.max or 0.0) - (told.summary.min or 0.0)) / 2 + 5e-4  # as it is rounded
+    half = ((told.summary.max or 0.0) - (told.summary.min or 0.0)) / 2
+    assert said <= half + 5e-4  # as it is rounded

@@ -282,7 +282,7 @@ def test_what_is_too_old_but_among_the_newest_is_told(say: Say, database: Path) 
 def test_a_run_that_does_not_exist_cannot_be_kept(
     database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "no run 9" in complaint(capsys, "retain", "9", "--database", str(database))
+    assert "No run 9" in complaint(capsys, "retain", "9", "--database", str(database))
 
 
 @pytest.mark.parametrize("limit", ["", "none", "500", "5 parsecs", "1GB,2GB", "-3d", "1GB;2d"])

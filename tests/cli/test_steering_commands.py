@@ -63,7 +63,7 @@ def test_send_pause_step_resume_and_keep(cli: Cli, driver: Driver, recording: Re
 @pytest.mark.parametrize(
     ("typed", "words"),
     [
-        ("run", "(a condition), --for "),
+        ("run", "Give --for 10 "),
         ("run --for nan", "--for must be less than or equal to 1000000, not nan"),
         ("run --for 0", "--for must be greater than 0, not 0"),
         ("run --for inf", "--for must be less than or equal to 1000000, not inf"),

@@ -91,9 +91,9 @@ def test_runs_are_found_by_the_values_that_they_had(
 def test_a_name_that_no_controller_declared_is_refused_with_the_nearest(
     connection: sqlite3.Connection,
 ) -> None:
-    with pytest.raises(InvalidInputError, match=r"no parameter .kpp.*nearest are kp"):
+    with pytest.raises(InvalidInputError, match=r"No parameter .kpp.*nearest of .*: kp"):
         list_runs(connection, parameters={"kpp": 1})
-    with pytest.raises(InvalidInputError, match="no run has such a value"):
+    with pytest.raises(InvalidInputError, match="No run has such a value"):
         list_runs(connection, parameters={"kp": float("nan")})
 
 

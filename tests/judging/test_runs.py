@@ -69,7 +69,7 @@ def test_a_note_stays_with_its_run(empty: sqlite3.Connection) -> None:
     assert (run_info(empty, 2).label, run_info(empty, 2).note) == ("baseline", "before tuning")
     annotate_run(empty, 2, note="")
     assert (run_info(empty, 2).label, run_info(empty, 2).note) == ("baseline", None)
-    with pytest.raises(InvalidInputError, match="label or a note"):
+    with pytest.raises(InvalidInputError, match="Give a label, a note or both"):
         annotate_run(empty, 2)
     with pytest.raises(InvalidInputError, match="101 characters"):
         annotate_run(empty, 2, label="x" * 101)

@@ -62,6 +62,7 @@ from webots_mcp.store.signals import RegisteredSignal
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
 
 
+SMOOTH_SHARE: Final = 0.2  # of its range, from one value to the next
 NET_SHARE: Final = 0.9  # of its range: what ends so far from where it began rose or fell
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
 TOLD_MISSING_SHARE: Final = 0.001
@@ -443,9 +444,16 @@ def _shape(trend: Trend) -> Shape:
     if trend.slope_per_s is not None and (trend.r2 or 0.0) >= STRAIGHT_R2:
         return "rising" if trend.slope_per_s > 0 else "falling"
     summary = trend.summary
-    if abs(net := (summary.last or 0.0) - (summary.first or 0.0)) >= NET_SHARE * _range(summary):
+    net = (summary.last or 0.0) - (summary.first or 0.0)
+    if abs(net) >= NET_SHARE * _range(summary) and _is_smooth(trend):
         return "rising" if net > 0 else "falling"
     return "resting" if trend.flat_since_s is not None else "varying"
+
+
+def _is_smooth(trend: Trend) -> bool:
+    """Whether no value is far from the one before: a step or noise has no course."""
+    steps = np.abs(np.diff(trend.course.numbers))
+    return len(steps) > 0 and float(steps.max()) <= SMOOTH_SHARE * _range(trend.summary)
 
 
 def _range(summary: Summary) -> float:

@@ -15,6 +15,7 @@ from pydantic import Field
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
+    LONGEST_NAME,
     answer_about,
     condensed,
     figure,
@@ -617,12 +618,7 @@ def _checked(
     counts = ", ".join(f"{count} {outcome}" for outcome, count in left.items())
     asked = {f"expects: {each.name}": each.name for each in expected}
     return {
-        "expected": {
-            asked[each.name]: f"{each.outcome}: {each.evidence}"
-            for each in checked.findings
-            if each.name in asked
-        }
-        or None,
+        "expected": _expectations(checked.findings, asked),
         "counts": dict(Counter(each.outcome for each in checked.findings)),
         "outcome": checked.outcome,
         "checks": without_empty(CHECK_COLUMNS, rows),
@@ -630,6 +626,19 @@ def _checked(
         "passed_on": _bases(passed),
         "notes": [f"not shown: {counts}; webots-mcp check shows all"] if left else None,
     }
+
+
+def _expectations(findings: Sequence[Finding], asked: Mapping[str, str]) -> dict[str, str] | None:
+    """Return what became of the conditions that were asked for, of the first ones that fit."""
+    found = [
+        (
+            cut_for_a_model(asked[each.name], LONGEST_NAME),
+            cut_for_a_model(f"{each.outcome}: {each.evidence}", _SIZES.passed_characters),
+        )
+        for each in findings
+        if each.name in asked
+    ]
+    return dict(fitting(found, None if is_for_a_person() else _SIZES.passed_tokens)) or None
 
 
 def _bases(passed: Sequence[Finding]) -> dict[str, str] | None:

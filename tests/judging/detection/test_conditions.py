@@ -144,7 +144,7 @@ def test_the_answer_says_whether_the_rows_are_all_that_was_published(
 def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connection) -> None:
     with pytest.raises(InvalidConditionError, match="column 16"):
         ask(rover, "sensors.bumper = true")
-    with pytest.raises(UnknownSignalError, match="no signal 'bmuper' is recorded"):
+    with pytest.raises(UnknownSignalError, match="No signal 'bmuper' is recorded"):
         ask(rover, "bmuper")
     with pytest.raises(InvalidInputError, match=r"the text 'cruise' < the number 3\? \(in run 1"):
         ask(rover, "mode < 3")

@@ -64,7 +64,8 @@ def test_commands_logs_and_notices_are_on_the_same_clock(rover: sqlite3.Connecti
     logs = ask(rover, "log").events
     assert [(log.start_s, log.name) for log in logs] == [(45.0, "warning"), (104.0, "error")]
     (noticed,) = ask(rover, "bridge_event").events
-    assert (noticed.start_s, noticed.details) == (61.0, {"what": "dropped", "data": {"rows": 3}})
+    dropped = {"what": "dropped", "data": {"row_count": 3}}
+    assert (noticed.start_s, noticed.details) == (61.0, dropped)
     (image,) = ask(rover, "image").events
     assert image.details["path"] == "camera/1.png"
 

@@ -123,8 +123,8 @@ def test_a_kind_is_found_judged_drawn_and_reported(
     (lane,) = [each for each in plot.events if each.name == kind]
     assert lane.intervals[0].start_s == pytest.approx(first.start_s, abs=0.6), notes
     picture = plot_signals(connection, [whole], names, sheet=Sheet(image_format="svg"))
-    assert f">{kind}</text>" in picture.data.decode()
-    assert kind in picture.caption.partition("; events: ")[2]
+    assert f">{kind} (" in picture.data.decode()
+    assert kind in picture.caption.partition("Events: ")[2]
     assert kind in json.dumps(signals_figure(plot).data["events"])
 
     chapter = chapter_of(connection, 1, 1e6, 60.0)

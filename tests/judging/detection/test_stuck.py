@@ -60,7 +60,7 @@ def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Co
     recorder = start_run(empty)
     for step in range(300):
         recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
-    assert "in 3 s: 0.9 m" in ask(empty, "stuck").verdicts.not_found["stuck"]
+    assert "in 3 s was 0.9 m" in ask(empty, "stuck").verdicts.not_found["stuck"]
 
 
 def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:

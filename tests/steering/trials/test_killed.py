@@ -153,7 +153,7 @@ def test_who_was_stopped_until_another_took_over_writes_nothing_more(
     wait_for_trial(project, 2, process)
     stop_between_writes(process.pid, project / "data" / "webots.db")
     refused = run("--jobs", "2")
-    assert f"process {process.pid} on " in refused.stderr
+    assert f"Process {process.pid} on " in refused.stderr
     with closing(sqlite3.connect(project / "data" / "webots.db")) as connection, connection:
         connection.execute("UPDATE lease SET until_wall_time_s = 1.0")
     answer = json.loads(run("--jobs", "2", "--json").stdout)

@@ -363,18 +363,18 @@ def test_a_run_that_has_only_begun_is_drawn(record: Record, rows: int) -> None:
 @pytest.mark.parametrize(
     ("question", "error", "message"),
     [
-        ({"signals": ["sensor.frnt"]}, UnknownSignalError, "there is sensors.front"),
+        ({"signals": ["sensor.frnt"]}, UnknownSignalError, "15 signals: sensors.front"),
         ({"signals": ["pose"], "bands": "mod"}, UnknownSignalError, "mode"),
         ({"signals": ["pose"], "bands": "ir"}, InvalidInputError, "'ir' holds numbers"),
         ({"signals": ["pose"], "bands": "sensors"}, InvalidInputError, "matches 2 signals"),
-        ({"run_ids": [77]}, UnknownRunError, "no run 77"),
+        ({"run_ids": [77]}, UnknownRunError, "No run 77 is"),
         ({"start_s": 9, "end_s": 3}, InvalidRangeError, "reversed"),
         ({"start_s": 900}, NothingRecordedError, "begins after the newest row"),
         ({"signals": ["sensors.front"], "start_s": 101, "end_s": 103, "bands": ""},
          NothingRecordedError, "none of the signals has a value in rover, run 1, 101 to 103 s"),
         ({"width_px": 12}, InvalidInputError, "width_px=12 must be from 400 to 2000"),
         ({"image_format": "gif"}, InvalidInputError, "png or svg, not 'gif'"),
-        ({"kind": "pie"}, InvalidInputError, "there is signals, trajectory"),
+        ({"kind": "pie"}, InvalidInputError, "Kinds: signals, trajectory"),
         ({"kind": "trajectory", "signals": ["pose.0"]}, InvalidInputError, "takes two signals"),
         ({"kind": "trajectory", "signals": ["mode", "pose.0"]}, InvalidInputError, "no numbers"),
         ({"run_ids": [], "since_wall_time": 0, "robot": "rovr"}, InvalidInputError, "'rover'"),
@@ -389,7 +389,9 @@ def test_a_question_that_makes_no_sense_is_answered_with_what_there_is(
 
 def test_a_robot_without_a_position_is_asked_for_one(record: Record) -> None:
     connection = record(lambda t: {"altitude": t})
-    with pytest.raises(InvalidInputError, match=r"among the 1 signals: .*numbers are altitude$"):
+    with pytest.raises(
+        InvalidInputError, match=r"among the 1 signals\..*signals of numbers: altitude$"
+    ):
         plot(connection, "trajectory")
 
 
@@ -416,7 +418,7 @@ def test_as_many_runs_as_a_tool_may_be_given_are_drawn_and_told_apart(
 def test_the_name_of_a_file_tells_its_format() -> None:
     assert image_format_of(Path("plot.PNG")) == "png"
     assert image_format_of(Path("a/b.svg")) == "svg"
-    with pytest.raises(InvalidInputError, match=r"end it in \.png or \.svg"):
+    with pytest.raises(InvalidInputError, match=r"End it in \.png or \.svg"):
         image_format_of(Path("plot.jpg"))
 
 

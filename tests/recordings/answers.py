@@ -9,7 +9,7 @@ from typing import Any, Final, cast
 
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.events import find_events, timeline
-from webots_mcp.judging.trends import trends
+from webots_mcp.judging.trends import Trend, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.series import query_history
 
@@ -39,6 +39,11 @@ def answers(connection: sqlite3.Connection, run_id: int, part: tuple[float, floa
 
 
 def _portable(value: Any) -> Any:
+    if isinstance(value, Trend):  # what it says is worked out from its course when it is asked for
+        members = {field.name: getattr(value, field.name) for field in fields(value)}
+        del members["course"]
+        said = {"swings": value.swings, "shape": value.shape, "says": value.says}
+        return _portable({**members, **said})
     if is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, dict):

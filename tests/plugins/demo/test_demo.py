@@ -20,7 +20,7 @@ from webots_mcp.questions import all_questions
 from webots_mcp.setup.client_entries import can_be_started, is_ours, words_of
 
 TURNS = tuple(
-    turn for turn in demo.CONVERSATION if turn[1] in ("webots_list_commands", "webots_plot")
+    turn for turn in demo.CONVERSATION if turn[1] in ("webots_get_parameters", "webots_plot")
 )
 QUESTIONS = {each.name: each for each in all_questions()}
 CLIENTS = (Path(__file__).parents[3] / "docs" / "clients.md").read_text("utf-8")

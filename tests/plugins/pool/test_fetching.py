@@ -16,7 +16,7 @@ from typing import Any, cast
 import pytest
 
 from tests.plugins.pool.lab import IN_EACH_POOL, Lab
-from tests.recordings.answers import answers
+from tests.recordings import answers as recorded_answers
 from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import publish
@@ -89,6 +89,20 @@ def valued(rows: Iterable[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
 
 def value_of(cell: Any) -> Any:
     return json.loads(cell) if isinstance(cell, str) and cell[:1] in "{[" and cell else cell
+
+
+def answers(connection: sqlite3.Connection, run_id: int, part: tuple[float, float]) -> Any:
+    """The answers of a run but `course`: arrays, which trends are not compared by either."""
+    return without_course(recorded_answers.answers(connection, run_id, part))
+
+
+def without_course(answer: Any) -> Any:
+    if isinstance(answer, dict):
+        named = cast("dict[str, Any]", answer)
+        return {key: without_course(each) for key, each in named.items() if key != "course"}
+    if isinstance(answer, list):
+        return [without_course(each) for each in cast("list[Any]", answer)]
+    return answer
 
 
 @IN_EACH_POOL

@@ -211,7 +211,7 @@ def test_pictures_are_scaled_down_and_thinned_evenly_where_they_have_no_room(
         ([], {}, InvalidInputError, "one run or two, not 0"),
         ([1, 2, 3], {}, InvalidInputError, "one run or two, not 3"),
         ([1, 1], {}, InvalidInputError, "named twice"),
-        ([7], {}, UnknownRunError, "no run 7"),
+        ([7], {}, UnknownRunError, "No run 7 is"),
         ([1], {"max_mb": 1}, InvalidInputError, "from 2 to 100"),
         ([1], {"max_mb": float("nan")}, InvalidInputError, "from 2 to 100"),
         ([1], {"names": ["nosuch"]}, UnknownSignalError, "nosuch"),

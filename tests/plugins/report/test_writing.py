@@ -51,14 +51,14 @@ def test_the_command_writes_a_file_says_what_it_holds_and_never_overwrites_unask
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["9"], "no run 9: the newest runs are [1]"),
+        (["9"], "No run 9 is recorded. Use one of the newest runs: 1."),
         (["1", "1", "1"], "one run or two, not 3"),
         (["-o", "run.pdf"], "end it in .html"),
         (["-o", "nowhere/run.html"], "there is no folder nowhere"),
         (["-o", "."], "is a folder"),
         (["-o", f"{'a' * 300}.html"], "cannot be written"),
         (["--max-mb", "1"], "--max-mb 1 must be from 2 to 100"),
-        (["--signal", "nope"], "no signal 'nope'"),
+        (["--signal", "nope"], "No signal 'nope' is recorded"),
         (["--robot", "nobody"], "nobody"),
     ],
 )
@@ -97,7 +97,7 @@ async def test_the_tool_writes_nowhere_else_and_refuses_what_is_not_there(file: 
         for outside in ("../run.html", "/tmp/run.html"):
             assert "outside the data folder" in await fail(client, "webots_report", file=outside)
         assert "not a usable path" in await fail(client, "webots_report", file="a\0.html")
-        assert "no run 8" in await fail(client, "webots_report", run_ids=[8])
+        assert "No run 8 is" in await fail(client, "webots_report", run_ids=[8])
         assert "two" in await fail(client, "webots_report", run_ids=[1, 2, 3])
         assert "end it in .html" in await fail(client, "webots_report", file="webots.db")
     assert not (file.parent / "reports").exists()

@@ -151,7 +151,7 @@ def test_without_optuna_it_names_what_to_install(
         ("speed = { low = 0, high = 1, step = 0.3 }", "high=1 must be a number of steps=0.3"),
         ("speed = { low = 0, high = 1, step = 0 }", "step=0 must be a number above 0"),
         ("speed = { low = 1, high = 3, step = 2, log = true }", "log and step go together only"),
-        ("speed = { low = 1, hight = 3 }", "unknown 'hight'; there is high"),
+        ("speed = { low = 1, hight = 3 }", "Unknown key 'hight'. Keys, the nearest first: high"),
         ("speed = { low = '1', high = 3 }", "low='1' is a str"),
         ("speed = { choices = [] }", "choices must be an array"),
         ("speed = { choices = [1, 1] }", "the same choice is given twice"),

@@ -188,7 +188,7 @@ def test_where_one_run_cannot_be_marked_none_is(recorded: Recorded) -> None:
     connection = recorded.connection
     for _ in range(2):
         recorded.add_run(1)
-    with pytest.raises(UnknownRunError, match="no run 9"):
+    with pytest.raises(UnknownRunError, match="No run 9"):
         mark_kept(connection, [1, 9])
     connection.execute(
         "CREATE TRIGGER no_more BEFORE UPDATE ON run WHEN NEW.id = 2 "

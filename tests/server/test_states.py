@@ -90,7 +90,7 @@ async def test_a_part_of_the_state_comes_whole_in_pages(
         rest = await ask(client, "webots_get_full_state", path=path, offset=100)
         assert len(rest["state"]) == 80
         assert "next_offset" not in rest
-        assert "there are ['lidar']" in await fail(
+        assert "Use one of ['lidar']" in await fail(
             client, "webots_get_full_state", path="sensors.lidr"
         )
 

@@ -81,7 +81,7 @@ async def test_a_frame_that_is_taken_now_is_not_one_of_the_past(
     async with connect() as client:
         await ask(client, "webots_get_robot_state")
         for past in ({"at_s": 1.0}, {"frames": 2}, {"run_id": 1}):
-            assert "without at_s" in await fail(client, "webots_get_camera", fresh=True, **past)
+            assert "it excludes at_s" in await fail(client, "webots_get_camera", fresh=True, **past)
     async with connect(read_only=True) as client:
         assert "--read-only" in await fail(client, "webots_get_camera", fresh=True)
 

@@ -27,7 +27,7 @@ def test_it_is_found_from_anywhere_inside(project: Path, monkeypatch: pytest.Mon
 def test_outside_of_one_it_is_said_and_one_below_is_named(project: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"lies below: .*a project"):
         project_of(str(project.parent))
-    with pytest.raises(InvalidInputError, match="is no folder"):
+    with pytest.raises(InvalidInputError, match="is not a folder"):
         project_of(str(project / "gone"))
 
 

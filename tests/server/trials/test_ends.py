@@ -61,7 +61,7 @@ async def test_a_set_whose_server_was_killed_is_gone_on_with_by_another(
         left = await ask(client, "webots_get_trials")
         assert left["state"] == "left by a server that ended"
         said = await fail(client, "webots_run_trials", parameters=SPEEDS, score="duration", for_s=1)
-        assert "trial set 1 of this robot is not over (its server ended)" in said
+        assert "Trial set 1 of this robot is not over (its server ended)" in said
         release.touch()
         answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=90)
         assert (answer["state"], answer["over"]) == ("done", 5)

@@ -38,12 +38,12 @@ async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
             assert "parameters must be sets, [{" in await refused(parameters=wrong)
         assert "more than 10000" in await refused(parameters={"kp": [0.01 * n for n in range(101)],
                                                               "gait": ["trot"] * 101})  # fmt: skip
-        assert "there is distance" in await refused(score="last(distanc)")
-        assert "no kind of event 'stcuk'" in await refused(score="count(stcuk)")
+        assert "Nearest signals: distance" in await refused(score="last(distanc)")
+        assert "unknown kind of event 'stcuk'" in await refused(score="count(stcuk)")
         assert "column" in await refused(score="last(distance")
         assert "distance" in await refused(until="distanc > 3")
-        assert "give until" in await refused(for_s=None)
-        assert "give both" in await refused(score=None)
+        assert "It is not said when to stop" in await refused(for_s=None)
+        assert "both" in await refused(score=None)
         assert "not both" in await refused(trial_set=1)
         assert "No trial set 1 is recorded: none was started yet" in await fail(
             client, "webots_run_trials", trial_set=1

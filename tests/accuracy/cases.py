@@ -36,8 +36,8 @@ The healthy kinds were drawn again with a row each {rates}, with other noise: {r
 _OSCILLATIONS: Final = 30
 _GROWTH: Final = """\
 Of {count} oscillations whose amplitude grows or decays 4 to 20 times in a minute, {found} are found
-and {told} are told with their amplitudes at start and end; of {count} that keep theirs, {false} are
-told to grow."""
+and {told} are reported with their amplitudes at start and end; of {count} that keep theirs,
+{false} are reported to grow."""
 _RATES: Final = """\
 One situation must not be judged differently because it was recorded faster or with more noise.
 Below, noise is a share of a signal's range (standard deviation). *Found* is an event with a start
@@ -76,7 +76,7 @@ def cases(bench: Bench) -> Iterator[str]:
 
 
 def _growth() -> str:
-    """Draw oscillations that grow, decay or keep their amplitude, and count what is told of it."""
+    """Draw oscillations that grow, decay or keep their amplitude, and count the reports of it."""
     random = np.random.default_rng(10_000)
     told, found = {True: 0, False: 0}, {True: 0, False: 0}
     for number in range(2 * _OSCILLATIONS):

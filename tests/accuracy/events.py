@@ -57,7 +57,7 @@ def events(bench: Bench) -> Iterator[str]:
     quiet = _sum(each for found in cells.values() for _, each in found if not each.incidents)
     yield (
         f"{percent(clear.recall)} % of {clear.incidents:,} events in drawn recordings are found, "
-        f"{percent(clear.precision)} % of what is told is true; where there is much noise "
+        f"{percent(clear.precision)} % of the reported ones are true; with much noise "
         f"{percent(noisy.recall)} % of {noisy.incidents:,} and {percent(noisy.precision)} %."
     )
     yield _EVENTS.format(
@@ -95,11 +95,11 @@ For each row interval and each level of noise recordings of {recordings} kinds a
 of each: drives, stops, docking, creeping, robots that are held, sensors that fail, values that
 swing, healthy ones and so on. The noise of a position is {places} in each coordinate, of a
 distance sensor {readings}, of a swing {swings} of its amplitude (standard deviations). *Found*
-is the share of what happened that is told (recall), *true* the share of what is told that
+is the share of what happened that is reported (recall), *true* the share of reports that
 happened (precision), both in per cent, then how often it happened; *off* is the median error of
 begin and end, in parentheses what nine in ten do not exceed (a dropout ends here in its last
 row, in an answer with the next one). In the {hours} hours of recordings in which a kind does not
-happen at all, {false} false events per hour are told of a kind."""
+happen at all, {false} false events of a kind are reported per hour."""
 
 _WHY: Final = """\
 The two weak places have a reason each. A dropout has to be {score:g} times as large as the steps

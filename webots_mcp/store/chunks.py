@@ -560,19 +560,6 @@ def statistics_by_signal(
     return {signal_id: Statistics(*figures) for signal_id, *figures in rows}
 
 
-def groups_with_steps(
-    connection: sqlite3.Connection, run_id: int, signal_id: int, between: tuple[int, int], by: float
-) -> list[int]:
-    """The groups between two ids in which a signal once changes by more than that."""
-    asked = (run_id, signal_id, *between, by)
-    return [
-        group_id
-        for (group_id,) in connection.execute(
-            f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?", asked
-        )
-    ]
-
-
 def values_in(
     connection: sqlite3.Connection, run_id: int, signal_id: int, wanted: Mapping[int, int]
 ) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:

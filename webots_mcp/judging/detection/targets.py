@@ -144,17 +144,7 @@ def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:
         end_s = float(cells.ends_s[run.stop - 1])
         if end_s - start_s < OFF_S:
             continue
-        part = error[run.start : run.stop]
-        middle = float(np.median(part))
-        yield search.event(
-            "off_target",
-            start_s,
-            end_s,
-            measured.name,
-            target=target.name,
-            off_by=round(middle, 6),
-            off_percent=round(100 * abs(middle) / size, 1),
-        )
+        yield _off_target(search, pursuit, start_s, end_s, error[run.start : run.stop], size)
 
 
 def _size_of(search: Search, pursuit: Pursuit) -> float:
@@ -183,16 +173,23 @@ def _never_reached(search: Search, pursuit: Pursuit) -> Iterator[Event]:
             continue
         first = int(np.flatnonzero(np.append(True, away[:-1] > away[-1] + nearer))[-1])
         start_s, end_s = float(cells.starts_s[cells.is_full][first]), stay.end_s
-        middle = float(np.median(error[first:]))
-        yield search.event(
-            "off_target",
-            start_s,
-            end_s,
-            measured.name,
-            target=target.name,
-            off_by=round(middle, 6),
-            off_percent=round(100 * abs(middle) / size, 1),
-        )
+        yield _off_target(search, pursuit, start_s, end_s, error[first:], size)
+
+
+def _off_target(
+    search: Search, pursuit: Pursuit, start_s: float, end_s: float, error: Array, size: float
+) -> Event:
+    """Return the event of an interval with the median of its errors, also in per cent of a size."""
+    off_by = float(np.median(error))
+    return search.event(
+        "off_target",
+        start_s,
+        end_s,
+        pursuit.measured.name,
+        target=pursuit.target.name,
+        off_by=round(off_by, 6),
+        off_percent=round(100 * abs(off_by) / size, 1),
+    )
 
 
 def _recent_range(times: Array, aims: Array) -> tuple[Array, Array]:

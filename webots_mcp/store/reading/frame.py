@@ -300,14 +300,6 @@ class Frame:
         for start, stop in _spans(self._edges, wanted):
             yield start, self.numbers(name)[start:stop]
 
-    def around_steps(self, longer_s: float) -> list[Array]:
-        """Times around all steps in time that are longer: those of whole chunks."""
-        if self._source.order is not None:
-            return [self.times]
-        parts = self._source.parts(self._start, self._stop)
-        spans = _spans(self._edges, self._source.with_long_steps(longer_s)[parts])
-        return [self.rows(*span).times for span in spans]
-
     @property
     def bounds_s(self) -> tuple[float, float]:
         """Simulation time of its first and last row; only of a frame that has rows."""

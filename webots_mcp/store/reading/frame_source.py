@@ -26,7 +26,6 @@ from webots_mcp.store.chunks import (
     StateColumns,
     Statistics,
     decoded_of,
-    groups_with_steps,
     statistics_by_signal,
     statistics_in,
     statistics_of,
@@ -287,17 +286,6 @@ class FrameSource:
     def _of_one_group(self) -> dict[int, Statistics]:
         """The statistics of all signals of a short run, read at once."""
         return statistics_by_signal(self.connection, self.run_id, int(self._group_ids[0]))
-
-    def with_long_steps(self, longer_s: float) -> Flags:
-        """Return in which parts two successive rows are further apart in simulation time."""
-        between = self.starts_s[1:] - self.ends_s[:-1] > longer_s
-        found = np.append(between, False) | np.append(False, between)
-        found[len(self._group_ids) :] = True
-        if len(self._group_ids):
-            asked = (self.run_id, SIM_TIMES, self._between, longer_s)
-            ids = groups_with_steps(self.connection, *asked)
-            found[self._places_of(np.array(ids, np.float64))[0]] = True
-        return found
 
     @property
     def _between(self) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from typing import Any, Final
 from webots_mcp.analysis.swings import LEAST_HALF_SWINGS
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.coverage import Cause
+from webots_mcp.judging.verdicts import Cause
 from webots_mcp.signals.naming import Value
 
 LEVELS: Final = LOG_LEVELS

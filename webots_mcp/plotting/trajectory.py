@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
 from webots_mcp.plotting.axes import AxesBox, axis_range, rounded_on, ticks
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, short, width_of

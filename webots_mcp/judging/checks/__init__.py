@@ -39,8 +39,9 @@ from webots_mcp.judging.detection.condition import (
     expectations_of,
     judge_expectation,
 )
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
-from webots_mcp.judging.detection.kinds import EventOptions, NotSearchableError
+from webots_mcp.judging.detection.kinds import NotSearchableError
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.judging.verdicts import WORST_FIRST, Coverage, Fault, Outcome, outcome_of
 from webots_mcp.signals.conditions.compiler import Expectation

@@ -25,11 +25,8 @@ from webots_mcp.judging.detection import (
     stored,
     targets,
 )
-from webots_mcp.judging.detection.kinds import (
-    Event,
-    EventOptions,
-    count_by_kind,
-)
+from webots_mcp.judging.detection.event_options import EventOptions
+from webots_mcp.judging.detection.kinds import Event, count_by_kind
 from webots_mcp.judging.detection.search import EventKind, Search, events_touching, find_motion
 from webots_mcp.judging.verdicts import SearchCoverage, Verdicts
 from webots_mcp.signals.naming import flatten

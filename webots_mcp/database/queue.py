@@ -202,7 +202,7 @@ def list_commands(
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:
-    """Return whether `dead_sessions.reap` could have anything to say about commands."""
+    """Return whether `session_cleanup.reap` could have anything to say about commands."""
     return bool(connection.execute(_UNFINISHED).fetchone()[0])
 
 

@@ -13,7 +13,7 @@ import pytest
 from tests.bridge.conftest import Recording
 from tests.bridge.processes.conftest import Start, has_states, last_number
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.database.dead_sessions import reap
+from webots_mcp.database.session_cleanup import reap
 from webots_mcp.database.waiting_file import adopt
 
 COUNTING = """

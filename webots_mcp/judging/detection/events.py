@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Final
 
-from webots_mcp.database.dead_sessions import find_dead_sessions
+from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection import (
     condition,

@@ -1,7 +1,7 @@
 """The sentence that says why a controller has ended: finished, killed, crashed or reloaded.
 
-`robot_status` shows it as the reason of a robot's state. Whether a session is dead is decided by its
-process, in `database.processes`.
+`robot_status` shows it as the reason of a robot's state. Whether a session is dead follows from its
+process, see `database.processes`.
 """
 
 from __future__ import annotations

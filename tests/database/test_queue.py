@@ -16,6 +16,7 @@ from webots_mcp.database import session_cleanup
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
 from webots_mcp.database.queue import (
+    CLAIM,
     MAX_PARAMS_BYTES,
     CommandQueue,
     _while_busy,
@@ -24,7 +25,6 @@ from webots_mcp.database.queue import (
     find_command,
     list_commands,
 )
-from webots_mcp.database.queue_statements import CLAIM
 from webots_mcp.errors import InvalidInputError
 
 

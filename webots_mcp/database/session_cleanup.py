@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, host_name
 from webots_mcp.database.processes import is_living, process_alive
-from webots_mcp.database.queue_statements import CLAIMED_BY_ENDED, EXPIRE, LOSE
+from webots_mcp.database.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
 from webots_mcp.database.waiting_file import waiting_path
 
 END_SESSION: Final = (

@@ -232,7 +232,7 @@ def test_controllers_that_start_at_once_on_a_missing_database_all_come_up(
 
 CLAIMER = """
 import sqlite3, sys, time
-from webots_mcp.database.queue_statements import CLAIM, PEEK
+from webots_mcp.database.queue import CLAIM, PEEK
 from webots_mcp.database.connection import connect
 from webots_mcp.database.connection import never_wait
 from pathlib import Path

@@ -56,9 +56,11 @@ _ENDINGS: Final = {  # others: "ended by reset"
 _BAD_NOTABLE: Final = ("log critical", "log error", "command failed", "dropped")
 _HELD: Final = {"pass": "held", "fail": "did not hold", "warn": "did not always hold"}
 TRIAL_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
-_PLURALS: Final = {
-    "change": "changes", "command": "commands", "log": "log lines", "bridge_event": "bridge events",
-    "kept_stretch": "kept stretches", "image": "images", "run": "beginnings and ends of runs",
+_NOUNS: Final = {  # one and several
+    "change": ("change", "changes"), "command": ("command", "commands"),
+    "log": ("log line", "log lines"), "bridge_event": ("bridge event", "bridge events"),
+    "kept_stretch": ("full-rate segment", "full-rate segments"), "image": ("image", "images"),
+    "run": ("beginning or end of a run", "beginnings and ends of runs"),
 }  # fmt: skip
 
 
@@ -377,7 +379,7 @@ def _noted(
                 said.append(f"{_count(len(runs), 'run')} that began or ended")
                 continue
         if counts[kind] > 0:
-            said.append(_count(counts[kind], kind.replace("_", " "), _PLURALS[kind]))
+            said.append(_count(counts[kind], *_NOUNS[kind]))
     return said
 
 

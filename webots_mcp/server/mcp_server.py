@@ -276,8 +276,8 @@ class ToolServer(MCPServer):
             raise ToolError(str(error)) from error
         if name in self._withheld:
             raise ToolError(
-                f"{name} changes the simulation or the recording, and this server is --read-only: "
-                "ask for a server that was started without"
+                f"{name} changes the simulation or the recording, and this server is --read-only. "
+                "To use it, restart the server without --read-only."
             )
         if self._tool_manager.get_tool(name) is None:
             make = self._unlisted.get(name)

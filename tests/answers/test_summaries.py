@@ -27,8 +27,8 @@ from webots_mcp.answers.models import (
     TrialsAnswer,
 )
 from webots_mcp.answers.summaries import MOST_WORDS, summary_of, verdict_of_kinds
-from webots_mcp.judging.coverage import AS_STUCK, JudgedInterval, SearchCoverage
 from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.judging.verdicts import AS_STUCK, JudgedInterval, SearchCoverage
 from webots_mcp.questions import all_questions
 
 _KINDS = st.sampled_from(kind_names())

@@ -41,7 +41,7 @@ from webots_mcp.answers.models import (
     TrialsAnswer,
     WorldAnswer,
 )
-from webots_mcp.judging.coverage import AS_STUCK
+from webots_mcp.judging.verdicts import AS_STUCK
 from webots_mcp.store.ages import age_in_words
 
 MOST_WORDS: Final = 40

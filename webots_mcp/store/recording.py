@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database import dead_sessions
+from webots_mcp.database import session_cleanup
 from webots_mcp.database.connection import (
     FAILURES,
     LONGEST_READ_S,
@@ -315,7 +315,7 @@ class RecordingAccess:
             if any_unfinished(connection):
                 if isinstance(self.database, Path):
                     adopt(connection, self.database)  # a command's result may wait there
-                dead_sessions.reap(connection, time.time())
+                session_cleanup.reap(connection, time.time())
 
     def ingest(self) -> None:
         """Take in what controllers wrote into journals; nothing where the asker may not write."""

@@ -396,7 +396,7 @@ class EventsAnswer(NotedAnswer):
         "Events in order of time; a column with @ holds that signal's value when the event began."
     )
     verdicts: KindVerdicts | None = said("What became of each kind that was searched for.")
-    from_s: float | None = said("Begin of the range, where that is not the begin of the run.")
+    start_s: float | None = said("Begin of the range, where that is not the begin of the run.")
     not_shown: dict[str, str] | None = said(
         "Number of events of each kind that are not shown, and when they began."
     )

@@ -259,7 +259,7 @@ def _clause(says: Any) -> str:
 
 @_summary.register
 def _(answer: EventsAnswer) -> str:
-    return _events(answer.verdicts, answer.events, answer.run_id, answer.from_s)
+    return _events(answer.verdicts, answer.events, answer.run_id, answer.start_s)
 
 
 @_summary.register
@@ -554,10 +554,10 @@ def _first_difference(answer: ComparisonAnswer) -> str:
     if not parted:
         rows = _count(compared["row_count"], "compared row")
         signals = _count(compared["signal_count"], "signal")
-        return f"{before}Identical in {rows} of {signals}, up to {compared['until_s']:.12g} s."
-    first_s = parted[0].get("from_s")
-    first = [_name(row) for row in parted if row.get("from_s") == first_s]
-    is_at_once = first_s is None or first_s == compared.get("from_s")
+        return f"{before}Identical in {rows} of {signals}, up to {compared['end_s']:.12g} s."
+    first_s = parted[0].get("start_s")
+    first = [_name(row) for row in parted if row.get("start_s") == first_s]
+    is_at_once = first_s is None or first_s == compared.get("start_s")
     when = "from the first compared row on"
     if not is_at_once:
         when = f"from {first_s:.12g} s on, and are identical before"

@@ -254,9 +254,9 @@ def _show_frame(recording: RecordingAccess, answer: RunAnswer, why: str) -> None
     frame = None
     if ran.get("run_id") is not None:
         with recording.reader() as connection:
-            found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
+            found = camera_frames(connection, ran["run_id"], at_s=ran["end_s"])
         frame = next(
-            (each for each in found if abs(each.sim_time_s - ran["to_s"]) < _LIMITS.same_s), None
+            (each for each in found if abs(each.sim_time_s - ran["end_s"]) < _LIMITS.same_s), None
         )
     if frame is None:
         answer.picture = {"missing": why}

@@ -192,10 +192,10 @@ def _run_facts(view: RobotView, command: QueuedCommand) -> dict[str, Any]:
     facts |= {
         "ran": {
             "run_id": progress.run_id,
-            "from_s": seconds(progress.from_s),
-            "to_s": seconds(progress.to_s),
+            "start_s": seconds(progress.from_s),
+            "end_s": seconds(progress.to_s),
             "advanced_s": seconds(progress.advanced_s),
-            "factor": figure(progress.factor),
+            "real_time_factor": figure(progress.factor),
         },
         "values": shown(result.get("values")) if result.get("values") else None,
         "mode": result.get("mode"),

@@ -182,7 +182,7 @@ class CommandAnswer(Answer):
     command_id: int | None = said("Number of the command.")
     action: str | None = said("Name of the action that was asked for.")
     outcome: str | None = said("done, failed, expired, cancelled, lost, or claimed (under way).")
-    waited_s: float | None = said("Wall-clock seconds that the call waited.")
+    waited_wall_s: float | None = said("Wall-clock seconds that the call waited.")
     result: Any = said("What the controller returned.")
     error: str | None = said("What the controller or the bridge reported.")
     route: str | None = said("What steered: bridge, websocket (of Webots), keyboard or process.")
@@ -431,7 +431,7 @@ class TimelineAnswer(NotedAnswer):
 class MonitorAnswer(NotedAnswer):
     """What was recorded in a window of wall time: of exactly those rows."""
 
-    window_s: float | None = said("Wall-clock seconds that were watched.")
+    window_wall_s: float | None = said("Wall-clock seconds that were watched.")
     row_count: int | None = said("Number of rows recorded in the window.")
     movement: dict[str, Any] | None = said(
         "From where to where the robot moved, with path and displacement in metres."

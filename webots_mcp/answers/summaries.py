@@ -272,7 +272,7 @@ def _(answer: TimelineAnswer) -> str:
 
 @_summary.register
 def _(answer: MonitorAnswer) -> str:
-    window = f"{answer.window_s or 0:.3g} s of wall-clock time"
+    window = f"{answer.window_wall_s or 0:.3g} s of wall-clock time"
     if (answer.status or "").startswith("stopped"):
         window = f"the last {window} recorded"
     if not answer.row_count:

@@ -278,7 +278,7 @@ def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
     return {
         "id": run.id,
         "began_by": run.start_reason,
-        "began_ago_s": view.age_s(run.started_wall_time_s),
+        "began_ago_wall_s": view.age_s(run.started_wall_time_s),
         "sim_duration_s": round(run.last_sim_time_s - run.started_sim_time_s, 3),
         "row_count": run.row_count,
         **ended,

@@ -339,7 +339,7 @@ def _health(view: RobotView) -> dict[str, Any] | None:
         **rows_waiting(view.connection, session),
         "rows_dropped": _dropped(view, session.rows_dropped),
         "last_error": error,
-        "heartbeat_age_s": round(session.silent_s(view.now_s), 2),
+        "heartbeat_age_wall_s": round(session.silent_s(view.now_s), 2),
         "polls_commands": session.last_poll_wall_time_s is not None,
         **({"recorded_by": BY_OBSERVER} if view.robot.kind == CUSTOM_DATA else {}),
         "controller": session.controller,

@@ -158,7 +158,7 @@ def _single(
     picture, note = _load_picture(image.file(recording.data_dir))
     return picture, {
         "picture_sim_time_s": seconds(image.sim_time_s),
-        "picture_age_s": view.age_s(image.wall_time_s),
+        "picture_age_wall_s": view.age_s(image.wall_time_s),
         "width_px": image.width,
         "height_px": image.height,
         "file": str(recording.data_dir / image.path),

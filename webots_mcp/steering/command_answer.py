@@ -81,7 +81,7 @@ def command_answer(view: RobotView, command: QueuedCommand, waited_s: float) -> 
         "command_id": command.id,
         "action": command.action,
         "outcome": command.status,
-        "waited_s": waited_s,
+        "waited_wall_s": waited_s,
         "error": cut_text(command.error or "", 2_000) if failed else None,
         "hint": _hint(view, command),
     }

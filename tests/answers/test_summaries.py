@@ -171,7 +171,7 @@ def test_too_few_runs_do_not_hide_the_largest_differences() -> None:
         (
             LogsAnswer(
                 lines=AnswerTable(columns=["level", "message"], rows=[["error", "drop all"]]),
-                matching=7,
+                total=7,
             ),
             "1 of 7 log lines; 1 error.",
         ),

@@ -172,7 +172,7 @@ class LogsAnswer(Answer):
     """Log lines, oldest first."""
 
     lines: AnswerTable | None = said("Log lines, oldest first.")
-    matching: int | None = said("Number of matching lines; with a cursor, of the older ones.")
+    total: int | None = said("Number of matching lines; with a cursor, of the older ones.")
     cursor: int | None = said("Cursor to ask with for older lines.")
 
 

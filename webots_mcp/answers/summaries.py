@@ -134,7 +134,7 @@ def _(answer: LogsAnswer) -> str:
         return "No log line matches."
     levels = Counter(str(each.get("level")) for each in lines)
     serious = [f"{levels[name]} {name}" for name in _SERIOUS if levels[name]]
-    total = max(answer.matching or 0, len(lines))
+    total = max(answer.total or 0, len(lines))
     shown = (
         f"{len(lines)} of {total} log lines" if total > len(lines) else _count(total, "log line")
     )

@@ -157,7 +157,7 @@ def _write(file: Path, answer: dict[str, Any]) -> None:
     for each in _checks_in(answer):
         name, says = spelled_out(each["check"]), spelled_out(each.get("evidence") or "")
         case = SubElement(suite, "testcase", classname="webots-mcp", name=name)
-        says += f" (since {each['since_s']:g} s)" if each.get("since_s") is not None else ""
+        says += f" (since {each['start_s']:g} s)" if each.get("start_s") is not None else ""
         element, counted = _ELEMENTS.get(each["outcome"], ("", ""))
         counts.update(filter(None, ("tests", counted)))
         if element:

@@ -86,7 +86,7 @@ PARTED_COLUMNS: Final = (
     "signal", "unit", "start_s", "values", "by", "largest", "largest_at_s", "tolerance", "beyond_s",
     "row_count",
 )  # fmt: skip
-CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
+CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "start_s", "count", "more")
 _GOING_ON: Final = "going on"
 _LEGEND: Final = {  # what columns of a comparison mean, where their names do not say it
     "range": "range, mean_range: minimum and maximum over the runs of a group",

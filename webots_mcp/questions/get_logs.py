@@ -115,7 +115,7 @@ def webots_get_logs(
         )
         return LogsAnswer(
             lines=_table(_newest_fitting(shown), time_of_day=time_of_day) if shown else None,
-            matching=len(waiting),
+            total=len(waiting),
             hint=_NO_RUN_YET if waiting else hint,
         )
 
@@ -161,7 +161,7 @@ def _answer(
     return LogsAnswer(
         **view.header(),
         lines=_table(shown, time_of_day=time_of_day),
-        matching=matching,
+        total=matching,
         cursor=recorded[0].id if older and recorded else None,
         hint="; ".join(hint for hint in hints if hint) or None,
     )

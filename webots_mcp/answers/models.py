@@ -134,7 +134,7 @@ class WorldAnswer(Answer):
     )
     supervisor: bool | None = said("Whether the robot may control the simulation.")
     run: dict[str, Any] | None = said("The run: how it began and ended, its duration and its rows.")
-    runs_recorded: int | None = said("Number of recorded runs of the robot.")
+    run_count: int | None = said("Number of recorded runs of the robot.")
     controller: dict[str, Any] | None = said(
         "The file, the code and the versions of the controller."
     )

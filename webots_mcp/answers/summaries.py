@@ -107,7 +107,7 @@ def _(answer: FullStateAnswer) -> str:
 @_summary.register
 def _(answer: WorldAnswer) -> str:
     world = answer.world.replace("\\", "/").rsplit("/", 1)[-1] if answer.world else "unknown world"
-    runs = f", {answer.runs_recorded} recorded" if answer.runs_recorded else ""
+    runs = f", {answer.run_count} recorded" if answer.run_count else ""
     return f"{world}: {_subject(answer)} {_when(answer)}; run {answer.run_id}{runs}."
 
 

@@ -334,7 +334,7 @@ def _health(view: RobotView) -> dict[str, Any] | None:
         return None
     error = cut_text(session.last_error, _SIZES.error_characters) if session.last_error else None
     return {
-        "rows_recorded": view.run.row_count if view.run else 0,
+        "row_count": view.run.row_count if view.run else 0,
         **({"kept_at_full_rate": kept} if (kept := _kept(view)) else {}),
         **rows_waiting(view.connection, session),
         "rows_dropped": _dropped(view, session.rows_dropped),

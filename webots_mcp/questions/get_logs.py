@@ -138,8 +138,8 @@ def _row(line: LogLine) -> dict[str, object]:
 def _table(lines: list[LogLine], *, time_of_day: bool) -> AnswerTable:
     columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
     if time_of_day:
-        columns.insert(columns.index("sim_time_s") + 1, "time")
-    rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]
+        columns.insert(columns.index("sim_time_s") + 1, "wall_time")
+    rows = [_row(line) | {"wall_time": wall_clock(line.wall_time_s)} for line in lines]
     return AnswerTable(columns=columns, rows=[[row[name] for name in columns] for row in rows])
 
 

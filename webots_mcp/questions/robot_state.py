@@ -322,7 +322,7 @@ def _events(view: RobotView) -> AnswerTable:
         for event in reversed(events)
     ]
     shown = fitting(rows, _SIZES.events_tokens)[::-1]
-    return AnswerTable(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
+    return AnswerTable(columns=["start_s", "kind", "name", "details"], rows=shown)
 
 
 def _health(view: RobotView) -> dict[str, Any] | None:

@@ -120,8 +120,8 @@ def test_a_first_difference_begins_with_where_it_is(
     unlike: dict[str, list[str]] | None, rows: list[list[object]], said: str
 ) -> None:
     compared = {"row_count": 500, "signal_count": 3, "start_s": 0.016, "end_s": 8.0}
-    answer = ComparisonAnswer(verdict="", unlike=unlike, compared=compared)
-    answer.parted = AnswerTable(columns=["signal", "start_s"], rows=rows)
+    answer = ComparisonAnswer(verdict="", different_before=unlike, compared=compared)
+    answer.diverging = AnswerTable(columns=["signal", "start_s"], rows=rows)
     assert summary_of(answer) == said
     answer.compared = {"row_count": 0, "signal_count": 0}
     assert "Cannot tell" in (summary_of(answer) or "")

@@ -517,11 +517,11 @@ class ComparisonAnswer(NotedAnswer):
     """Runs beside each other; the first group is the reference."""
 
     verdict: str | None = said("Where the two runs diverge, with first_difference.")
-    unlike: dict[str, list[Any]] | None = said(
+    different_before: dict[str, list[Any]] | None = said(
         "Properties in which the two runs differed from the beginning."
     )
     compared: dict[str, Any] | None = said("Rows that both runs have at the same simulation time.")
-    parted: AnswerTable | None = said(
+    diverging: AnswerTable | None = said(
         "Signals in the order in which they diverge; beyond_s is when they exceed the tolerance."
     )
     growth: dict[str, Any] | None = said("Largest difference of the signal that diverges most.")

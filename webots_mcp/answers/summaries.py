@@ -546,8 +546,8 @@ def _(answer: ComparisonAnswer) -> str | None:
 
 def _first_difference(answer: ComparisonAnswer) -> str:
     """Return where two runs diverge, and what was different before they began."""
-    compared, parted = answer.compared or {}, list(_rows(answer.parted))
-    begun = [name for name in answer.unlike or () if name != "began_by"]
+    compared, parted = answer.compared or {}, list(_rows(answer.diverging))
+    begun = [name for name in answer.different_before or () if name != "began_by"]
     before = f"The runs were started differently ({_listed(begun)}). " if begun else ""
     if not compared.get("row_count") or not compared.get("signal_count"):
         return f"{before}Cannot tell: no row of one run could be compared with one of the other."

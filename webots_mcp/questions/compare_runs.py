@@ -356,13 +356,13 @@ def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     left, worst = len(found.parted) - len(rows), found.worst
     return {
         "verdict": cut_for_a_model(found.verdict, _SIZES.verdict_characters),
-        "unlike": known or None,
+        "different_before": known or None,
         "compared": {"row_count": found.rows, "signal_count": found.signals,
                      "start_s": seconds(found.from_s), "end_s": seconds(found.until_s)},
-        "parted": without_empty(PARTED_COLUMNS, rows),
+        "diverging": without_empty(PARTED_COLUMNS, rows),
         "growth": worst and {"signal": short_name(worst.signal), **worst.growth},
         "notes": notes,
-        "hint": f"{left} more signals part: limit or signals for others" if left else None,
+        "hint": f"{left} more signals diverge: limit or signals for others" if left else None,
     }  # fmt: skip
 
 

@@ -75,7 +75,7 @@ def test_send_pause_step_resume_and_keep(cli: Cli, driver: Driver, recording: Re
         ("step many", "Invalid value for N: 'many' is no whole number"),
         ("breakpoint 'steps <'", "column"),
         ("breakpoint 'steps < 3' --remove 1", "not both"),
-        ("breakpoint --remove 1", "no breakpoint 1; it has none"),
+        ("breakpoint --remove 1", "no breakpoint 1. It has no breakpoints."),
         ("wait 999", "no command 999"),
         ("field ROVER.nothing", "has no field 'nothing'"),
         ("field ROVER.translation '[NaN,0,0]'", "such as [0, 0.5, 0.1]; got '[NaN,0,0]'"),

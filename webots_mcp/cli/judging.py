@@ -157,7 +157,7 @@ def _write(file: Path, answer: dict[str, Any]) -> None:
     for each in _checks_in(answer):
         name, says = spelled_out(each["check"]), spelled_out(each.get("evidence") or "")
         case = SubElement(suite, "testcase", classname="webots-mcp", name=name)
-        says += f" (since {each['since_s']:g} s)" if each.get("since_s") is not None else ""
+        says += f" (since {each['start_s']:g} s)" if each.get("start_s") is not None else ""
         element, counted = _ELEMENTS.get(each["outcome"], ("", ""))
         counts.update(filter(None, ("tests", counted)))
         if element:
@@ -319,9 +319,11 @@ def _answer(found: Sequence[Parting]) -> dict[str, Any]:
 
     facts = [{"run_id": each.run_ids[1], **parting_facts(each)} for each in found]
     shown = ("run_id", "verdict", "growth", "notes")
+    diverging = [each.run_ids[1] for each in found if each.parted]
     return {
         "run_ids": [found[0].run_ids[0], *(each["run_id"] for each in facts)],
-        "parted": [each.run_ids[1] for each in found if each.parted],
+        "diverging": diverging,
+        "parted": diverging,  # its former name, for scripts
         "verdict": verdict_on(found),
         "repeats": [{name: each[name] for name in shown if each[name]} for each in facts],
     }

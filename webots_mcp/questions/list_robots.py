@@ -66,7 +66,8 @@ _RECORDER_COLUMNS: Final = (
 )  # fmt: skip
 BY_OBSERVER: Final = "the observer, from customData: it has no bridge and takes no commands"
 _ROBOT_COLUMNS: Final = (
-    "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
+    "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "run_count",
+    "action_count",
 )  # fmt: skip
 
 
@@ -150,7 +151,7 @@ def webots_get_world_info(
             real_time_factor=_pace(view, run),
             supervisor=session.supervisor if session else None,
             run=_run(view, run),
-            runs_recorded=count_runs(view.connection, view.robot.id),
+            run_count=count_runs(view.connection, view.robot.id),
             controller=_controller(view, session),
             devices=_devices(view.robot.devices),
             other_robots=AnswerTable(columns=["robot", "kind", "pause_state"], rows=shown)
@@ -278,7 +279,7 @@ def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
     return {
         "id": run.id,
         "began_by": run.start_reason,
-        "began_ago_s": view.age_s(run.started_wall_time_s),
+        "began_ago_wall_s": view.age_s(run.started_wall_time_s),
         "sim_duration_s": round(run.last_sim_time_s - run.started_sim_time_s, 3),
         "row_count": run.row_count,
         **ended,

@@ -252,7 +252,7 @@ def _first_run(recording: RecordingAccess, set_id: int) -> int:
 @question(
     "Annotate a run",
     SETS,
-    command="label",
+    command="annotate",
     positional=("run_id", "label"),
     options={"run_id": "RUN", "label": "TEXT"},
     example="4 baseline --note 'before the new gait'",

@@ -187,7 +187,7 @@ def _recorder(view: RobotView) -> dict[str, Any]:
     return {
         "row_count": view.run.row_count if view.run else 0,
         "why": view.header().get("why"),
-        "pace": view.run and pace_of(view.connection, "it", view.run.id),
+        "pace": view.run and pace_of(view.connection, view.robot.name, view.run.id),
         "waiting_in": None,
         **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped if session else 0,

@@ -39,7 +39,7 @@ def tunable(tmp_path: Path) -> Iterator[TunableDriver]:
 def test_a_run_says_why_it_stopped_and_what_happened(cli: Cli) -> None:
     said = cli("run --for 0.48 --reset --until 'steps < 0'")
     assert "stopped simulation time reached" in said
-    assert "ran: run_id 2, from_s 0, to_s 0.48, advanced_s 0.48" in said
+    assert "ran: run_id 2, start_s 0, end_s 0.48, advanced_s 0.48" in said
     assert "mode pause" in said
     assert "\nrows:\n  sim_time_s  steps\n" in said
     ran = cli.json("run --for 0.16 --then go_on")["ran"]

@@ -287,7 +287,9 @@ async def test_parameters_beyond_the_limit_are_refused(
 ) -> None:
     recorded.robot()
     async with connect() as client:
-        assert "at most" in await fail(client, "webots_send_command", action="go", params=params)
+        assert "the limit is 65,536" in await fail(
+            client, "webots_send_command", action="go", params=params
+        )
 
 
 async def test_without_a_database_a_command_is_an_error_that_says_what_to_do(

@@ -59,13 +59,13 @@ from webots_mcp.store.run_rows import (
 )
 from webots_mcp.store.sessions import SessionRecord, companions, fetch_session
 
-_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
-_PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
-_RECORDER_COLUMNS: Final = (
+BODY_COLUMNS: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
+PLACE_COLUMNS: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
+RECORDER_COLUMNS: Final = (
     "row_count", "why", "pace", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
 )  # fmt: skip
 BY_OBSERVER: Final = "the observer, from customData: it has no bridge and takes no commands"
-_ROBOT_COLUMNS: Final = (
+ROBOT_COLUMNS: Final = (
     "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "run_count",
     "action_count",
 )  # fmt: skip
@@ -169,9 +169,9 @@ def webots_get_world_info(
 
 def _robots(views: list[RobotView], *, told: bool) -> AnswerTable:
     """Return a row for each robot; counts of losses only if there are any, or for a person."""
-    columns, rows = [*_ROBOT_COLUMNS], [_row(view) for view in views]
+    columns, rows = [*ROBOT_COLUMNS], [_row(view) for view in views]
     recorders = [_recorder(view) for view in views]
-    for name in _RECORDER_COLUMNS:
+    for name in RECORDER_COLUMNS:
         values = [recorder[name] for recorder in recorders]
         if any(values) and (told or name not in ("row_count", "why")):
             columns.append(name)
@@ -203,7 +203,7 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
     shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
     used = [
         column
-        for column in (*_TOLD_IN_WORLD, *_PLACE)
+        for column in (*BODY_COLUMNS, *PLACE_COLUMNS)
         if any(body.get(column) is not None for body in shown)
     ]
     rows = fitting([_in_world(body, used) for body in shown], budget_tokens)

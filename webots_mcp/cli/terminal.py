@@ -17,7 +17,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TextIO, cast
 
 from webots_mcp.cli.streams import write_styled
@@ -78,12 +77,13 @@ _MOST_IMPORTANT: Final = frozenset(
 )
 # Columns whose words have a colour, and the colours of those words.
 _COLOURED_COLUMNS: Final = frozenset({"outcome", "status", "level", "ended_by", "verdict"})
-_COLOURS: Final[Mapping[str, str]] = MappingProxyType(
-    dict.fromkeys(("done", "pass", "running", "ok", "goal reached"), "green")
-    | dict.fromkeys(("fail", "failed", "lost", "error", "critical", "crashed", "wrong"), "bold red")
-    | dict.fromkeys(
-        ("warn", "warning", "expired", "cancelled", "pruned", "not judged", "paused"), "yellow"
-    )
+_COLOURS: Final[Sequence[tuple[str, frozenset[str]]]] = (
+    ("green", frozenset({"done", "pass", "running", "ok", "finished"})),
+    ("bold red", frozenset({"fail", "failed", "lost", "error", "critical", "crashed", "wrong"})),
+    (
+        "yellow",
+        frozenset({"warn", "warning", "expired", "cancelled", "pruned", "not judged", "paused"}),
+    ),
 )
 
 
@@ -320,7 +320,7 @@ def _cut(text: str, width: int) -> str:
 def _colour_of(column: str, cell: str) -> str:
     if column not in _COLOURED_COLUMNS:
         return ""
-    return _COLOURS.get(cell) or _COLOURS.get(cell.split(" ", 1)[0], "")
+    return next((colour for colour, words in _COLOURS if cell in words), "")
 
 
 def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> list[str]:

@@ -12,7 +12,7 @@ import anyio
 
 import webots_mcp
 from webots_mcp import MemoryDatabase, testing
-from webots_mcp.answers.models import Answer, AnswerPart
+from webots_mcp.answers.answer_models import Answer, AnswerPart
 from webots_mcp.cli import described
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS

@@ -12,7 +12,7 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any, Final, TypeVar
 
-from webots_mcp.answers.models import Answer, AnswerTable
+from webots_mcp.answers.answer_models import Answer, AnswerTable
 from webots_mcp.answers.shortening import (
     ShorteningLimits,
     compact_json,

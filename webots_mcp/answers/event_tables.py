@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+from webots_mcp.answers.answer_models import AnswerTable, KindVerdicts
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     detailed,
@@ -15,7 +16,6 @@ from webots_mcp.answers.budget import (
     wall_clock,
     without_empty,
 )
-from webots_mcp.answers.models import AnswerTable, KindVerdicts
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.judging.detection.events import (
     Events,

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, singledispatch
 from typing import Any, Final, cast
 
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     Answer,
     AnswerTable,
     BreakpointAnswer,

@@ -110,7 +110,10 @@ def parameters(
 
         webots-mcp parameters kp=3.5 gait=trot
     """
-    from webots_mcp.questions.parameters import webots_get_parameters, webots_set_parameters
+    from webots_mcp.questions.controller_parameters import (
+        webots_get_parameters,
+        webots_set_parameters,
+    )
 
     if from_reset and not settings:
         raise InvalidInputError("--from-reset needs what is set then: NAME=VALUE")
@@ -220,17 +223,17 @@ def breakpoint_(
 
     It is asked of every published state, stored, and armed again after a reset or reload.
     """
-    from webots_mcp.questions import breakpoints
+    from webots_mcp.questions import set_breakpoints
 
     if condition is not None and breakpoint_id is not None:
         raise InvalidInputError("give a condition to set, or --remove ID, not both")
     if breakpoint_id is not None:
-        remove = breakpoints.webots_remove_breakpoint
+        remove = set_breakpoints.webots_remove_breakpoint
         return _show(remove, asked, as_json=json, breakpoint_id=breakpoint_id)
     if condition is None:
-        return _show(breakpoints.webots_list_breakpoints, asked, as_json=json)
+        return _show(set_breakpoints.webots_list_breakpoints, asked, as_json=json)
     given = {"condition": condition, "action": action, "after_hits": after_hits}
-    _show(breakpoints.webots_breakpoint, asked, as_json=json, **given)
+    _show(set_breakpoints.webots_breakpoint, asked, as_json=json, **given)
 
 
 def field(
@@ -463,7 +466,7 @@ def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManage
 
 @contextmanager
 def _cluster(options: TrialOptions, plan: WorldPlan) -> Generator[Simulators]:
-    from webots_mcp.extras.plugins import cluster_offered, load
+    from webots_mcp.extras.plugin_registry import cluster_offered, load
 
     with load(cluster_offered())(
         options.scheduler,

@@ -47,10 +47,10 @@ from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, in_one_snapshot
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_infos
-from webots_mcp.store.signals import RegisteredSignal
 
 # -- how a signal differs between groups of runs ---------------------------------------------------
 

@@ -26,8 +26,8 @@ from webots_mcp.store.reading.catalogue import held_by, resolve_signals, signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot, just_after
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.signals import RegisteredSignal
 
 _MATTERS: Final = 0.001  # of metres, of radians, of the largest value where there is no scale
 _SHORT_ROWS: Final = 2  # between the last row and the time up to which rows are compared

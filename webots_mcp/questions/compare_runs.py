@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
+from webots_mcp.answers.answer_models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     LONGEST_NAME,
@@ -29,7 +30,6 @@ from webots_mcp.answers.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.answers.models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 from anyio import to_thread
 from pydantic import Field, WithJsonSchema
 
-from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Cursor, RobotName

@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import AnswerTable, LogsAnswer
 from webots_mcp.answers.budget import fitting, wall_clock
-from webots_mcp.answers.models import AnswerTable, LogsAnswer
 from webots_mcp.answers.shortening import cut_text, is_for_a_person
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError

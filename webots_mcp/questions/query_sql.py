@@ -14,8 +14,8 @@ from anyio import to_thread
 from anyio.lowlevel import RunVar
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import AnswerTable, SqlAnswer
 from webots_mcp.answers.budget import LONGEST_NAME, fitting, header_of_only, room_tokens
-from webots_mcp.answers.models import AnswerTable, SqlAnswer
 from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import ShownLimit

@@ -15,6 +15,7 @@ from anyio import to_thread
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
 from webots_mcp.analysis.summary import Best, Ranked, Ranking
+from webots_mcp.answers.answer_models import TrialsAnswer
 from webots_mcp.answers.budget import (
     condensed,
     figure,
@@ -24,7 +25,6 @@ from webots_mcp.answers.budget import (
     notes_of,
     shown,
 )
-from webots_mcp.answers.models import TrialsAnswer
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.contract import MAX_RUN_S
@@ -32,8 +32,8 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
+from webots_mcp.questions.controller_parameters import settable
 from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
-from webots_mcp.questions.parameters import settable
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.parameter import require_known
 from webots_mcp.steering.run_command import ACTION, known_names, require_possible

@@ -13,16 +13,16 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    CommandAnswer,
+    CommandsAnswer,
+)
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     condensed,
     fitting,
     seconds,
     short_name,
-)
-from webots_mcp.answers.models import (
-    CommandAnswer,
-    CommandsAnswer,
 )
 from webots_mcp.answers.shortening import cut_text, is_for_a_person, shorten, tokens_of
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus

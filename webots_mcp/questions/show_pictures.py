@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import CommandAnswer, RunAnswer, ShownPicture
 from webots_mcp.answers.budget import notes_of, seconds, some
-from webots_mcp.answers.models import CommandAnswer, RunAnswer, ShownPicture
 from webots_mcp.answers.shortening import compact_json
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError

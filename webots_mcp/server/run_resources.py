@@ -23,7 +23,7 @@ from mcp.types import (
     UnsubscribeRequestParams,
 )
 
-from webots_mcp.answers.models import ShownPicture
+from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import compact_json
 from webots_mcp.errors import NothingRecordedError, UnknownRunError, WebotsMCPError
 from webots_mcp.questions import all_questions

@@ -22,7 +22,7 @@ from webots_mcp.signals.meaning import (
     meanings_by_name,
 )
 from webots_mcp.signals.naming import nearest_first
-from webots_mcp.store.signals import RegisteredSignal, stored_roles
+from webots_mcp.store.registered_signals import RegisteredSignal, stored_roles
 
 OF_TOOLS: Final = ("mcp", "cli")  # a person or an assistant has set it, the newest counts
 OF_PROJECT: Final = "project"

@@ -33,7 +33,7 @@ from webots_mcp.store.reading.frame_summary import (
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
-from webots_mcp.store.signals import RegisteredSignal, cleaned
+from webots_mcp.store.registered_signals import RegisteredSignal, cleaned
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500

@@ -36,7 +36,7 @@ from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, ZoneMap, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts, just_after
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _MAY_TURN: Final = frozenset((None, *ANGLES))  # quantities of what may be an angle by its values
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks

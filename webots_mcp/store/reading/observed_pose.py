@@ -18,7 +18,7 @@ from webots_mcp.contract import OBSERVER, WORLD_EVENT
 from webots_mcp.signals.naming import OBSERVED, WORLD, find_position
 from webots_mcp.signals.register import kind_of, unit_of
 from webots_mcp.store.chunks import IS_ABSENT, IS_NUMBER, Decoded, StateColumns, signals_in
-from webots_mcp.store.signals import RegisteredSignal, registered, seen_with, with_roles
+from webots_mcp.store.registered_signals import RegisteredSignal, registered, seen_with, with_roles
 
 Derived = Mapping[str, Callable[[Array], Decoded]]
 """Signals that no row of a run holds, by name: their values at some simulation times."""

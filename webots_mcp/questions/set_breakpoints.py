@@ -10,14 +10,14 @@ from typing import Annotated, Any, Final
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    BreakpointAnswer,
+    BreakpointsAnswer,
+)
 from webots_mcp.answers.budget import (
     fitting,
     header_of,
     table,
-)
-from webots_mcp.answers.models import (
-    BreakpointAnswer,
-    BreakpointsAnswer,
 )
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import BreakpointAction

@@ -12,15 +12,15 @@ from typing import Annotated, Any, Final, Literal
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    CommandAnswer,
+    ParametersAnswer,
+)
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     fitting,
     seconds,
     without_empty,
-)
-from webots_mcp.answers.models import (
-    CommandAnswer,
-    ParametersAnswer,
 )
 from webots_mcp.answers.shortening import WHOLE, shorten
 from webots_mcp.questions.arguments import RobotName, RunId, TimeoutS, Value

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from webots_mcp.questions.declaring import Question
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.steering.trial_run import Simulators
-    from webots_mcp.store.parameters import TrialRecord, TrialResult
     from webots_mcp.store.recording import RecordingAccess
+    from webots_mcp.store.trial_sets import TrialRecord, TrialResult
 
 _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
@@ -500,7 +500,7 @@ def _picture_of(file: Path | None) -> Callable[[RecordingAccess, int], None] | N
 
 def _set_of(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) -> int:
     """Return the set that was begun with this plan, or a new one."""
-    from webots_mcp.store.parameters import create_trial_set, find_trial_set
+    from webots_mcp.store.trial_sets import create_trial_set, find_trial_set
 
     text = _text_of(plan, options)
     with recording.writer() as connection:
@@ -516,7 +516,7 @@ def _begun_set(
     Raises:
         NothingRecordedError: There is none.
     """
-    from webots_mcp.store.parameters import find_trial_set
+    from webots_mcp.store.trial_sets import find_trial_set
 
     with recording.reader() as connection:
         known = find_trial_set(connection, _text_of(plan, options))
@@ -534,7 +534,7 @@ class _TrialProgress:
     """A line on stderr for each trial that is over, and for each set that takes the lead."""
 
     def __init__(self, recording: RecordingAccess, set_id: int, plan: WorldPlan) -> None:
-        from webots_mcp.store.parameters import trials_of
+        from webots_mcp.store.trial_sets import trials_of
 
         with recording.reader() as connection:
             known = trials_of(connection, set_id)
@@ -564,7 +564,7 @@ class _TrialProgress:
             self._ranked_s = time.monotonic()
 
     def _tell_leader(self) -> None:
-        from webots_mcp.store.parameters import ranking_of, trials_of
+        from webots_mcp.store.trial_sets import ranking_of, trials_of
 
         with self._recording.reader() as connection:
             first = ranking_of(trials_of(connection, self._set_id), self._plan.best).sets[0]
@@ -579,7 +579,7 @@ def _show_trials(
 ) -> None:
     from webots_mcp.judging.divergence import repeats_noted
     from webots_mcp.judging.run_score import unseen
-    from webots_mcp.store.parameters import ranking_of, trials_of
+    from webots_mcp.store.trial_sets import ranking_of, trials_of
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)

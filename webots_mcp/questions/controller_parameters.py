@@ -31,8 +31,8 @@ from webots_mcp.questions.send_command import (
 from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
 from webots_mcp.steering.dispatch import Dispatcher, ProgressReport
 from webots_mcp.steering.target import find_target
-from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, described
 from webots_mcp.store.recording import RecordingAccess, RobotView
+from webots_mcp.store.run_parameters import COLUMNS, Declared, declared_by, described
 
 SET_WAIT_S: Final = 10.0
 _ACTION: Final = "set_parameters"

@@ -40,8 +40,12 @@ from webots_mcp.steering.run_command import ACTION, known_names, require_possibl
 from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
-from webots_mcp.store.parameters import (
-    Declared,
+from webots_mcp.store.reading.segment import in_one_snapshot
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
+from webots_mcp.store.requests import permit
+from webots_mcp.store.robots import robot_name
+from webots_mcp.store.run_parameters import Declared
+from webots_mcp.store.trial_sets import (
     TrialRecord,
     TrialSetRecord,
     best_of,
@@ -55,10 +59,6 @@ from webots_mcp.store.parameters import (
     stop_trial_set,
     trials_of,
 )
-from webots_mcp.store.reading.segment import in_one_snapshot
-from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
-from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import robot_name
 
 _Value = float | int | bool | str
 CANCELLED: Final = "it was cancelled"

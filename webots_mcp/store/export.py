@@ -38,13 +38,13 @@ from webots_mcp.store.chunks import (
     signals_in,
     values_in,
 )
-from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 from webots_mcp.store.reading.frame import deleted_part
 from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.segment import full_rate_parts
 from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.registered_signals import RegisteredSignal, registered
 from webots_mcp.store.run_rows import put_back
+from webots_mcp.store.trial_sets import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 
 # Rows to be exported: those of a range, flattened, and trials; one value per dotted name.
 #

@@ -29,7 +29,6 @@ EVENT_COLUMNS: Final = (
     "kind", "count", "run_id", "start_s", "time", "duration_s", "ongoing", "name", "details",
 )  # fmt: skip
 _GROUP_BUDGET_TOKENS: Final = 200
-_NO_DATA: Final = "no data is recorded for it"
 
 
 def fitting_events(
@@ -55,7 +54,9 @@ def verdicts_of(verdicts: Verdicts, *, in_short: bool = False) -> KindVerdicts:
     """
     if in_short:
         reasons = {
-            kind: (_NO_DATA,) if verdicts.unlooked(kind) and not each.lacks("unread") else said
+            kind: ("no data is recorded for it",)
+            if verdicts.unlooked(kind) and not each.lacks("unread")
+            else said
             for kind, said in verdicts.reasons.items()
             for each in (verdicts.coverage.get(kind, Coverage()),)
         }

@@ -32,8 +32,6 @@ from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.robots import list_robots
 
-_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
-_FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
 _ANY_LINE: Final = LogFilter(None, LogWindow(-math.inf, math.inf), "", "debug")
 _BELOW_LEVEL: Final = (
     "no robot has recorded yet, and no line of Webots' console has the level {} or above: these "
@@ -135,7 +133,13 @@ def _row(line: LogLine) -> dict[str, object]:
 
 
 def _table(lines: list[LogLine], *, time_of_day: bool) -> AnswerTable:
-    columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
+    columns: list[str] = [
+        *(
+            ("id", "sim_time_s", "level", "run_id", "message")
+            if is_for_a_person()
+            else ("sim_time_s", "level", "message", "run_id")
+        )
+    ]
     if time_of_day:
         columns.insert(columns.index("sim_time_s") + 1, "time")
     rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]

@@ -59,8 +59,6 @@ from webots_mcp.store.run_rows import (
 )
 from webots_mcp.store.sessions import SessionRecord, companions, fetch_session
 
-_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
-_PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
 _RECORDER_COLUMNS: Final = (
     "row_count", "why", "pace", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
 )  # fmt: skip
@@ -200,9 +198,13 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
         return {}
     bodies = [*world.content.get("robots", ()), *world.content.get("solids", ())]
     shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
+    # as they differ
     used = [
         column
-        for column in (*_TOLD_IN_WORLD, *_PLACE)
+        for column in (
+            *("key", "type", "def", "name", "controller", "on_robot"),
+            *("x_m", "y_m", "z_m", "heading_rad", "speed_mps"),
+        )
         if any(body.get(column) is not None for body in shown)
     ]
     rows = fitting([_in_world(body, used) for body in shown], budget_tokens)

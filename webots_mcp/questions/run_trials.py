@@ -62,10 +62,6 @@ from webots_mcp.store.trial_sets import (
 
 _Value = float | int | bool | str
 CANCELLED: Final = "it was cancelled"
-_IN_SIMULATORS: Final = (
-    "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
-)
-_FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
 _RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
 
 
@@ -291,7 +287,11 @@ def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, can
 
 def _goes_on(found: TrialSetRecord) -> str:
     """Return how to continue a set that no robot's simulation runs."""
-    return _IN_SIMULATORS if "world" in json.loads(found.plan) else _FROM_ELSEWHERE
+    return (
+        "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
+        if "world" in json.loads(found.plan)
+        else "came from another recording, and its robot did not: begin a new set"
+    )
 
 
 def _stop(recording: RecordingAccess, set_id: int, reason: str | None) -> None:

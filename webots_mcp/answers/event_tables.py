@@ -13,7 +13,6 @@ from webots_mcp.answers.budget import (
     seconds,
     short_name,
     shown,
-    wall_clock,
     without_empty,
 )
 from webots_mcp.answers.shortening import tokens_of
@@ -23,6 +22,7 @@ from webots_mcp.judging.detection.events import (
 )
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.verdicts import Coverage, Verdicts
+from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.recording import RobotView
 
 EVENT_COLUMNS: Final = (

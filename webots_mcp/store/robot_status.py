@@ -25,6 +25,7 @@ from webots_mcp.database.pauses import (
     breakpoint_at,
 )
 from webots_mcp.database.processes import is_stopped
+from webots_mcp.store.ages import age_in_words, ago
 from webots_mcp.store.loop_evidence import (
     change_since_heartbeat,
     find_backlog,
@@ -165,11 +166,11 @@ def _decide_alive(
         return Status(RUNNING, hang) if is_slow else _stopped(session, moved_s, now_s, hang)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
+        waited = age_in_words(now_s - backlog.oldest_wall_time_s)
         why = (
             f"the database takes no rows: those of its controller wait in {backlog.file_name} "
-            f"next to it, for {max(now_s - backlog.oldest_wall_time_s, 0.0):.0f} s now (is "
-            "the disk full, or does another program hold a lock?); what is shown here is "
-            "older"
+            f"next to it, for {waited} now (is the disk full, or does another program hold a "
+            "lock?); what is shown here is older"
         )
         if session.age_s(moved_s, now_s) <= pace_s:
             return Status(RUNNING, why)
@@ -345,8 +346,8 @@ def _why_standing(
 
 
 def stopped_for(seconds: float) -> str:
-    """Return `stopped N s ago`, with a decimal below 10 s."""
-    return f"stopped {max(seconds, 0.0):.{1 if seconds < 10 else 0}f} s ago"
+    """Return how long ago it stopped: `stopped 42 s ago`, `stopped 3 years ago`."""
+    return f"stopped {ago(seconds)}"
 
 
 def _stopped(
@@ -354,5 +355,5 @@ def _stopped(
 ) -> Status:
     seconds = session.age_s(moved_s or session.started_wall_time_s, now_s)
     if why and why.startswith(UNMOVED):
-        return Status(f"not seen moving for {max(seconds, 0.0):.0f} s", why)
+        return Status(f"not seen moving for {age_in_words(seconds)}", why)
     return Status(stopped_for(seconds), why)

@@ -34,10 +34,6 @@ from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.robots import list_robots
 
 _ANY_LINE: Final = LogFilter(None, LogWindow(-math.inf, math.inf), "", "debug")
-_BELOW_LEVEL: Final = (
-    "no robot has recorded yet, and no line of Webots' console has the level {} or above: these "
-    "have a lower one"
-)
 _NO_RUN_YET: Final = (
     "lines without a run_id came from Webots' console before a run began: a controller that never "
     "began one may have failed there"
@@ -103,8 +99,12 @@ def webots_get_logs(
             # What a controller prints as it fails has no level of its own.
             any_level = replace(asked, lowest_level=_ANY_LINE.lowest_level)
             shown = waiting or waiting_lines(connection, any_level, lines)
+        below_level = (
+            "no robot has recorded yet, and no line of Webots' console has the level {} or "
+            "above: these have a lower one"
+        )
         hint = (
-            _BELOW_LEVEL.format(lowest)
+            below_level.format(lowest)
             if shown
             else (
                 "no robot has recorded yet, and no line of Webots' console matches: leave out the "

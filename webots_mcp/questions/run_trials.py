@@ -62,7 +62,6 @@ from webots_mcp.store.trial_sets import (
 
 _Value = float | int | bool | str
 CANCELLED: Final = "it was cancelled"
-_RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
 
 
 @dataclass(frozen=True)
@@ -361,6 +360,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
     rows = fitting(_rows(ranking, trials), _SIZES.table_tokens)
     repeats = [] if state == "under way" else repeats_noted(connection, found.id)
     left_out = len(ranking.sets) - len(rows)
+    rank_lower = "that rank lower are not shown: webots_query_sql has all in table trial"
     return {
         "trial_set": found.id,
         "state": state,
@@ -375,7 +375,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
         "verdict": ranking.verdict if over else None,
         "notes": notes_of(
             [
-                *[f"{left_out} sets {_RANK_LOWER}"] * (left_out > 0),
+                *[f"{left_out} sets {rank_lower}"] * (left_out > 0),
                 *repeats,
                 *unseen(connection, (each.run_id for each in trials if each.score is not None)),
             ]

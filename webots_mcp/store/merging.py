@@ -59,11 +59,6 @@ _NEW_REQUESTS: Final = (
     "source.command WHERE session_id = (SELECT session_id FROM source.run WHERE id = :run))) "
     "ORDER BY id"
 )
-_RUN_OF_REQUESTS: Final = (
-    "UPDATE main.request SET run_id = (SELECT n.id FROM source.request s JOIN source.run r "
-    "ON r.id = s.run_id JOIN main.run n ON n.uuid = r.uuid WHERE s.uuid = request.uuid) "
-    "WHERE run_id IS NULL AND uuid IN (SELECT uuid FROM source.request)"
-)
 _OF_MEANING: Final = ", ".join(
     ("name", "source", *MEANING_FIELDS, "set_wall_time_s", "set_by", "why")
 )
@@ -156,7 +151,13 @@ def merge(
             with transaction(connection):
                 _ingest_run_rows(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
-            connection.execute(_RUN_OF_REQUESTS)
+            query = (
+                "UPDATE main.request SET run_id = (SELECT n.id FROM source.request s "
+                "JOIN source.run r ON r.id = s.run_id JOIN main.run n ON n.uuid = r.uuid "
+                "WHERE s.uuid = request.uuid) WHERE run_id IS NULL AND uuid IN (SELECT uuid "
+                "FROM source.request)"
+            )
+            connection.execute(query)
             _ingest_trials(connection, run_id)
         return dict(
             connection.execute(

@@ -400,11 +400,6 @@ class StoredImage:
 
 
 _COLUMNS: Final = columns_of(StoredImage)
-_FRAMES: Final = (
-    f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
-    "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
-    "ORDER BY {order}, id DESC LIMIT :count"
-)
 
 
 def inside(data_dir: Path, path: str) -> Path:
@@ -482,7 +477,12 @@ def camera_frames(
     """
     order = "sim_time_s DESC" if at_s is None else "abs(sim_time_s - :at_s)"
     values = {"run_id": run_id, "device": device, "kind": None, "at_s": at_s, "count": 1}
-    query = _FRAMES.format(order=order)
+    frames_query = (
+        f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
+        "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
+        "ORDER BY {order}, id DESC LIMIT :count"
+    )
+    query = frames_query.format(order=order)
     found = connection.execute(query, values).fetchall()
     if found and count > 1:
         of = {"device": found[0][5], "kind": found[0][4], "count": count}

@@ -44,10 +44,6 @@ TURNS_COUNTED: Final = (
 WEIGHTED: Final = "means and deviations are weighted by time"
 STATES_SHARE: Final = 0.5  # of the time, where numbers are asked for as well
 
-_NEWEST_WALL: Final = (
-    "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
-)
 MOST_ROWS: Final = 1000
 
 
@@ -224,6 +220,10 @@ def _run_history(
     cuts_s = [frame.cut_at_s, None if kept is None else kept.cut_at_s, changes.unread_from_s]
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     rhythm = rhythm_in(frame)
+    query = (
+        "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
+        "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
+    )
     return RunHistory(
         run_id=segment.run_id,
         start_s=segment.start_s,
@@ -240,7 +240,7 @@ def _run_history(
         gaps=rhythm.gaps,
         cut_at_s=min((each for each in cuts_s if each is not None), default=None),
         unread=(*_unread(frame), *signals_left(left)),
-        age_s=time.time() - connection.execute(_NEWEST_WALL, (segment.run_id,)).fetchone()[0],
+        age_s=time.time() - connection.execute(query, (segment.run_id,)).fetchone()[0],
     )
 
 

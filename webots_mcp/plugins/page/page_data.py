@@ -76,10 +76,6 @@ Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 
 _log: Final = logging.getLogger(__name__)
 _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
-_DEFECT: Final = (
-    "a defect of webots-mcp, or rows that it did not write; webots-mcp view has written more about "
-    "it to its terminal"
-)
 _OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
 """Marks of ended runs by database, run and start. The result of a check of them is final."""
 _CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp lights")
@@ -209,7 +205,11 @@ def problem(error: Exception) -> dict[str, Any]:
     waits = isinstance(error, (NoDatabaseError, NothingRecordedError))
     why = str(error)
     if not isinstance(error, WebotsMCPError):
-        why = f"{_DEFECT} ({type(error).__name__}: {why[: _LIMITS.line_characters]})"
+        defect = (
+            "a defect of webots-mcp, or rows that it did not write; webots-mcp view has written "
+            "more about it to its terminal"
+        )
+        why = f"{defect} ({type(error).__name__}: {why[: _LIMITS.line_characters]})"
     unknown: list[str] = []
     if waits or isinstance(error, (UnknownRobotError, UnknownRunError)):
         unknown = ["run", "beside", "view", "at"]

@@ -56,10 +56,6 @@ _KEPT: Final = (
     "SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state "
     f"WHERE {_IN} ORDER BY sim_time_s, id LIMIT ?"
 )
-_SIGNALS: Final = (
-    "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
-    "AND typeof(s.name) = 'text'"
-)
 
 
 class Coded(NamedTuple):
@@ -474,7 +470,11 @@ def _source_of(
         groups = groups_as_array(connection, run_id, *span)
         if every_call and cut_at_s is None:
             cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
-    names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
+    query = (
+        "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
+        "AND typeof(s.name) = 'text'"
+    )
+    names = dict(connection.execute(query, (run_id,)).fetchall())
     source = FrameSource(connection, run_id, groups, columns, names)
     source.derived = _observed_pose(connection, segment, columns, deadline)
     if lost := deleted_part(connection, segment):

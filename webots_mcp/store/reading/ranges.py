@@ -46,11 +46,6 @@ from webots_mcp.store.reading.segment import (
 
 _MOST_HITS: Final = 1000
 _LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
-_BOUND: Final = (
-    "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state WHERE run_id = :run "
-    "UNION ALL SELECT {0}(sim_time_s) FROM kept_state WHERE run_id = :run UNION ALL SELECT "
-    "{0}({1}_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1)"
-)
 # What was stored just before a bound and is shown as of it; commands know no run but their robot's.
 _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
     " UNION ALL ".join(
@@ -307,8 +302,14 @@ def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float,
 
 def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times of a run's first and newest row; None without any."""
+    query = (
+        "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state "
+        "WHERE run_id = :run UNION ALL SELECT {0}(sim_time_s) FROM kept_state "
+        "WHERE run_id = :run UNION ALL SELECT {0}({1}_sim_time_s) FROM row_group "
+        "WHERE run_id = :run AND is_complete = 1)"
+    )
     bounds = [
-        connection.execute(_BOUND.format(*which), {"run": run_id}).fetchone()[0]
+        connection.execute(query.format(*which), {"run": run_id}).fetchone()[0]
         for which in (("min", "start"), ("max", "end"))
     ]
     return None if bounds[0] is None else (bounds[0], bounds[1])

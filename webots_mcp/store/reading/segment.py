@@ -38,7 +38,6 @@ _FULL_RATE_SEGMENTS: Final = (
     "ORDER BY start_sim_time_s DESC LIMIT ?"
 )
 _IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
-_ROWS: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
 
 
 def shown_time(time_s: float) -> float:
@@ -294,7 +293,8 @@ def rows_in(
         most: Where counting ends.
     """
     asked = (run_id, *span, most)
-    return int(connection.execute(_ROWS.format(table=table), asked).fetchone()[0])
+    query = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
+    return int(connection.execute(query.format(table=table), asked).fetchone()[0])
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from tests.cases.public import FALSE, HELPFUL, PUBLIC, RIGHT, labels, score
 
 # What is answered wrongly or not at all today, and why.
 _GAPS = {
-    "hand_guided_arm": "targets do not hold in a mode in which the drives are limp",
     "gripper_loses_a_block": "a force that vanishes under an unchanged command is no event",
 }
 

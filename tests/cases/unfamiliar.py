@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -65,7 +65,7 @@ def _robot(name: str, lasts_s: float, **label: Any) -> Callable[[Draw], Draw]:
     return register
 
 
-def _ramped(t: Array, marks: list[float], values: list[float]) -> Array:
+def _ramped(t: Array, marks: Sequence[float], values: Sequence[float]) -> Array:
     return np.interp(t, marks, values)
 
 
@@ -320,7 +320,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
     aim = _ramped(t, [0, 5, 5.01, 110, 110.01, 200], [10, 10, 30, 30, 18, 18])
-    tracked, value, step = [], 10.0, t[1] - t[0]
+    tracked, value, step = list[float](), 10.0, float(t[1] - t[0])
     for wanted in aim.tolist():
         value += max(-0.5 * step, min(0.5 * step, (wanted - value) * 0.2 * step))
         tracked.append(value)

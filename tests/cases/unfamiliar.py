@@ -432,7 +432,8 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-def _situation(name: str, interval_s: float, *, faulty: bool) -> Situation:
+def situation_of(name: str, interval_s: float, *, faulty: bool) -> Situation:
+    """Return the recording of a robot at a rate, healthy or with its fault."""
     robot = ROBOTS[name]
 
     def draw(t: Array, random: Random) -> Columns:
@@ -443,7 +444,7 @@ def _situation(name: str, interval_s: float, *, faulty: bool) -> Situation:
 
 def ask_healthy(name: str, interval_s: float) -> tuple[str, str]:
     """Return whether a healthy robot is quiet, and what was said."""
-    with recorded(_situation(name, interval_s, faulty=False)) as asked:
+    with recorded(situation_of(name, interval_s, faulty=False)) as asked:
         alarms = [f"{each.name}: {each.evidence}" for each in asked.checked.of("warn", "fail")]
         return (FALSE if alarms else GOOD), "; ".join(alarms)
 
@@ -451,7 +452,7 @@ def ask_healthy(name: str, interval_s: float) -> tuple[str, str]:
 def ask_faulty(name: str) -> tuple[str, str]:
     """Return how a faulty robot is answered, and what was said."""
     robot = ROBOTS[name]
-    with recorded(_situation(name, FAULTY_INTERVAL_S, faulty=True)) as asked:
+    with recorded(situation_of(name, FAULTY_INTERVAL_S, faulty=True)) as asked:
         return _judged(asked, robot)
 
 

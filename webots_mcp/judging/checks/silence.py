@@ -116,14 +116,16 @@ def _limit_between(values: Array, lacks: Flags, noise: float) -> float | None:
     for low, high in ((inside, outside), (outside, inside)):
         # The largest of some and the smallest of the others overlap by the width of the border.
         limit = float((low.max() + high.min()) / 2)
-        if low.max() - high.min() <= border and _keeps_away(values, lacks, limit, border):
+        overlap = float(low.max() - high.min())
+        near = max(overlap, _NOISE * noise)
+        if overlap <= border and _keeps_away(values, lacks, limit, near):
             return limit
     return None
 
 
-def _keeps_away(values: Array, lacks: Flags, limit: float, border: float) -> bool:
+def _keeps_away(values: Array, lacks: Flags, limit: float, near: float) -> bool:
     """Whether a signal mostly stays away from a limit, with and without a value of the other."""
-    is_near = np.abs(values - limit) <= border
+    is_near = np.abs(values - limit) <= near
     return all(float(is_near[rows].mean()) <= MOSTLY for rows in (lacks, ~lacks))
 
 

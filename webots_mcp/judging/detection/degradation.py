@@ -68,7 +68,7 @@ def degradation_events(search: Search) -> Iterator[Event]:
             "rows with a value on"
         )
         if not signals:
-            raise NotSearchableError(why)
+            raise NotSearchableError(why, "undecided")
         search.not_searched("degradation", why)
     found_any = False
     for signal in search.in_time("degradation", signals):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, np, runs_of
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, inner, median, np, runs_of
 
 WINDOW_S: Final = 3.0  # a follower may lag by as much
 LOST_SHARE: Final = 0.5  # of the usual gain
@@ -176,12 +176,12 @@ def _explained(
     """The share of the variance in some rows that the target a moment before explains."""
     first, stop = span
     part = slice(first, stop)
-    before = slice(max(0, int(np.searchsorted(times, times[first] - lag_s)) - 1), stop)
+    before = slice(max(0, int(np.searchsorted(times, float(times[first]) - lag_s)) - 1), stop)
     moments: Array = times[part] - lag_s
-    aimed: Array = np.interp(moments, times[before], aims[before])
-    x, y = aimed - aimed.mean(), values[part] - values[part].mean()
-    both = float((x * x).sum() * (y * y).sum())
-    product = float((x * y).sum())
+    x: Array = np.interp(moments, times[before], aims[before])
+    y: Array = values[part]
+    x, y = x - x.mean(), y - y.mean()
+    both, product = inner(x, x) * inner(y, y), inner(x, y)
     return product * abs(product) / both if both > 0 else 0.0
 
 

@@ -150,7 +150,10 @@ def growth_begins_s(frame: Frame, event: Event, turn: float | None = None) -> fl
     if score - 1 <= _GROWTH_DEVIATIONS * math.sqrt(variance):
         return None
     bend = _bend_of(np.log(np.maximum(sizes, np.finfo(np.float64).tiny)))
-    return None if bend is None else float(times[starts[bend]])
+    if bend is None:
+        return None
+    # A bend in the first period cannot be told from growth since the start.
+    return float(times[starts[bend]]) if bend > 2 else event.start_s
 
 
 def _bend_of(values: Array) -> int | None:

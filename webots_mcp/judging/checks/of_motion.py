@@ -11,6 +11,7 @@ from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times, total_s
 from webots_mcp.judging.coverage import Coverage, Fault
 from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
+from webots_mcp.judging.detection.holding import grips_in
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.oscillation import GROWS, OSCILLATION, growth_begins_s
@@ -164,13 +165,16 @@ def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
 def follows_targets(run: RunUnderCheck) -> Examined:
     """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
 
-    So where it made less than half of the usual share of the motion of a target that keeps moving.
-    Places where a robot shall go are no targets, and grippers hold things. A target that is always
-    0 has no range to judge by.
+    Also where it made less than half of the usual share of the motion of a target that keeps
+    moving. Warns where a closed gripper lost the force with which it held something. Places where a
+    robot shall go are no targets, and grippers hold things. A target that is always 0 has no range
+    to judge by.
     """
     found = run.events(OFF_TARGET.name)
     if not found:
         pursuits = pursuits_in(run.search)
+        if not pursuits and (grips := grips_in(run.search)):
+            return run.covered(f"{counted(len(grips), 'grip')} kept", of=OFF_TARGET.name)
         if not pursuits:
             raise NotSearchableError("no target is published next to what it is the target of")
         said = f"{counted(len(pursuits), 'target')} followed, as by {pursuits[0].measured.name}"
@@ -185,7 +189,9 @@ def follows_targets(run: RunUnderCheck) -> Examined:
     )
     firm = run.firmest(each.name or "" for each in found)
     more = run.more(OFF_TARGET.name)
-    return Fault("fail", evidence, found[0].start_s, len(found), more, signals=firm)
+    grips = {each.force.name for each in grips_in(run.search)}
+    severity = "warn" if grips.issuperset(each.name or "" for each in found) else "fail"
+    return Fault(severity, evidence, found[0].start_s, len(found), more, signals=firm)
 
 
 def stays_stable(run: RunUnderCheck) -> Examined:

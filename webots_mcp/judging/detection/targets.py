@@ -9,7 +9,7 @@ stayed, nor any nearer in the second half of its stay.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -24,6 +24,7 @@ from webots_mcp.analysis.arrays import (
 )
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.following import following_of
+from webots_mcp.judging.detection.holding import Grip, grips_in, lost_grips
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
@@ -117,8 +118,9 @@ def _scale_between(target: Meaning, measured: Meaning) -> float | None:
 
 def off_target_events(search: Search) -> Iterator[Event]:
     """Where the median of each second is off the target, and not on its way to it, for 3 s."""
-    pursuits = pursuits_in(search)
-    if not pursuits:
+    pursuits, grips = pursuits_in(search), grips_in(search)
+    yield from _lost_grips(search, grips)
+    if not pursuits and not grips:
         raise NotSearchableError(
             "no signal is known to be the target of another, or it is always 0: declare one with "
             "target_of"
@@ -128,6 +130,26 @@ def off_target_events(search: Search) -> Iterator[Event]:
     for signal in search.in_time("off_target", [each.measured for each in pursuits]):
         pursuit = targets[signal.name]
         yield from (_never_reached if pursuit.is_height else _off_or_lost)(search, pursuit)
+
+
+def _lost_grips(search: Search, grips: Sequence[Grip]) -> Iterator[Event]:
+    """Where closed grippers lost what they held; what they hold decides what is a loss."""
+    segment = search.segment
+    search.judged("off_target", [each for grip in grips for each in grip])
+    for grip in grips:
+        for lost in lost_grips(search, grip):
+            if lost.start_s >= segment.end_s or lost.end_s < segment.start_s:
+                continue
+            size = abs(lost.held - lost.empty)
+            error = np.array([lost.empty - lost.held])
+            event = _off_target(
+                search, Pursuit(grip.force, grip.command), lost.start_s, lost.end_s, error, size
+            )
+            says = (
+                f"the grip was lost: from {lost.held:.3g} to {lost.empty:.3g}, as while it is "
+                f"open, though {grip.command.name} stayed"
+            )
+            yield replace(event, details=event.details | {"says": says})
 
 
 def _off_or_lost(search: Search, pursuit: Pursuit) -> Iterator[Event]:

@@ -1,4 +1,4 @@
-"""How often rules that rest on a chosen number raise a false alarm: healthy robots, drawn at random.
+"""How often rules with a chosen number raise a false alarm: healthy robots, drawn at random.
 
 `python -m tests.cases.false_alarms` prints a line for each rule.
 """

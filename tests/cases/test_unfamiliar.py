@@ -15,8 +15,6 @@ from tests.cases.unfamiliar import (
     ask_healthy,
 )
 
-# Of the first answers: how many healthy recordings were quiet, and how faults were answered.
-FIRST_ANSWERS = {"quiet": 39, "false alarm": 6, "right": 10, "helpful": 3, "not judged": 2}
 _NOT_JUDGED = {"tracked excavator": "speeds of tracks are not known to be those of wheels"}
 
 

@@ -27,6 +27,8 @@ RIGHT, HELPFUL, NOT_JUDGED, DENIED, FALSE = (
     "false alarm",
 )
 GOOD: Final = "quiet"
+# Of the first answers, before a rule was changed for what was missed.
+FIRST_ANSWERS: Final = {GOOD: 39, FALSE: 6, RIGHT: 10, HELPFUL: 3, NOT_JUDGED: 2, DENIED: 0}
 Draw = Callable[[Array, Random, bool], Columns]
 
 

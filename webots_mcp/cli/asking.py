@@ -216,7 +216,7 @@ def _valid(
 
 def _kinds_in(recording: RecordingAccess) -> Mapping[str, str]:
     """Of the parameters that robots have, by name."""
-    from webots_mcp.store.parameters import kinds_of
+    from webots_mcp.store.run_parameters import kinds_of
 
     with recording.reader() as connection:
         return kinds_of(connection)

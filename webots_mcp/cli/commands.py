@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.extras.plugins import plugin_commands
+from webots_mcp.extras.plugin_registry import plugin_commands
 
 _STEERING: Final = "webots_mcp.cli.steering"
 
@@ -31,7 +31,7 @@ NOW, PAST, STEER, DATA, SETUP = (
 GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
 _Q: Final = "webots_mcp.questions"
 _OF_THE_CORE: Final = {
-    "events": CommandEntry(PAST, f"{_Q}.events", "webots_find_events"),
+    "events": CommandEntry(PAST, f"{_Q}.find_events", "webots_find_events"),
     "check": CommandEntry(PAST, "webots_mcp.cli.judging", "check"),
     "compare": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
     "diff": CommandEntry(PAST, "webots_mcp.cli.judging", "diff"),

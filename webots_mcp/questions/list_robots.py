@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.answers.budget import (
-    fitting,
-    room_tokens,
-)
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     AnswerTable,
     RobotsAnswer,
     WorldAnswer,
+)
+from webots_mcp.answers.budget import (
+    fitting,
+    room_tokens,
 )
 from webots_mcp.answers.shortening import (
     cut_for_a_model,

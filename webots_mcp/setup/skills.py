@@ -16,9 +16,7 @@ from webots_mcp.setup.file_change import FileChange, read
 
 PLUGIN: Final = Path(__file__).parent / "plugin"
 _BEGIN: Final = "<!-- webots-mcp: its lines begin here -->"
-_END: Final = "<!-- webots-mcp {}: updated by 'webots-mcp init --skills' until you change it -->\n"
 _OURS: Final = r"(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->(?:\r?\n)?{}"
-_KEPT: Final = "it is kept, as you wrote or changed it: remove {} to get that of this version"
 
 
 class ManagedText(NamedTuple):
@@ -39,7 +37,13 @@ class ManagedText(NamedTuple):
         held = (before or b"").decode("utf-8")
         edges = (r"\A", r"\Z") if self.is_whole else (rf"{_BEGIN}\r?\n", "")
         ours = re.search(_OURS.format(*edges), held)
-        begin, end = "" if self.is_whole else f"{_BEGIN}\n", _END.format(_digest(self.text))
+        begin, end = (
+            "" if self.is_whole else f"{_BEGIN}\n",
+            (
+                f"<!-- webots-mcp {_digest(self.text)}: updated by 'webots-mcp init --skills' "
+                "until you change it -->\n"
+            ),
+        )
         line_end = "\r\n" if "\r\n" in held else "\n"
         wanted = f"{begin}{self.text}{end}".replace("\n", line_end)
         if not held.strip():
@@ -48,7 +52,9 @@ class ManagedText(NamedTuple):
             after = held[: ours.start()] + wanted + held[ours.end() :]
         elif self.is_whole or _BEGIN in held:
             what = "the file" if self.is_whole else "what stands between its marks"
-            return FileChange(self.file, before, held.encode()), _KEPT.format(what)
+            return FileChange(self.file, before, held.encode()), (
+                f"it is kept, as you wrote or changed it: remove {what} to get that of this version"
+            )
         else:
             apart = line_end if held.endswith("\n") else 2 * line_end
             after = f"{held}{apart}{wanted}"

@@ -28,7 +28,7 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts
-from webots_mcp.store.signals import registered
+from webots_mcp.store.registered_signals import registered
 
 Kind = Literal["null", "bool", "int", "num", "text"]
 

@@ -47,10 +47,10 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.export import Progress
 from webots_mcp.store.journal_intake import ingest_journals
-from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.registered_signals import enter_signals
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
-from webots_mcp.store.signals import enter_signals
+from webots_mcp.store.trial_sets import fetch_trial_set, is_at_work
 
 # With one run come those of its time, and those that its session's commands were sent for.
 _NEW_REQUESTS: Final = (

@@ -79,10 +79,6 @@ SILENT: Final = (
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
     "simulation these look alike"
 )
-_WAITING: Final = (
-    "the database takes no rows: those of its controller wait in {0} next to it, for {1} now "
-    "(is the disk full, or does another program hold a lock?); what is shown here is older"
-)
 _LEFT_WAITING: Final = (
     "its last rows wait in {} next to the database, until a server that may write there (not "
     "--read-only) takes them in: what is shown here is older"
@@ -170,7 +166,12 @@ def _decide_alive(
         return Status(RUNNING, hang) if is_slow else _stopped(session, moved_s, now_s, hang)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
-        why = _WAITING.format(backlog.file_name, age_in_words(now_s - backlog.oldest_wall_time_s))
+        waited = age_in_words(now_s - backlog.oldest_wall_time_s)
+        why = (
+            f"the database takes no rows: those of its controller wait in {backlog.file_name} "
+            f"next to it, for {waited} now (is the disk full, or does another program hold a "
+            "lock?); what is shown here is older"
+        )
         if session.age_s(moved_s, now_s) <= pace_s:
             return Status(RUNNING, why)
         return _stopped(session, moved_s, now_s, why)

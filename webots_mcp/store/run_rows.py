@@ -199,9 +199,6 @@ def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
     )
 
 
-_NO_RUN: Final = "No run {} is recorded, because no controller has recorded a run yet."
-
-
 def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None) -> str:
     ids = [
         row[0]
@@ -216,7 +213,7 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
         return (
             f"No run {run_id} is recorded. Use one of the newest runs: {known}."
             if ids
-            else _NO_RUN.format(run_id)
+            else f"No run {run_id} is recorded, because no controller has recorded a run yet."
         )
     query = "SELECT name FROM robot JOIN run ON run.robot_id = robot.id WHERE run.id = ?"
     owner = connection.execute(query, (run_id,)).fetchone()

@@ -33,7 +33,7 @@ from webots_mcp.store.reading.frame_summary import (
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
-from webots_mcp.store.signals import RegisteredSignal, cleaned
+from webots_mcp.store.registered_signals import RegisteredSignal, cleaned
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
@@ -49,8 +49,6 @@ _NEWEST_WALL: Final = (
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
 )
 MOST_ROWS: Final = 1000
-_STATES: Final = "SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))"
-_KEPT_STATES: Final = "SELECT id, data FROM kept_state WHERE id IN (SELECT value FROM json_each(?))"
 
 
 @dataclass(frozen=True)
@@ -447,7 +445,10 @@ def _states_by_id(
     listed = json.dumps([abs(row_id) for row_id in ids])
     return {
         sign * row_id: flatten(parse(data))
-        for query, sign in ((_STATES, 1), (_KEPT_STATES, -1))
+        for query, sign in (
+            ("SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))", 1),
+            ("SELECT id, data FROM kept_state WHERE id IN (SELECT value FROM json_each(?))", -1),
+        )
         if any(row_id * sign > 0 for row_id in ids)
         for row_id, data in connection.execute(query, (listed,))
     }

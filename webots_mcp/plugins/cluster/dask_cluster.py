@@ -40,8 +40,8 @@ from webots_mcp.steering.trial_run import (
     webots,
 )
 from webots_mcp.store.merging import pack, unpack
-from webots_mcp.store.parameters import TrialResult
 from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.trial_sets import TrialResult
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000

@@ -26,8 +26,8 @@ from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Segment
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, EventRecord, StoredImage, columns_of
-from webots_mcp.store.signals import RegisteredSignal
 
 # What is counted, in the order in which it is reported.
 KINDS: Final = (

@@ -34,12 +34,12 @@ from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.ages import age_in_words
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
-from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robot_status import RUNNING
 from webots_mcp.store.robots import list_robots, nothing_recorded, without_observers
+from webots_mcp.store.run_parameters import described
 from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
 from webots_mcp.store.runs import RunInfo, list_runs
 

@@ -28,7 +28,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
 )
 from webots_mcp.store.reading.unchunked_rows import has_few_new_rows, rows_in_no_chunk
-from webots_mcp.store.signals import RegisteredSignal, cleaned, registered, seen_with
+from webots_mcp.store.registered_signals import RegisteredSignal, cleaned, registered, seen_with
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
 _MOST_OFFERED: Final = 5

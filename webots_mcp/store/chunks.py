@@ -579,12 +579,12 @@ def values_in(
             f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))",
             [*asked, json.dumps([*wanted])],
         )
-    for group_id, *encoded in connection.execute(query, asked):
+    for group_id, codec, numbers, codes, labels in connection.execute(query, asked):
         rows = wanted.get(group_id)
         if rows is None:
             continue
         try:
-            yield group_id, decode(EncodedChunk(*encoded), rows)
+            yield group_id, decode(EncodedChunk(codec, numbers, codes, labels), rows)
         except DamagedChunkError as error:
             yield group_id, error
 

@@ -158,7 +158,7 @@ def decode(encoded: EncodedChunk, rows: int) -> Decoded:
     """
     try:
         if encoded.codes is None:
-            numbers = np.empty(rows)
+            numbers: Array = np.empty(rows)
             _decompress(encoded, numbers)
             return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
@@ -288,8 +288,8 @@ def _decompress(encoded: EncodedChunk, into: Array) -> None:
         )
     if encoded.numbers is None:
         raise DamagedChunkError("damaged: its numbers are missing")
-    checksum, packed = encoded.numbers[:_CHECKSUM_BYTES], encoded.numbers[_CHECKSUM_BYTES:]
-    if zlib.crc32(packed) != int.from_bytes(checksum, "little"):
+    packed = encoded.numbers[_CHECKSUM_BYTES:]
+    if zlib.crc32(packed) != int.from_bytes(encoded.numbers[:_CHECKSUM_BYTES], "little"):
         raise DamagedChunkError("damaged: its bytes do not match their checksum")
     whole: Any = into if encoded.codec == _FLOATS else np.empty(len(into), np.int64)
     progress = _pcodec().simple_decompress_into(packed, whole)

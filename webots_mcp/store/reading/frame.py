@@ -461,15 +461,17 @@ def read_frame(
 
 
 def _wider(
-    memo: Mapping[Any, FrameSource], asked: tuple[int, float, float, bool], every_call: bool
+    memo: Mapping[tuple[int, float, float, bool, bool], FrameSource],
+    asked: tuple[int, float, float, bool],
+    every_call: bool,
 ) -> FrameSource | None:
     """Return what a longer segment of the run was read from, where that is the same."""
     run_id, start_s, end_s, at_full_rate = asked
     if at_full_rate or every_call:
         return None
     for (other_id, first_s, last_s, *kinds), source in memo.items():
-        covers = other_id == run_id and first_s <= start_s and last_s >= end_s
-        if covers and not any(kinds) and source.may_serve(start_s, end_s):
+        is_longer = other_id == run_id and first_s <= start_s and last_s >= end_s
+        if is_longer and not any(kinds) and source.may_serve(start_s, end_s):
             return source
     return None
 

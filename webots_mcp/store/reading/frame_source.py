@@ -138,8 +138,9 @@ class FrameSource:
         """
         parts = self.parts(start, stop)
         places = range(parts.start, parts.stop)
+        edges = self.first_rows.tolist()
         for place, values in self._of_parts(column, places if wanted is None else wanted.tolist()):
-            first, behind = self.first_rows[place : place + 2].tolist()
+            first, behind = edges[place], edges[place + 1]
             if start <= first and behind <= stop:
                 yield first - start, values
                 continue
@@ -207,9 +208,10 @@ class FrameSource:
         signal_id = self._signal_id(column)
         if signal_id is None or not places:
             return
-        of_group = {int(self._group_ids[place]): place for place in places}
-        sizes = np.diff(self.first_rows)
-        wanted = {group_id: int(sizes[place]) for group_id, place in of_group.items()}
+        at = np.array(places, np.intp)
+        ids = self._group_ids[at].tolist()
+        of_group = dict(zip(ids, places, strict=True))
+        wanted = dict(zip(ids, np.diff(self.first_rows)[at].tolist(), strict=True))
         missing = dict(of_group) if signal_id <= SIM_TIMES else {}  # each group has times and ids
         for group_id, values in values_in(self.connection, self.run_id, signal_id, wanted):
             missing.pop(group_id, None)

@@ -47,10 +47,7 @@ def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> I
 
 def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
     starts = np.arange(0, len(values) - _WINDOW + 1, _HOP)
-    parts = [
-        _peaks_of(values, part) for part in np.split(starts, range(_AT_ONCE, len(starts), _AT_ONCE))
-    ]
-    swings, peak, share, amplitude = map(np.concatenate, zip(*parts, strict=True))
+    swings, peak, share, amplitude = _peaks_in(values, starts)
     for run in runs_of(swings, times[starts]).spans():
         if run.stop - run.start < _LEAST_WINDOWS or np.ptp(peak[run.start : run.stop]) > 2:
             continue
@@ -66,6 +63,30 @@ def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
             yield Swing(
                 float(times[begin]), float(times[end]), half_swings, period_s, size, explained
             )
+
+
+def _peaks_in(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Array]:
+    """Return what `_peaks_of` does of the windows that may be among enough that oscillate.
+
+    So many windows that follow each other include one of which the place is a multiple of their
+    number, and all of them lie near such a one. The others are not examined, and count as quiet.
+    """
+    swings = np.zeros(len(starts), np.bool_)
+    peak = np.zeros(len(starts), np.intp)
+    share, amplitude = np.zeros(len(starts)), np.zeros(len(starts))
+    first = np.arange(0, len(starts), _LEAST_WINDOWS)
+    for wanted in (first, None):
+        if wanted is None:
+            near = np.zeros(len(starts), np.bool_)
+            for shift in range(1, _LEAST_WINDOWS):
+                near[shift:] |= swings[:-shift]
+                near[:-shift] |= swings[shift:]
+            near[first] = False
+            wanted = np.flatnonzero(near)
+        for begin in range(0, len(wanted), _AT_ONCE):
+            some = wanted[begin : begin + _AT_ONCE]
+            swings[some], peak[some], share[some], amplitude[some] = _peaks_of(values, starts[some])
+    return swings, peak, share, amplitude
 
 
 def _peaks_of(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Array]:

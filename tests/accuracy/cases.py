@@ -34,8 +34,8 @@ or a pass of the check that should have noticed). The first answers earned {firs
 some of their misses were then mended as classes. The right answers are in
 `tests/cases/public_labels.toml`."""
 _UNFAMILIAR: Final = """\
-{robots} robots of kinds that are in no other list, from a gantry to an underwater glider, were drawn
-healthy with a row each {rates}, and once with a fault each; what had to be answered was committed
+{robots} robots of kinds that are in no other list, from a gantry to an underwater glider, were
+drawn healthy with a row each {rates}, and once with a fault each; what to answer was committed
 before the first question. An alarm about a healthy one is false; a fault is answered *right* if the
 check that has to warns or fails, names it and says when it began, *helpful* if one of the three is
 missing, *not judged* if the answer says that it cannot tell, and *denied* if that check passes."""

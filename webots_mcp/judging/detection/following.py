@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, inner, median, np, runs_of
 
 WINDOW_S: Final = 3.0  # a follower may lag by as much
-# Of the usual gain: in 40 recordings of healthy joints that follow with gains of 0.4 to 1 and lags up
-# to a fifth of a period, none was taken to be lost.
+# Of the usual gain: in 40 recordings of healthy joints that follow with gains of 0.4 to 1 and lags
+# up to a fifth of a period, none was taken to be lost.
 LOST_SHARE: Final = 0.5
 _STEP_S: Final = 1.0  # from one window to the next
 _LEAST_ROWS: Final = 6  # of a window

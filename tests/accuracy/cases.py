@@ -35,11 +35,10 @@ some of their misses were then mended as classes. The right answers are in
 `tests/cases/public_labels.toml`."""
 _UNFAMILIAR: Final = """\
 {robots} robots of kinds that are in no other list, from a gantry to an underwater glider, were
-drawn healthy with a row each {rates}, and once with a fault each; what had to be answered was
-committed before the first question. An alarm about a healthy one is false; a fault is answered
-*right* if the check that has to warns or fails, names it and says when it began, *helpful* if one
-of the three is missing, *not judged* if the answer says that it cannot tell, and *denied* if that
-check passes."""
+drawn healthy with a row each {rates}, and once with a fault each; what to answer was committed
+before the first question. An alarm about a healthy one is false; a fault is answered *right* if the
+check that has to warns or fails, names it and says when it began, *helpful* if one of the three is
+missing, *not judged* if the answer says that it cannot tell, and *denied* if that check passes."""
 _ALSO_DRAWN: Final = """\
 The healthy kinds were drawn again with a row each {rates}, with other noise: {runs} runs, of which
 {alarmed} raise an alarm{names}."""

@@ -27,8 +27,8 @@ from webots_mcp.answers.models import (
     TrialsAnswer,
 )
 from webots_mcp.answers.summaries import MOST_WORDS, summary_of, verdict_of_kinds
-from webots_mcp.judging.coverage import AS_STUCK, JudgedInterval, SearchCoverage
 from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.judging.verdicts import AS_STUCK, JudgedInterval, SearchCoverage
 from webots_mcp.questions import all_questions
 
 _KINDS = st.sampled_from(kind_names())
@@ -99,6 +99,34 @@ def test_an_undecided_comparison_does_not_say_that_nothing_differs() -> None:
     assert said == "No figure is known to differ; 1 cannot be decided."
 
 
+@pytest.mark.parametrize(
+    ("unlike", "rows", "said"),
+    [
+        (None, [], "Identical in 500 compared rows of 3 signals, up to 8 s."),
+        (
+            None,
+            [["speed", 1.5], ["pose.0", 1.516]],
+            "The runs differ in speed from 1.5 s on, and are identical before.",
+        ),
+        (
+            {"git_commit": ["a", "b"], "began_by": ["start", "reset"]},
+            [["speed", 0.016], ["pose.0", 0.016]],
+            "The runs were started differently (git_commit). The runs differ in speed, pose.0 from "
+            "the first compared row on.",
+        ),
+    ],
+)
+def test_a_first_difference_begins_with_where_it_is(
+    unlike: dict[str, list[str]] | None, rows: list[list[object]], said: str
+) -> None:
+    compared = {"row_count": 500, "signal_count": 3, "from_s": 0.016, "until_s": 8.0}
+    answer = ComparisonAnswer(verdict="", unlike=unlike, compared=compared)
+    answer.parted = AnswerTable(columns=["signal", "from_s"], rows=rows)
+    assert summary_of(answer) == said
+    answer.compared = {"row_count": 0, "signal_count": 0}
+    assert "Cannot tell" in (summary_of(answer) or "")
+
+
 def test_too_few_runs_do_not_hide_the_largest_differences() -> None:
     groups = AnswerTable(columns=["name", "runs"], rows=[["before", [1, 2]], ["after", [3]]])
     measures = AnswerTable(
@@ -122,7 +150,7 @@ def test_too_few_runs_do_not_hide_the_largest_differences() -> None:
         (StateAnswer(status="never seen"), "Nothing is recorded here yet."),
         (
             StateAnswer(robot="rover", status="running", sim_time_s=3.2, age_s=0.21, state={}),
-            "rover is running at 3.2 s (data 0.21 s old).",
+            "rover is running at 3.2 s (data 0.2 s old).",
         ),
         (
             StateAnswer(robot="rover", status="paused", sim_time_s=3.2, state={"mode": "dig"}),

@@ -20,8 +20,8 @@ from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.database.connection import connect
 from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events, timeline
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.divergence import compare_rows
 from webots_mcp.judging.trends import trends
 from webots_mcp.plotting import plot

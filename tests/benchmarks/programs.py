@@ -46,7 +46,7 @@ def claimer(database: str) -> None:
     from pathlib import Path
 
     from webots_mcp.database.connection import connect, never_wait
-    from webots_mcp.database.queue_statements import CLAIM, PEEK
+    from webots_mcp.database.queue import CLAIM, PEEK
 
     connection = connect(Path(database), "loop")
     never_wait(connection)

@@ -12,8 +12,8 @@ from tests.bridge.conftest import STEP_MS, Recording, eager, heartbeat_now
 from tests.bridge.test_registration import change, start_again
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.database.connection import connect
-from webots_mcp.database.dead_sessions import reap
 from webots_mcp.database.processes import process_identity
+from webots_mcp.database.session_cleanup import reap
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.recording import view_robot
 

@@ -10,8 +10,8 @@ import pytest
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
-from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.database.waiting_file import FORMAT, adopt
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.purge import prune

@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp.database import dead_sessions
+from webots_mcp.database import session_cleanup
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
 from webots_mcp.database.queue import (
+    CLAIM,
     MAX_PARAMS_BYTES,
     CommandQueue,
     _while_busy,
@@ -24,7 +25,6 @@ from webots_mcp.database.queue import (
     find_command,
     list_commands,
 )
-from webots_mcp.database.queue_statements import CLAIM
 from webots_mcp.errors import InvalidInputError
 
 
@@ -149,7 +149,7 @@ def test_of_cancelling_and_claiming_at_once_exactly_one_wins(tmp_path: Path) -> 
 def test_an_unclaimed_command_expires_and_is_never_run(recorded: Recorded) -> None:
     queue, robot = CommandQueue(recorded.connection), recorded.robot()
     command = queue.enqueue(robot.id, "go", time_to_live_s=0.0)
-    dead_sessions.reap(recorded.connection, time.time() + 1)
+    session_cleanup.reap(recorded.connection, time.time() + 1)
     assert fetch_command(recorded.connection, command.id).status == "expired"
     assert claim(recorded.connection, robot.id, robot.session_id) == []
 

@@ -21,7 +21,7 @@ from tests.judging.test_outcomes import driving, measure, medians, record
 from tests.recordings.rows import Recorded
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import mcp_bridge
-from webots_mcp.database import dead_sessions
+from webots_mcp.database import session_cleanup
 from webots_mcp.database.stacks import (
     FORMAT,
     SIGNAL,
@@ -267,7 +267,7 @@ def test_the_signal_is_only_for_a_silent_loop_whose_process_could_write_nothing(
     assert needs_signal(path, silent_s) == is_needed
 
 
-@pytest.mark.parametrize("module", [mcp_bridge, dead_sessions, json])
+@pytest.mark.parametrize("module", [mcp_bridge, session_cleanup, json])
 def test_files_of_this_package_and_of_python_are_no_controllers_own(module: ModuleType) -> None:
     assert is_library(str(module.__file__))
     assert not is_library(__file__)

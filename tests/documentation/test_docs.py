@@ -17,7 +17,8 @@ import webots_mcp
 from webots_mcp import MCPBridge, MemoryDatabase, testing
 from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.bridge.backlog import MAX_WAITING_BYTES, MAX_WAITING_ROWS
-from webots_mcp.bridge.devices import MOST_OBJECTS, SECTORS
+from webots_mcp.bridge.devices import MOST_OBJECTS
+from webots_mcp.bridge.lidar_summary import SECTORS
 from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import described, names
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S

@@ -24,7 +24,7 @@ _RECORDED_THEN: Final = re.compile(
     r"|^(since|until|when|clock|longest_step_s|rows_per_s|own_ms|step_wait_ms)$"
 )
 _UUID: Final = re.compile(r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b")
-_AGO: Final = re.compile(r"\b[\d.,]+ (ms|s|min|h|hours|days|years|d)( old| ago)\b")
+_AGO: Final = re.compile(r"\b[\d.,]+ (ms|s|minutes|hours|days|months|years)( old| ago)\b")
 _MOMENT: Final = re.compile(r"\b20\d\d-\d\d-\d\d([ T]\d\d:\d\d(:\d\d(\.\d+)?)?)?( ?UTC|Z)?")
 _COMMIT: Final = re.compile(r"\b[0-9a-f]{40}\b")
 _VERSIONS: Final = re.compile(r"\b(python|sqlite) [\d.]+\d")

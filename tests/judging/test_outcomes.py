@@ -10,7 +10,7 @@ import pytest
 
 from tests.recordings.rover import Recorder
 from webots_mcp.judging.comparison import Comparison, compare_runs
-from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.run_measures import Measure
 
 State = Callable[[float], dict[str, Any]]

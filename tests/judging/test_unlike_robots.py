@@ -10,8 +10,8 @@ from typing import Any
 
 from tests.recordings.rover import start_run
 from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.signals.meaning import meanings_by_name, targets_in
 from webots_mcp.signals.naming import REDUCTIONS
 from webots_mcp.store.chunk_making import make_chunks

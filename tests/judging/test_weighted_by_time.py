@@ -12,8 +12,8 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.analysis.arrays import time_weights
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.judging.trends import trends
 from webots_mcp.store.chunk_making import make_chunks

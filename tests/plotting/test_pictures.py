@@ -29,9 +29,10 @@ from webots_mcp.errors import (
 )
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, image_format_of
-from webots_mcp.plotting.colours import DASHES, LINES
+from webots_mcp.plotting.colours import LINES
 from webots_mcp.plotting.curves import Curve, Panel
 from webots_mcp.plotting.intervals import Interval
+from webots_mcp.plotting.line_styles import DASHES
 from webots_mcp.plotting.signal_plot import compose_signals, paint_signals, plot_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
 from webots_mcp.questions.arguments import RunIds

@@ -235,6 +235,46 @@ def test_a_change_in_the_newest_row_is_not_the_one_that_is_waited_for(recorded: 
         require_possible(recording, None, "mode == 'turn'", None, reset=False)
 
 
+@pytest.mark.parametrize(
+    ("action", "is_known"),
+    [("start", False), ("set_parameters", False), ("pause", True), ("take_frame", True)],
+)
+def test_what_held_before_a_command_that_may_have_ended_it_is_waited_for(
+    recorded: Recorded, action: str, is_known: bool
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"mode": "idle"})
+    times = ("created", "expires", "claimed", "finished")
+    command = {"robot_id": robot.id, "action": action, "status": "done", "params": "{}"}
+    command |= {f"{name}_wall_time_s": robot.now + 5 for name in times}
+    insert(recorded.connection, "command", command | {"session_id": robot.session_id})
+    assert isinstance(recorded.database, Path)
+    recording = RecordingAccess(recorded.database, recorded.database.parent)
+
+    def refused() -> bool:
+        try:
+            require_possible(recording, None, "mode == 'idle'", None, reset=False)
+        except CommandRefusedError:
+            return True
+        return False
+
+    assert refused() == is_known
+    recorded.connection.execute("UPDATE state SET wall_time_s = ?", (robot.now + 6,))
+    assert refused(), "this row shows what the command did"
+    require_possible(recording, None, "mode == 'idle'", None, reset=False, parameters=True)
+
+
+async def test_a_run_right_after_a_command_ends_when_its_condition_holds_again(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        await paused(client)
+        await ask(client, "webots_send_command", action="set_speed", params={"speed": 2.0})
+        answer = await ask(client, "webots_run", until="steps >= 3", then="go_on")
+    assert answer["stopped"] == "condition held"
+    assert answer["ran"]["advanced_s"] <= 2 * STEP_MS / 1000
+
+
 async def test_a_run_that_ended_before_its_row_was_written_is_told_of_all_the_same(
     connect: Connect, recorded: Recorded
 ) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import find_motion
 from webots_mcp.signals.naming import USUAL_POSITIONS, find_position, flatten, metres_in
 from webots_mcp.store.chunk_making import chunk_whole_run

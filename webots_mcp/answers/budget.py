@@ -9,7 +9,6 @@ import math
 import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from datetime import datetime
 from typing import Any, Final, TypeVar
 
 from webots_mcp.answers.models import Answer, AnswerTable
@@ -39,14 +38,6 @@ _FOR_A_PERSON_TOKENS: Final = 10_000_000
 LONGEST_NAME: Final = 80
 _MOST_NOTES: Final = 5
 MOST_RUNS: Final = 5  # of which one answer tells
-
-
-def wall_clock(wall_time_s: float) -> str:
-    """Return a moment of wall time in this machine's zone, as ISO 8601 with that zone."""
-    try:
-        return datetime.fromtimestamp(wall_time_s).astimezone().isoformat("T", "milliseconds")
-    except (OverflowError, OSError, ValueError):  # no bridge has written this
-        return f"{wall_time_s}"
 
 
 _AT_LENGTH: Final = (ShorteningLimits(items=2000, text=20_000, keys=1000, depth=20),)

@@ -12,17 +12,17 @@ from webots_mcp.answers.budget import (
     seconds,
     short_name,
     shown,
-    wall_clock,
     without_empty,
 )
 from webots_mcp.answers.models import AnswerTable, KindVerdicts
 from webots_mcp.answers.shortening import tokens_of
-from webots_mcp.judging.coverage import Coverage, Verdicts
 from webots_mcp.judging.detection.events import (
     Events,
     Found,
 )
 from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.verdicts import Coverage, Verdicts
+from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.recording import RobotView
 
 EVENT_COLUMNS: Final = (

@@ -51,8 +51,11 @@ class Answer(AnswerPart):
     run_id: int | None = said("Number of the run that the answer is about.")
     sim_time_s: float | None = said("Simulation time of the newest data, in seconds.")
     age_s: float | None = said("Wall-clock seconds since the newest data.")
+    newest_wall_time: str | None = said(
+        "Time of day of the newest data, if that is more than an hour old."
+    )
     status: str | None = said(
-        "Whether the robot is running, paused or starting, stopped N s ago or never seen."
+        "Whether the robot is running, paused or starting, stopped some time ago or never seen."
     )
     why: str | None = said("The evidence for the status.")
     quoted: str | None = said(

@@ -9,7 +9,7 @@ from webots_mcp.answers.budget import (
     figure,
     seconds,
 )
-from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import doubt_of_length, doubt_of_unit, motion_in
 from webots_mcp.judging.run_measures import Way, way_in
 from webots_mcp.store.reading.catalogue import known_signals

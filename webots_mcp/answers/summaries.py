@@ -41,7 +41,8 @@ from webots_mcp.answers.models import (
     TrialsAnswer,
     WorldAnswer,
 )
-from webots_mcp.judging.coverage import AS_STUCK
+from webots_mcp.judging.verdicts import AS_STUCK
+from webots_mcp.store.ages import age_in_words
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
@@ -525,7 +526,7 @@ def _ended_badly(run: Mapping[str, Any]) -> str:
 @_summary.register
 def _(answer: ComparisonAnswer) -> str | None:
     if answer.verdict is not None:
-        return None
+        return _first_difference(answer)
     if len(list(_rows(answer.groups))) < 2:
         return "Figures of one group of runs; there is nothing to compare it with."
     rows = [*_rows(answer.measures), *_rows(answer.differences)]
@@ -539,6 +540,26 @@ def _(answer: ComparisonAnswer) -> str | None:
     parts.append(f"{same} equal within what matters" if same else "")
     parts.append(f"{undecided} cannot be decided" if undecided and not apart else "")
     return f"{'; '.join(part for part in parts if part)}."
+
+
+def _first_difference(answer: ComparisonAnswer) -> str:
+    """Return where two runs diverge, and what was different before they began."""
+    compared, parted = answer.compared or {}, list(_rows(answer.parted))
+    begun = [name for name in answer.unlike or () if name != "began_by"]
+    before = f"The runs were started differently ({_listed(begun)}). " if begun else ""
+    if not compared.get("row_count") or not compared.get("signal_count"):
+        return f"{before}Cannot tell: no row of one run could be compared with one of the other."
+    if not parted:
+        rows = _count(compared["row_count"], "compared row")
+        signals = _count(compared["signal_count"], "signal")
+        return f"{before}Identical in {rows} of {signals}, up to {compared['until_s']:.12g} s."
+    first_s = parted[0].get("from_s")
+    first = [_name(row) for row in parted if row.get("from_s") == first_s]
+    is_at_once = first_s is None or first_s == compared.get("from_s")
+    when = "from the first compared row on"
+    if not is_at_once:
+        when = f"from {first_s:.12g} s on, and are identical before"
+    return f"{before}The runs differ in {_listed(first)} {when}."
 
 
 def _largest_differences(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -596,7 +617,9 @@ def _when(answer: Answer) -> str:
     """Return whether the robot runs, at which simulated time, and how old that is."""
     at = f" at {answer.sim_time_s:.12g} s" if answer.sim_time_s is not None else ""
     age = answer.age_s
-    old = f" (data {age:.3g} s old)" if age is not None and answer.status == "running" else ""
+    old = (
+        f" (data {age_in_words(age)} old)" if age is not None and answer.status == "running" else ""
+    )
     if answer.why and answer.why.startswith("this is an earlier run"):
         return f"was last recorded in this run{at}"
     return f"is {answer.status or 'known'}{at}{old}"

@@ -1,6 +1,6 @@
 """Claims and answers the commands of this robot; holds its custom actions and reload callbacks.
 
-The SQL statements and their guarantees are in `webots_mcp.database.queue_statements`.
+The SQL statements and their guarantees are in `webots_mcp.database.queue`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
-from webots_mcp.database.queue_statements import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
+from webots_mcp.database.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.signals.naming import harmless_first
 

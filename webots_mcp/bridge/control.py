@@ -24,7 +24,7 @@ from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S, Pause
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import BUILT_IN_ACTIONS, ENDING, LOOPING
-from webots_mcp.database.dead_sessions import EXTERN
+from webots_mcp.database.session_cleanup import EXTERN
 from webots_mcp.errors import (
     CommandRefusedError,
     ControllerEndedError,

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.devices import SECTORS
+from webots_mcp.bridge.lidar_summary import SECTORS
 from webots_mcp.bridge.scene_nodes import world_up_axis
 from webots_mcp.signals.meaning import LONGEST_NAME, DeclaredMeaning, Quantity
 

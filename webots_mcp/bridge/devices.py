@@ -11,15 +11,14 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from itertools import pairwise
 from operator import methodcaller
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.lidar_summary import summarise_lidar, summarise_range_finder
 from webots_mcp.bridge.simulation import Simulation
 
-SECTORS: Final = 8
 MOST_OBJECTS: Final = 8  # of a camera or a radar that are published, the nearest first
 _MOST_READ: Final = 64  # objects of which the nearest are chosen: each is a call of the C library
 _WGS84: Final = 1  # GPS.WGS84: degrees, not metres
@@ -214,52 +213,6 @@ def _read_touch(device: Any) -> object:
     return [force[i] for i in range(3)] if force else None
 
 
-def _summarise_lidar(device: Any) -> dict[str, object] | None:
-    """Return a lidar's ranges; its image is layer after layer, each from left to right."""
-    return _summarise_ranges(device, device.getHorizontalResolution())
-
-
-def _summarise_range_finder(device: Any) -> dict[str, object] | None:
-    """Return a range finder's ranges; its image is row after row, each from left to right."""
-    return _summarise_ranges(device, device.getWidth())
-
-
-def _summarise_ranges(device: Any, columns: int) -> dict[str, object] | None:
-    """Return the smallest distance, its index, and the minimum of eight sectors; None before data.
-
-    The raw pointer is tested first: reading a null pointer can crash the interpreter.
-    """
-    if not device.range_image:
-        return None
-    ranges: list[float] = device.getRangeImage()
-    directions = _column_minima(ranges, columns)
-    sectors = _sector_minima(directions)
-    nearest = min(sectors)
-    if not math.isfinite(nearest) or math.isnan(sum(sectors)):  # a minimum ends at a NaN
-        nearest = min(filter(math.isfinite, directions), default=None)
-    return {
-        "count": len(ranges),
-        "min_m": math.inf if nearest is None else nearest,
-        "min_index": None if nearest is None else ranges.index(nearest),
-        "sector_min_m": sectors,
-    }
-
-
-def _column_minima(ranges: list[float], columns: int) -> list[float]:
-    """Return the smallest distance in each direction, over all layers or rows."""
-    if not 0 < columns < len(ranges):
-        return ranges
-    rows = [ranges[i : i + columns] for i in range(0, len(ranges), columns)]
-    return list(map(min, zip(*rows, strict=False)))
-
-
-def _sector_minima(directions: list[float]) -> list[float]:
-    """Return the sectors' minima from left to right; with fewer than eight directions, one each."""
-    count = min(SECTORS, len(directions))
-    bounds = [len(directions) * i // count for i in range(count + 1)]
-    return [min(directions[i:j]) for i, j in pairwise(bounds)]
-
-
 # By the names of the classes in Webots' `controller` package. Not here: `Brake`, `Display`,
 # `Emitter`, `Pen`, `Skin` and `Speaker`, which have nothing to read, and `Keyboard`, `Mouse` and
 # `Joystick`, which are not among the robot's devices, and whose events a reading would consume.
@@ -274,12 +227,12 @@ RULES: Final[dict[str, Rule]] = {
     "Gyro": _sensor(methodcaller("getValues")),
     "InertialUnit": _sensor(methodcaller("getRollPitchYaw")),
     "LED": _actuator("actuators", methodcaller("get")),
-    "Lidar": _sensor(_summarise_lidar),
+    "Lidar": _sensor(summarise_lidar),
     "LightSensor": _sensor(methodcaller("getValue")),
     "Motor": _actuator("motors", _read_motor),
     "PositionSensor": _sensor(methodcaller("getValue")),
     "Radar": _sensor(_summarise_targets),
-    "RangeFinder": _sensor(_summarise_range_finder),
+    "RangeFinder": _sensor(summarise_range_finder),
     "Receiver": _sensor(lambda receiver: {"queue_length": receiver.getQueueLength()}),
     "TouchSensor": _sensor(_read_touch),
     "VacuumGripper": _actuator("actuators", _read_vacuum_gripper),

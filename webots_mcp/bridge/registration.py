@@ -19,7 +19,7 @@ from webots_mcp.contract import (
     is_extern,
     recorded_name,
 )
-from webots_mcp.database import dead_sessions
+from webots_mcp.database import session_cleanup
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.pauses import PAUSED, STEPPING_WORLD
 from webots_mcp.database.processes import process_identity
@@ -212,11 +212,11 @@ def register(
     """
     now_s = time.time()
     # Before the transaction too: most of the work is then done without blocking other writers.
-    dead_sessions.reap(connection, now_s)
+    session_cleanup.reap(connection, now_s)
     with transaction(connection):
-        dead_sessions.reap(connection, now_s)
+        session_cleanup.reap(connection, now_s)
         makes_way = partial(_makes_way, identity=identity)
-        name = dead_sessions.free_name(connection, identity.robot_name, makes_way)
+        name = session_cleanup.free_name(connection, identity.robot_name, makes_way)
         before = connection.execute(_KIND, (name,)).fetchone()
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         # A bridge is not the reloaded successor of an observer's reading of customData.
@@ -263,7 +263,7 @@ def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: i
     return row[0] if row else None
 
 
-def _makes_way(session: dead_sessions.OpenSession, identity: Identity) -> bool:
+def _makes_way(session: session_cleanup.OpenSession, identity: Identity) -> bool:
     """Return whether a session gives up its name: an observer's, or an old one of this process."""
     if session.kind == CUSTOM_DATA != identity.kind:
         return same_simulation(session.instance, identity.instance)

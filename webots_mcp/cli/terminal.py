@@ -18,13 +18,15 @@ from typing import Any, Final, TextIO, cast
 
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.signals.naming import spelled_out
+from webots_mcp.store.ages import age_in_words
 
 _HEAD: Final = {
     "robot": "{}",
     "run_id": "run {}",
     "sim_time_s": "at {} s",
     "status": "{}",
-    "age_s": "{} s old",
+    "age_s": "{} old",
+    "newest_wall_time": "recorded {}",
 }
 _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
 _NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
@@ -41,6 +43,7 @@ class TextLayout:
         endless: Width where nobody reads: no line is folded.
         gap: Gap between columns.
         word: Length up to which no column folds a word, such as a time.
+        seconds_up_to: Age up to which it is shown in seconds, to the hundredth.
     """
 
     paragraph: int = 100
@@ -49,6 +52,7 @@ class TextLayout:
     endless: int = 100_000
     gap: int = 2
     word: int = 24
+    seconds_up_to: float = 120.0
 
 
 _LAYOUT: Final = TextLayout()
@@ -71,7 +75,9 @@ def answer_lines(
         most_rows: Of tables; it is said how many more there are. None for all.
     """
     layout = _Layout(width, most_rows, is_of_command="outcome" in answer)
-    head = [text.format(text_of(answer[name])) for name, text in _HEAD.items() if name in answer]
+    head = [
+        text.format(_head(name, answer[name])) for name, text in _HEAD.items() if name in answer
+    ]
     if summary := answer.get("summary"):
         yield from textwrap.wrap(printable(str(summary)), width, subsequent_indent=_LAYOUT.indent)
     if head:
@@ -83,6 +89,13 @@ def answer_lines(
         texts = cast("list[str]", value if isinstance(value, list) else [value] if value else [])
         for text in texts:
             yield from note_lines(f"left out: {text}" if name == "left_out" else text, width)
+
+
+def _head(name: str, value: Any) -> str:
+    """Return a member of the header; an age of hours in the words of sentences."""
+    if name != "age_s" or not isinstance(value, (int, float)):
+        return text_of(value)
+    return f"{text_of(value)} s" if value < _LAYOUT.seconds_up_to else age_in_words(value)
 
 
 def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:

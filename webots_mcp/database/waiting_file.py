@@ -30,8 +30,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 
-from webots_mcp.database import queue_statements
 from webots_mcp.database.connection import in_transaction
+from webots_mcp.database.queue import CONFIRM_RELOAD, FINISH, ISSUE
 from webots_mcp.database.stacks import LOGGER, read_stacks, stacks_path
 from webots_mcp.errors import SessionGoneError, warn
 
@@ -165,9 +165,9 @@ STATEMENTS: Final[dict[Kind, str]] = {
         f"SELECT s.robot_id, {_OF_ITEMS}, 'device', :now, 'bridge' "
         f"FROM session s, json_each(:rows) r WHERE s.id = :session {_SAME_MEANING}"
     ),
-    "command issued": queue_statements.ISSUE,
-    "command finished": queue_statements.FINISH,
-    "reload confirmed": queue_statements.CONFIRM_RELOAD,
+    "command issued": ISSUE,
+    "command finished": FINISH,
+    "reload confirmed": CONFIRM_RELOAD,
     "breakpoint hit": "UPDATE breakpoint SET hit_count = hit_count + 1 WHERE id = ?",
     "breakpoint failed": "UPDATE breakpoint SET enabled = 0, error = ? WHERE id = ?",
     # What a controller's code has set ends with its session.

@@ -23,7 +23,7 @@ from webots_mcp.analysis.summary import (
     with_extremes,
 )
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import motion_in
 from webots_mcp.judging.run_measures import (
     MOST_SEARCHED,

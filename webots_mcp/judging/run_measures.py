@@ -23,8 +23,8 @@ from webots_mcp.analysis.summary import (
 )
 from webots_mcp.analysis.track import PathLength, tracks_of, travelled
 from webots_mcp.judging.detection.condition import VIOLATION, expectations_of
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
 from webots_mcp.judging.run_sampling import SampledRun
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S

@@ -14,7 +14,6 @@ from zlib import crc32
 
 LINES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 EVENT_COLOURS: Final = (*LINES[1:-1], LINES[0])  # one kind after the other
-DASHES: Final = ("none", "6 2", "2 1.6", "6 2 2 2")  # in pixels
 AREAS: Final = (
     "#77AADD", "#EE8866", "#44BB99", "#EEDD88", "#FFAABB", "#AAAA00", "#99DDFF", "#BBCC33",
 )  # fmt: skip

@@ -25,9 +25,10 @@ from webots_mcp.plotting.canvas import (
     width_of,
     wrapped,
 )
-from webots_mcp.plotting.colours import DASHES, INK, LINES, ON_PAPER, Area, Theme, area_styles
+from webots_mcp.plotting.colours import INK, ON_PAPER, Area, Theme, area_styles
 from webots_mcp.plotting.curves import Curve, Panel, by_choice, by_scale, by_signal, curve_of
 from webots_mcp.plotting.intervals import Interval, Lane, at_resolution, lane_of, merged_notes
+from webots_mcp.plotting.line_styles import LineStyle, line_style
 from webots_mcp.plotting.painting import (
     LINE_PX,
     LegendEntry,
@@ -444,12 +445,11 @@ class _SignalPainter:
         run = self._plot.colour_by_run.get(curve.run_id)
         return f"run {curve.run_id}" if run is not None else f"curve {spelled_out(curve.name)}"
 
-    def _pen(self, panel: Panel, index: int) -> tuple[str, str]:
-        """Colour and dashes: by run where several are overlaid, else by signal."""
+    def _pen(self, panel: Panel, index: int) -> LineStyle:
+        """Return the style of a curve: by run where several are overlaid, else by signal."""
         runs = list(self._plot.colour_by_run)
         index = runs.index(panel.curves[index].run_id) if runs else index
-        colour = LINES[index % len(LINES)]
-        return (self._canvas.theme.ink if colour == "#000000" else colour), DASHES[index % 4]
+        return line_style(index, self._canvas.theme)
 
     def _panel(self, panel: Panel, frame: AxesBox) -> None:
         canvas = self._canvas
@@ -535,7 +535,7 @@ class _SignalPainter:
             canvas.open(data_part=self._part(curve))
             canvas.open(class_="at", data_x=x, data_y=y, transform=f"translate({x:.1f} {y:.1f})")
             to = f"M1 0L{_LAYOUT.leader_px - 2:g} {middle - y:.1f}"
-            pen = {"stroke": self._pen(panel, index)[0], "stroke_width": 1.4, "fill": "none"}
+            pen = {"stroke": self._pen(panel, index).colour, "stroke_width": 1.4, "fill": "none"}
             canvas.add("path", d=to, **pen)
             halo: dict[str, Any] = {
                 "stroke": canvas.theme.ground,
@@ -641,7 +641,7 @@ class _SignalPainter:
         plot = self._plot
         entries: list[LegendEntry] = []
         for index, (run_id, name) in enumerate(plot.colour_by_run.items()):
-            sample = line_sample(LINES[index % len(LINES)], DASHES[index % len(DASHES)])
+            sample = line_sample(*line_style(index, self._canvas.theme))
             room = self._canvas.width_px - 80
             entries.append(LegendEntry(fitted(name, room), sample, f"run {run_id}"))
         if plot.gaps:

@@ -9,13 +9,14 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import motion_in
 from webots_mcp.plotting.axes import AxesBox, axis_range, rounded_on, ticks
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, short, width_of
-from webots_mcp.plotting.colours import DASHES, INK, LINES, ON_PAPER, Theme, area_styles, scaled
+from webots_mcp.plotting.colours import INK, LINES, ON_PAPER, Theme, area_styles, scaled
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
+from webots_mcp.plotting.line_styles import line_style
 from webots_mcp.plotting.painting import (
     LINE_PX,
     SCALE_PX,
@@ -393,9 +394,8 @@ class _TrajectoryPainter:
 
     def _ink(self, index: int) -> str:
         """Of several ways each has a colour of its own."""
-        if self._alone or LINES[index % len(LINES)] == "#000000":
-            return self._canvas.theme.ink
-        return LINES[index % len(LINES)]
+        theme = self._canvas.theme
+        return theme.ink if self._alone else line_style(index, theme).colour
 
     def _obstacles(self, frame: AxesBox) -> None:
         """Outlines where sizes are known, squares elsewhere; a page tells their names."""
@@ -416,7 +416,7 @@ class _TrajectoryPainter:
             leap = [path.places[at - 1], path.places[at]]
             self._line(frame, [leap], canvas.theme.faint, 0.8, stroke_dasharray="1 2")
         if not self._alone:
-            pen = {"stroke_dasharray": DASHES[index % len(DASHES)]}
+            pen = {"stroke_dasharray": line_style(index, canvas.theme).dash}
             self._line(frame, path.pieces(), self._ink(index), 1.8, **pen)
         elif self._modes is not None:
             self._by_mode(frame, path, self._modes)
@@ -516,7 +516,7 @@ class _TrajectoryPainter:
             if not track.path.places:
                 continue
             if not self._alone:
-                sample = line_sample(self._ink(index), DASHES[index % len(DASHES)], 2.0)
+                sample = line_sample(*line_style(index, self._canvas.theme), 2.0)
                 room = self._canvas.width_px - 80
                 entries.append(LegendEntry(fitted(track.name, room), sample, f"track {index}"))
             whose = "" if self._alone else f", {track.name}"

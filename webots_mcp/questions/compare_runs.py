@@ -41,7 +41,7 @@ from webots_mcp.judging.comparison import (
     Group,
     compare_runs,
 )
-from webots_mcp.judging.detection.kinds import EventOptions, both_of
+from webots_mcp.judging.detection.event_options import EventOptions, both_of
 from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
 from webots_mcp.judging.run_measures import WHOLE_RUNS, Measure
 from webots_mcp.questions.arguments import (

@@ -335,7 +335,10 @@ async def webots_run(
     If timeout_wall_s is over first, it goes on, and webots_list_commands shows its outcome later.
     Needs a Supervisor. To stop at a condition without starting a run use webots_breakpoint.
     """
-    await to_thread.run_sync(lambda: require_possible(recording, robot, until, for_s, reset=reset))
+    sets = bool(parameters)
+    await to_thread.run_sync(
+        lambda: require_possible(recording, robot, until, for_s, reset=reset, parameters=sets)
+    )
     params = {
         "until": until,
         "for_s": for_s,

@@ -13,6 +13,7 @@ from webots_mcp.answers.event_tables import events_table, fitting_events, not_sh
 from webots_mcp.answers.models import EventsAnswer, TimelineAnswer
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.event_options import EventOptions, both_of
 from webots_mcp.judging.detection.events import (
     KINDS,
     kind_names,
@@ -20,7 +21,6 @@ from webots_mcp.judging.detection.events import (
     stored_kinds,
     timeline,
 )
-from webots_mcp.judging.detection.kinds import EventOptions, both_of
 from webots_mcp.questions.arguments import (
     AnyNames,
     LogLevel,

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from webots_mcp.answers.budget import fitting, wall_clock
+from webots_mcp.answers.budget import fitting
 from webots_mcp.answers.models import AnswerTable, LogsAnswer
 from webots_mcp.answers.shortening import cut_text, is_for_a_person
 from webots_mcp.contract import LogLevel, LogSource
@@ -17,6 +17,7 @@ from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.arguments import Cursor, EndS, Id, LastS, RobotName, StartS, TimeOfDay
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.simulator.console import console_state
+from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
     OF_CONSOLE,

@@ -28,7 +28,7 @@ from webots_mcp.answers.shortening import (
     shorten,
 )
 from webots_mcp.contract import CUSTOM_DATA
-from webots_mcp.database.dead_sessions import find_dead_sessions
+from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
 from webots_mcp.questions.declaring import READS, question

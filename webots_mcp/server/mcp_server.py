@@ -30,15 +30,16 @@ from pydantic import ValidationError
 
 from webots_mcp.contract import VERSION
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.database.dead_sessions import reap_if_dead
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.session_cleanup import reap_if_dead
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import TIERS, Tier
 from webots_mcp.questions.faults import faults_of, shown_value
 from webots_mcp.questions.former_calls import current_call
 from webots_mcp.server.channel import CHANNEL_INSTRUCTIONS, Channel
+from webots_mcp.server.client_view import make_view, name_the_view
 from webots_mcp.server.connected_clients import ConnectedClients
 from webots_mcp.server.occurrences import OccurrenceReader
 from webots_mcp.server.prompts import add_prompts
@@ -121,7 +122,8 @@ def create_server(
         title="Webots flight recorder",
         version=VERSION,
         instructions=f"{INSTRUCTIONS}\n{CHANNEL_INSTRUCTIONS}" if notify else INSTRUCTIONS,
-        middleware=[clients, subscriptions, *channels],
+        middleware=[clients, subscriptions, name_the_view, *channels],
+        extensions=[make_view()],
         subscriptions=bus,
         tools=[
             tool_of(each, recording, listed=names, output_schema=output_schemas) for each in shown

@@ -14,11 +14,11 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, NamedTuple, cast
 
-from webots_mcp.database.dead_sessions import find_dead_sessions
+from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.database.stored_breakpoints import VIOLATION
 from webots_mcp.errors import NoDatabaseError
 from webots_mcp.store.recording import RecordingAccess
-from webots_mcp.store.robot_status import ended_by
+from webots_mcp.store.why_ended import ended_by
 
 OccurrenceKind = Literal["breakpoint", "violation", "crash", "trials"]
 MAX_AGE_S: Final = 600.0  # of what comes late, such as rows of a journal

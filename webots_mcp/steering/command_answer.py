@@ -33,6 +33,7 @@ from webots_mcp.steering.run_command import (
     params_of,
     result_of,
 )
+from webots_mcp.store.ages import ago
 from webots_mcp.store.loop_evidence import handler_at_work
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import Subject
@@ -174,7 +175,7 @@ def _hint_unclaimed(view: RobotView) -> str:
         return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     silent_s = session.age_s(session.last_poll_wall_time_s, view.now_s)
     if silent_s > HEARTBEAT_LATE_S:
-        return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"
+        return f"its loop runs, but last called bridge.get_command() {ago(silent_s)}"
     return "its loop runs but did not claim it in time: ask again with a longer timeout_wall_s"
 
 

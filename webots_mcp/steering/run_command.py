@@ -29,6 +29,10 @@ from webots_mcp.store.runs import pace
 from webots_mcp.store.sessions import fetch_session
 
 ACTION: Final = "run"
+_KEEP_THE_STATE: Final = (  # actions after which the newest row still shows the state
+    "pause", "resume", "fast", "step", "run", "cancel_run", "screenshot", "take_frame",
+    "arm_breakpoints", "keep", "get_scene", "get_field",
+)  # fmt: skip
 
 
 class RunProgress(NamedTuple):
@@ -59,8 +63,17 @@ def require_possible(
     for_s: float | None,
     *,
     reset: bool,
+    parameters: bool = False,
 ) -> None:
     """Refuse a run that could not end as requested, before anything is sent.
+
+    Args:
+        recording: The recording of the robot.
+        robot: Its name; None for the only one that can be meant.
+        until: The condition at which the run ends.
+        for_s: The simulated seconds after which it ends.
+        reset: Whether the run begins with a reset.
+        parameters: Whether the run begins by setting parameters.
 
     Raises:
         InvalidInputError: Neither a condition nor a time is given, or the condition is invalid or
@@ -82,7 +95,7 @@ def require_possible(
         view = find_target(connection, robot, ACTION)
         if condition is not None:
             _require_known(view, condition)
-            if not reset:
+            if not (reset or parameters):
                 _require_open(view, condition)
 
 
@@ -187,9 +200,11 @@ def _require_known(view: RobotView, condition: Condition) -> None:
 def _require_open(view: RobotView, condition: Condition) -> None:
     """Refuse a condition that holds at the newest row: the run would be over at once.
 
-    A condition with `changed` may hold: a change lasts one step, so the next one is awaited.
+    A condition with `changed` may hold: a change lasts one step, so the next one is awaited. One
+    that held before the newest command may hold no more: the controller evaluates it on its next
+    state.
     """
-    if view.run is None or "changed(" in condition.text:
+    if view.run is None or "changed(" in condition.text or _is_outdated(view):
         return
     since_s = holds_since(view.connection, view.run.id, condition)
     if since_s is None:
@@ -199,6 +214,22 @@ def _require_open(view: RobotView, condition: Condition) -> None:
         f"time. Run until 'not ({condition.text})' first, give for_s alone, or give reset=true to "
         "begin a new run and evaluate it there."
     )
+
+
+def _is_outdated(view: RobotView) -> bool:
+    """Return whether a command that may have changed the state was answered after the newest row.
+
+    Until the next row it is unknown what it changed.
+    """
+    if view.state is None:
+        return False
+    listed = ", ".join("?" * len(_KEEP_THE_STATE))
+    ((answered_s,),) = view.connection.execute(
+        "SELECT max(finished_wall_time_s) FROM command WHERE robot_id = ? AND status = 'done' "
+        f"AND action NOT IN ({listed})",
+        (view.robot.id, *_KEEP_THE_STATE),
+    ).fetchall()
+    return answered_s is not None and answered_s >= view.state.wall_time_s
 
 
 def _run_that_ended(connection: sqlite3.Connection, command: QueuedCommand) -> int | None:

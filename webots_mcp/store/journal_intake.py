@@ -42,7 +42,7 @@ from webots_mcp.contract import (
     is_extern,
     recorded_name,
 )
-from webots_mcp.database import dead_sessions, processes, waiting_file
+from webots_mcp.database import processes, session_cleanup, waiting_file
 from webots_mcp.database.connection import identify_files, in_transaction
 from webots_mcp.database.waiting_file import (
     FORMAT,
@@ -388,9 +388,9 @@ class _Reading:
 
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
-                dead_sessions.reap(connection, time.time())
+                session_cleanup.reap(connection, time.time())
                 wanted = recorded_name(name)
-                free = dead_sessions.free_name(
+                free = session_cleanup.free_name(
                     connection, wanted, lambda it: it.kind == CUSTOM_DATA
                 )
                 robot = {"name": free, "kind": "Robot", "devices": "{}"}
@@ -462,9 +462,9 @@ class _Reading:
             self.connection.execute(_SEEN_RUN, values)
             self.connection.execute(_SEEN_SESSION, values)
         if begun := ends.get("run"):
-            dead_sessions.end_runs(self.connection, session_id, "reset", begun["uuid"])
+            session_cleanup.end_runs(self.connection, session_id, "reset", begun["uuid"])
         if end := ends.get("session end"):
-            dead_sessions.end_runs(self.connection, session_id, end["reason"])
+            session_cleanup.end_runs(self.connection, session_id, end["reason"])
         dropped = self.faults.and_those(faults)
         self.faults = _NO_FAULTS if last else dropped
         if last and dropped.lines:

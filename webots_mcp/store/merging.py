@@ -27,8 +27,8 @@ from webots_mcp.database.connection import (
     require_shipped,
     transaction,
 )
-from webots_mcp.database.dead_sessions import end_session, reap
 from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
+from webots_mcp.database.session_cleanup import end_session, reap
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.signals.meaning import MEANING_FIELDS

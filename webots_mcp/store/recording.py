@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database import dead_sessions
+from webots_mcp.database import session_cleanup
 from webots_mcp.database.connection import (
     FAILURES,
     LONGEST_READ_S,
@@ -47,6 +47,7 @@ from webots_mcp.errors import (
     NothingRecordedError,
 )
 from webots_mcp.signals.naming import counted
+from webots_mcp.store.ages import LONG_AGO_S, wall_clock
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.journal_intake import (
@@ -130,10 +131,17 @@ class RobotView:
             "run_id": self.run.id if self.run else None,
             "sim_time_s": None if sim_time_s is None else round(sim_time_s, 4),
             "age_s": None if wall_time_s is None else self.age_s(wall_time_s),
+            **self._time_of_day(wall_time_s),
             "status": self.status.text,
             "why": self._why(),
             **storage(self.connection),
         }
+
+    def _time_of_day(self, wall_time_s: float | None) -> dict[str, str]:
+        """Return when the newest data were recorded, if that is long ago."""
+        if wall_time_s is None or self.now_s - wall_time_s <= LONG_AGO_S:
+            return {}
+        return {"newest_wall_time": wall_clock(wall_time_s)}
 
     def _why(self) -> str | None:
         """Why time stands still; of a robot that is gone also what a later start has said."""
@@ -307,7 +315,7 @@ class RecordingAccess:
             if any_unfinished(connection):
                 if isinstance(self.database, Path):
                     adopt(connection, self.database)  # a command's result may wait there
-                dead_sessions.reap(connection, time.time())
+                session_cleanup.reap(connection, time.time())
 
     def ingest(self) -> None:
         """Take in what controllers wrote into journals; nothing where the asker may not write."""

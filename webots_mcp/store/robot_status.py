@@ -10,15 +10,11 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import (
-    CUSTOM_DATA,
-    ENDED_BY,
     HEARTBEAT_INTERVAL_S,
     ISSUED_TIME_TO_LIVE_S,
     UNMOVED,
-    UNSEEN,
     host_name,
 )
-from webots_mcp.database.dead_sessions import EXTERN
 from webots_mcp.database.pauses import (
     HELD_ELSEWHERE,
     LEFT_PAUSED,
@@ -29,10 +25,9 @@ from webots_mcp.database.pauses import (
     breakpoint_at,
 )
 from webots_mcp.database.processes import is_stopped
-from webots_mcp.database.stacks import LOGGER, stacks_at, stacks_path
+from webots_mcp.store.ages import age_in_words, ago
 from webots_mcp.store.loop_evidence import (
     change_since_heartbeat,
-    file_of_session,
     find_backlog,
     find_hang,
     find_holder,
@@ -53,6 +48,7 @@ from webots_mcp.store.run_rows import (
     recent_interval_s,
 )
 from webots_mcp.store.sessions import SessionRecord, companions, left_holding
+from webots_mcp.store.why_ended import unseen_report, why_ended
 
 
 @dataclass(frozen=True)
@@ -64,14 +60,12 @@ class _StatusLimits:
         unpublished_intervals: The same, in usual intervals between two rows.
         beginning_s: Time that the first step may take: Webots loads, or compiles shaders.
         slow_steps: Usual steps that one step may last before the world counts as standing.
-        error_characters: Maximum length of the exception that ended a controller.
     """
 
     unpublished_s: float = 5.0
     unpublished_intervals: float = 10.0
     beginning_s: float = 10.0
     slow_steps: float = 3.0
-    error_characters: int = 300
 
 
 _LIMITS: Final = _StatusLimits()
@@ -79,12 +73,6 @@ _LIMITS: Final = _StatusLimits()
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
 STARTING: Final = "starting"
-_ENDED: Final = {
-    "finished": "its controller finished",
-    "reload": "the world was reloaded and no new controller session has appeared yet",
-    "crashed": "its controller process is gone without having finished (killed or crashed)",
-    "superseded": "a newer session took its place",
-}
 # These causes look the same from inside the simulation; `setup.doctor` tells them apart.
 SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
@@ -92,7 +80,7 @@ SILENT: Final = (
     "simulation these look alike"
 )
 _WAITING: Final = (
-    "the database takes no rows: those of its controller wait in {0} next to it, for {1:.0f} s now "
+    "the database takes no rows: those of its controller wait in {0} next to it, for {1} now "
     "(is the disk full, or does another program hold a lock?); what is shown here is older"
 )
 _LEFT_WAITING: Final = (
@@ -158,7 +146,7 @@ def _decide_dead(
     connection: sqlite3.Connection, session: SessionRecord, moved_s: float | None, now_s: float
 ) -> Status:
     """Return the state of a robot whose controller process has ended, and why it ended."""
-    why = _why_ended(connection, session)
+    why = why_ended(connection, session)
     if (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
         why = "; ".join(filter(None, (why, _LEFT_WAITING.format(backlog.file_name))))
@@ -182,7 +170,7 @@ def _decide_alive(
         return Status(RUNNING, hang) if is_slow else _stopped(session, moved_s, now_s, hang)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
-        why = _WAITING.format(backlog.file_name, max(now_s - backlog.oldest_wall_time_s, 0.0))
+        why = _WAITING.format(backlog.file_name, age_in_words(now_s - backlog.oldest_wall_time_s))
         if session.age_s(moved_s, now_s) <= pace_s:
             return Status(RUNNING, why)
         return _stopped(session, moved_s, now_s, why)
@@ -227,7 +215,7 @@ def find_block(
     if session is None:
         return None
     if not session.is_alive(now_s):
-        why = _why_ended(connection, session) or "its controller is gone"
+        why = why_ended(connection, session) or "its controller is gone"
         return None if may_return(session, now_s) else BlockedLoop(why, "start its controller")
     holder = find_holder(connection, session, now_s)
     if holder is not None and holder.id != session.id:
@@ -310,75 +298,10 @@ def _why_unpublished(
         or unpublished_s <= 0
     ):
         return None
-    return _unseen(session) or (
+    return unseen_report(session) or (
         f"its loop runs, but for {unpublished_s:.1f} s of simulation time it recorded no "
         "state: is bridge.publish() still called in the loop?"
     )
-
-
-def _unseen(session: SessionRecord) -> str | None:
-    """Return the report of its bridge that the loop steps without it; None without a report."""
-    return UNSEEN if (session.last_error or "").startswith(UNSEEN) else None
-
-
-def _why_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
-    """Return why the controller of a dead session ended."""
-    (kind,) = connection.execute(
-        "SELECT kind FROM robot WHERE id = ?", (session.robot_id,)
-    ).fetchone() or (None,)
-    if kind == CUSTOM_DATA:
-        return (
-            "it was recorded by the observer from its customData: the observer ended, or the "
-            "robot is gone"
-        )
-    if session.end_reason is None and (ended := _run_ended(connection, session)) == "finished":
-        return _ENDED[ended]  # it noted that of its run, and had no time left to note it of itself
-    if session.end_reason == "reload" and session.extern:
-        return f"the world was reloaded, which ended its controller; {EXTERN}"
-    if session.end_reason == "finished" and (unseen := _unseen(session)):
-        return unseen
-    if session.end_reason == "finished" and _run_ended(connection, session) == "reset":
-        return "a reset ended its last run, then its controller finished before another began"
-    if session.end_reason == "crashed" and (error := ended_by(connection, session.id)):
-        return f"its controller ended by {error}"
-    why = _ENDED.get(session.end_reason or "crashed")
-    if session.end_reason in (None, "crashed"):
-        hung = connection.execute(
-            "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run "
-            f"WHERE session_id = ?) AND logger = '{LOGGER}' AND wall_time_s > ? ORDER BY id DESC "
-            "LIMIT 1",
-            (session.id, session.last_seen_wall_time_s),
-        ).fetchone()
-        said = hung[0] if hung else _left_stacks(connection, session)
-        why = f"{why}; it was {said.partition(chr(10))[0]}" if said else why
-    return why
-
-
-def _run_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
-    """Return how the last run of a session ended; None where that is not known."""
-    found = connection.execute(
-        "SELECT end_reason FROM run WHERE session_id = ? ORDER BY id DESC LIMIT 1", (session.id,)
-    ).fetchone()
-    return found[0] if found else None
-
-
-def _left_stacks(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
-    """Return where a dead process hung, from a file that was not ingested yet."""
-    path = file_of_session(connection, session, stacks_path)
-    stacks = stacks_at(path) if path else None
-    is_current = stacks and stacks.is_hang and stacks.began_after(session.last_seen_wall_time_s)
-    return f"{stacks.log_values(None)['message']}" if stacks and is_current else None
-
-
-def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:
-    """Return the exception that ended a controller; None if its bridge could not log it."""
-    found = connection.execute(
-        "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
-        "AND level = 'error' AND source = 'controller' AND message GLOB ? "
-        "ORDER BY sim_time_s DESC, id DESC LIMIT 1",
-        (session_id, f"{ENDED_BY} *"),
-    ).fetchone()
-    return found[0].removeprefix(f"{ENDED_BY} ")[: _LIMITS.error_characters] if found else None
 
 
 def _why_standing(
@@ -422,8 +345,8 @@ def _why_standing(
 
 
 def stopped_for(seconds: float) -> str:
-    """Return `stopped N s ago`, with a decimal below 10 s."""
-    return f"stopped {max(seconds, 0.0):.{1 if seconds < 10 else 0}f} s ago"
+    """Return how long ago it stopped: `stopped 42 s ago`, `stopped 3 years ago`."""
+    return f"stopped {ago(seconds)}"
 
 
 def _stopped(
@@ -431,5 +354,5 @@ def _stopped(
 ) -> Status:
     seconds = session.age_s(moved_s or session.started_wall_time_s, now_s)
     if why and why.startswith(UNMOVED):
-        return Status(f"not seen moving for {max(seconds, 0.0):.0f} s", why)
+        return Status(f"not seen moving for {age_in_words(seconds)}", why)
     return Status(stopped_for(seconds), why)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.database.connection import transaction
-from webots_mcp.database.dead_sessions import find_dead_sessions
 from webots_mcp.database.pauses import paused_s
+from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.parameter import Value
 from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters

@@ -18,8 +18,8 @@ from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
-from webots_mcp.database.dead_sessions import reap
 from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.session_cleanup import reap
 from webots_mcp.database.waiting_file import adopt, waiting_paths
 from webots_mcp.standin import InProcessSupervisor
 

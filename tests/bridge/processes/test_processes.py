@@ -13,7 +13,7 @@ import pytest
 from tests.bridge.conftest import Recording
 from tests.bridge.processes.conftest import Start, has_states, last_number
 from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.database.dead_sessions import reap
+from webots_mcp.database.session_cleanup import reap
 from webots_mcp.database.waiting_file import adopt
 
 COUNTING = """
@@ -232,7 +232,7 @@ def test_controllers_that_start_at_once_on_a_missing_database_all_come_up(
 
 CLAIMER = """
 import sqlite3, sys, time
-from webots_mcp.database.queue_statements import CLAIM, PEEK
+from webots_mcp.database.queue import CLAIM, PEEK
 from webots_mcp.database.connection import connect
 from webots_mcp.database.connection import never_wait
 from pathlib import Path

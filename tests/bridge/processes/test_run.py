@@ -10,7 +10,7 @@ from tests.bridge.conftest import Recording
 from tests.bridge.processes.conftest import Start, has_states
 from tests.bridge.processes.test_control import wait
 from webots_mcp.database.connection import connect
-from webots_mcp.database.dead_sessions import reap
+from webots_mcp.database.session_cleanup import reap
 from webots_mcp.standin import Mode, Simulation
 
 # `front_m` falls and rises with time in the same way in each run, whatever the physics do.

@@ -21,8 +21,8 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.judging.checks import check_run
 from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.signals.conditions.compiler import read_expectation

@@ -8,8 +8,8 @@ import sqlite3
 import pytest
 
 from tests.recordings.rover import start_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.detection.search import find_motion
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.catalogue import known_signals

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run

@@ -21,8 +21,8 @@ from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.analysis.swings import MUCH_SLOWER
 from webots_mcp.judging.detection import standstill
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 pytestmark = pytest.mark.slow

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 CYCLE_S, STAND_S, CYCLES = 20.0, 6.0, 10

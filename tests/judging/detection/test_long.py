@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 

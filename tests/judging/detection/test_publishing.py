@@ -11,8 +11,8 @@ from tests.judging.detection.publishing import WAYS, Publishing, moments
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.signals.meaning import declare_meaning
 from webots_mcp.store.meanings import set_meanings
 from webots_mcp.store.reading.ranges import Scope, find_range

@@ -12,8 +12,8 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 

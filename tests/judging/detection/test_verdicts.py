@@ -10,10 +10,10 @@ import numpy as np
 
 from tests.recordings.rover import start_run
 from webots_mcp.judging.checks import check_run
-from webots_mcp.judging.coverage import Verdicts
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.fall import NO_ATTITUDE
-from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.verdicts import Verdicts
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 

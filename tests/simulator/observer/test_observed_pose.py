@@ -13,7 +13,7 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import ask, text_of
-from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import motion_in
 from webots_mcp.judging.run_measures import way_in
 from webots_mcp.server.mcp_server import create_server

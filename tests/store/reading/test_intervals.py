@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.reading.ranges import Scope, find_range

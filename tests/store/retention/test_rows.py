@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.memory import memory_connection
 from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.conftest import TABLES
-from webots_mcp.database.dead_sessions import end_session
+from webots_mcp.database.session_cleanup import end_session
 from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks

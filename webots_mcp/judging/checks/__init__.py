@@ -24,7 +24,6 @@ from webots_mcp.judging.checks.finding import (
     times,
     total_s,
 )
-from webots_mcp.judging.coverage import WORST_FIRST, Coverage, Fault, Outcome, outcome_of
 from webots_mcp.judging.detection import (
     degradation,
     fall,
@@ -40,9 +39,11 @@ from webots_mcp.judging.detection.condition import (
     expectations_of,
     judge_expectation,
 )
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
-from webots_mcp.judging.detection.kinds import EventOptions, NotSearchableError
+from webots_mcp.judging.detection.kinds import NotSearchableError
 from webots_mcp.judging.detection.search import Search
+from webots_mcp.judging.verdicts import WORST_FIRST, Coverage, Fault, Outcome, outcome_of
 from webots_mcp.signals.conditions.compiler import Expectation
 from webots_mcp.signals.meaning import DECLARED_WORDS, Source, declaration_of
 from webots_mcp.signals.naming import counted, listed

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from webots_mcp.judging.coverage import Coverage, Fault, JudgedInterval, Outcome, cause_of
 from webots_mcp.judging.detection.condition import every_call_of
 from webots_mcp.judging.detection.events import Found
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import Motion, RunNoise, Search
+from webots_mcp.judging.verdicts import Coverage, Fault, JudgedInterval, Outcome, cause_of
 from webots_mcp.signals.conditions.compiler import Expectation
 from webots_mcp.signals.meaning import SOURCES, Meaning
 from webots_mcp.store.reading.frame import Frame
@@ -22,7 +22,7 @@ Examined = Fault | Coverage
 
 
 class Finding(NamedTuple):
-    """What a check came to, as it is reported; `coverage.outcome_of` derives it.
+    """What a check came to, as it is reported; `verdicts.outcome_of` derives it.
 
     Attributes:
         evidence: The numbers that it rests on.

@@ -9,7 +9,6 @@ from typing import Any, Final, cast
 from webots_mcp.analysis.arrays import Array, Indexes, RowSpan, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times, total_s
-from webots_mcp.judging.coverage import Coverage, Fault
 from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
@@ -22,6 +21,7 @@ from webots_mcp.judging.detection.standstill import (
     TURNED_RAD,
 )
 from webots_mcp.judging.detection.targets import OFF_S, OFF_SHARE, OFF_TARGET, pursuits_in
+from webots_mcp.judging.verdicts import Coverage, Fault
 from webots_mcp.signals.meaning import words_in
 from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, words_of
 from webots_mcp.signals.register import PLACES

@@ -9,11 +9,11 @@ from typing import Any, Final, Literal
 
 from webots_mcp.analysis.arrays import MOSTLY, Array, Runs, median, np, runs_of
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times
-from webots_mcp.judging.coverage import Fault
 from webots_mcp.judging.detection.degradation import DEGRADATION, TIMES
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, MOST_REPEATED, OTHER_ROWS, is_noisy
+from webots_mcp.judging.verdicts import Fault
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT, Meaning
 from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, find_targets, listed
 from webots_mcp.store.reading.frame import Frame

@@ -11,9 +11,8 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Final
 
-from webots_mcp.database.dead_sessions import find_dead_sessions
+from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.coverage import SearchCoverage, Verdicts
 from webots_mcp.judging.detection import (
     condition,
     degradation,
@@ -26,12 +25,10 @@ from webots_mcp.judging.detection import (
     stored,
     targets,
 )
-from webots_mcp.judging.detection.kinds import (
-    Event,
-    EventOptions,
-    count_by_kind,
-)
+from webots_mcp.judging.detection.event_options import EventOptions
+from webots_mcp.judging.detection.kinds import Event, count_by_kind
 from webots_mcp.judging.detection.search import EventKind, Search, events_touching, find_motion
+from webots_mcp.judging.verdicts import SearchCoverage, Verdicts
 from webots_mcp.signals.naming import flatten
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals

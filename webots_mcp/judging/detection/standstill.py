@@ -16,13 +16,8 @@ from webots_mcp.analysis.standstill import (
     shortest_seen_s,
 )
 from webots_mcp.analysis.track import SmoothedTrack, track_of
-from webots_mcp.judging.coverage import AS_STUCK
-from webots_mcp.judging.detection.kinds import (
-    Alike,
-    Event,
-    EventOptions,
-    NotSearchableError,
-)
+from webots_mcp.judging.detection.event_options import EventOptions
+from webots_mcp.judging.detection.kinds import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.search import (
     LEAST_VISITS,
     NO_TIME,
@@ -35,6 +30,7 @@ from webots_mcp.judging.detection.search import (
     in_metres,
     tracks_in,
 )
+from webots_mcp.judging.verdicts import AS_STUCK
 from webots_mcp.signals.meaning import meaning_by_name, words_in
 from webots_mcp.signals.naming import NAME_POSITION
 from webots_mcp.store.chunks import shown

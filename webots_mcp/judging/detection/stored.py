@@ -10,9 +10,9 @@ from itertools import pairwise
 from typing import Any, Final
 
 from webots_mcp.analysis.arrays import longest_usual_s, np, usual_interval_s
+from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.database.stored_breakpoints import VIOLATION
 from webots_mcp.judging.detection.kinds import (
-    LEVELS,
     Alike,
     Event,
     NotSearchableError,
@@ -197,7 +197,7 @@ def _is_number(value: object) -> bool:
 def log_events(search: Search) -> Iterator[Event]:
     """Log lines of the level and above; where there are only lower ones, this is noted."""
     wanted, run_id = search.options.log_level, search.segment.run_id
-    lower, levels = LEVELS[: LEVELS.index(wanted)], LEVELS[LEVELS.index(wanted) :]
+    lower, levels = LOG_LEVELS[: LOG_LEVELS.index(wanted)], LOG_LEVELS[LOG_LEVELS.index(wanted) :]
     query = f"{_LOGS} AND level IN ({', '.join('?' * len(levels))}) "
     rows = _newest(search, "log", query, *levels)
     for time_s, wall_s, level, source, message in rows:
@@ -207,7 +207,7 @@ def log_events(search: Search) -> Iterator[Event]:
         asked = (*_bounds(search.segment), level)
         if search.connection.execute(f"{_LOGS} AND level = ? LIMIT 1", asked).fetchone():
             what = f"there are lines of level {level}, none of {wanted} or above"
-            search.note_nearest("log", rank / len(LEVELS), what)
+            search.note_nearest("log", rank / len(LOG_LEVELS), what)
             return
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.detection.kinds import EventOptions
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import Motion, find_motion
 from webots_mcp.signals.naming import FARTHEST_M, metres_in
 from webots_mcp.store.export import (

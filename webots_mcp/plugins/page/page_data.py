@@ -32,6 +32,7 @@ from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.signals.naming import spelled_out
+from webots_mcp.store.ages import age_in_words
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
@@ -197,7 +198,7 @@ def _status(header: Mapping[str, Any]) -> dict[str, Any]:
     """Return whether the robot's time is advancing, and the age of the shown data."""
     text = "no data yet"
     if header["sim_time_s"] is not None:
-        text = f"simulation time {header['sim_time_s']:.2f} s, {header['age_s']:.1f} s old"
+        text = f"simulation time {header['sim_time_s']:.2f} s, {age_in_words(header['age_s'])} old"
     run = f"run {header['run_id']}, " if header["run_id"] is not None else ""
     kind = "running" if header["status"] == RUNNING else "standing"
     return {"pill": header["status"], "kind": kind, "text": run + text, "why": header["why"] or ""}

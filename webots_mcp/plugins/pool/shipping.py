@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from webots_mcp.database.connection import FrozenConnection
-from webots_mcp.database.dead_sessions import find_dead_sessions
+from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,

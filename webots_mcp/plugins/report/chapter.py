@@ -12,10 +12,11 @@ from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.judging.checks import check_run
 from webots_mcp.judging.comparison import compare_runs
-from webots_mcp.judging.coverage import Verdicts
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import KINDS, Found, choose, search_events, stored_kinds
-from webots_mcp.judging.detection.kinds import Event, EventOptions
+from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
+from webots_mcp.judging.verdicts import Verdicts
 from webots_mcp.plugins.report.grid import Grid, GridRow
 from webots_mcp.plugins.report.words import (
     clock,

@@ -190,14 +190,6 @@ def last_seen_s(view: RobotView) -> float:
     return max(seen_s, view.session.last_seen_wall_time_s) if view.session else seen_s
 
 
-def ago(seconds: float) -> str:
-    """Return how long ago something was, in the unit in which a person thinks of it."""
-    for size, unit in ((86_400, "days"), (3_600, "hours"), (120, "minutes")):
-        if seconds >= 2 * size or (unit == "minutes" and seconds >= size):
-            return f"{seconds / (60 if unit == 'minutes' else size):.0f} {unit} ago"
-    return f"{max(seconds, 0.0):.1f} s ago"
-
-
 def diagnose(subject: Examined, checks: Sequence[DoctorCheck] | None = None) -> list[Checked]:
     """Run the checks, all but those that start a process; what cannot be checked says why."""
     with ExitStack() as stack:

@@ -25,7 +25,6 @@ from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldEr
 from webots_mcp.setup.doctor import (
     Diagnosis,
     Examined,
-    ago,
     check,
     last_seen_s,
     ok,
@@ -33,6 +32,7 @@ from webots_mcp.setup.doctor import (
     warning,
     wrong,
 )
+from webots_mcp.store.ages import ago
 from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.loop_evidence import handler_at_work, rows_waiting
 from webots_mcp.store.recording import GETTING_STARTED, RobotView, name_of

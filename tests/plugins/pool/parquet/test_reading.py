@@ -18,8 +18,8 @@ from tests.plugins.pool.parquet.conftest import RECORDINGS, Many
 from tests.plugins.pool.rows import ship, uuid_of
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import EventOptions
 from webots_mcp.judging.trends import trends
 from webots_mcp.plugins.pool import duckdb_statement as asking
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool

@@ -1,7 +1,7 @@
-"""What detectors and checks could judge, and the words that follow from it.
+"""Derives verdicts: whether an event was found, not found or not searched, and how a check ends.
 
-Each returns what it found with its coverage. Whether a kind of event was found, not found or not
-searched, and whether a check passes, is derived from both here and nowhere else.
+A detector or check returns what it found and its coverage: what it could judge. Every verdict,
+from "not searched" of a kind to "not judged" of a check, is derived from both in this module only.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from webots_mcp.judging.coverage import (
+from webots_mcp.judging.verdicts import (
     Coverage,
     Fault,
     JudgedInterval,

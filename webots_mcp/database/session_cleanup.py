@@ -1,8 +1,8 @@
-"""Distinguishes a dead controller from a slow one, and settles what a dead one left behind.
+"""Finds sessions whose controller has died, and settles what they left open: runs and commands.
 
 A session is dead once its process no longer runs (`processes`); silence alone does not count. Its
-runs are ended as of their last sign of life, and its commands become `lost`. The text of a robot's
-status is made from this by `store.robot_status.decide_status`.
+runs are ended as of their last sign of life, and its commands become `lost`. The sentence that a
+reader gets about a dead controller is in `store.why_ended`.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, host_name
 from webots_mcp.database.processes import is_living, process_alive
-from webots_mcp.database.queue_statements import CLAIMED_BY_ENDED, EXPIRE, LOSE
+from webots_mcp.database.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
 from webots_mcp.database.waiting_file import waiting_path
 
 END_SESSION: Final = (

@@ -11,8 +11,8 @@ import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
-from webots_mcp.database.dead_sessions import reap
 from webots_mcp.database.processes import process_identity
+from webots_mcp.database.session_cleanup import reap
 from webots_mcp.database.waiting_file import FORMAT, adopt
 from webots_mcp.store.recording import view_robot
 

@@ -1,0 +1,45 @@
+"""How long ago something was, in the words in which a person thinks of it, and the time of day.
+
+Sentences use it for wall time; the data of an answer have the seconds, and the time of day.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Final
+
+LONG_AGO_S: Final = 3_600.0  # from here on an answer says the time of day as well
+_MINUTE_S: Final = 60.0
+_UNITS: Final = (  # each is used from twice its length on: 90 minutes, not 2 hours
+    (365.25 * 86_400.0, "years"),
+    (30.44 * 86_400.0, "months"),
+    (86_400.0, "days"),
+    (3_600.0, "hours"),
+    (_MINUTE_S, "minutes"),
+)
+
+
+def age_in_words(seconds: float) -> str:
+    """Return an age: 0.4 s, 42 s, 5 minutes, 3 hours, 2 days, 5 months, 3 years.
+
+    Args:
+        seconds: The age; a negative one, of a clock that runs ahead, counts as none.
+    """
+    age_s = max(seconds, 0.0)
+    for unit_s, unit in _UNITS:
+        if age_s >= 2 * unit_s:
+            return f"{age_s / unit_s:.0f} {unit}"
+    return f"{age_s:.{1 if age_s < 10 else 0}f} s"
+
+
+def ago(seconds: float) -> str:
+    """Return an age with `ago` behind it."""
+    return f"{age_in_words(seconds)} ago"
+
+
+def wall_clock(wall_time_s: float) -> str:
+    """Return a moment of wall time in this machine's zone, as ISO 8601 with that zone."""
+    try:
+        return datetime.fromtimestamp(wall_time_s).astimezone().isoformat("T", "milliseconds")
+    except (OverflowError, OSError, ValueError):  # no bridge has written this
+        return f"{wall_time_s}"

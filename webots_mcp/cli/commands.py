@@ -50,6 +50,7 @@ _OF_THE_CORE: Final = {
     "completion": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "completion"),
     "doctor": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "doctor"),
     "header": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "header"),
+    "help": CommandEntry(SETUP, "webots_mcp.cli.help_pages", "help_"),
     "init": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "init"),
     "observe": CommandEntry(SETUP, "webots_mcp.cli.serving", "observe"),
     "serve": CommandEntry(SETUP, "webots_mcp.cli.serving", "serve"),

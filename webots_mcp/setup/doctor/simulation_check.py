@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 
-_SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
+_SEE_PAGE: Final = "see 'webots-mcp help troubleshooting simulation'"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
 
 

@@ -24,7 +24,7 @@ WIDTHS = (390, 1280)
 
 
 class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
+    def log_message(self, *_args: Any, **_named: Any) -> None:
         """Nothing of a request is printed."""
 
 

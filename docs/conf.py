@@ -28,6 +28,7 @@ html_theme = "furo"
 html_title = f"webots-mcp {__version__}"
 html_extra_path = ["site"]  # its index.html leads to the first page
 html_copy_source = False
+smartquotes = False  # it would make one dash of the two of an option
 # A symptom leads to what to do about it.
 html_search_scorer = str(CHECKOUT / "docs" / "search_scorer.js")
 

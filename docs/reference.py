@@ -78,13 +78,17 @@ def tools_below(heading: str) -> set[str]:
 
 def _tool(tool: Any) -> str:
     required = tool.input_schema.get("required", ())
-    rows = [
-        [f"`{name}`", _kind(schema), _default(schema, name in required),
-         schema.get("description", "")]
+    arguments = [
+        (f"`{name}` ({_kind(schema)}{', required' if name in required else ''})",
+         schema.get("description", "") + _default(schema))
         for name, schema in tool.input_schema["properties"].items()
     ]  # fmt: skip
-    table = _table(["parameter", "type", "default", "meaning"], rows) if rows else ""
-    return f"### {tool.name}\n\n{as_markdown(tool.description)}\n\n{table}"
+    return f"### {tool.name}\n\n{as_markdown(tool.description)}\n\n{_list(arguments)}"
+
+
+def _list(entries: list[tuple[str, str]]) -> str:
+    """Names with their meaning, which fit a telephone where a table would not."""
+    return "".join(f"- {name}: {escaped(' '.join(text.split()))}\n" for name, text in entries)
 
 
 def _kind(schema: dict[str, Any]) -> str:
@@ -101,10 +105,11 @@ def _kind(schema: dict[str, Any]) -> str:
     return " ".join([kind, *between])
 
 
-def _default(schema: dict[str, Any], required: bool) -> str:
-    if required:
-        return "required"
-    return f"`{schema['default']}`" if schema.get("default") is not None else ""
+def _default(schema: dict[str, Any]) -> str:
+    """The default, unless the description gives it."""
+    default = schema.get("default")
+    is_said = "default" in schema.get("description", "").lower()
+    return "" if default is None or is_said else f" Default: `{default}`."
 
 
 def fields(_page: str = "") -> str:
@@ -196,14 +201,14 @@ def commands(group: str | None = None) -> str:
     shown = {
         name: (
             each.text,
-            [[f"`{typed}`", said] for typed, said in each.arguments.items()],
+            [(f"`{typed}`", said) for typed, said in each.arguments.items()],
         )
         for name, each in described().items()
         if group in (None, COMMANDS[name].group)
     }
     return "## Reference\n\n" + "\n".join(
-        f"### {name}\n\n{as_markdown(text)}\n\n{_table(['argument', 'meaning'], rows)}"
-        for name, (text, rows) in sorted(shown.items())
+        f"### {name}\n\n{as_markdown(text)}\n\n{_list(arguments)}"
+        for name, (text, arguments) in sorted(shown.items())
     )
 
 

@@ -28,7 +28,7 @@ def test_each_tool_has_its_parameters_with_their_meaning() -> None:
     shown = parts(reference.tools())
     assert shown.keys() == {tool.name for tool in tools}
     for tool in tools:
-        rows = re.findall(r"(?m)^\| `(\w+)` \| .+ \| .* \| (.*) \|$", shown[tool.name])
+        rows = re.findall(r"(?m)^- `(\w+)` \(.+?\): (.*)$", shown[tool.name])
         assert dict(rows).keys() == tool.input_schema["properties"].keys()
         assert all(meaning for _, meaning in rows), tool.name
 
@@ -38,7 +38,7 @@ def test_each_command_has_its_options() -> None:
     assert sorted(shown) == names()
     for name, command in described().items():
         for typed in command.arguments:
-            assert f"`{typed}`".replace("|", "\\|") in shown[name], name
+            assert f"- `{typed}`: " in shown[name], name
 
 
 def test_each_table_and_view_has_its_columns_and_every_comment_of_the_schema() -> None:

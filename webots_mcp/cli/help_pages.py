@@ -92,7 +92,7 @@ def sections_about(topic: Sequence[str]) -> list[Section]:
         if len(topic) == 1:
             return [within[0]]
         if inside := _matching(_words(" ".join(topic[1:])), within[1:]):
-            return inside
+            return inside[:1]
     return _matching(
         _words(" ".join(topic)), [each for page in _ranked() for each in _sections(page)]
     )

@@ -9,6 +9,7 @@ from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 _PICTURE = re.compile(r"(?m)^!\[[^\]]*\]\((?!https?:)([^)\s]+)\)\n+")
 _GITHUB = re.compile(r"https://github\.com/([\w.-]+)/([\w.-]+?)(?:\.git)?/?")
+PLACEHOLDER = "OWNER"  # stands in [project.urls] of pyproject.toml until a release
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:|#)([^)\s]+)\)")
 
 
@@ -21,11 +22,17 @@ class Readme(MetadataHookInterface):
     def update(self, metadata: dict[str, Any]) -> None:
         """Set the field `readme`."""
         text = (Path(self.root) / "README.md").read_text("utf-8")
-        source = metadata.get("urls", {}).get("Source")
+        source = source_of(metadata.get("urls", {}))
         shown = with_absolute_links(text, source)
         if source is not None and _GITHUB.fullmatch(source):
             shown += f"\n<!-- mcp-name: {registry_name(source)} -->\n"
         metadata["readme"] = {"content-type": "text/markdown", "text": shown}
+
+
+def source_of(urls: dict[str, str]) -> str | None:
+    """Return the address of the repository; None if there is none, or a placeholder."""
+    source = urls.get("Source")
+    return None if source is None or PLACEHOLDER in source else source
 
 
 def with_absolute_links(text: str, source: str | None) -> str:

@@ -160,7 +160,8 @@ def means(simulation: RecordedSimulation) -> dict[str, float]:
 def stuck_explorer(folder: Path) -> Generator[Path]:
     """Let the tutorial's robot drive until it is stuck; yields the folder of its recording."""
     world, data_dir = walkthrough.write_project(folder), folder / "mcp_data"
-    with RecordedSimulation(world, data_dir=data_dir) as simulation:
+    simulation = RecordedSimulation(world, data_dir=data_dir)
+    with simulation:
         simulation.run_for(DRIVEN_S)
         yield data_dir
 
@@ -184,7 +185,8 @@ def conversation(data_dir: Path) -> list[str]:
         f"  └ {failed['check']}: {failed['outcome']}, {evidence}, since {since}",
         f"● {_call(*TURNS[1])}",
         f"  └ {signal} {course.partition(';')[0]}; constant: {run['constant']}",
-        f"● At {since} it hit something that only its left eye saw. Your code asks only the right eye.",
+        f"● At {since} it hit something that only its left eye saw. "
+        "Your code asks only the right eye.",
     ]
 
 

@@ -10,6 +10,7 @@ from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 _PICTURE = re.compile(r"(?m)^!\[[^\]]*\]\((?!https?:)([^)\s]+)\)\n+")
 _GITHUB = re.compile(r"https://github\.com/([\w.-]+)/([\w.-]+?)(?:\.git)?/?")
+PLACEHOLDER = "OWNER"  # stands in [project.urls] of pyproject.toml until a release
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:|#)([^)\s]+)\)")
 
 
@@ -22,7 +23,7 @@ class Readme(MetadataHookInterface):
     def update(self, metadata: dict[str, Any]) -> None:
         """Set the field `readme`."""
         text = (Path(self.root) / "README.md").read_text("utf-8")
-        source = metadata.get("urls", {}).get("Source")
+        source = source_of(metadata.get("urls", {}))
         shown = with_absolute_links(text, source)
         if source is not None and _GITHUB.fullmatch(source):
             shown += f"\n<!-- mcp-name: {registry_name(source)} -->\n"
@@ -36,6 +37,12 @@ class Documentation(BuildHookInterface[Any]):
         """Add each page; an editable installation reads those of the checkout."""
         pages = sorted((Path(self.root) / "docs").glob("*.md"))
         build_data["force_include"] |= {str(p): f"webots_mcp/docs/{p.name}" for p in pages}
+
+
+def source_of(urls: dict[str, str]) -> str | None:
+    """Return the address of the repository; None if there is none, or a placeholder."""
+    source = urls.get("Source")
+    return None if source is None or PLACEHOLDER in source else source
 
 
 def with_absolute_links(text: str, source: str | None) -> str:

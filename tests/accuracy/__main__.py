@@ -29,7 +29,13 @@ PARTS: Final = (
     Part("loop", "What recording costs", recorders.loop),
     Part("answers", "Tokens", costs.answers),
 )
-SHOWN: Final = ("events", "kills", "loop", "answers")  # in the README
+# The parts whose figure is in the README, each with the question that it answers.
+SHOWN: Final = {
+    "events": "Can you trust what it finds?",
+    "kills": "Does a crash lose data?",
+    "loop": "Does it slow the controller?",
+    "answers": "Does it fill the assistant's context?",
+}
 _INTRODUCTION: Final = """\
 # How accurate, at what cost
 
@@ -82,9 +88,14 @@ def page_of(known: dict[str, str]) -> str:
 
 
 def figures(page: str) -> str:
-    """What the README shows: a line for each of four parts."""
-    known, shown = sections(page), [part.title for part in PARTS if part.name in SHOWN]
-    return "\n".join(f"- {headline(known[title])}" for title in shown if title in known)
+    """What the README shows: a question for each of four parts, and the figure that answers it."""
+    known = sections(page)
+    titles = {part.name: part.title for part in PARTS}
+    return "\n".join(
+        f"- **{question}** {headline(known[titles[name]])}"
+        for name, question in SHOWN.items()
+        if titles[name] in known
+    )
 
 
 def _show(text: str) -> None:

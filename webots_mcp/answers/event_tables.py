@@ -26,7 +26,7 @@ from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.recording import RobotView
 
 EVENT_COLUMNS: Final = (
-    "kind", "count", "run_id", "start_s", "time", "duration_s", "ongoing", "name", "details",
+    "kind", "count", "run_id", "start_s", "wall_time", "duration_s", "ongoing", "name", "details",
 )  # fmt: skip
 _GROUP_BUDGET_TOKENS: Final = 200
 _NO_DATA: Final = "no data is recorded for it"

@@ -71,13 +71,34 @@ def step(
     _control("step", asked, as_json=json, steps=steps)
 
 
+def fast(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Let the simulation run as fast as it can."""
+    _control("fast", asked, as_json=json)
+
+
+def reset(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Reset the simulation to its first state; a new run begins at time 0.
+
+    Controllers keep running with the code they have. `webots-mcp reload` restarts them.
+    """
+    _control("reset", asked, as_json=json)
+
+
+def reload(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Reload the world and restart its controllers with their code as it is now.
+
+    An extern controller ends and must be started by hand.
+    """
+    _control("reload", asked, as_json=json)
+
+
 def _control(command: str, asked: ToWebots, *, as_json: bool, **given: Any) -> None:
     from webots_mcp.questions.control_simulation import webots_simulation_control
 
     _show(webots_simulation_control, asked, as_json=as_json, command=command, **given)
 
 
-def keep(
+def capture(
     reason: Annotated[str, Parameter("REASON", help="Why, as it is shown with the stretch.")],
     /,
     *,
@@ -285,7 +306,7 @@ def _has(question: Question, argument: str) -> bool:
     return any(each.name == argument for each in question.parameters)
 
 
-def requests(
+def audit(
     *,
     number: Annotated[Count, Parameter("-n", metavar="N", help="The newest N (20).")] = 20,
     refused: Annotated[

@@ -22,7 +22,9 @@ _OTHERS: Final = {  # by tool: those that are answered by a command of another n
     "list_signals": "signals", "describe_signals": "signals --describe",
     "list_meanings": "signals --meanings", "get_field": "field", "diagnose_setup": "doctor",
     "plot": "plot", "report": "report",
-    "simulation_control": "send", "world_reset": "send reset",
+    "simulation_control": "send", "world_reset": "reset", "world_reload": "reload",
+    "launch_world": "launch", "list_robots": "status", "get_world_info": "status --verbose",
+    "get_camera": "camera", "take_screenshot": "screenshot", "check_run": "check",
 }  # fmt: skip
 _FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
     "start the server with --data-dir or --database": "give --data-dir or --database",

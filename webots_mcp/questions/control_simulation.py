@@ -263,7 +263,7 @@ def _answer(
         **header,
         action="launch",
         outcome="done" if first else "claimed",
-        waited_s=round(time.monotonic() - started_s, 3),
+        waited_wall_s=round(time.monotonic() - started_s, 3),
         result=_described(launched),
         route="process",
         evidence=f"{first.robot} records: run {first.run_id}" if first else None,

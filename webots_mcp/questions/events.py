@@ -160,7 +160,7 @@ def _found(
     return {
         "events": events,
         "verdicts": verdicts,
-        "from_s": _begin_of(view, asked),
+        "start_s": _begin_of(view, asked),
         "not_shown": not_shown_of(told),
         "cursor": told.cursor,
         "notes": notes,

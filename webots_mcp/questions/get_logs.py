@@ -115,7 +115,7 @@ def webots_get_logs(
         )
         return LogsAnswer(
             lines=_table(_newest_fitting(shown), time_of_day=time_of_day) if shown else None,
-            matching=len(waiting),
+            total=len(waiting),
             hint=_NO_RUN_YET if waiting else hint,
         )
 
@@ -138,8 +138,8 @@ def _row(line: LogLine) -> dict[str, object]:
 def _table(lines: list[LogLine], *, time_of_day: bool) -> AnswerTable:
     columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
     if time_of_day:
-        columns.insert(columns.index("sim_time_s") + 1, "time")
-    rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]
+        columns.insert(columns.index("sim_time_s") + 1, "wall_time")
+    rows = [_row(line) | {"wall_time": wall_clock(line.wall_time_s)} for line in lines]
     return AnswerTable(columns=columns, rows=[[row[name] for name in columns] for row in rows])
 
 
@@ -161,7 +161,7 @@ def _answer(
     return LogsAnswer(
         **view.header(),
         lines=_table(shown, time_of_day=time_of_day),
-        matching=matching,
+        total=matching,
         cursor=recorded[0].id if older and recorded else None,
         hint="; ".join(hint for hint in hints if hint) or None,
     )

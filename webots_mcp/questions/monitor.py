@@ -142,7 +142,7 @@ def _report(view: RobotView, wall_start_s: float, window_s: float) -> MonitorAns
         view,
         MonitorAnswer,
         lambda: {
-            "window_s": round(window_s, 2),
+            "window_wall_s": round(window_s, 2),
             **_found(view.connection, view, wall_start_s),
         },
     )

@@ -34,8 +34,8 @@ from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 COMMAND_COLUMNS: Final = (
-    "id", "action", "params", "outcome", "run_id", "sim_time_s", "asked_ago_s", "took_s", "result",
-    "error",
+    "id", "action", "params", "outcome", "run_id", "sim_time_s", "asked_ago_wall_s", "took_wall_s",
+    "result", "error",
 )  # fmt: skip
 _WAIT_S: Final = 10.0
 _MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be

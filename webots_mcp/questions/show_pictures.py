@@ -158,7 +158,7 @@ def _single(
     picture, note = _load_picture(image.file(recording.data_dir))
     return picture, {
         "picture_sim_time_s": seconds(image.sim_time_s),
-        "picture_age_s": view.age_s(image.wall_time_s),
+        "picture_age_wall_s": view.age_s(image.wall_time_s),
         "width_px": image.width,
         "height_px": image.height,
         "file": str(recording.data_dir / image.path),
@@ -254,9 +254,9 @@ def _show_frame(recording: RecordingAccess, answer: RunAnswer, why: str) -> None
     frame = None
     if ran.get("run_id") is not None:
         with recording.reader() as connection:
-            found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
+            found = camera_frames(connection, ran["run_id"], at_s=ran["end_s"])
         frame = next(
-            (each for each in found if abs(each.sim_time_s - ran["to_s"]) < _LIMITS.same_s), None
+            (each for each in found if abs(each.sim_time_s - ran["end_s"]) < _LIMITS.same_s), None
         )
     if frame is None:
         answer.picture = {"missing": why}

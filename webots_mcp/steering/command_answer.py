@@ -81,7 +81,7 @@ def command_answer(view: RobotView, command: QueuedCommand, waited_s: float) -> 
         "command_id": command.id,
         "action": command.action,
         "outcome": command.status,
-        "waited_s": waited_s,
+        "waited_wall_s": waited_s,
         "error": cut_text(command.error or "", 2_000) if failed else None,
         "hint": _hint(view, command),
     }
@@ -192,10 +192,10 @@ def _run_facts(view: RobotView, command: QueuedCommand) -> dict[str, Any]:
     facts |= {
         "ran": {
             "run_id": progress.run_id,
-            "from_s": seconds(progress.from_s),
-            "to_s": seconds(progress.to_s),
+            "start_s": seconds(progress.from_s),
+            "end_s": seconds(progress.to_s),
             "advanced_s": seconds(progress.advanced_s),
-            "factor": figure(progress.factor),
+            "real_time_factor": figure(progress.factor),
         },
         "values": shown(result.get("values")) if result.get("values") else None,
         "mode": result.get("mode"),

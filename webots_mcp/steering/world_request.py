@@ -192,7 +192,7 @@ class WorldRequest(Request):
             )
         if self.launcher.running is not None:
             self.launcher.running.world = world
-        answer.waited_s = self._waited_s
+        answer.waited_wall_s = self._waited_s
         return answer
 
     def _begun_in(self, situation: Situation, world: Path, before: int) -> SessionStart | None:
@@ -223,5 +223,5 @@ class WorldRequest(Request):
     def _answer(self, action: str, route: str, evidence: str) -> CommandAnswer:
         waited_s = self._waited_s
         return CommandAnswer(
-            action=action, outcome="done", waited_s=waited_s, route=route, evidence=evidence
+            action=action, outcome="done", waited_wall_s=waited_s, route=route, evidence=evidence
         )

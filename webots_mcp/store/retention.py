@@ -168,7 +168,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, StoredLimit]:
         except (KeyError, TypeError, InvalidInputError) as error:
             raise InvalidInputError(
                 f"the row {kind!r} of the table retention_limit is not a limit ({error}): set it "
-                "again with 'webots-mcp retain'"
+                "again with 'webots-mcp retention'"
             ) from error
         settings[name] = StoredLimit(value, set_by, set_s)
     return settings
@@ -224,7 +224,7 @@ def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
         option = option_of(_KIND_OF[name])
         found.append(
             f"{option} {_text(value)} is not in force: the database keeps {_said(setting)}; "
-            f"'webots-mcp retain {option} ...' changes it"
+            f"'webots-mcp retention {option} ...' changes it"
         )
     return found
 

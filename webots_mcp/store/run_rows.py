@@ -280,13 +280,16 @@ def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | No
         return None
     share = own_ms / max(own_ms + wait_ms, 1e-9)
     if share >= _SETS_PACE:
-        why = "the controller, not the physics, sets the pace"
+        why = "the controller sets the pace, not the physics"
     elif share > 1 - _SETS_PACE:
         why = "controller and Webots (or another controller) take turns"
     else:
-        why = "Webots, real time or another controller sets the pace, not this one"
-    needs = f"{robot} needs {own_ms:.4g} of each {own_ms + wait_ms:.4g} ms"
-    return f"{needs}: {why} (mean of {steps} steps)"
+        why = "not the bottleneck: Webots, real time or another controller sets the pace"
+    step_ms = own_ms + wait_ms
+    return (
+        f"{robot}: controller load {100 * share:.2g} % of {step_ms:.4g} ms per step; {why} "
+        f"(mean of {steps} steps)"
+    )
 
 
 def select(value: Any, path: str) -> Any:

@@ -6,6 +6,4 @@ cannot write. Its buttons send the same commands as the tools.
 
 from webots_mcp.extras.plugins import Plugin, PluginCommand
 
-PLUGIN = Plugin(
-    commands=(PluginCommand("view", "What is recorded now", f"{__name__}.view_command:view"),)
-)
+PLUGIN = Plugin(commands=(PluginCommand("view", "Watch", f"{__name__}.view_command:view"),))

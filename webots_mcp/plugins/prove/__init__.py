@@ -3,5 +3,5 @@
 from webots_mcp.extras.plugins import Plugin, PluginCommand
 
 PLUGIN = Plugin(
-    commands=(PluginCommand("prove", "Setting up and running", f"{__name__}.prove_command:prove"),),
+    commands=(PluginCommand("prove", "Server and set-up", f"{__name__}.prove_command:prove"),),
 )

@@ -326,6 +326,7 @@ ADDED: Final[dict[str, Callable[[str], str]]] = {
     "docs/events": events,
     "docs/fields": fields,
     "docs/meanings": meanings,
+    "docs/accuracy": lambda _page: subpages("accuracy"),
     "docs/tools": lambda _page: subpages("tools"),
     "docs/command-line": lambda _page: subpages("command-line"),
     "docs/database": tables,

@@ -138,7 +138,7 @@ def situations(details: str) -> list[str]:
     )
     assert counts is not None, headline(details)
     quiet, healthy, answered, problems, labelled, points, most = counts.groups()
-    rows = re.findall(r"(?m)^\| (.+) \| (-?\d+) \| (-?\d+) \|$", details)
+    rows = re.findall(r"(?m)^\| (.+\(\[report\].+) \| (-?\d+) \| (-?\d+) \|$", details)
     first = sum(int(points) for _, points, _ in rows)
     missed = [(name, int(now)) for name, _, now in rows if int(now) < _RIGHT]
     right = len(rows) - len(missed)

@@ -14,8 +14,8 @@ import anyio
 
 import webots_mcp
 from webots_mcp import MemoryDatabase, testing
+from webots_mcp.answers.answer_models import Answer, AnswerPart
 from webots_mcp.answers.columns import COLUMNS
-from webots_mcp.answers.models import Answer, AnswerPart
 from webots_mcp.cli import described
 from webots_mcp.cli.commands import COMMANDS, DATA, NOW, PAST, RUNS, SERVER, START, STEER
 from webots_mcp.database.connection import connect, create_schema

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.answers.event_tables import verdicts_of
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     Answer,
     AnswerTable,
     BreakpointAnswer,
@@ -26,6 +25,7 @@ from webots_mcp.answers.models import (
     TrendsAnswer,
     TrialsAnswer,
 )
+from webots_mcp.answers.event_tables import verdicts_of
 from webots_mcp.answers.summaries import MOST_WORDS, summary_of, verdict_of_kinds
 from webots_mcp.judging.detection.events import kind_names
 from webots_mcp.judging.verdicts import AS_STUCK, JudgedInterval, SearchCoverage

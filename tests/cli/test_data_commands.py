@@ -19,8 +19,8 @@ import pytest
 
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.retention import Limit, parse_limit, size_text
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 Say = Callable[..., str]
 

@@ -212,17 +212,17 @@ def test_what_a_dead_process_left_is_logged_where_its_loop_had_been_silent(
         ),
         (
             (1.0, 31.0, 1000),
-            "r: controller load 3.1 % of 32 ms per step; not the bottleneck: Webots, real time",
+            "r: controller load 3.1 % of 32 ms per step; not the bottleneck: Webots",
         ),
         (
             (16.0, 16.0, 1000),
-            "r: controller load 50 % of 32 ms per step; controller and Webots (or another",
+            "r: controller load 50 % of 32 ms per step; controller and Webots (or",
         ),
         ((0.0, 0.0, 1000), "r: controller load 0 % of 0 ms per step; not the bottleneck: Webots"),
         ((0.31, 0.01, 19), "None"),
         (
             (12.0, 0.1, 3),
-            "r: controller load 99 % of 4033 ms per step; the controller sets the pace",
+            "r: controller load 99 % of 4033 ms per step; the controller",
         ),
         ((None, None, None), "None"),
     ],

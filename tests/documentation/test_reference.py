@@ -11,15 +11,14 @@ import pytest
 
 from docs import reference
 from webots_mcp import MemoryDatabase
+from webots_mcp.answers.answer_models import AnswerTable
 from webots_mcp.answers.columns import COLUMNS
 from webots_mcp.answers.event_tables import EVENT_COLUMNS
-from webots_mcp.answers.models import AnswerTable
 from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.answers.trend_tables import STATE_COLUMNS, TREND_COLUMNS
 from webots_mcp.cli import described, names
 from webots_mcp.database.connection import SCHEMA_FILE
 from webots_mcp.judging.divergence import PartedSignal
-from webots_mcp.questions.breakpoints import BREAKPOINT_COLUMNS
 from webots_mcp.questions.compare_runs import (
     CHECK_COLUMNS,
     DIFFERENCE_COLUMNS,
@@ -37,8 +36,9 @@ from webots_mcp.questions.list_robots import (
     ROBOT_COLUMNS,
 )
 from webots_mcp.questions.send_command import COMMAND_COLUMNS
+from webots_mcp.questions.set_breakpoints import BREAKPOINT_COLUMNS
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.store.parameters import COLUMNS as COLUMNS_OF_PARAMETERS
+from webots_mcp.store.run_parameters import COLUMNS as COLUMNS_OF_PARAMETERS
 
 
 def parts(text: str) -> dict[str, str]:

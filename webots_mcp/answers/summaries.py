@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, singledispatch
 from typing import Any, Final, cast
 
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     Answer,
     AnswerTable,
     BreakpointAnswer,
@@ -46,14 +46,11 @@ from webots_mcp.store.ages import age_in_words
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
-_SERIOUS: Final = ("critical", "error", "warning")
 _NOTED_FIRST: Final = ("change", "command", "log", "bridge_event", "kept_stretch", "image", "run")
-_SERIOUS_LOG: Final = {"critical": 1, "error": 1}
 _OUTCOMES: Final = {"fail": "failed", "warn": "warned", "not judged": "could not be judged"}
 _ENDINGS: Final = {  # others: "ended by reset"
     "finished": "finished", "crashed": "crashed", "going on": "goes on",
 }  # fmt: skip
-_BAD_NOTABLE: Final = ("log critical", "log error", "command failed", "dropped")
 _HELD: Final = {"pass": "held", "fail": "did not hold", "warn": "did not always hold"}
 TRIAL_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 _NOUNS: Final = {  # one and several
@@ -133,7 +130,9 @@ def _(answer: LogsAnswer) -> str:
     if not lines:
         return "No log line matches."
     levels = Counter(str(each.get("level")) for each in lines)
-    serious = [f"{levels[name]} {name}" for name in _SERIOUS if levels[name]]
+    serious = [
+        f"{levels[name]} {name}" for name in ("critical", "error", "warning") if levels[name]
+    ]
     total = max(answer.total or 0, len(lines))
     shown = (
         f"{len(lines)} of {total} log lines" if total > len(lines) else _count(total, "log line")
@@ -357,7 +356,9 @@ def _noted(
 ) -> list[str]:
     """Return what was noted: errors and failed commands first, and the rest if there is room."""
     logs = [row for row in rows if row.get("kind") == "log"]
-    errors = sum(_SERIOUS_LOG.get(str(row.get("name")), 0) * _times(row) for row in logs)
+    errors = sum(
+        {"critical": 1, "error": 1}.get(str(row.get("name")), 0) * _times(row) for row in logs
+    )
     failed = sum(
         _times(row) for row in rows
         if row.get("kind") == "command" and _detail(row, "status") in ("failed", "refused", "lost")
@@ -517,7 +518,11 @@ def _ended_badly(run: Mapping[str, Any]) -> str:
     counted: dict[str, int] = {}
     if isinstance(notable, dict):
         counted = cast("dict[str, int]", notable)
-    bad = [f"{count} {name}" for name, count in counted.items() if name in _BAD_NOTABLE]
+    bad = [
+        f"{count} {name}"
+        for name, count in counted.items()
+        if name in ("log critical", "log error", "command failed", "dropped")
+    ]
     crashed = run.get("ended_by") == "crashed"
     if not crashed and not bad:
         return ""

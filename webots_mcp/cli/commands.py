@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.extras.plugins import plugin_commands
+from webots_mcp.extras.plugin_registry import plugin_commands
 
 
 class CommandEntry(NamedTuple):
@@ -43,7 +43,7 @@ _OF_THE_CORE: Final = {
     "commands": CommandEntry(NOW, f"{_Q}.send_command", "webots_list_commands"),
     "profile": CommandEntry(NOW, f"{_CLI}.judging", "profile"),
     "check": CommandEntry(PAST, f"{_CLI}.judging", "check"),
-    "events": CommandEntry(PAST, f"{_Q}.events", "webots_find_events"),
+    "events": CommandEntry(PAST, f"{_Q}.find_events", "webots_find_events"),
     "runs": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
     "compare": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
     "plot": CommandEntry(PAST, f"{_CLI}.data", "plot"),

@@ -32,7 +32,7 @@ from webots_mcp.cli.streams import binary_stdout, shown_progress, wait
 from webots_mcp.cli.terminal import id_ranges, print_json, print_notes, print_table, printable
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.extras.plugins import export_formats
+from webots_mcp.extras.plugin_registry import export_formats
 from webots_mcp.store.merging import write_bundle
 from webots_mcp.store.purge import Purged
 

@@ -281,7 +281,7 @@ def _in_processes(
     """Run a world in simulators of their own, as trials without parameters."""
     from webots_mcp.cli.steering import TrialOptions, run_plan
     from webots_mcp.steering.trial_plan import WorldPlan
-    from webots_mcp.store.parameters import trials_of
+    from webots_mcp.store.trial_sets import trials_of
 
     recording = asked.recording(read_only=False)
     if world is None:

@@ -29,7 +29,7 @@ from webots_mcp.cli.options import (
 from webots_mcp.cli.terminal import print_json
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
-from webots_mcp.extras.plugins import stand_in_simulator
+from webots_mcp.extras.plugin_registry import stand_in_simulator
 
 if TYPE_CHECKING:
     from webots_mcp.database.location import Database

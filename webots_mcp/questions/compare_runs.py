@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
+from webots_mcp.answers.answer_models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     LONGEST_NAME,
@@ -29,7 +30,6 @@ from webots_mcp.answers.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.answers.models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
@@ -60,10 +60,10 @@ from webots_mcp.questions.arguments import (
 from webots_mcp.questions.declaring import READS, SETS, question
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.signals.naming import listed
-from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
+from webots_mcp.store.trial_sets import scored_runs
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",

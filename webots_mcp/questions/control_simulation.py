@@ -10,7 +10,7 @@ import anyio
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.answers.models import CommandAnswer, RunAnswer
+from webots_mcp.answers.answer_models import CommandAnswer, RunAnswer
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.answers.budget import (
-    fitting,
-    room_tokens,
-)
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     AnswerTable,
     RobotsAnswer,
     WorldAnswer,
+)
+from webots_mcp.answers.budget import (
+    fitting,
+    room_tokens,
 )
 from webots_mcp.answers.shortening import (
     cut_for_a_model,
@@ -201,6 +201,7 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
         return {}
     bodies = [*world.content.get("robots", ()), *world.content.get("solids", ())]
     shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
+    # as they differ
     used = [
         column
         for column in (*BODY_COLUMNS, *PLACE_COLUMNS)

@@ -11,18 +11,18 @@ from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    AnswerTable,
+    FullStateAnswer,
+    SensorsAnswer,
+    StateAnswer,
+)
 from webots_mcp.answers.budget import (
     ANSWER_TOKENS,
     LARGE_ANSWER_TOKENS,
     detailed,
     fitting,
     some,
-)
-from webots_mcp.answers.models import (
-    AnswerTable,
-    FullStateAnswer,
-    SensorsAnswer,
-    StateAnswer,
 )
 from webots_mcp.answers.shortening import (
     STATE_BUDGET_TOKENS,

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
+from webots_mcp.answers.answer_models import CommandAnswer, RunAnswer
 from webots_mcp.answers.budget import RESULT_BUDGET_TOKENS, detailed, figure, seconds, shown, table
 from webots_mcp.answers.event_tables import fitting_events, not_shown_of
-from webots_mcp.answers.models import CommandAnswer, RunAnswer
 from webots_mcp.answers.movement import movement
 from webots_mcp.answers.shortening import WHOLE, cut_text, shorten
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables

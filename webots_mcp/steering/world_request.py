@@ -11,7 +11,7 @@ from typing import Any, Final
 import anyio
 from anyio import to_thread
 
-from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator.instances import instance_at
 from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, newest_in, starts_since

@@ -3,7 +3,7 @@
 Jinja2 is imported with the first report.
 """
 
-from webots_mcp.extras.plugins import Plugin, PluginCommand
+from webots_mcp.extras.plugin_registry import Plugin, PluginCommand
 
 PLUGIN = Plugin(
     commands=(PluginCommand("report", "Ask", f"{__name__}.report_command:report"),),

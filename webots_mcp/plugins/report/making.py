@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import NotedAnswer
 from webots_mcp.answers.budget import notes_of
-from webots_mcp.answers.models import NotedAnswer
 from webots_mcp.contract import VERSION
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError

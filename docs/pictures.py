@@ -204,9 +204,10 @@ def animate(browser: Any, lines: list[str], plot: Path, images: Path) -> None:
     shown += [(asked[:end], 90) for end in range(4, len(asked), 4)]
     shown += [("\n".join([asked, *said[:count]]), 1300) for count in range(len(said))]
     plotted = "\n".join([asked, *said[:-1], '● webots_plot(signals=["proximity.*", "pose.x_m"])'])
-    frames = [(text, "", pause_ms) for text, pause_ms in shown]
+    # The last frame comes first: it is what a page shows that does not animate.
+    frames = [("\n".join([plotted, said[-1]]), encoded, 6000)]
+    frames += [(text, "", pause_ms) for text, pause_ms in shown]
     frames.append((plotted, encoded, 2600))
-    frames.append(("\n".join([plotted, said[-1]]), encoded, 6000))
     pictures: list[Image.Image] = []
     for text, picture, _ in frames:
         page.set_content(_WINDOW.format(text=escape(text), picture=_picture(picture)))

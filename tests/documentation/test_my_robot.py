@@ -1,10 +1,11 @@
-"""docs/my-robot.md: each symptom is recorded, and each answer on the page is what a command prints."""
+"""docs/my-robot.md: each symptom is recorded, and each answer is what a command prints."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+import sqlite3
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -46,21 +47,21 @@ while robot.step(32) != -1:
 
 
 @contextmanager
-def situation(name: str, folder: Path) -> Iterator[walkthrough.Terminal]:
+def situation(name: str, folder: Path) -> Generator[walkthrough.Terminal]:
     with closing(_new_database(folder)) as connection:
         record(connection, *PROBLEMS[name].columns())
     yield walkthrough.Terminal(folder)
 
 
 @contextmanager
-def slow(folder: Path) -> Iterator[walkthrough.Terminal]:
+def slow(folder: Path) -> Generator[walkthrough.Terminal]:
     rng = np.random.default_rng(1)
     with closing(_new_database(folder)) as connection:
         labelled.record(connection, labelled.healthy(rng), labelled.WRITTEN["slow"][0])
     yield walkthrough.Terminal(folder)
 
 
-def _new_database(folder: Path):
+def _new_database(folder: Path) -> sqlite3.Connection:
     data_dir = folder / PROJECT_DATA_FOLDER
     data_dir.mkdir()
     (folder / "worlds").mkdir()
@@ -71,7 +72,7 @@ def _new_database(folder: Path):
 
 
 @contextmanager
-def driving(folder: Path, hangs: bool = False) -> Iterator[walkthrough.Terminal]:
+def driving(folder: Path, hangs: bool = False) -> Generator[walkthrough.Terminal]:
     for file, text in (
         ("worlds/arena.wbt", ARENA.read_text("utf-8")),
         ("controllers/rover/rover.py", CONTROLLER.format(hangs=hangs)),
@@ -86,7 +87,7 @@ def driving(folder: Path, hangs: bool = False) -> Iterator[walkthrough.Terminal]
         yield terminal
 
 
-SYMPTOMS: dict[str, Callable[[Path], object]] = {
+SYMPTOMS: dict[str, Callable[[Path], AbstractContextManager[walkthrough.Terminal]]] = {
     "It does not move, or is stuck": lambda folder: situation(
         "a robot is held; its command is a target speed", folder
     ),
@@ -110,8 +111,7 @@ def test_each_symptom_of_the_page_is_recorded() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("symptom", SYMPTOMS)
 def test_the_answer_to_a_symptom_is_what_the_command_prints(symptom: str, tmp_path: Path) -> None:
-    recorded: object = SYMPTOMS[symptom](tmp_path)
-    with recorded as terminal:  # type: ignore[attr-defined]
+    with SYMPTOMS[symptom](tmp_path) as terminal:
         printed, shown = "", 0
         for step in walkthrough.steps(SECTIONS[symptom]):
             if step.language == "sh":

@@ -6,8 +6,10 @@ import re
 from pathlib import Path
 
 import pytest
+import resvg_py
 
-from docs import walkthrough
+from docs import pictures, walkthrough
+from tests.documentation.test_pictures import ANEW, DRAWN, NEAR, difference
 
 PAGE = walkthrough.PAGE.read_text("utf-8")
 
@@ -26,8 +28,11 @@ def test_each_step_prints_what_the_page_shows(tmp_path: Path) -> None:
                 assert form(line) in form(printed)
                 shown += 1
     assert shown > 5
-    for name in re.findall(r"-o (\w+\.png)", PAGE):
-        assert (terminal.folder / name).read_bytes().startswith(b"\x89PNG")
+    for shown_as, drawn_as in pictures.TUTORIAL_PLOTS.items():
+        drawn = terminal.folder / drawn_as
+        assert drawn.read_bytes().startswith(b"\x89PNG")
+        if resvg_py.__version__ == DRAWN["by"]["resvg"]:
+            assert difference(drawn, pictures.IMAGES / shown_as) < NEAR, f"{shown_as} {ANEW}"
 
 
 def test_its_pictures_are_those_that_its_steps_draw() -> None:

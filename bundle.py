@@ -19,7 +19,7 @@ from typing import Any, Final
 import anyio
 from mcp.types import Tool
 
-from hatch_build import registry_name
+from hatch_build import registry_name, source_of
 from webots_mcp import __version__
 from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER
 from webots_mcp.database.location import MemoryDatabase
@@ -153,7 +153,7 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     wheel = Path(sys.argv[1])
     print(write_bundle(wheel, wheel.parent))
-    if source := PROJECT.get("urls", {}).get("Source"):
+    if source := source_of(PROJECT.get("urls", {})):
         file = wheel.with_name("server.json")
         file.write_text(_text(server_of(source)), "utf-8")
         print(file)

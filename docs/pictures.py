@@ -1,11 +1,13 @@
 """Makes the pictures of the pages, and the README's conversation, anew: `python -m docs.pictures`.
 
-They show the world and the controller of `webots-mcp demo`, up to a breakpoint at a certain step.
+Most show the world and the controller of `webots-mcp demo`, up to a breakpoint at a certain step.
+The conversation, its animation and the pictures of the tutorial show the robot of the tutorial.
 `images/drawn.json` says what was drawn by what; a test does the same again and compares.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import re
@@ -16,6 +18,7 @@ import sys
 import tempfile
 from collections.abc import Generator
 from contextlib import closing, redirect_stdout, suppress
+from html import escape
 from io import BytesIO, StringIO
 from pathlib import Path
 from statistics import fmean
@@ -25,6 +28,7 @@ import anyio
 import resvg_py
 from PIL import Image
 
+from docs import walkthrough
 from webots_mcp.cli import main as webots_mcp
 from webots_mcp.contract import DATABASE_NAME, THROTTLE_VARIABLE
 from webots_mcp.database.connection import connect
@@ -41,15 +45,23 @@ PLOTS: Final = {
     "signals.png": "lidar.nearest_m distance_m.left distance_m.right wheel_radps.left --height 520",
     "way.png": "--trajectory --height 620",
 }
-# What a person would say, and the tool call that an assistant makes of it.
+# Drawn by the steps of the tutorial, under these names in its folder.
+TUTORIAL_PLOTS: Final = {"tutorial-stuck.png": "stuck.png", "tutorial-paths.png": "paths.png"}
+ANIMATION: Final = "conversation.gif"
+# What a person asks of the tutorial's robot, and the calls that an assistant makes to find out.
+QUESTION: Final = "Why did the explorer stop?"
 TURNS: Final[tuple[demo.Turn, ...]] = (
-    (
-        "When did it begin and end to turn in the first ten seconds, and was it ever stuck?",
-        "webots_find_events",
-        {"kinds": ["change", "stuck"], "signals": ["mode"], "end_s": 10},
-    ),
+    (QUESTION, "webots_check_run", {}),
+    (QUESTION, "webots_get_trends", {"signals": ["proximity.*"]}),
 )
+DRIVEN_S: Final = 30.0
 CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
+_WINDOW: Final = """<!doctype html><meta charset="utf-8"><style>
+body {{ margin: 0; background: #1b1e24; color: #d7dae0; font: 15px/1.5 monospace; }}
+header {{ background: #2a2e37; color: #8a909c; padding: 6px 14px; font-size: 13px; }}
+pre {{ margin: 0; padding: 14px 18px; font: inherit; white-space: pre-wrap; }}
+img {{ display: block; margin: 0 18px; width: 500px; border-radius: 4px; }}
+</style><header>an assistant, connected to webots-mcp</header><pre>{text}</pre>{picture}"""
 FIGURES_ARE_THERE: Final = """() => document.querySelector(".figure > svg")
     && [...document.querySelectorAll(".figure > svg")].every(each => each.parentNode.figure)"""
 CONVERSATION: Final = re.compile(r"(?<=<!-- conversation -->\n```text\n).*?(?=^```$)", re.M | re.S)
@@ -144,11 +156,71 @@ def means(simulation: RecordedSimulation) -> dict[str, float]:
     return {name: round(fmean(each), 4) for name, each in numbers.items() if each}
 
 
-def conversation(data_dir: Path) -> str:
-    """What a person asks, what is called and what is answered, as the demo prints it."""
-    with redirect_stdout(StringIO()) as out:
-        anyio.run(demo.converse, data_dir, TURNS)
-    return re.sub(r"(?m)^  \(.* s\)\n", "", out.getvalue()).lstrip()
+@contextlib.contextmanager
+def stuck_explorer(folder: Path) -> Generator[Path]:
+    """Let the tutorial's robot drive until it is stuck; yields the folder of its recording."""
+    world, data_dir = walkthrough.write_project(folder), folder / "mcp_data"
+    simulation = RecordedSimulation(world, data_dir=data_dir)
+    with simulation:
+        simulation.run_for(DRIVEN_S)
+        yield data_dir
+
+
+def conversation(data_dir: Path) -> list[str]:
+    """Ask an MCP server about the tutorial's robot; return the lines that a client shows.
+
+    The calls and answers are those of the server. The last line is written here, with figures of
+    the answers.
+    """
+    with redirect_stdout(StringIO()):
+        checked, trends = anyio.run(demo.converse, data_dir, TURNS)
+    table = checked["answer"]["checks"]
+    failed = dict(zip(table["columns"], table["rows"][0], strict=True))
+    evidence, since = failed["evidence"].partition(";")[0], f"{failed['since_s']:.1f} s"
+    (run,) = trends["answer"]["runs"]
+    ((signal, course, *_),) = run["numbers"]["rows"]
+    return [
+        f"> {QUESTION}",
+        f"● {_call(*TURNS[0])}",
+        f"  └ {failed['check']}: {failed['outcome']}, {evidence}, since {since}",
+        f"● {_call(*TURNS[1])}",
+        f"  └ {signal} {course.partition(';')[0]}; constant: {run['constant']}",
+        f"● At {since} it hit something that only its left eye saw. "
+        "Your code asks only the right eye.",
+    ]
+
+
+def _call(_question: str, tool: str, arguments: dict[str, Any]) -> str:
+    given = ", ".join(f"{name}={json.dumps(value)}" for name, value in arguments.items())
+    return f"{tool}({given})"
+
+
+def animate(browser: Any, lines: list[str], plot: Path, images: Path) -> None:
+    """Show a conversation line by line, and the plot of it, as an animated picture."""
+    asked, *said = lines
+    encoded = base64.b64encode(plot.read_bytes()).decode()
+    page = browser.new_page(viewport={"width": 860, "height": 560})
+    shown: list[tuple[str, int]] = [("", 600)]
+    shown += [(asked[:end], 90) for end in range(4, len(asked), 4)]
+    shown += [("\n".join([asked, *said[:count]]), 1300) for count in range(len(said))]
+    plotted = "\n".join([asked, *said[:-1], '● webots_plot(signals=["proximity.*", "pose.x_m"])'])
+    # The last frame comes first: it is what a page shows that does not animate.
+    frames = [("\n".join([plotted, said[-1]]), encoded, 6000)]
+    frames += [(text, "", pause_ms) for text, pause_ms in shown]
+    frames.append((plotted, encoded, 2600))
+    pictures: list[Image.Image] = []
+    for text, picture, _ in frames:
+        page.set_content(_WINDOW.format(text=escape(text), picture=_picture(picture)))
+        seen = Image.open(BytesIO(page.screenshot())).convert("RGB")
+        pictures.append(seen.quantize(64, dither=Image.Dither.NONE))
+    pictures[0].save(
+        images / ANIMATION, save_all=True, append_images=pictures[1:], loop=0, optimize=True,
+        duration=[pause_ms for *_, pause_ms in frames],
+    )  # fmt: skip
+
+
+def _picture(encoded: str) -> str:
+    return f'<img src="data:image/png;base64,{encoded}">' if encoded else ""
 
 
 def main() -> int:
@@ -165,7 +237,19 @@ def main() -> int:
                 by = {"resvg": resvg_py.__version__, "chromium": browser.version}
             drawn = {"by": by, "means": means(simulation)}
             DRAWN.write_text(json.dumps(drawn, indent=2) + "\n", "utf-8")
-            said = conversation(data_dir)
+    with tempfile.TemporaryDirectory() as folder:
+        terminal = walkthrough.Terminal(Path(folder))
+        for _ in walkthrough.follow(walkthrough.PAGE.read_text("utf-8"), terminal):
+            pass
+        for name, drawn_as in TUTORIAL_PLOTS.items():
+            shutil.copyfile(terminal.folder / drawn_as, IMAGES / name)
+    with tempfile.TemporaryDirectory() as folder, stuck_explorer(Path(folder)) as data_dir:
+        lines = conversation(data_dir)
+        plot = Path(folder) / "plot.png"
+        _run("plot", "proximity.*", "pose.x_m", "-o", str(plot), "--data-dir", str(data_dir))
+        with started_browser() as browser:
+            animate(browser, lines, plot, IMAGES)
+    said = "\n".join(lines) + "\n"
     README.write_text(CONVERSATION.sub(lambda _: said, README.read_text("utf-8")), "utf-8")
     return 0
 

@@ -337,8 +337,10 @@ def _groups(good: Indexes, share: Array, which: Indexes, loud: Array) -> Iterato
     apart |= np.abs(np.diff(np.log(loud))) > math.log(AS_LOUD) / 2
     waiting: list[tuple[float, float, Indexes]] = []
     edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(good)]
-    likely = np.maximum.reduceat(share, edges[:-1]) >= LIKELY if len(good) else np.zeros(0)
-    for at in np.flatnonzero(likely).tolist():
+    likely: list[int] = []
+    if len(good):
+        likely = np.flatnonzero(np.maximum.reduceat(share, edges[:-1]) >= LIKELY).tolist()
+    for at in likely:
         group: Indexes = np.arange(edges[at], edges[at + 1])
         period, size = _period(which[group]), median(loud[group])
         beside, waiting = waiting, []

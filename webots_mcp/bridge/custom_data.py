@@ -391,7 +391,8 @@ class _Recording:
         self._errors.warn(  # also shown by status, as its newest error
             "missed",
             f"robot {self._body.name!r} overwrote {counted.missed} of {counted.total} messages in "
-            "its customData before the observer read them (seq): see docs/any-language.md#rates",
+            "its customData before the observer read them (seq): "
+            "see 'webots-mcp help any-language rates'",
         )
         self._heartbeat.beat()
 

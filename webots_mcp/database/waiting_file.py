@@ -283,7 +283,9 @@ def left_waiting(database: Path) -> list[Path]:
 
 
 def journal_parts(database: Path) -> dict[str, list[Path]]:
-    """Return the journals of controllers that open no database (docs/journal.md), by session.
+    """Return the journals of controllers that open no database, by session.
+
+    Their format is described by 'webots-mcp help journal'.
 
     Returns:
         Of each UUID the parts in order; those that were written last come last. Where a part is

@@ -507,7 +507,7 @@ def _signals_of(
 
 
 def count_lost(columns: StateColumns, signals: dict[str, RegisteredSignal]) -> int:
-    """How many values of some rows chunks do not hold as they were (docs/database.md)."""
+    """How many values of some rows chunks do not hold as they were ('webots-mcp help database')."""
     lost = 0
     for name, values in columns.values.items():
         signal = signals.get(name)

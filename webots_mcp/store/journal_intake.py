@@ -1,4 +1,6 @@
-"""Takes into the database what controllers write without it: the journals of docs/journal.md.
+"""Takes into the database what controllers write without it: journals.
+
+Their format is described by 'webots-mcp help journal'.
 
 A controller in C, or any program, appends lines to a file of its session in the data folder, and
 never opens the database. Servers and commands take the lines in while it does: exactly once, as

@@ -150,7 +150,11 @@ def situations(details: str) -> list[str]:
             [
                 ("healthy robots, about which any alarm is false", healthy, quiet),
                 ("problems, which must be found or reported as not searched", problems, answered),
-                (f"labelled first ({points} of {most} points)", labelled, str(right)),
+                (
+                    f"labelled before the first question ({points} of {most} points)",
+                    labelled,
+                    str(right),
+                ),
             ],
         ),
     ]

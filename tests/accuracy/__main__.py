@@ -52,10 +52,10 @@ what recording costs.
 ## Public situations
 
 `tests/cases` rebuilds situations from public reports as recordings, with the answer that an expert
-would give. The rules were made with the first two groups in view. The third group was labelled
-before its first question was asked: 2 points for the right answer, 1 for a helpful one, 0 for none,
--1 for a false one. The first answers earned {first} of {most} points; then some rules were improved
-for whole classes of misses."""
+would give. The rules were made with the first two groups in view. The other groups were labelled
+before the first question about them was asked; then some rules were improved for whole classes of
+misses. In the third group, the right answer earns 2 points, a helpful one 1, none 0 and a false one
+-1: {first} of {most} points at first, {now} now."""
 _SIMULATED: Final = """\
 ## All figures
 
@@ -137,32 +137,44 @@ def situations(details: str) -> list[str]:
         headline(details),
     )
     assert counts is not None, headline(details)
-    quiet, healthy, answered, problems, labelled, points, most = counts.groups()
-    rows = re.findall(r"(?m)^\| (.+\(\[report\].+) \| (-?\d+) \| (-?\d+) \|$", details)
-    first = sum(int(points) for _, points, _ in rows)
-    missed = [(name, int(now)) for name, _, now in rows if int(now) < _RIGHT]
-    right = len(rows) - len(missed)
-    wrong = re.search(r"(?ms)^Answered wrongly:\n\n(.*?)\n\n", details)
-    texts = [
-        _INTRODUCTION.format(first=first, most=most),
-        table(
-            ("situations", "number", "answered rightly"),
-            [
-                ("healthy robots, about which any alarm is false", healthy, quiet),
-                ("problems, which must be found or reported as not searched", problems, answered),
-                (
-                    f"labelled before the first question ({points} of {most} points)",
-                    labelled,
-                    str(right),
-                ),
-            ],
-        ),
+    quiet, healthy, answered, problems, labelled, _, most = counts.groups()
+    found = re.findall(r"(?m)^\| (.+\(\[report\].+) \| (-?\d+) \| (-?\d+) \|$", details)
+    points = {name: (int(first), int(now)) for name, first, now in found}
+    right = [str(sum(each[at] == _RIGHT for each in points.values())) for at in (0, 1)]
+    rows = [
+        ("healthy robots of public reports: no alarm", healthy, "", quiet),
+        ("problems of public reports: found, or reported as not searched", problems, "", answered),
+        ("public reports labelled before the first question", labelled, *right),
+        *_unfamiliar(details),
     ]
+    sums = [sum(each[at] for each in points.values()) for at in (0, 1)]
+    texts = [
+        _INTRODUCTION.format(first=sums[0], now=sums[1], most=most),
+        table(("situations", "number", "right at first", "right now"), rows),
+    ]
+    wrong = re.search(r"(?ms)^Answered wrongly:\n\n(.*?)\n\n", details)
     texts += [f"Answered wrongly in the first two groups:\n\n{wrong[1]}"] if wrong else []
+    missed = [f"- {name}: {now}" for name, (_, now) in points.items() if now < _RIGHT]
     if missed:
-        lines = "\n".join(f"- {name}: {now}" for name, now in missed)
-        texts.append(f"Not answered rightly in the third group, with the points:\n\n{lines}")
+        head = "Not answered rightly in the third group, with the points:"
+        texts.append("\n".join([f"{head}\n", *missed]))
     return texts
+
+
+def _unfamiliar(details: str) -> list[tuple[str, ...]]:
+    """Rows about robots of unfamiliar kinds, once they were measured."""
+    found = re.findall(r"(?m)^\| ([a-z ]+) \| (\d+) \| (\d+) \|$", details)
+    counts = {kind: (int(first), int(now)) for kind, first, now in found}
+    if not counts.keys() >= {"quiet", "false alarm", "right"}:
+        return []
+    healthy = sum(counts[kind][1] for kind in ("quiet", "false alarm"))
+    faulty = sum(now for _, now in counts.values()) - healthy
+    return [
+        ("recordings of healthy robots of unfamiliar kinds: no alarm", str(healthy),
+         *map(str, counts["quiet"])),
+        ("faults of such robots: found, named and timed", str(faulty),
+         *map(str, counts["right"])),
+    ]  # fmt: skip
 
 
 def _in_words(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

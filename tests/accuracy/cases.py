@@ -23,35 +23,36 @@ from tests.cases.unfamiliar import INTERVALS_S as INTERVALS_OF_ROBOTS_S
 _MODULES = (healthy_robots, problems)  # which fill the registries
 _OTHER_INTERVALS_S: Final = (0.016, 0.064, 0.16)
 _INTRODUCTION: Final = """\
-`tests/cases` rebuilds situations of public reports as recordings, with the answer that an expert
-would give: {healthy} kinds of healthy robots, about which any alarm is false, and {problems}
-problems, each of which has to be noticed, or be said not to have been searched."""
+`tests/cases` rebuilds situations from public reports as recordings, with the answer that an
+expert would give. {healthy} are kinds of healthy robots, about which any alarm is false.
+{problems} are problems, which must be found or reported as not searched."""
 _LABELLED: Final = """\
-The rules were made with those in view. For a fairer score, {count} further public situations of
-other kinds were labelled, and the labels committed, before the first question: 2 points for the
-right answer, 1 for one that helps, 0 for none, -1 for a false one (an alarm about a healthy robot,
-or a pass of the check that should have noticed). The first answers earned {first} of {most} points;
-some of their misses were then mended as classes. The right answers are in
+The rules were made with those situations in view. Therefore {count} further public situations of
+other kinds were labelled, and the labels committed, before the first question. The right answer
+earns 2 points, a helpful one 1, none 0. A false one earns -1: an alarm about a healthy robot, or
+a pass of the responsible check. The first answers earned {first} of {most} points. Then some
+rules were improved for whole classes of misses. The labels are in
 `tests/cases/public_labels.toml`."""
 _UNFAMILIAR: Final = """\
 {robots} robots of kinds that are in no other list, from a gantry to an underwater glider, were
-drawn healthy with a row each {rates}, and once with a fault each; what to answer was committed
-before the first question. An alarm about a healthy one is false; a fault is answered *right* if the
-check that has to warns or fails, names it and says when it began, *helpful* if one of the three is
-missing, *not judged* if the answer says that it cannot tell, and *denied* if that check passes."""
+simulated: healthy with a row each {rates}, and once with a fault each. The right answers were
+committed before the first question. An alarm about a healthy robot is false. A fault is answered
+*right* if the responsible check warns or fails, names it and gives its start. The answer is
+*helpful* if one of the three is missing, *not judged* if it says that it cannot tell, and
+*denied* if that check passes."""
 _ALSO_DRAWN: Final = """\
-The healthy kinds were drawn again with a row each {rates}, with other noise: {runs} runs, of which
+The healthy kinds were also simulated with a row each {rates} and other noise. Of {runs} runs,
 {alarmed} raise an alarm{names}."""
 _OSCILLATIONS: Final = 30
 _GROWTH: Final = """\
-Of {count} oscillations whose amplitude grows or decays 4 to 20 times in a minute, {found} are found
-and {told} are reported with their amplitudes at start and end; of {count} that keep theirs,
-{false} are reported to grow."""
+Of {count} oscillations whose amplitude grows or decays 4 to 20 times in a minute, {found} are
+found, and {told} are reported with their amplitudes at start and end. Of {count} with a constant
+amplitude, {false} are reported to grow."""
 _RATES: Final = """\
-One situation must not be judged differently because it was recorded faster or with more noise.
-Below, noise is a share of a signal's range (standard deviation). *Found* is an event with a start
-and an end that are right within 1 s or 3 rows, *not searched* an answer that says why it cannot
-tell, *denied* a wrong "not found" or pass, *inexact* an event at another time."""
+The verdict about a situation must not depend on the rate or the noise of its recording. In this
+table, noise is a share of a signal's range (standard deviation). *Found* means an event whose
+start and end are right within 1 s or 3 rows. *Not searched* means an answer that says why it
+cannot tell, *denied* a wrong "not found" or pass, and *inexact* an event at another time."""
 
 
 def cases(bench: Bench) -> Iterator[str]:

@@ -35,7 +35,7 @@ def test_the_page_begins_with_the_public_situations_and_names_those_that_are_mis
     _, _, *texts = situations(details)
     missed = re.findall(r"(?m)^- .+: (-?\d+)$", texts[-1]) if texts else []
     assert sorted(missed) == sorted(each for each in rows if each != "2")
-    assert PAGE_TEXT.index("healthy robots") < PAGE_TEXT.index("## All figures")
+    assert PAGE_TEXT.index("healthy robots of public reports") < PAGE_TEXT.index("## All figures")
 
 
 def test_the_page_knows_every_kind_of_event_every_check_and_every_fault() -> None:

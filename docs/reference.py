@@ -12,11 +12,13 @@ import anyio
 
 import webots_mcp
 from webots_mcp import MemoryDatabase, testing
-from webots_mcp.answers.models import Answer, AnswerPart
+from webots_mcp.answers.answer_models import Answer, AnswerPart
+from webots_mcp.answers.columns import COLUMNS
 from webots_mcp.cli import described
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.judging.detection.events import KINDS
+from webots_mcp.questions import all_questions
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.signals.meaning import QUANTITIES, ROLES, SIDES, short_forms, understood_words
 from webots_mcp.testing import pytest_plugin
@@ -77,8 +79,8 @@ def _default(schema: dict[str, Any], required: bool) -> str:
 
 
 def fields(_page: str = "") -> str:
-    """Each field of each answer with its type and its meaning; shared ones stand once."""
-    parts = ["## Reference\n"]
+    """Each field and column of each answer with its meaning; shared fields stand once."""
+    parts, shown = ["## Reference\n"], dict[int, str]()
     for model in answer_models():
         own = {name: each for name, each in model.model_fields.items() if _is_own(model, name)}
         rows = [[f"`{n}`", _plain_type(each), each.description or ""] for n, each in own.items()]
@@ -86,18 +88,35 @@ def fields(_page: str = "") -> str:
         parts.append(
             f"### {model.__name__}\n\n{inspect.getdoc(model)}{_based_on(model)}\n\n{table}"
         )
+        parts += [_columns(f"{model.__name__}.{name}", shown) for name in own]
     return "\n".join(parts)
 
 
+def _columns(field: str, shown: dict[int, str]) -> str:
+    """Return the columns of a field that is a table; those that were shown before by their name."""
+    columns = COLUMNS.get(field)
+    if columns is None:
+        return ""
+    name = field.partition(".")[2]
+    if (before := shown.setdefault(id(columns), field)) != field:
+        return f"Columns of `{name}`: as those of `{before}`.\n"
+    rows = [[f"`{column}`", means] for column, means in columns.items()]
+    return f"Columns of `{name}`:\n\n{_table(['column', 'meaning'], rows)}"
+
+
 def answer_models() -> list[type[AnswerPart]]:
-    """The models of all answers and of their parts, the header of every answer first."""
+    """The models of all answers and of their parts, the header of every answer first.
+
+    Those of plugins come with their questions.
+    """
+    all_questions()
     found: dict[type[AnswerPart], None] = {}
     waiting: list[type[AnswerPart]] = [AnswerPart]
     while waiting:
         derived = waiting.pop().__subclasses__()
         found |= dict.fromkeys(derived)
         waiting += derived
-    of_tools = (model for model in found if model.__module__ == Answer.__module__)
+    of_tools = (model for model in found if model.__module__.startswith("webots_mcp."))
     return sorted(of_tools, key=lambda model: (model is not Answer, model.__name__))
 
 

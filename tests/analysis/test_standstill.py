@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.driving import noisy_track
-from webots_mcp.analysis.standstill import find_standstills
+from webots_mcp.analysis.still_intervals import find_standstills
 from webots_mcp.analysis.track import noise_of, track_of
 
 RADIUS_M = 0.05

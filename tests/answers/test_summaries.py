@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.answers.event_tables import verdicts_of
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     Answer,
     AnswerTable,
     BreakpointAnswer,
@@ -26,6 +25,7 @@ from webots_mcp.answers.models import (
     TrendsAnswer,
     TrialsAnswer,
 )
+from webots_mcp.answers.event_tables import verdicts_of
 from webots_mcp.answers.summaries import MOST_WORDS, summary_of, verdict_of_kinds
 from webots_mcp.judging.detection.events import kind_names
 from webots_mcp.judging.verdicts import AS_STUCK, JudgedInterval, SearchCoverage
@@ -119,9 +119,9 @@ def test_an_undecided_comparison_does_not_say_that_nothing_differs() -> None:
 def test_a_first_difference_begins_with_where_it_is(
     unlike: dict[str, list[str]] | None, rows: list[list[object]], said: str
 ) -> None:
-    compared = {"row_count": 500, "signal_count": 3, "from_s": 0.016, "until_s": 8.0}
-    answer = ComparisonAnswer(verdict="", unlike=unlike, compared=compared)
-    answer.parted = AnswerTable(columns=["signal", "from_s"], rows=rows)
+    compared = {"row_count": 500, "signal_count": 3, "start_s": 0.016, "end_s": 8.0}
+    answer = ComparisonAnswer(verdict="", different_before=unlike, compared=compared)
+    answer.diverging = AnswerTable(columns=["signal", "start_s"], rows=rows)
     assert summary_of(answer) == said
     answer.compared = {"row_count": 0, "signal_count": 0}
     assert "Cannot tell" in (summary_of(answer) or "")
@@ -171,7 +171,7 @@ def test_too_few_runs_do_not_hide_the_largest_differences() -> None:
         (
             LogsAnswer(
                 lines=AnswerTable(columns=["level", "message"], rows=[["error", "drop all"]]),
-                matching=7,
+                total=7,
             ),
             "1 of 7 log lines; 1 error.",
         ),
@@ -229,7 +229,7 @@ def test_each_kind_that_was_asked_for_has_exactly_one_verdict(
 def test_what_began_before_the_range_is_said_to_go_on() -> None:
     table = AnswerTable(columns=["kind", "start_s"], rows=[["stuck", 40.0], ["jump", 46.0]])
     verdicts = KindVerdicts(found={"stuck": 1, "jump": 1})
-    said = summary_of(EventsAnswer(events=table, verdicts=verdicts, from_s=45.0))
+    said = summary_of(EventsAnswer(events=table, verdicts=verdicts, start_s=45.0))
     assert said == "Already going on at 45 s: stuck since 40 s; found jump once at 46 s."
 
 

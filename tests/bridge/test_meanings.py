@@ -53,7 +53,7 @@ def test_a_wrong_declaration_is_refused_where_it_stands_and_nothing_is_written(
 def test_a_controller_may_describe_two_thousand_signals(
     bridge: MCPBridge, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.bridge.meanings.MOST_DECLARED", 2)
+    monkeypatch.setattr("webots_mcp.bridge.signal_meanings.MOST_DECLARED", 2)
     for name in ("a", "b", "a"):
         bridge.describe(name, unit=f"m{name}")
     with pytest.raises(ValueError, match="describe several at once with"):

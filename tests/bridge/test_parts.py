@@ -12,7 +12,7 @@ import pytest
 from tests.bridge.conftest import send
 from webots_mcp import MemoryDatabase
 from webots_mcp.bridge.breakpoints import Breakpoints
-from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
+from webots_mcp.bridge.claimed_commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.error_report import ErrorReport

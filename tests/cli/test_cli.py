@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -16,6 +17,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.waiting import wait_for
 from webots_mcp.cli import described, main, names
+from webots_mcp.cli.commands import EVERYDAY, FORMER_NAMES
 from webots_mcp.database.queue import CommandQueue
 from webots_mcp.store.logs import Follower
 
@@ -60,8 +62,32 @@ def test_every_command_explains_itself(
         assert ended.code == 0
     text = capsys.readouterr().out
     assert "sage: webots-mcp" in text
-    for each in names() if name is None else ():
+    for each in EVERYDAY if name is None else ():
         assert each in text
+
+
+def test_the_short_help_names_the_one_that_lists_every_command(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with contextlib.suppress(SystemExit):
+        main(["--help"])
+    short = capsys.readouterr().out
+    assert "webots-mcp --help --all" in short and "first-difference" not in short
+    with contextlib.suppress(SystemExit):
+        main(["--help", "--all"])
+    whole = capsys.readouterr().out
+    assert [name for name in names() if name not in whole] == []
+
+
+@pytest.mark.parametrize(("former", "name"), FORMER_NAMES.items())
+def test_a_former_name_runs_the_command_and_tells_its_name_of_today(
+    former: str, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with contextlib.suppress(SystemExit):
+        main([former, "--help"])
+    said = capsys.readouterr()
+    assert said.err == f"webots-mcp: {former!r} is now called {name!r}\n"
+    assert f"webots-mcp {name}" in said.out
 
 
 def test_no_help_has_words_that_are_taken_for_markup() -> None:
@@ -105,7 +131,7 @@ def test_a_path_that_cannot_be_followed_is_one_line(
 
 def test_without_a_command_it_says_which_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
-    assert "Steering" in capsys.readouterr().out
+    assert "Start" in capsys.readouterr().out
 
 
 def test_an_unknown_command_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,15 +168,19 @@ def test_status_tells_what_runs_and_what_could_not_be_recorded(
     text = capsys.readouterr().out
     for words in (
         str(tmp_path / "webots.db"),
-        f"{rover.name}, run {rover.run_id}, at 1.5 s, running",
         "Supervisor",
-        "the controller's memory",
+        "rows wait in the controller's memory",
+        f"warning: {rover.name}: last error: ",
         "disk full",
-        "states 1.00 GB",
+        "rows could not be recorded",
     ):
         assert words in text
-    (head,) = (line.split() for line in text.splitlines() if "rows_waiting" in line)
-    assert head[-4:] == ["rows_waiting", "waiting_in", "rows_dropped", "last_error"]
+    (row,) = (line for line in text.splitlines() if line.startswith(f"{rover.name} "))
+    assert row.split()[:4] == [rover.name, "running", str(rover.run_id), "1.5"]
+    assert "states 1.00 GB" not in text
+    for option in ("--storage", "--verbose"):
+        assert main(["status", option, "--data-dir", str(tmp_path)]) == 0
+        assert "states 1.00 GB" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("arguments", [["status"], ["tail"]])

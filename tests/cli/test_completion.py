@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.recordings.rows import Recorded
 from webots_mcp.cli import main
 from webots_mcp.cli.commands import COMMANDS
 
@@ -47,15 +49,27 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["launch", "wor"], {"worlds"}),
         (["status", "--data-dir", "wor"], {"worlds"}),
         (["events", "--datab"], {"--database"}),
+        (["events", "--kind", "osc"], {"oscillation"}),
+        (["history", "po"], {"pose.x", "pose.y"}),
+        (["plot", "--run", ""], {"1"}),
+        (["tail", "--robot", ""], {"rover"}),
+        (["logs", "--database", "other.db", "--robot", ""], {"dog"}),
+        (["check", ""], {"1"}),
     ],
 )
-def test_bash_completes_commands_options_choices_and_files(
+def test_bash_completes_commands_options_choices_files_and_recorded_names(
     script: Path, tmp_path: Path, typed: list[str], offered: set[str]
 ) -> None:
     (tmp_path / "worlds").mkdir()
+    for file, robot in (("webots.db", "rover"), ("other.db", "dog")):
+        recording = Recorded(tmp_path / file)
+        recording.robot(robot).state(0.1, {"pose": {"x": 1.0, "y": 2.0}, "mode": "drive"})
+        recording.close()
+    programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     ended = subprocess.run(
         [str(BASH), "--noprofile", "--norc", "-c", TAB, "bash", script, "webots-mcp", *typed],
         cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={**os.environ, "PATH": programs, "WEBOTS_MCP_DATA_DIR": str(tmp_path)},
     )  # fmt: skip
     assert set(ended.stdout.split()) - {"--help", "--version"} == offered, ended.stderr
 

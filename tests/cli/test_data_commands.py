@@ -19,8 +19,8 @@ import pytest
 
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.retention import Limit, parse_limit, size_text
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 Say = Callable[..., str]
 
@@ -249,7 +249,7 @@ def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
 
 
 def test_what_is_pruned_is_told_to_programs_in_bytes_and_ids(say: Say, database: Path) -> None:
-    limits = json.loads(say("retain", "2", "--keep-states", "0rows", "--json"))
+    limits = json.loads(say("retention", "2", "--keep-states", "0rows", "--json"))
     assert (limits["run_ids"], limits["retained"]) == ([2], True)
     assert limits["limits"]["states"].startswith("0rows (set by retain")
     tried = json.loads(say("prune", "--dry-run", "--json"))
@@ -264,11 +264,11 @@ def test_what_is_pruned_is_told_to_programs_in_bytes_and_ids(say: Say, database:
 
 
 def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None:
-    assert say("retain", "1") == ""
+    assert say("retention", "1") == ""
     nothing, note = say("prune", "--keep-states", "400rows").splitlines()
     assert nothing == "nothing is beyond the limits"
     assert "kept because of a label, a note or a mark, and not counted: run 1, about " in note
-    say("retain", "1", "--release")
+    say("retention", "1", "--release")
     say("prune", "--keep-states", "400rows")
     assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(530,)]
 
@@ -282,7 +282,7 @@ def test_what_is_too_old_but_among_the_newest_is_told(say: Say, database: Path) 
 def test_a_run_that_does_not_exist_cannot_be_kept(
     database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "No run 9" in complaint(capsys, "retain", "9", "--database", str(database))
+    assert "No run 9" in complaint(capsys, "retention", "9", "--database", str(database))
 
 
 @pytest.mark.parametrize("limit", ["", "none", "500", "5 parsecs", "1GB,2GB", "-3d", "1GB;2d"])
@@ -295,7 +295,7 @@ def test_a_limit_that_is_none_is_told_how_to_write_one(
 
 
 @pytest.mark.parametrize(
-    "arguments", [["export"], ["prune"], ["prune", "--dry-run"], ["retain", "1"]]
+    "arguments", [["export"], ["prune"], ["prune", "--dry-run"], ["retention", "1"]]
 )
 def test_without_a_recording_each_says_so(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

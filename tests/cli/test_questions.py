@@ -35,9 +35,12 @@ ANSWERED = [
     ("compare", "commanded_m_s .*0.2.*0.3", "mean_speed_m_s .*0.2.*0.3"),
     ("compare 1 3", "signal mean .*effect", r"^run 3 \[3\]"),
     ("compare 1 -n 3 3", r"^run 3 \[3\]", "the 3 that differ most of 13"),
-    ("diff 1 3", "controller_sha256 .*aaaaaaaaaa.*bbbbbbbbbb", "^verdict not alike to begin with"),
-    ("diff 1 2 --signal 'pose*'", "unlike: began_by", "^verdict equal to the last digit in the 300",
-     "row_count 300, signal_count 2, from_s 0, until_s 29.9", "one run goes on to 119.900 s"),
+    ("first-difference 1 3", "controller_sha256 .*aaaaaaaaaa.*bbbbbbbbbb",
+     "^verdict not alike to begin with"),
+    ("first-difference 1 2 --signal 'pose*'", "different_before: began_by",
+     "^verdict equal to the last digit in the 300",
+     "row_count 300, signal_count 2, start_s 0, end_s 29.9",
+     "one run goes on to 119.900 s"),
     ("signals --run 1", "pose.0 num .*12.78"),
     ("signals -n 1", "1 of 15: go on with --after"),
     ("sql 'SELECT id, label, 1e999 AS big FROM run ORDER BY id'", "id label big", "1 NULL inf"),
@@ -61,10 +64,10 @@ REFUSED = [
     ("events --after x", "--after 'x' is not a cursor"),
     ("compare 1 1", "1 to 300"),
     ("compare 77 78", "No run 77 is recorded. Use one of the newest runs: "),
-    ("diff 1", "RUN"),
-    ("diff 1 1", "two different runs"),
-    ("diff 1 77", "No run 77"),
-    ("diff 1 2 --signal moed", "mode"),
+    ("first-difference 1", "RUN"),
+    ("first-difference 1 1", "two different runs"),
+    ("first-difference 1 77", "No run 77"),
+    ("first-difference 1 2 --signal moed", "mode"),
     ("compare 1 --first-difference", "compares exactly two runs, not [1]"),
     ("runs -n 501", "-n must be less than or equal to 500, not 501"),
     ("plot -o a.gif", ".png or .svg"),
@@ -80,11 +83,11 @@ REFUSED = [
     ("sql 'DELETE FROM run'", "only one reading statement"),
     ("sql 'WITH a AS (SELECT 1) DELETE FROM run'", "Only reading is allowed"),
     ("sql 'SELECT lable FROM run'", "label"),
-    ("label 1", "Give a label, a note or both"),
-    ("label 99 x", "No run 99 is recorded. Use one of the newest runs: "),
-    (f"label 1 {'x' * 101}", "at most 100"),
-    ("label 1 \udcff", "TEXT must be a valid string"),
-    ("label --note --raw", 'Invalid value "--raw" for --note'),
+    ("annotate 1", "Give a label, a note or both"),
+    ("annotate 99 x", "No run 99 is recorded. Use one of the newest runs: "),
+    (f"annotate 1 {'x' * 101}", "at most 100"),
+    ("annotate 1 \udcff", "TEXT must be a valid string"),
+    ("annotate --note --raw", 'Invalid value "--raw" for --note'),
     ("step 0", "N must be greater than or equal to 1, not 0"),
     ("parameters --from-reset", "--from-reset needs what is set then: NAME=VALUE"),
     ("field ROVER.translation --stop", "--stop goes with a VALUE"),
@@ -94,7 +97,7 @@ REFUSED = [
     *((f"{name} -n {number}", number) for name in ("events", "tail") for number in ("-1", "1.5")),
     *(
         (asked.format(number), number)
-        for asked in ("compare 1 {}", "label {} x", "trends --run {}", "wait {}", "report {}",
+        for asked in ("compare 1 {}", "annotate {} x", "trends --run {}", "wait {}", "report {}",
                       "plot -o a.png --run {}", "export --run {}", "export --trials {}")
         for number in (str(2**63), "1.5", "x")
     ),
@@ -160,12 +163,12 @@ def test_a_person_reads_log_lines_whole_and_as_many_as_were_asked_for(
 
 def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, cli: Cli) -> None:
     copy_of(story, tmp_path / "webots.db")
-    given = cli("label 2 'kp 3' --note 'on ice'")
+    given = cli("annotate 2 'kp 3' --note 'on ice'")
     assert "run_id 2, robot rover, label kp 3" in given and "note on ice" in given
     assert line_with(cli("runs"), "  2  kp 3", "on ice")
-    run = cli.json("label 2 -")["run"]
+    run = cli.json("annotate 2 -")["run"]
     assert (run.get("label"), run["note"]) == (None, "on ice")
-    cli("label 2 --note -")
+    cli("annotate 2 --note -")
     assert "on ice" not in cli("runs")
     cli("events --where '-pose.0 < 0'")
 

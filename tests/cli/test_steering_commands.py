@@ -39,7 +39,7 @@ def tunable(tmp_path: Path) -> Iterator[TunableDriver]:
 def test_a_run_says_why_it_stopped_and_what_happened(cli: Cli) -> None:
     said = cli("run --for 0.48 --reset --until 'steps < 0'")
     assert "stopped simulation time reached" in said
-    assert "ran: run_id 2, from_s 0, to_s 0.48, advanced_s 0.48" in said
+    assert "ran: run_id 2, start_s 0, end_s 0.48, advanced_s 0.48" in said
     assert "mode pause" in said
     assert "\nrows:\n  sim_time_s  steps\n" in said
     ran = cli.json("run --for 0.16 --then go_on")["ran"]
@@ -75,7 +75,7 @@ def test_send_pause_step_resume_and_keep(cli: Cli, driver: Driver, recording: Re
         ("step many", "Invalid value for N: 'many' is no whole number"),
         ("breakpoint 'steps <'", "column"),
         ("breakpoint 'steps < 3' --remove 1", "not both"),
-        ("breakpoint --remove 1", "no breakpoint 1; it has none"),
+        ("breakpoint --remove 1", "no breakpoint 1. It has no breakpoints."),
         ("wait 999", "no command 999"),
         ("field ROVER.nothing", "has no field 'nothing'"),
         ("field ROVER.translation '[NaN,0,0]'", "such as [0, 0.5, 0.1]; got '[NaN,0,0]'"),

@@ -90,7 +90,7 @@ def test_a_database_that_stays_locked_is_an_error_and_no_command(recorded: Recor
 
 @pytest.mark.parametrize(
     ("params", "said"),
-    [({"x": [float("nan"), 0]}, r"NaN or an infinity \({'x': \[nan, 0\]}\)"),
+    [({"x": [float("nan"), 0]}, r"NaN or infinity, which JSON cannot hold: {'x': \[nan, 0\]}\."),
      ({"x": object()}, "not plain JSON")],
 )  # fmt: skip
 def test_parameters_that_are_no_json_are_refused(
@@ -103,7 +103,7 @@ def test_parameters_that_are_no_json_are_refused(
 
 def test_parameters_beyond_the_limit_are_refused(recorded: Recorded) -> None:
     robot = recorded.robot()
-    with pytest.raises(InvalidInputError, match="at most 65536"):
+    with pytest.raises(InvalidInputError, match="the limit is 65,536"):
         CommandQueue(recorded.connection).enqueue(
             robot.id, "go", {"x": "ü" * (MAX_PARAMS_BYTES // 2)}
         )

@@ -207,14 +207,23 @@ def test_what_a_dead_process_left_is_logged_where_its_loop_had_been_silent(
     [
         (
             (31.0, 1.0, 1000),
-            "r needs 31 of each 32 ms: the controller, not the physics, sets the pace "
-            "(mean of 1000 steps)",
+            "r: controller load 97 % of 32 ms per step; the controller sets the pace, not the "
+            "physics (mean of 1000 steps)",
         ),
-        ((1.0, 31.0, 1000), "r needs 1 of each 32 ms: Webots, real time or another controller"),
-        ((16.0, 16.0, 1000), "r needs 16 of each 32 ms: controller and Webots (or another"),
-        ((0.0, 0.0, 1000), "r needs 0 of each 0 ms: Webots"),
+        (
+            (1.0, 31.0, 1000),
+            "r: controller load 3.1 % of 32 ms per step; not the bottleneck: Webots",
+        ),
+        (
+            (16.0, 16.0, 1000),
+            "r: controller load 50 % of 32 ms per step; controller and Webots (or",
+        ),
+        ((0.0, 0.0, 1000), "r: controller load 0 % of 0 ms per step; not the bottleneck: Webots"),
         ((0.31, 0.01, 19), "None"),
-        ((12.0, 0.1, 3), "r needs 4000 of each 4033 ms: the controller, not the physics"),
+        (
+            (12.0, 0.1, 3),
+            "r: controller load 99 % of 4033 ms per step; the controller",
+        ),
         ((None, None, None), "None"),
     ],
 )

@@ -3,15 +3,42 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from typing import get_args
 
 import anyio
 import pytest
 
 from docs import reference
 from webots_mcp import MemoryDatabase
+from webots_mcp.answers.answer_models import AnswerTable
+from webots_mcp.answers.columns import COLUMNS
+from webots_mcp.answers.event_tables import EVENT_COLUMNS
+from webots_mcp.answers.summaries import TRIAL_FIGURES
+from webots_mcp.answers.trend_tables import STATE_COLUMNS, TREND_COLUMNS
 from webots_mcp.cli import described, names
 from webots_mcp.database.connection import SCHEMA_FILE
+from webots_mcp.judging.divergence import PartedSignal
+from webots_mcp.questions.compare_runs import (
+    CHECK_COLUMNS,
+    DIFFERENCE_COLUMNS,
+    GROUP_COLUMNS,
+    MEASURE_COLUMNS,
+    PARTED_COLUMNS,
+    RUN_COLUMNS,
+)
+from webots_mcp.questions.describe_signals import MEANING_COLUMNS
+from webots_mcp.questions.history import SIGNAL_COLUMNS
+from webots_mcp.questions.list_robots import (
+    BODY_COLUMNS,
+    PLACE_COLUMNS,
+    RECORDER_COLUMNS,
+    ROBOT_COLUMNS,
+)
+from webots_mcp.questions.send_command import COMMAND_COLUMNS
+from webots_mcp.questions.set_breakpoints import BREAKPOINT_COLUMNS
 from webots_mcp.server.mcp_server import create_server
+from webots_mcp.store.run_parameters import COLUMNS as COLUMNS_OF_PARAMETERS
 
 
 def parts(text: str) -> dict[str, str]:
@@ -63,6 +90,57 @@ def test_each_field_of_each_answer_has_a_meaning() -> None:
         rows = re.findall(r"(?m)^\| `(\w+)` \| .+ \| (.*) \|$", shown[model.__name__])
         assert dict(rows).keys() == model.model_fields.keys() - inherited
         assert all(meaning.endswith(".") for _, meaning in rows), model.__name__
+
+
+def test_the_fields_of_plugins_are_there_too() -> None:
+    assert "size_bytes" in parts(reference.fields())["ReportAnswer"]
+
+
+def test_each_table_of_an_answer_has_its_columns_with_their_meaning() -> None:
+    tables = {
+        f"{model.__name__}.{name}"
+        for model in reference.answer_models()
+        for name, field in model.model_fields.items()
+        if AnswerTable in get_args(field.annotation)
+    }
+    assert tables == COLUMNS.keys()
+    shown = parts(reference.fields())
+    for field, columns in COLUMNS.items():
+        assert all(meaning.endswith(".") for meaning in columns.values()), field
+        model, _, name = field.partition(".")
+        assert f"Columns of `{name}`:" in shown[model]
+        first = next(each for each, others in COLUMNS.items() if others is columns)
+        for column in columns if first == field else ():
+            assert f"| `{column}` |" in shown[model], (field, column)
+
+
+@pytest.mark.parametrize(
+    ("field", "filled"),
+    [
+        ("RobotsAnswer.robots", (*ROBOT_COLUMNS, *RECORDER_COLUMNS)),
+        ("WorldAnswer.in_world", (*BODY_COLUMNS, *PLACE_COLUMNS)),
+        ("ParametersAnswer.parameters", COLUMNS_OF_PARAMETERS),
+        ("CommandsAnswer.commands", COMMAND_COLUMNS),
+        ("BreakpointsAnswer.breakpoints", BREAKPOINT_COLUMNS),
+        ("SignalsAnswer.signals", SIGNAL_COLUMNS),
+        ("SignalMeaningsAnswer.signals", MEANING_COLUMNS),
+        ("RunTrendTables.numbers", TREND_COLUMNS),
+        ("RunTrendTables.states", STATE_COLUMNS),
+        ("EventsAnswer.events", (*EVENT_COLUMNS, "@SIGNAL")),
+        ("CheckAnswer.checks", CHECK_COLUMNS),
+        ("TrialsAnswer.ranked", ("PARAMETER", *TRIAL_FIGURES)),
+        ("RunsAnswer.runs", RUN_COLUMNS),
+        ("ComparisonAnswer.diverging", PARTED_COLUMNS),
+        ("ComparisonAnswer.groups", GROUP_COLUMNS),
+        ("ComparisonAnswer.measures", MEASURE_COLUMNS),
+        ("ComparisonAnswer.differences", DIFFERENCE_COLUMNS),
+    ],
+)
+def test_the_columns_that_are_described_are_those_that_are_filled(
+    field: str, filled: Sequence[str]
+) -> None:
+    assert list(COLUMNS[field]) == list(filled)
+    assert PARTED_COLUMNS[3:] == PartedSignal._fields[3:-1]
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from tests.plugins.report.conftest import Shown
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.extras.plugins import export_formats
+from webots_mcp.extras.plugin_registry import export_formats
 from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials

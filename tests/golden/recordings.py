@@ -21,7 +21,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.contract import new_uuid
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 STEP_MS: Final = 16
 DRIVE_S: Final = 24.0

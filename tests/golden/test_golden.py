@@ -11,7 +11,7 @@ from tests.golden.asking import ACTIONS, NEEDS_A_SIMULATION, TOOLS, Answers, ask
 from tests.golden.recordings import RECORDINGS
 from tests.golden.stored import difference, drawn
 from tests.golden.text import Portable
-from webots_mcp.extras.plugins import export_formats
+from webots_mcp.extras.plugin_registry import export_formats
 from webots_mcp.plotting import PlotKind
 from webots_mcp.questions import all_questions
 

@@ -16,7 +16,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting import plot
 from webots_mcp.plotting.canvas import Sheet
 from webots_mcp.plotting.trials import compose_trials, plot_trials
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 SVG = Sheet(image_format="svg")
 Tried = Callable[..., sqlite3.Connection]

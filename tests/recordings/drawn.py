@@ -21,9 +21,9 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 CHECKOUT: Final = Path(__file__).parents[2]
 _EXAMPLES: Final = CHECKOUT / "examples"

@@ -62,7 +62,7 @@ async def test_it_says_what_is_not_there_and_refuses_what_is_no_condition(
         assert "write ==" in await fail(client, "webots_breakpoint", condition="steps = 5")
         known = answer["breakpoint_id"]
         wrong = await fail(client, "webots_remove_breakpoint", breakpoint_id=known + 7)
-        assert f"there are {known}" in wrong
+        assert f"Its breakpoints are {known}." in wrong
 
 
 async def test_one_that_would_go_off_at_once_says_so(connect: Connect, driver: Driver) -> None:

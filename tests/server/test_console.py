@@ -139,7 +139,7 @@ async def test_a_line_that_may_be_of_any_robot_of_a_simulation_is_told_of_each(
             answer = await ask(client, "webots_get_logs", robot="rover", **scope)
             told = [row[2] for row in answer["lines"]["rows"]]
             assert told == ["console: foul", "webots: WARNING: slow", "mine"]
-            assert answer["matching"] == 3
+            assert answer["total"] == 3
         other = await ask(client, "webots_get_logs", robot=elsewhere.name)
         assert other["lines"]["rows"] == []
         assert "'x'" in await fail(client, "webots_get_logs", source="x")
@@ -174,12 +174,12 @@ async def test_what_the_console_says_of_a_controller_that_never_recorded_is_name
             answer = await client.call_tool(f"webots_{tool}", {})
             assert named in text_of(answer), tool
         told = await ask(client, "webots_get_logs", level="error")
-        assert (told["matching"], told["hint"][:25]) == (0, "no robot has recorded yet")
+        assert (told["total"], told["hint"][:25]) == (0, "no robot has recorded yet")
         assert [row[2] for row in told["lines"]["rows"]] == [
             "webots: WARNING: bot exited with status: 1."
         ]
         none = await ask(client, "webots_get_logs", filter_text="no such words")
-        assert "lines" not in none and none["matching"] == 0
+        assert "lines" not in none and none["total"] == 0
 
 
 async def test_a_controller_that_failed_after_another_run_is_named_until_one_records_again(

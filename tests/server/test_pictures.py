@@ -31,7 +31,7 @@ async def test_a_camera_frame_comes_as_a_picture_with_its_age(
         result = await client.call_tool("webots_get_camera", {})
         caption = json.loads(text_of(result))
         assert (caption["camera"], caption["picture_sim_time_s"]) == ("eye", 1.5)
-        assert caption["picture_age_s"] >= 0
+        assert caption["picture_age_wall_s"] >= 0
         assert [picture.mime_type for picture in pictures_of(result)] == ["image/png"]
         other = await client.call_tool("webots_get_camera", {"camera": "left"})
         assert "there are some of run_id=1: eye" in text_of(other)

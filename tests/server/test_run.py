@@ -48,7 +48,9 @@ async def test_it_says_why_and_where_it_stopped_and_what_happened(
         assert answer["status"] == "paused"
         assert answer["values"] == {"steps": goal}
         assert answer["state"]["steps"] == goal
-        assert answer["state_at_s"] == answer["ran"]["to_s"] == pytest.approx(goal * STEP_MS / 1000)
+        assert (
+            answer["state_at_s"] == answer["ran"]["end_s"] == pytest.approx(goal * STEP_MS / 1000)
+        )
         assert [goal - row[1] for row in answer["rows"]["rows"]] == [5, 4, 3, 2, 1, 0]
         assert {row[0] for row in answer["trends"]["numbers"]["rows"]} >= {"steps"}
         events = answer["events"]
@@ -193,7 +195,7 @@ async def test_where_no_screenshot_comes_the_frame_of_that_step_does_and_the_ans
         assert len(pictures_of(result)) == 1, answer["picture"]
         picture = answer["picture"]
         assert picture["camera"] == "camera"
-        assert picture["sim_time_s"] == answer["ran"]["to_s"]
+        assert picture["sim_time_s"] == answer["ran"]["end_s"]
         assert "nothing is rendered" in picture["no_screenshot"]
         assert "webots_get_camera" in picture["see"]
         assert Path(picture["file"]).is_file()
@@ -221,7 +223,7 @@ async def test_what_cannot_end_is_refused_before_anything_is_sent(
         sent = rows_of((await ask(client, "webots_list_commands"))["commands"])
         assert [row["action"] for row in sent] == ["run"], "only the parameter met the bridge"
         again = await ask(client, "webots_run", until="steps >= 3", reset=True, then="go_on")
-        assert again["ran"]["to_s"] <= 0.064
+        assert again["ran"]["end_s"] <= 0.064
 
 
 def test_a_change_in_the_newest_row_is_not_the_one_that_is_waited_for(recorded: Recorded) -> None:

@@ -200,10 +200,10 @@ async def test_events_and_log_lines_have_their_time_of_day_where_it_is_asked_for
     asked = {"webots_get_logs": "lines", "webots_find_events": "events"}
     async with connect() as client:
         for tool, table in asked.items():
-            assert "time" not in (await ask(client, tool))[table]["columns"]
+            assert "wall_time" not in (await ask(client, tool))[table]["columns"]
             found = (await ask(client, tool, time_of_day=True))[table]
             told: dict[str, Any] = dict(found.get("in_every_row") or {})
             told |= dict(zip(found["columns"], found["rows"][0], strict=True))
-            moment = datetime.fromisoformat(told["time"])
+            moment = datetime.fromisoformat(told["wall_time"])
             assert moment.tzinfo is not None
             assert moment.timestamp() == pytest.approx(robot.now, abs=0.001)

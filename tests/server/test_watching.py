@@ -119,7 +119,7 @@ async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(
     recorded.connection.execute("UPDATE session SET ended_wall_time_s = last_seen_wall_time_s")
     async with connect() as client:
         answer = await ask(client, "webots_monitor", duration_wall_s=60)
-    assert (answer["row_count"], answer["window_s"] < 30) == (0, True)
+    assert (answer["row_count"], answer["window_wall_s"] < 30) == (0, True)
     (kinds,) = (k for k, why in answer["verdicts"]["not_searched"].items() if "no row" in why)
     assert {"gap", "missing", "flat", "jump", "standstill", "stuck"} <= set(kinds.split(", "))
 

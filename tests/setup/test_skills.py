@@ -91,14 +91,14 @@ STORIES: Final[dict[str, tuple[dict[str, Any], tuple[tuple[str, ...], ...]]]] = 
         {"for_s": 1},
         (
             *UNKNOWN, KNOWN,
-            ("webots-mcp repeat", "run_ids [2, 3, 4, 5]"),
-            ("webots-mcp repeat", "run_ids [7, 8, 9, 10]"),
+            ("webots-mcp repeatability", "run_ids [2, 3, 4, 5]"),
+            ("webots-mcp repeatability", "run_ids [7, 8, 9, 10]"),
             ("webots_simulation_control(", '"outcome":"done"'),
             ("webots_list_runs(", "repeat 1 of 4, by reset"),
             ("webots_compare_runs(", '"runs_wanted"', "2, 3, 4, 5", "7, 8, 9, 10"),
             ("webots_plot(", "run 5", "run 10"),
             ("webots_check_run(run_id=10)", '"run_id":10'),
-            ("webots-mcp label", "after the edit"),
+            ("webots-mcp annotate", "after the edit"),
         ),
     ),
     "webots-test-a-behaviour": (

@@ -20,7 +20,7 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import DatabaseError, InvalidInputError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import is_bundle, merge, settled, unpacked, write_bundle
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 OF_RUN = ("state", "kept_stretch", "kept_state", "log", "event", "image", "parameter_value")
 # What a row is called, and where it stands, in each recording; and whether it is in chunks.

@@ -17,7 +17,7 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge, settled
-from webots_mcp.store.parameters import (
+from webots_mcp.store.trial_sets import (
     TrialResult,
     create_trial_set,
     fetch_trial_set,

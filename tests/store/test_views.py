@@ -19,7 +19,7 @@ from webots_mcp.signals.naming import USUAL_POSITIONS, find_position, flatten, m
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.segment import Subject
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
     ({"pose": [1, 2, 0.5], "mode": "cruise"}, (1, 2, 0.5, "cruise")),

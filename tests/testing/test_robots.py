@@ -84,7 +84,7 @@ def test_a_pause_that_nobody_can_end_is_an_error_and_no_endless_wait(
     webots_recording: RobotRecording,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("webots_mcp.testing.simulation.HOLD_LIMIT_S", 0.05)
+    monkeypatch.setattr("webots_mcp.testing.recorded_simulation.HOLD_LIMIT_S", 0.05)
     webots_recording.send("pause")
     webots_robot.step(16)
     with pytest.raises(WouldBlockError, match="send 'resume' before"):

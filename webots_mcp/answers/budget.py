@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final, TypeVar
 
-from webots_mcp.answers.models import Answer, AnswerTable
+from webots_mcp.answers.answer_models import Answer, AnswerTable
 from webots_mcp.answers.shortening import (
     ShorteningLimits,
     compact_json,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+from webots_mcp.answers.answer_models import AnswerTable, KindVerdicts
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     detailed,
@@ -14,7 +15,6 @@ from webots_mcp.answers.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.answers.models import AnswerTable, KindVerdicts
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.judging.detection.events import (
     Events,
@@ -26,10 +26,9 @@ from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.recording import RobotView
 
 EVENT_COLUMNS: Final = (
-    "kind", "count", "run_id", "start_s", "time", "duration_s", "ongoing", "name", "details",
+    "kind", "count", "run_id", "start_s", "wall_time", "duration_s", "ongoing", "name", "details",
 )  # fmt: skip
 _GROUP_BUDGET_TOKENS: Final = 200
-_NO_DATA: Final = "no data is recorded for it"
 
 
 def fitting_events(
@@ -55,7 +54,9 @@ def verdicts_of(verdicts: Verdicts, *, in_short: bool = False) -> KindVerdicts:
     """
     if in_short:
         reasons = {
-            kind: (_NO_DATA,) if verdicts.unlooked(kind) and not each.lacks("unread") else said
+            kind: ("no data is recorded for it",)
+            if verdicts.unlooked(kind) and not each.lacks("unread")
+            else said
             for kind, said in verdicts.reasons.items()
             for each in (verdicts.coverage.get(kind, Coverage()),)
         }

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, singledispatch
 from typing import Any, Final, cast
 
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     Answer,
     AnswerTable,
     BreakpointAnswer,
@@ -46,19 +46,18 @@ from webots_mcp.store.ages import age_in_words
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
-_SERIOUS: Final = ("critical", "error", "warning")
 _NOTED_FIRST: Final = ("change", "command", "log", "bridge_event", "kept_stretch", "image", "run")
-_SERIOUS_LOG: Final = {"critical": 1, "error": 1}
 _OUTCOMES: Final = {"fail": "failed", "warn": "warned", "not judged": "could not be judged"}
 _ENDINGS: Final = {  # others: "ended by reset"
     "finished": "finished", "crashed": "crashed", "going on": "goes on",
 }  # fmt: skip
-_BAD_NOTABLE: Final = ("log critical", "log error", "command failed", "dropped")
 _HELD: Final = {"pass": "held", "fail": "did not hold", "warn": "did not always hold"}
 TRIAL_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
-_PLURALS: Final = {
-    "change": "changes", "command": "commands", "log": "log lines", "bridge_event": "bridge events",
-    "kept_stretch": "kept stretches", "image": "images", "run": "beginnings and ends of runs",
+_NOUNS: Final = {  # one and several
+    "change": ("change", "changes"), "command": ("command", "commands"),
+    "log": ("log line", "log lines"), "bridge_event": ("bridge event", "bridge events"),
+    "kept_stretch": ("full-rate segment", "full-rate segments"), "image": ("image", "images"),
+    "run": ("beginning or end of a run", "beginnings and ends of runs"),
 }  # fmt: skip
 
 
@@ -105,7 +104,7 @@ def _(answer: FullStateAnswer) -> str:
 @_summary.register
 def _(answer: WorldAnswer) -> str:
     world = answer.world.replace("\\", "/").rsplit("/", 1)[-1] if answer.world else "unknown world"
-    runs = f", {answer.runs_recorded} recorded" if answer.runs_recorded else ""
+    runs = f", {answer.run_count} recorded" if answer.run_count else ""
     return f"{world}: {_subject(answer)} {_when(answer)}; run {answer.run_id}{runs}."
 
 
@@ -131,8 +130,10 @@ def _(answer: LogsAnswer) -> str:
     if not lines:
         return "No log line matches."
     levels = Counter(str(each.get("level")) for each in lines)
-    serious = [f"{levels[name]} {name}" for name in _SERIOUS if levels[name]]
-    total = max(answer.matching or 0, len(lines))
+    serious = [
+        f"{levels[name]} {name}" for name in ("critical", "error", "warning") if levels[name]
+    ]
+    total = max(answer.total or 0, len(lines))
     shown = (
         f"{len(lines)} of {total} log lines" if total > len(lines) else _count(total, "log line")
     )
@@ -257,7 +258,7 @@ def _clause(says: Any) -> str:
 
 @_summary.register
 def _(answer: EventsAnswer) -> str:
-    return _events(answer.verdicts, answer.events, answer.run_id, answer.from_s)
+    return _events(answer.verdicts, answer.events, answer.run_id, answer.start_s)
 
 
 @_summary.register
@@ -270,7 +271,7 @@ def _(answer: TimelineAnswer) -> str:
 
 @_summary.register
 def _(answer: MonitorAnswer) -> str:
-    window = f"{answer.window_s or 0:.3g} s of wall-clock time"
+    window = f"{answer.window_wall_s or 0:.3g} s of wall-clock time"
     if (answer.status or "").startswith("stopped"):
         window = f"the last {window} recorded"
     if not answer.row_count:
@@ -355,7 +356,9 @@ def _noted(
 ) -> list[str]:
     """Return what was noted: errors and failed commands first, and the rest if there is room."""
     logs = [row for row in rows if row.get("kind") == "log"]
-    errors = sum(_SERIOUS_LOG.get(str(row.get("name")), 0) * _times(row) for row in logs)
+    errors = sum(
+        {"critical": 1, "error": 1}.get(str(row.get("name")), 0) * _times(row) for row in logs
+    )
     failed = sum(
         _times(row) for row in rows
         if row.get("kind") == "command" and _detail(row, "status") in ("failed", "refused", "lost")
@@ -377,7 +380,7 @@ def _noted(
                 said.append(f"{_count(len(runs), 'run')} that began or ended")
                 continue
         if counts[kind] > 0:
-            said.append(_count(counts[kind], kind.replace("_", " "), _PLURALS[kind]))
+            said.append(_count(counts[kind], *_NOUNS[kind]))
     return said
 
 
@@ -515,7 +518,11 @@ def _ended_badly(run: Mapping[str, Any]) -> str:
     counted: dict[str, int] = {}
     if isinstance(notable, dict):
         counted = cast("dict[str, int]", notable)
-    bad = [f"{count} {name}" for name, count in counted.items() if name in _BAD_NOTABLE]
+    bad = [
+        f"{count} {name}"
+        for name, count in counted.items()
+        if name in ("log critical", "log error", "command failed", "dropped")
+    ]
     crashed = run.get("ended_by") == "crashed"
     if not crashed and not bad:
         return ""
@@ -544,18 +551,18 @@ def _(answer: ComparisonAnswer) -> str | None:
 
 def _first_difference(answer: ComparisonAnswer) -> str:
     """Return where two runs diverge, and what was different before they began."""
-    compared, parted = answer.compared or {}, list(_rows(answer.parted))
-    begun = [name for name in answer.unlike or () if name != "began_by"]
+    compared, parted = answer.compared or {}, list(_rows(answer.diverging))
+    begun = [name for name in answer.different_before or () if name != "began_by"]
     before = f"The runs were started differently ({_listed(begun)}). " if begun else ""
     if not compared.get("row_count") or not compared.get("signal_count"):
         return f"{before}Cannot tell: no row of one run could be compared with one of the other."
     if not parted:
         rows = _count(compared["row_count"], "compared row")
         signals = _count(compared["signal_count"], "signal")
-        return f"{before}Identical in {rows} of {signals}, up to {compared['until_s']:.12g} s."
-    first_s = parted[0].get("from_s")
-    first = [_name(row) for row in parted if row.get("from_s") == first_s]
-    is_at_once = first_s is None or first_s == compared.get("from_s")
+        return f"{before}Identical in {rows} of {signals}, up to {compared['end_s']:.12g} s."
+    first_s = parted[0].get("start_s")
+    first = [_name(row) for row in parted if row.get("start_s") == first_s]
+    is_at_once = first_s is None or first_s == compared.get("start_s")
     when = "from the first compared row on"
     if not is_at_once:
         when = f"from {first_s:.12g} s on, and are identical before"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.answers.budget import figure, fitting, seconds, short_name, shown, some, table
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     RunTrendTables,
 )
+from webots_mcp.answers.budget import figure, fitting, seconds, short_name, shown, some, table
 from webots_mcp.answers.shortening import compact_json, cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from webots_mcp.bridge.commands import ClaimedCommand, Handlers
+from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handlers
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pause import Pause

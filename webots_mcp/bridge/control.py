@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from typing import Final
 
-from webots_mcp.bridge.commands import (
+from webots_mcp.bridge.claimed_commands import (
     Action,
     ClaimedCommand,
     ClaimedCommands,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import cast
 
 from webots_mcp.bridge.breakpoints import Breakpoints
-from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress, Reloads
+from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress, Reloads
 from webots_mcp.bridge.error_report import describe
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.parameters import Parameters, setter_of

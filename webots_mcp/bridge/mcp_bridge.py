@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.attachment import Attachment
-from webots_mcp.bridge.commands import ClaimedCommand, Handler
+from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handler
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport, describe
 from webots_mcp.bridge.parameters import Parameter, V

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any, Final, Generic, NamedTuple, TypeVar, cast
 
-from webots_mcp.bridge.commands import Handlers
+from webots_mcp.bridge.claimed_commands import Handlers
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import Recorder

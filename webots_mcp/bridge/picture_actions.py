@@ -9,7 +9,7 @@ import time
 from collections.abc import Generator
 from pathlib import Path
 
-from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress, whole_number
+from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.picture_files import PictureFiles, complete_png_size
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import SCREENSHOT_FOLDER

@@ -11,8 +11,8 @@ from itertools import islice
 from typing import Any, Final, cast
 
 from webots_mcp.bridge.breakpoints import Breakpoints
+from webots_mcp.bridge.claimed_commands import Reloads
 from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
-from webots_mcp.bridge.commands import Reloads
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut

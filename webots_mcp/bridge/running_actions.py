@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator
 from typing import Final
 
 from webots_mcp.bridge.breakpoints import Breakpoints
-from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress, whole_number
+from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.parameters import Parameters, setter_of
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.run_goal import Goal, Watch, read_goal

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from webots_mcp.bridge.commands import Action, ClaimedCommand, Progress
+from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Clock, Simulation

@@ -13,7 +13,7 @@ import time
 from collections.abc import Generator
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.claimed_commands import ClaimedCommand, Progress
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.field_values import (
     MOST_ENTRIES,

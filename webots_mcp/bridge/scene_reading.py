@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.commands import Progress, whole_number
+from webots_mcp.bridge.claimed_commands import Progress, whole_number
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.field_values import read, read_entries
 from webots_mcp.bridge.scene_nodes import (

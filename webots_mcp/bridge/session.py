@@ -9,14 +9,13 @@ from typing import Any, Final
 
 from webots_mcp.bridge.attachment import Attachment, UnseenSteps
 from webots_mcp.bridge.breakpoints import Breakpoints
-from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
+from webots_mcp.bridge.claimed_commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.controller_actions import ControllerActions
 from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.meanings import SignalMeanings
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.picture_actions import PictureActions
@@ -27,6 +26,7 @@ from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_actions import SceneActions
+from webots_mcp.bridge.signal_meanings import SignalMeanings
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog

@@ -10,7 +10,7 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.bridge.commands import (
+from webots_mcp.bridge.claimed_commands import (
     Action,
     ClaimedCommand,
     ClaimedCommands,

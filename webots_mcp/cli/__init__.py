@@ -34,9 +34,15 @@ EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
 
-Controllers record into one SQLite database, an AI assistant reads it and steers the simulation
-over MCP. Try `webots-mcp demo` first; `webots-mcp COMMAND --help` explains a command.
+Controllers record into one SQLite database. An AI assistant reads it and steers the simulation over
+MCP. Try `webots-mcp demo` first. `webots-mcp COMMAND --help` explains a command.
 """
+_HELP_OF_A_FEW: Final = (
+    "\nThese are the everyday commands; `webots-mcp --help --all` lists all {number}.\n"
+)
+_HELP_OF_DISPLAY: Final = (
+    "\nEvery command takes `--verbose` (show every column and detail) and `--no-color`.\n"
+)
 
 
 def names() -> list[str]:
@@ -48,7 +54,7 @@ def names() -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    given = list(sys.argv[1:] if argv is None else argv)
+    given = _take_global_options(list(sys.argv[1:] if argv is None else argv))
     try:
         return _run(given, is_process=argv is None)
     except NotAllowedError as error:  # which quotes a line of a file as it stands there
@@ -73,6 +79,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _take_global_options(given: list[str]) -> list[str]:
+    """Set how answers are shown; returns the rest, with the command's name of today."""
+    from webots_mcp.cli.commands import FORMER_NAMES
+    from webots_mcp.cli.terminal import Display, set_display
+
+    end = given.index("--") if "--" in given else len(given)
+    options, rest = given[:end], given[end:]
+    set_display(Display("--verbose" in options, "--no-color" not in options))
+    options = [each for each in options if each not in ("--verbose", "--no-color")]
+    if options and (name := FORMER_NAMES.get(options[0])):
+        with contextlib.suppress(OSError):
+            print(f"webots-mcp: {options[0]!r} is now called {name!r}", file=sys.stderr)
+        options[0] = name
+    return options + rest
+
+
 def _run(argv: Sequence[str], *, is_process: bool) -> int:
     """Call the command that was given; without one, show which there are."""
     from cyclopts import CycloptsError, UnusedCliTokensError
@@ -92,6 +114,8 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
             if each.names
         )
     is_help = not {"--help", "-h"}.isdisjoint(argv)  # nothing of a recording, and may have colours
+    if is_help:
+        argv = [each for each in argv if each != "--all" or argv[0] in COMMANDS]
     ending = ending_by_signals(is_process=is_process)
     with ending, contextlib.nullcontext() if is_help else spelling_out():
         try:
@@ -190,23 +214,30 @@ def _discard_output() -> None:
 # -- commands as cyclopts knows them --
 
 
-def app_for(argv: Sequence[str]) -> App:
-    """Return the application with the called command, or with all for help and completion."""
+def app_for(argv: Sequence[str], *, shows_all: bool = False) -> App:
+    """Return the application with the commands that a command line needs.
+
+    Args:
+        argv: Only the called command, or for its help those of everyday use (`--all`: all).
+        shows_all: Have all commands, for completion and documentation.
+    """
     from cyclopts import App, Group, Parameter
 
-    from webots_mcp.cli.commands import COMMANDS, GROUPS
+    from webots_mcp.cli.commands import COMMANDS, EVERYDAY, GROUPS
     from webots_mcp.contract import VERSION
 
+    called = argv[0] if argv else ""
+    is_short = called in ("", "--help", "-h") and "--all" not in argv and not shows_all
+    of_a_few = _HELP_OF_A_FEW.format(number=len(COMMANDS)) if is_short else ""
     app = App(
         name="webots-mcp",
-        help=_HELP,
+        help=f"{_HELP}{of_a_few}{_HELP_OF_DISPLAY}",
         version=VERSION,
         version_flags=["--version"],
         suppress_keyboard_interrupt=False,
         default_parameter=Parameter(negative=(), show_default=False),
     )
-    called = argv[0] if argv else ""
-    names = [called] if called in COMMANDS else list(COMMANDS)
+    names = [called] if called in COMMANDS else list(EVERYDAY) if is_short else list(COMMANDS)
     groups = {name: Group(name, sort_key=place) for place, name in enumerate(GROUPS)}
     for name in names:
         command = COMMANDS[name]
@@ -235,7 +266,7 @@ def described() -> dict[str, CommandHelp]:
     """Every command by its name."""
     from webots_mcp.cli.commands import COMMANDS
 
-    app = app_for([])
+    app = app_for([], shows_all=True)
     return {
         name: CommandHelp(
             inspect.getdoc(_function_of(command)) or "",

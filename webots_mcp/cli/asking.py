@@ -69,7 +69,6 @@ _FOLLOW: Final = Annotated[
         "--follow", help="Go on with what comes, until Ctrl-C. As JSON each row is an object."
     ),
 ]
-_FLOOD: Final = "more than {} rows came at once: --before {} shows those that were left out"
 
 
 def command_of(question: Question) -> Callable[..., None]:
@@ -216,7 +215,7 @@ def _valid(
 
 def _kinds_in(recording: RecordingAccess) -> Mapping[str, str]:
     """Of the parameters that robots have, by name."""
-    from webots_mcp.store.parameters import kinds_of
+    from webots_mcp.store.run_parameters import kinds_of
 
     with recording.reader() as connection:
         return kinds_of(connection)
@@ -296,12 +295,13 @@ def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json:
     most = max(each.le for each in bounds if hasattr(each, "le"))
     again = given | {question.follows: most} | {"robot": data.get("robot") or given.get("robot")}
     is_live = where.may_change()
+    flood = "more than {} rows came at once: --before {} shows those that were left out"
     while is_live:
         wait(0.5)
         rows = _rows_in(ask(question, again, where).data or {}, question.follows)
         came = new.of(rows)
         if came and len(came) == most:
-            print(f"webots-mcp: {_FLOOD.format(most, came[0]['id'])}", file=sys.stderr)
+            print(f"webots-mcp: {flood.format(most, came[0]['id'])}", file=sys.stderr)
         _print_rows(came, as_json=as_json)
 
 

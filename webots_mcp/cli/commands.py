@@ -8,9 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.extras.plugins import plugin_commands
-
-_STEERING: Final = "webots_mcp.cli.steering"
+from webots_mcp.extras.plugin_registry import plugin_commands
 
 
 class CommandEntry(NamedTuple):
@@ -25,55 +23,70 @@ class CommandEntry(NamedTuple):
         return getattr(importlib.import_module(self.module), self.name)
 
 
-NOW, PAST, STEER, DATA, SETUP = (
-    "What is recorded now", "The past", "Steering", "Recordings", "Setting up and running",
+START, NOW, PAST, STEER, RUNS, DATA, SERVER = (
+    "Start", "Watch", "Ask", "Steer", "Experiments", "Recordings", "Server and set-up",
 )  # fmt: skip
-GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
+GROUPS: Final = (START, NOW, PAST, STEER, RUNS, DATA, SERVER)
 _Q: Final = "webots_mcp.questions"
+_CLI: Final = "webots_mcp.cli"
 _OF_THE_CORE: Final = {
-    "events": CommandEntry(PAST, f"{_Q}.events", "webots_find_events"),
-    "check": CommandEntry(PAST, "webots_mcp.cli.judging", "check"),
-    "compare": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
-    "diff": CommandEntry(PAST, "webots_mcp.cli.judging", "diff"),
-    "logs": CommandEntry(PAST, f"{_Q}.get_logs", "webots_get_logs"),
-    "history": CommandEntry(PAST, f"{_Q}.history", "webots_query_history"),
-    "label": CommandEntry(DATA, f"{_Q}.compare_runs", "webots_annotate_run"),
-    "runs": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
-    "signals": CommandEntry(PAST, _STEERING, "signals"),
-    "sql": CommandEntry(PAST, f"{_Q}.query_sql", "webots_query_sql"),
-    "status": CommandEntry(NOW, f"{_Q}.list_robots", "webots_list_robots"),
-    "trends": CommandEntry(PAST, f"{_Q}.history", "webots_get_trends"),
-    "export": CommandEntry(DATA, "webots_mcp.cli.data", "export"),
-    "import": CommandEntry(DATA, "webots_mcp.cli.data", "import_"),
-    "prune": CommandEntry(DATA, "webots_mcp.cli.data", "prune"),
-    "retain": CommandEntry(DATA, "webots_mcp.cli.data", "retain"),
-    "completion": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "completion"),
-    "doctor": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "doctor"),
-    "header": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "header"),
-    "init": CommandEntry(SETUP, "webots_mcp.cli.setting_up", "init"),
-    "observe": CommandEntry(SETUP, "webots_mcp.cli.serving", "observe"),
-    "serve": CommandEntry(SETUP, "webots_mcp.cli.serving", "serve"),
-    "token": CommandEntry(SETUP, "webots_mcp.cli.serving", "token"),
-    "run": CommandEntry(STEER, f"{_Q}.control_simulation", "webots_run"),
-    "send": CommandEntry(STEER, f"{_Q}.send_command", "webots_send_command"),
-    "wait": CommandEntry(STEER, f"{_Q}.send_command", "webots_wait_for_command"),
+    "init": CommandEntry(START, f"{_CLI}.setting_up", "init"),
+    "launch": CommandEntry(START, f"{_CLI}.serving", "launch"),
+    "doctor": CommandEntry(START, f"{_CLI}.setting_up", "doctor"),
+    "status": CommandEntry(NOW, f"{_CLI}.status", "status"),
+    "tail": CommandEntry(NOW, f"{_CLI}.data", "tail"),
+    "logs": CommandEntry(NOW, f"{_Q}.get_logs", "webots_get_logs"),
+    "camera": CommandEntry(NOW, f"{_CLI}.pictures", "camera"),
+    "screenshot": CommandEntry(NOW, f"{_CLI}.pictures", "screenshot"),
     "scene": CommandEntry(NOW, f"{_Q}.edit_scene", "webots_get_scene"),
     "commands": CommandEntry(NOW, f"{_Q}.send_command", "webots_list_commands"),
-    "field": CommandEntry(NOW, _STEERING, "field"),
-    "parameters": CommandEntry(NOW, _STEERING, "parameters"),
-    "pause": CommandEntry(STEER, _STEERING, "pause"),
-    "resume": CommandEntry(STEER, _STEERING, "resume"),
-    "step": CommandEntry(STEER, _STEERING, "step"),
-    "keep": CommandEntry(STEER, _STEERING, "keep"),
-    "breakpoint": CommandEntry(STEER, _STEERING, "breakpoint_"),
-    "requests": CommandEntry(STEER, _STEERING, "requests"),
-    "trials": CommandEntry(STEER, "webots_mcp.cli.steering", "trials"),
-    "repeat": CommandEntry(STEER, "webots_mcp.cli.judging", "repeat"),
-    "launch": CommandEntry(SETUP, "webots_mcp.cli.serving", "launch"),
-    "profile": CommandEntry(NOW, "webots_mcp.cli.judging", "profile"),
-    "plot": CommandEntry(PAST, "webots_mcp.cli.data", "plot"),
-    "tail": CommandEntry(NOW, "webots_mcp.cli.data", "tail"),
+    "profile": CommandEntry(NOW, f"{_CLI}.judging", "profile"),
+    "check": CommandEntry(PAST, f"{_CLI}.judging", "check"),
+    "events": CommandEntry(PAST, f"{_Q}.find_events", "webots_find_events"),
+    "runs": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
+    "compare": CommandEntry(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
+    "plot": CommandEntry(PAST, f"{_CLI}.data", "plot"),
+    "history": CommandEntry(PAST, f"{_Q}.history", "webots_query_history"),
+    "trends": CommandEntry(PAST, f"{_Q}.history", "webots_get_trends"),
+    "signals": CommandEntry(PAST, f"{_CLI}.steering", "signals"),
+    "sql": CommandEntry(PAST, f"{_Q}.query_sql", "webots_query_sql"),
+    "pause": CommandEntry(STEER, f"{_CLI}.steering", "pause"),
+    "resume": CommandEntry(STEER, f"{_CLI}.steering", "resume"),
+    "fast": CommandEntry(STEER, f"{_CLI}.steering", "fast"),
+    "step": CommandEntry(STEER, f"{_CLI}.steering", "step"),
+    "reset": CommandEntry(STEER, f"{_CLI}.steering", "reset"),
+    "reload": CommandEntry(STEER, f"{_CLI}.steering", "reload"),
+    "run": CommandEntry(STEER, f"{_Q}.control_simulation", "webots_run"),
+    "breakpoint": CommandEntry(STEER, f"{_CLI}.steering", "breakpoint_"),
+    "parameters": CommandEntry(STEER, f"{_CLI}.steering", "parameters"),
+    "field": CommandEntry(STEER, f"{_CLI}.steering", "field"),
+    "send": CommandEntry(STEER, f"{_Q}.send_command", "webots_send_command"),
+    "wait": CommandEntry(STEER, f"{_Q}.send_command", "webots_wait_for_command"),
+    "capture": CommandEntry(STEER, f"{_CLI}.steering", "capture"),
+    "trials": CommandEntry(RUNS, f"{_CLI}.steering", "trials"),
+    "repeatability": CommandEntry(RUNS, f"{_CLI}.judging", "repeatability"),
+    "first-difference": CommandEntry(RUNS, f"{_CLI}.judging", "first_difference"),
+    "export": CommandEntry(DATA, f"{_CLI}.data", "export"),
+    "import": CommandEntry(DATA, f"{_CLI}.data", "import_"),
+    "annotate": CommandEntry(DATA, f"{_Q}.compare_runs", "webots_annotate_run"),
+    "retention": CommandEntry(DATA, f"{_CLI}.data", "retention"),
+    "prune": CommandEntry(DATA, f"{_CLI}.data", "prune"),
+    "serve": CommandEntry(SERVER, f"{_CLI}.serving", "serve"),
+    "token": CommandEntry(SERVER, f"{_CLI}.serving", "token"),
+    "observe": CommandEntry(SERVER, f"{_CLI}.serving", "observe"),
+    "header": CommandEntry(SERVER, f"{_CLI}.setting_up", "header"),
+    "audit": CommandEntry(SERVER, f"{_CLI}.steering", "audit"),
+    "completion": CommandEntry(SERVER, f"{_CLI}.setting_up", "completion"),
 }
+# The commands of everyday use, in their order; `--help --all` shows the rest.
+EVERYDAY: Final = (
+    "demo", "init", "launch", "doctor", "status", "view", "logs", "check", "events", "plot",
+    "compare", "report",
+)  # fmt: skip
+FORMER_NAMES: Final = {
+    "requests": "audit", "keep": "capture", "label": "annotate", "retain": "retention",
+    "diff": "first-difference", "repeat": "repeatability",
+}  # fmt: skip
 COMMANDS: Final[dict[str, CommandEntry]] = _OF_THE_CORE | {
     each.name: CommandEntry(each.group, *each.function.split(":")) for each in plugin_commands()
 }

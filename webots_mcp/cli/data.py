@@ -32,7 +32,7 @@ from webots_mcp.cli.streams import binary_stdout, shown_progress, wait
 from webots_mcp.cli.terminal import id_ranges, print_json, print_notes, print_table, printable
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.extras.plugins import export_formats
+from webots_mcp.extras.plugin_registry import export_formats
 from webots_mcp.store.merging import write_bundle
 from webots_mcp.store.purge import Purged
 
@@ -307,7 +307,7 @@ def prune(
     """Delete what is beyond the limits, and give the space back to the disk.
 
     Rows go in the order in which they were recorded, whatever their run. Runs with a label (but
-    that of a trial) or a note, and those marked by 'webots-mcp retain', lose nothing and do not
+    that of a trial) or a note, and those marked by 'webots-mcp retention', lose nothing and do not
     count. A LIMIT is a size
     (500MB), an age (30d), a number of rows (100000rows), several of them with commas between; all,
     which keeps everything; or default. What is given belongs to the database from then on, and
@@ -344,7 +344,7 @@ def prune(
     _print_purged(purged)
 
 
-def retain(
+def retention(
     *run_ids: Annotated[Id, Parameter("RUN", help="As 'webots-mcp runs' lists them.")],
     release: Annotated[bool, Parameter("--release", help="Let retention have them again.")] = False,
     limits: RetentionOptions = _UNLIMITED,

@@ -28,7 +28,7 @@ from webots_mcp.cli.options import (
     Where,
     make_chunks_first,
 )
-from webots_mcp.cli.terminal import print_answer, print_json, print_table
+from webots_mcp.cli.terminal import is_verbose, print_answer, print_json, print_table
 from webots_mcp.contract import host_name
 from webots_mcp.database.files import placed
 from webots_mcp.database.location import find_project
@@ -85,7 +85,7 @@ def check(
     given = {"run_id": run_id, "robot": robot, "expect": expect}
     reply = ask(webots_check_run, given, recorded)
     data = reply.data or {}
-    shown = reply if as_json else reply._replace(data=_as_typed(data))
+    shown = reply if as_json else reply._replace(data=_in_short(_as_typed(data)))
     if junit is not None:  # first: who reads what is shown may not read it to its end
         _write(junit, data)
     show(webots_check_run, shown, recorded, as_json=as_json)
@@ -133,6 +133,26 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     return answer | changed
 
 
+def _in_short(answer: dict[str, Any]) -> dict[str, Any]:
+    """Return the answer with what does not apply in one line, and no details of what passed."""
+    table = answer.get("checks")
+    if is_verbose() or not table:
+        return answer
+    place, named = table["columns"].index("outcome"), table["columns"].index("check")
+    found = [row for row in table["rows"] if row[place] != "not applicable"]
+    others = [str(row[named]) for row in table["rows"] if row[place] == "not applicable"]
+    short = {name: value for name, value in answer.items() if name not in ("passed_on", "counts")}
+    short["checks"] = table | {"rows": found}
+    if not found:
+        del short["checks"]
+    if others:
+        short["not applicable"] = f"{len(others)}: {', '.join(others)}"
+    if others or "passed_on" in answer:
+        hint = "--verbose shows what each check rests on, and why others do not apply"
+        short["hint"] = "; ".join(filter(None, (answer.get("hint"), hint)))
+    return short
+
+
 _DESCRIBE_TYPED: Final = "webots-mcp signals --describe"
 
 
@@ -157,7 +177,7 @@ def _write(file: Path, answer: dict[str, Any]) -> None:
     for each in _checks_in(answer):
         name, says = spelled_out(each["check"]), spelled_out(each.get("evidence") or "")
         case = SubElement(suite, "testcase", classname="webots-mcp", name=name)
-        says += f" (since {each['since_s']:g} s)" if each.get("since_s") is not None else ""
+        says += f" (since {each['start_s']:g} s)" if each.get("start_s") is not None else ""
         element, counted = _ELEMENTS.get(each["outcome"], ("", ""))
         counts.update(filter(None, ("tests", counted)))
         if element:
@@ -182,7 +202,7 @@ _Names = list[str] | None
 _World = Path | None
 
 
-def diff(
+def first_difference(
     first: Annotated[Id, Parameter("RUN", help="The id of a run.")],
     other: Annotated[Id, Parameter("RUN", help="The id of another.")],
     /,
@@ -195,7 +215,7 @@ def diff(
 ) -> None:
     """Where two runs part: which signal is first not the same to the last digit, and how it grows.
 
-        webots-mcp diff 3 4 --signal 'pose*'
+        webots-mcp first-difference 3 4 --signal 'pose*'
 
     Parameters, code, world and versions that differ are named first. Rows are compared with those
     of the other run at the same simulation time; the others are counted.
@@ -207,7 +227,7 @@ def diff(
     ask_and_show(webots_compare_runs, asked, recorded, as_json=json)
 
 
-def repeat(
+def repeatability(
     world: Annotated[_World, Parameter("WORLD", help="Of processes (the newest run's).")] = None,
     /,
     *,
@@ -220,7 +240,7 @@ def repeat(
 ) -> None:
     """Run the same again, and say where the runs part from the first, and how it grows.
 
-        webots-mcp repeat --by reset --by process -n 3 --for 20
+        webots-mcp repeatability --by reset --by process -n 3 --for 20
 
     Each begins with a reset or reload of the live simulation, whose controller has to be a
     Supervisor, or in a simulator process of its own, as a trial does. Where runs part after a
@@ -261,7 +281,7 @@ def _in_processes(
     """Run a world in simulators of their own, as trials without parameters."""
     from webots_mcp.cli.steering import TrialOptions, run_plan
     from webots_mcp.steering.trial_plan import WorldPlan
-    from webots_mcp.store.parameters import trials_of
+    from webots_mcp.store.trial_sets import trials_of
 
     recording = asked.recording(read_only=False)
     if world is None:
@@ -319,9 +339,11 @@ def _answer(found: Sequence[Parting]) -> dict[str, Any]:
 
     facts = [{"run_id": each.run_ids[1], **parting_facts(each)} for each in found]
     shown = ("run_id", "verdict", "growth", "notes")
+    diverging = [each.run_ids[1] for each in found if each.parted]
     return {
         "run_ids": [found[0].run_ids[0], *(each["run_id"] for each in facts)],
-        "parted": [each.run_ids[1] for each in found if each.parted],
+        "diverging": diverging,
+        "parted": diverging,  # its former name, for scripts
         "verdict": verdict_on(found),
         "repeats": [{name: each[name] for name in shown if each[name]} for each in facts],
     }

@@ -29,7 +29,7 @@ from webots_mcp.cli.options import (
 from webots_mcp.cli.terminal import print_json
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
-from webots_mcp.extras.plugins import stand_in_simulator
+from webots_mcp.extras.plugin_registry import stand_in_simulator
 
 if TYPE_CHECKING:
     from webots_mcp.database.location import Database
@@ -113,7 +113,7 @@ def serve(
     With --http 8000 it runs until Ctrl-C, and clients come and go: see docs/clients.md.
 
     While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
-    Limits belong to the database: what 'webots-mcp prune' or 'retain' has set,
+    Limits belong to the database: what 'webots-mcp prune' or 'retention' has set,
     or another server that runs, holds on, and is said.
     A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
     commas between, or all, which keeps everything. 'webots-mcp prune --dry-run' with the same

@@ -596,7 +596,7 @@ def header(
 def completion(
     shell: Annotated[
         Literal["bash", "zsh", "fish", "powershell"] | None,
-        Parameter("SHELL", help="Else the one that this is typed in."),
+        Parameter("SHELL", help="Shell to complete in. Default: the one that runs this command."),
     ] = None,
     /,
     *,
@@ -604,38 +604,49 @@ def completion(
         bool,
         Parameter(
             "--install",
-            help="Write it where the shell looks, with a line in its start-up file that loads it.",
+            negative=(),
+            help="Write the script where the shell looks for it, and load it in its start-up file.",
         ),
     ] = False,
+    values: Annotated[
+        Literal["robots", "runs", "signals", "kinds"] | None,
+        Parameter("--values", help="List these names of the recording, one per line."),
+    ] = None,
     as_json: Json = False,
+    recorded: Where = HERE,
 ) -> None:
-    """Print the script by which a shell completes commands, options and files at the Tab key.
+    """Print the script that completes commands, options, files and recorded names at the Tab key.
 
     For one session:
 
         source <(webots-mcp completion bash)
 
-    With --install for all that are begun from then on. After an update of webots-mcp write it
-    again.
+    `--install` does it for all later sessions. Install it again after an update of webots-mcp.
+    Names of robots, runs, signals and kinds of events are completed in bash and fish.
     """
     from cyclopts.completion import detect_shell
     from cyclopts.completion.detect import ShellDetectionError
 
     from webots_mcp.cli import app_for
+    from webots_mcp.cli.completing import values_of, with_values
 
+    if values is not None:
+        names = values_of(values, recorded.recording())
+        return print_json(names) if as_json else print(*map(printable, names), sep="\n")
     try:
         shell = shell or detect_shell()
     except ShellDetectionError as error:
-        raise InvalidInputError("which shell this is cannot be told: name it") from error
+        raise InvalidInputError("The shell is not known. Name it: bash, zsh or fish.") from error
     if shell == "powershell" and sys.version_info < (3, 11):  # cyclopts 4 knows none
         raise InvalidInputError("the script for PowerShell needs Python 3.11 or newer")
-    app = app_for([])
+    app = app_for([], shows_all=True)
     if install:
         file = app.install_completion(shell=shell, add_to_startup=shell != "fish")
+        file.write_text(with_values(file.read_text("utf-8"), shell), "utf-8", newline="\n")
         if as_json:
             return print_json({"shell": shell, "file": str(file)})
-        return print(f"written: {file}; begin a new {shell} to use it")
-    script = app.generate_completion(shell=shell)
+        return print(f"{file} written. Start a new {shell} to use it.")
+    script = with_values(app.generate_completion(shell=shell), shell)
     if as_json:
         return print_json({"shell": shell, "script": script})
     print(script)

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from webots_mcp.questions.declaring import Question
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.steering.trial_run import Simulators
-    from webots_mcp.store.parameters import TrialRecord, TrialResult
     from webots_mcp.store.recording import RecordingAccess
+    from webots_mcp.store.trial_sets import TrialRecord, TrialResult
 
 _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
@@ -71,13 +71,34 @@ def step(
     _control("step", asked, as_json=json, steps=steps)
 
 
+def fast(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Let the simulation run as fast as it can."""
+    _control("fast", asked, as_json=json)
+
+
+def reset(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Reset the simulation to its first state; a new run begins at time 0.
+
+    Controllers keep running with the code they have. `webots-mcp reload` restarts them.
+    """
+    _control("reset", asked, as_json=json)
+
+
+def reload(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Reload the world and restart its controllers with their code as it is now.
+
+    An extern controller ends and must be started by hand.
+    """
+    _control("reload", asked, as_json=json)
+
+
 def _control(command: str, asked: ToWebots, *, as_json: bool, **given: Any) -> None:
     from webots_mcp.questions.control_simulation import webots_simulation_control
 
     _show(webots_simulation_control, asked, as_json=as_json, command=command, **given)
 
 
-def keep(
+def capture(
     reason: Annotated[str, Parameter("REASON", help="Why, as it is shown with the stretch.")],
     /,
     *,
@@ -110,7 +131,10 @@ def parameters(
 
         webots-mcp parameters kp=3.5 gait=trot
     """
-    from webots_mcp.questions.parameters import webots_get_parameters, webots_set_parameters
+    from webots_mcp.questions.controller_parameters import (
+        webots_get_parameters,
+        webots_set_parameters,
+    )
 
     if from_reset and not settings:
         raise InvalidInputError("--from-reset needs what is set then: NAME=VALUE")
@@ -220,17 +244,17 @@ def breakpoint_(
 
     It is asked of every published state, stored, and armed again after a reset or reload.
     """
-    from webots_mcp.questions import breakpoints
+    from webots_mcp.questions import set_breakpoints
 
     if condition is not None and breakpoint_id is not None:
         raise InvalidInputError("give a condition to set, or --remove ID, not both")
     if breakpoint_id is not None:
-        remove = breakpoints.webots_remove_breakpoint
+        remove = set_breakpoints.webots_remove_breakpoint
         return _show(remove, asked, as_json=json, breakpoint_id=breakpoint_id)
     if condition is None:
-        return _show(breakpoints.webots_list_breakpoints, asked, as_json=json)
+        return _show(set_breakpoints.webots_list_breakpoints, asked, as_json=json)
     given = {"condition": condition, "action": action, "after_hits": after_hits}
-    _show(breakpoints.webots_breakpoint, asked, as_json=json, **given)
+    _show(set_breakpoints.webots_breakpoint, asked, as_json=json, **given)
 
 
 def field(
@@ -285,7 +309,7 @@ def _has(question: Question, argument: str) -> bool:
     return any(each.name == argument for each in question.parameters)
 
 
-def requests(
+def audit(
     *,
     number: Annotated[Count, Parameter("-n", metavar="N", help="The newest N (20).")] = 20,
     refused: Annotated[
@@ -463,7 +487,7 @@ def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManage
 
 @contextmanager
 def _cluster(options: TrialOptions, plan: WorldPlan) -> Generator[Simulators]:
-    from webots_mcp.extras.plugins import cluster_offered, load
+    from webots_mcp.extras.plugin_registry import cluster_offered, load
 
     with load(cluster_offered())(
         options.scheduler,
@@ -497,7 +521,7 @@ def _picture_of(file: Path | None) -> Callable[[RecordingAccess, int], None] | N
 
 def _set_of(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) -> int:
     """Return the set that was begun with this plan, or a new one."""
-    from webots_mcp.store.parameters import create_trial_set, find_trial_set
+    from webots_mcp.store.trial_sets import create_trial_set, find_trial_set
 
     text = _text_of(plan, options)
     with recording.writer() as connection:
@@ -513,7 +537,7 @@ def _begun_set(
     Raises:
         NothingRecordedError: There is none.
     """
-    from webots_mcp.store.parameters import find_trial_set
+    from webots_mcp.store.trial_sets import find_trial_set
 
     with recording.reader() as connection:
         known = find_trial_set(connection, _text_of(plan, options))
@@ -531,7 +555,7 @@ class _TrialProgress:
     """A line on stderr for each trial that is over, and for each set that takes the lead."""
 
     def __init__(self, recording: RecordingAccess, set_id: int, plan: WorldPlan) -> None:
-        from webots_mcp.store.parameters import trials_of
+        from webots_mcp.store.trial_sets import trials_of
 
         with recording.reader() as connection:
             known = trials_of(connection, set_id)
@@ -561,7 +585,7 @@ class _TrialProgress:
             self._ranked_s = time.monotonic()
 
     def _tell_leader(self) -> None:
-        from webots_mcp.store.parameters import ranking_of, trials_of
+        from webots_mcp.store.trial_sets import ranking_of, trials_of
 
         with self._recording.reader() as connection:
             first = ranking_of(trials_of(connection, self._set_id), self._plan.best).sets[0]
@@ -576,7 +600,7 @@ def _show_trials(
 ) -> None:
     from webots_mcp.judging.divergence import repeats_noted
     from webots_mcp.judging.run_score import unseen
-    from webots_mcp.store.parameters import ranking_of, trials_of
+    from webots_mcp.store.trial_sets import ranking_of, trials_of
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)

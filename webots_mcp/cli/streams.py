@@ -83,6 +83,12 @@ def wait(seconds: float) -> None:
         raise BrokenPipeError
 
 
+def write_styled(stream: TextIO, line: str) -> None:
+    """Write a line whose parts are spelled out already, with the colours that it has."""
+    raw = stream.stream if isinstance(stream, _SpelledOut) and "\x1b[" in line else stream
+    print(line, file=raw)
+
+
 def rewrite(stream: TextIO, text: str = "") -> None:
     """Put a text in the place of the line that stands there, on a terminal; elsewhere nothing."""
     if stream.isatty():

@@ -1,21 +1,25 @@
 """Answers as text in a terminal.
 
-Tables fit the terminal, by folding their cells; in a pipe each row is one line. Notes are wrapped
-and never cut.
+The first line answers. Tables fit the terminal: cells are folded, and columns that do not fit are
+left out, the least important first, and named below the table. In a pipe each row is one line and
+nothing is left out. Notes are wrapped and never cut. `--verbose` shows every column.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import sys
 import textwrap
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, Final, TextIO, cast
+from typing import Any, Final, NamedTuple, TextIO, cast
 
+from webots_mcp.cli.streams import write_styled
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.ages import age_in_words
@@ -43,6 +47,8 @@ class TextLayout:
         endless: Width where nobody reads: no line is folded.
         gap: Gap between columns.
         word: Length up to which no column folds a word, such as a time.
+        text: Minimum width of a column of texts.
+        cell_lines: Lines of a cell on a terminal; a longer text ends with an ellipsis there.
         seconds_up_to: Age up to which it is shown in seconds, to the hundredth.
     """
 
@@ -52,20 +58,81 @@ class TextLayout:
     endless: int = 100_000
     gap: int = 2
     word: int = 24
+    text: int = 16
+    cell_lines: int = 4
     seconds_up_to: float = 120.0
 
 
 _LAYOUT: Final = TextLayout()
+# Columns that a narrow table does without first, least important first; then those on the right.
+_LESS_IMPORTANT: Final = (
+    "sha256", "git_commit", "world", "controller", "route", "database", "began_by", "kind_of",
+    "own_ms", "step_wait_ms", "real_time_factor", "took_wall_s", "deviation", "pace", "command_id",
+    "actions", "runs", "row_count", "age_s", "more", "set_by", "source", "live", "first_id",
+    "arguments",
+)  # fmt: skip
+# Columns that stay as long as two columns fit.
+_MOST_IMPORTANT: Final = frozenset(
+    {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode"}
+)
+# Columns whose words have a colour, and the colours of those words.
+_COLOURED_COLUMNS: Final = frozenset({"outcome", "status", "level", "ended_by", "verdict"})
+_COLOURS: Final[Sequence[tuple[str, frozenset[str]]]] = (
+    ("green", frozenset({"done", "pass", "running", "ok", "finished"})),
+    ("bold red", frozenset({"fail", "failed", "lost", "error", "critical", "crashed", "wrong"})),
+    (
+        "yellow",
+        frozenset({"warn", "warning", "expired", "cancelled", "pruned", "not judged", "paused"}),
+    ),
+)
+
+
+class Display(NamedTuple):
+    """How answers are shown, as the global options say.
+
+    Attributes:
+        verbose: Show every column and every detail.
+        colour: Whether colour may be used where stdout is a terminal.
+    """
+
+    verbose: bool = False
+    colour: bool = True
+
+
+_USUAL: Final = Display()
+_display: ContextVar[Display] = ContextVar("display", default=_USUAL)
+
+
+def set_display(display: Display) -> None:
+    """Show the answers of this command in this way."""
+    _display.set(display)
+
+
+def is_verbose() -> bool:
+    """Return whether every detail was asked for."""
+    return _display.get().verbose
+
+
+def has_colour() -> bool:
+    """Return whether stdout is a terminal that shows colours, and nobody forbids them."""
+    if not _display.get().colour or os.environ.get("NO_COLOR") or not sys.stdout.isatty():
+        return False
+    return os.environ.get("TERM", "") not in ("", "dumb")
 
 
 def print_answer(answer: Mapping[str, Any]) -> None:
     """Print an answer on stdout, its notes last."""
-    for line in answer_lines(answer, width=terminal_width(sys.stdout)):
-        print(line)
+    colour = has_colour()
+    for line in answer_lines(answer, width=terminal_width(sys.stdout), colour=colour):
+        write_styled(sys.stdout, line)
 
 
 def answer_lines(
-    answer: Mapping[str, Any], *, width: int = _LAYOUT.paragraph, most_rows: int | None = None
+    answer: Mapping[str, Any],
+    *,
+    width: int = _LAYOUT.paragraph,
+    most_rows: int | None = None,
+    colour: bool = False,
 ) -> Iterator[str]:
     """Yield what an answer says in a sentence, whom and when it is about, then its parts.
 
@@ -73,15 +140,15 @@ def answer_lines(
         answer: As JSON knows it.
         width: Of the lines, characters.
         most_rows: Of tables; it is said how many more there are. None for all.
+        colour: Whether lines have the colour codes of a terminal.
     """
-    layout = _Layout(width, most_rows, is_of_command="outcome" in answer)
-    head = [
-        text.format(_head(name, answer[name])) for name, text in _HEAD.items() if name in answer
-    ]
+    layout = _Layout(width, most_rows, is_of_command="outcome" in answer, colour=colour)
     if summary := answer.get("summary"):
-        yield from textwrap.wrap(printable(str(summary)), width, subsequent_indent=_LAYOUT.indent)
-    if head:
-        yield from textwrap.wrap(", ".join(head), width, subsequent_indent=_LAYOUT.indent)
+        for line in textwrap.wrap(printable(str(summary)), width, subsequent_indent=_LAYOUT.indent):
+            yield _styled(line, "bold") if colour else line
+    if head := _head_of(answer):
+        for line in textwrap.wrap(", ".join(head), width, subsequent_indent=_LAYOUT.indent):
+            yield _styled(line, "dim") if colour else line
     apart = ("summary", *_HEAD, *_NOTES)
     yield from layout.members({k: v for k, v in answer.items() if k not in apart})
     for name in _NOTES:
@@ -91,11 +158,28 @@ def answer_lines(
             yield from note_lines(f"left out: {text}" if name == "left_out" else text, width)
 
 
-def _head(name: str, value: Any) -> str:
-    """Return a member of the header; an age of hours in the words of sentences."""
-    if name != "age_s" or not isinstance(value, (int, float)):
-        return text_of(value)
-    return f"{text_of(value)} s" if value < _LAYOUT.seconds_up_to else age_in_words(value)
+def _head_of(answer: Mapping[str, Any]) -> list[str]:
+    """Return the members of the header, as words.
+
+    An age of hours is in the words of sentences. It is left out where the status says it.
+    """
+    head: list[str] = []
+    for name, text in _HEAD.items():
+        value = answer.get(name)
+        if name not in answer or (name == "age_s" and " ago" in str(answer.get("status"))):
+            continue
+        if name == "age_s" and isinstance(value, (int, float)):
+            is_short = value < _LAYOUT.seconds_up_to
+            value = f"{text_of(value)} s" if is_short else age_in_words(value)
+        head.append(text.format(text_of(value)))
+    return head
+
+
+def _styled(line: str, style: str) -> str:
+    """Return a line in a style of rich, with the colour codes of a terminal."""
+    from rich.style import Style
+
+    return Style.parse(style).render(line)
 
 
 def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:
@@ -117,47 +201,126 @@ def print_notes(notes: Iterable[str], file: TextIO | None = None) -> None:
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print rows under their column names; columns that are empty throughout are left out."""
-    for line in table_lines(columns, rows, terminal_width(sys.stdout)):
-        print(line)
+    for line in table_lines(columns, rows, terminal_width(sys.stdout), colour=has_colour()):
+        write_styled(sys.stdout, line)
 
 
 def table_lines(
-    columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int = _LAYOUT.endless
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    width: int = _LAYOUT.endless,
+    *,
+    colour: bool = False,
 ) -> Iterator[str]:
-    """The lines of a table that is no wider than that many characters; what is longer is folded.
+    """Yield the lines of a table that is no wider than `width` characters.
 
-    Where not even the longest words of its columns fit beside each other, each row is a paragraph.
+    Longer cells are folded. Columns that do not fit are left out and named below the table; with
+    `--verbose` each row is a paragraph instead, which names every value.
     """
+    kept = [i for i in range(len(columns)) if any(row[i] is not None for row in rows)]
+    least = {i: _minimum_width(columns[i], [row[i] for row in rows]) for i in kept}
+    shown = _fitting_columns(columns, least, width)
+    if len(shown) < len(kept) and (is_verbose() or len(shown) < 2):
+        yield from (line for row in rows for line in _row_in_words(columns, row, width))
+        return
+    full = {i: max(len(columns[i]), *(len(text_of(row[i])) for row in rows), 1) for i in shown}
+    least = {i: least[i] for i in shown}
+    widths = _shared_out(width - _LAYOUT.gap * len(shown), least, full)
+    yield from _drawn(columns, rows, widths, is_cut=width < _LAYOUT.endless, colour=colour)
+    if omitted := [printable(columns[i]) for i in kept if i not in shown]:
+        names = ", ".join(omitted)
+        yield from textwrap.wrap(
+            f"not shown: {names} (--verbose shows all)", width, subsequent_indent=_LAYOUT.indent
+        )
+
+
+def _minimum_width(header: str, values: Sequence[Any]) -> int:
+    """Return the width below which a column cannot be read.
+
+    That is its longest word, and a few words of a text.
+    """
+    texts = [text_of(value) for value in values]
+    words = [word for text in texts for word in text.split()]
+    parts = printable(header).replace("_", "_ ").split()
+    of_a_text = min(max(map(len, texts), default=0), _LAYOUT.text)
+    return max(_longest([*parts, *words]), of_a_text)
+
+
+def _fitting_columns(columns: Sequence[str], least: Mapping[int, int], width: int) -> list[int]:
+    """Return the columns that fit, without the least important ones."""
+    order = {name: place for place, name in enumerate(_LESS_IMPORTANT)}
+
+    def importance(index: int) -> tuple[int, int]:
+        name = columns[index]
+        if name in order:
+            return 0, order[name]
+        is_extra = name.startswith("@")  # values of other signals at the time of an event
+        return (1 if is_extra else 3 if name in _MOST_IMPORTANT else 2), -index
+
+    shown = sorted(least)
+    for index in sorted(least, key=importance):
+        if sum(least[i] + _LAYOUT.gap for i in shown) <= width + _LAYOUT.gap:
+            break
+        shown.remove(index)
+    return shown
+
+
+def _drawn(
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    widths: Mapping[int, int],
+    *,
+    is_cut: bool,
+    colour: bool,
+) -> Iterator[str]:
+    """Yield the lines of a table with columns of these widths."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    kept = [i for i in range(len(columns)) if any(row[i] is not None for row in rows)]
-    headers = {index: printable(columns[index]) for index in kept}
-    words = {i: [word for row in rows for word in text_of(row[i]).split()] for i in kept}
-    if sum(_longest([headers[i], *words[i]]) + _LAYOUT.gap for i in kept) > width:
-        headers = {index: header.replace("_", "_\n") for index, header in headers.items()}
-    least = {i: _longest([*headers[i].split(), *words[i]]) for i in kept}
-    full = {i: max(len(headers[i]), *(len(text_of(row[i])) for row in rows), 1) for i in kept}
-    if sum(least.values()) + _LAYOUT.gap * len(kept) > width:
-        return (line for row in rows for line in _row_in_words(columns, row, width))
-    widths = _shared_out(width - _LAYOUT.gap * len(kept), least, full)
     table = Table(box=None, pad_edge=False, padding=(0, _LAYOUT.gap, 0, 0), show_edge=False)
-    for index in kept:
+    if colour:
+        table.header_style = "dim"
+    for index, width in widths.items():
         numbers = all(isinstance(row[index], (int, float, type(None))) for row in rows)
+        header = printable(columns[index])
         table.add_column(
-            Text(headers[index]),
+            Text(header if len(header) <= width else header.replace("_", "_\n")),
             justify="right" if numbers else "left",
             overflow="fold",
-            width=widths[index],
+            width=width,
         )
     for row in rows:
-        table.add_row(*(Text(text_of(row[index])) for index in kept))
-    wide = sum(widths.values()) + _LAYOUT.gap * len(kept)
-    console = Console(width=wide, color_system=None, highlight=False, markup=False, emoji=False)
+        cells = {index: text_of(row[index]) for index in widths}
+        if is_cut and not is_verbose():
+            cells = {index: _cut(cell, widths[index]) for index, cell in cells.items()}
+        table.add_row(
+            *(Text(cell, style=_colour_of(columns[i], cell)) for i, cell in cells.items())
+        )
+    console = Console(
+        width=sum(widths.values()) + _LAYOUT.gap * len(widths),
+        force_terminal=colour,
+        color_system="standard" if colour else None,
+        no_color=not colour,
+        highlight=False,
+        markup=False,
+        emoji=False,
+    )
     with console.capture() as captured:
         console.print(table)
-    return (line.rstrip() for line in captured.get().splitlines())
+    yield from (line.rstrip() for line in captured.get().splitlines())
+
+
+def _cut(text: str, width: int) -> str:
+    """Return a text that takes a few lines of a cell, with an ellipsis where some is left out."""
+    most = width * _LAYOUT.cell_lines
+    return text if len(text) <= most else textwrap.shorten(text, most - 2, placeholder=" ...")
+
+
+def _colour_of(column: str, cell: str) -> str:
+    if column not in _COLOURED_COLUMNS:
+        return ""
+    return next((colour for colour, words in _COLOURS if cell in words), "")
 
 
 def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> list[str]:
@@ -176,13 +339,13 @@ def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> lis
     )
 
 
-def _shared_out(room: int, least: Mapping[int, int], full: Mapping[int, int]) -> dict[int, int]:
+def _shared_out(space: int, least: Mapping[int, int], full: Mapping[int, int]) -> dict[int, int]:
     """Return the width of each column: what its words need, and a share of what is left.
 
     Those that want little more come first.
     """
     widths = dict(least)
-    spare = max(room - sum(least.values()), 0)
+    spare = max(space - sum(least.values()), 0)
     wanting = sorted(full, key=lambda index: full[index] - least[index])
     for number, index in enumerate(wanting):
         more = min(full[index] - least[index], spare // (len(wanting) - number))
@@ -249,8 +412,11 @@ def _number_text(value: float) -> str:
 class _Layout:
     """How the parts of an answer stand below each other."""
 
-    def __init__(self, width: int, most_rows: int | None, *, is_of_command: bool) -> None:
+    def __init__(
+        self, width: int, most_rows: int | None, *, is_of_command: bool, colour: bool
+    ) -> None:
         self._width = width
+        self._colour = colour
         self._paragraph = min(width, _LAYOUT.paragraph)
         self._most_rows = most_rows
         self._is_of_command = is_of_command
@@ -311,7 +477,10 @@ class _Layout:
         if shared:
             yield from self._wrapped(f"{name} {text_of(value)}" for name, value in shared.items())
         yield from table_lines(
-            table["columns"], rows[: self._most_rows], self._width - len(_LAYOUT.indent)
+            table["columns"],
+            rows[: self._most_rows],
+            self._width - len(_LAYOUT.indent),
+            colour=self._colour,
         )
         if self._most_rows is not None and len(rows) > self._most_rows:
             yield f"... and {len(rows) - self._most_rows} more"

@@ -22,13 +22,14 @@ _OTHERS: Final = {  # by tool: those that are answered by a command of another n
     "list_signals": "signals", "describe_signals": "signals --describe",
     "list_meanings": "signals --meanings", "get_field": "field", "diagnose_setup": "doctor",
     "plot": "plot", "report": "report",
-    "simulation_control": "send", "world_reset": "send reset",
+    "simulation_control": "send", "world_reset": "reset", "world_reload": "reload",
+    "launch_world": "launch", "list_robots": "status", "get_world_info": "status --verbose",
+    "get_camera": "camera", "take_screenshot": "screenshot", "check_run": "check",
 }  # fmt: skip
 _FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
     "start the server with --data-dir or --database": "give --data-dir or --database",
     "the resource webots://schema": "'.schema' in the sqlite3 shell",
 }
-_TOOL: Final = re.compile(r"webots_(?P<tool>\w+)(?:\(\w+=(?P<id>\d+)\))?")
 _running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 
 
@@ -75,7 +76,7 @@ def as_typed(text: str) -> str:
 def _text_as_typed(text: str) -> str:
     for of_a_client, of_a_person in _FOR_A_CLIENT.items():
         text = text.replace(of_a_client, of_a_person)
-    text = _TOOL.sub(_command_for, text)
+    text = re.sub(r"webots_(?P<tool>\w+)(?:\(\w+=(?P<id>\d+)\))?", _command_for, text)
     typed = {each.name: each.typed for each in _running.get()}
     for each in _running.get():
         shown = f"{each.typed} {each.value_name}" if each.typed.startswith("-") else each.typed

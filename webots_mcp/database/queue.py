@@ -199,8 +199,8 @@ class CommandQueue:
         command = QueuedCommand(*self._connection.execute(_BY_KEY, (key,)).fetchone())
         if any(getattr(command, name) != values[name] for name in ("robot_id", "action", "params")):
             raise InvalidInputError(
-                f"idempotency key {key!r} already belongs to command {command.id} "
-                f"({command.action!r}); use another key"
+                f"The idempotency key {key!r} already belongs to command {command.id} "
+                f"({command.action!r}). Use another key."
             )
         return command
 
@@ -235,7 +235,9 @@ def fetch_command(connection: sqlite3.Connection, command_id: int) -> QueuedComm
     """
     row = connection.execute(_BY_ID, (command_id,)).fetchone()
     if row is None:
-        raise InvalidInputError(f"no command {command_id}; webots_list_commands lists them")
+        raise InvalidInputError(
+            f"There is no command {command_id}. webots_list_commands lists the commands."
+        )
     return QueuedCommand(*row)
 
 
@@ -265,15 +267,17 @@ def _encode_params(params: Mapping[str, Any]) -> str:
         text = json.dumps(dict(params), allow_nan=False, ensure_ascii=False, sort_keys=True)
     except ValueError as error:
         raise InvalidInputError(
-            f"params hold NaN or an infinity ({params!r:.200}), which are no numbers of JSON: give "
-            "finite numbers, or null"
+            f"params contain NaN or infinity, which JSON cannot hold: {params!r:.200}. Send finite "
+            "numbers or null."
         ) from error
     except TypeError as error:
-        raise InvalidInputError(f"params are not plain JSON: {error}") from error
+        raise InvalidInputError(
+            f"params are not plain JSON: {error}. Send numbers, texts, lists and objects."
+        ) from error
     if (size := len(text.encode())) > MAX_PARAMS_BYTES:
         raise InvalidInputError(
-            f"params are {size} bytes of JSON, at most {MAX_PARAMS_BYTES} are taken; "
-            "write a file and pass its path"
+            f"params are {size:,} bytes of JSON; the limit is {MAX_PARAMS_BYTES:,}. Write the data "
+            "to a file and send its path."
         )
     return text
 

@@ -110,7 +110,8 @@ def set_breakpoint(
             return int(like[0])
         if connection.execute(_COUNT, (robot_id,)).fetchone()[0] >= MAX_BREAKPOINTS:
             raise InvalidInputError(
-                f"this robot has {MAX_BREAKPOINTS} breakpoints: remove one first"
+                f"This robot has {MAX_BREAKPOINTS} breakpoints, the maximum. Remove one with "
+                "webots_remove_breakpoint first."
             )
         values = (robot_id, None, *asked, time.time(), created_by, None, None, None)
         return int(connection.execute(SET, values).fetchall()[0][0])
@@ -129,10 +130,10 @@ def remove_breakpoint(connection: sqlite3.Connection, robot_id: int, breakpoint_
     there = [str(number) for (number,) in connection.execute(_IDS, (robot_id,)).fetchall()]
     if str(breakpoint_id) in there:
         raise InvalidInputError(
-            f"breakpoint {breakpoint_id} is an expectation of {PROJECT_FILE}: change it there"
+            f"Breakpoint {breakpoint_id} is an expectation in {PROJECT_FILE}. Remove it there."
         )
-    known = f"there are {', '.join(there)}" if there else "it has none"
-    raise InvalidInputError(f"this robot has no breakpoint {breakpoint_id}; {known}")
+    known = f"Its breakpoints are {', '.join(there)}." if there else "It has no breakpoints."
+    raise InvalidInputError(f"This robot has no breakpoint {breakpoint_id}. {known}")
 
 
 def newest_hit(

@@ -41,16 +41,17 @@ from webots_mcp.judging.run_sampling import SampledRun, shared_interval_s
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import listed
 from webots_mcp.signals.parameter import Value
-from webots_mcp.store.parameters import differing, parameters_of, scored_runs
 from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, in_one_snapshot
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.robots import resolve_robot
+from webots_mcp.store.run_parameters import differing, parameters_of
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_infos
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.trial_sets import scored_runs
 
 # -- how a signal differs between groups of runs ---------------------------------------------------
 

@@ -21,13 +21,14 @@ from webots_mcp.judging.run_measures import OUT_OF_TIME
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import METRES, Value, counted, listed
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, Decoded, Replaced
-from webots_mcp.store.parameters import parameters_of, scored_runs
 from webots_mcp.store.reading.catalogue import held_by, resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot, just_after
+from webots_mcp.store.registered_signals import RegisteredSignal
+from webots_mcp.store.run_parameters import parameters_of
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.trial_sets import scored_runs
 
 _MATTERS: Final = 0.001  # of metres, of radians, of the largest value where there is no scale
 _SHORT_ROWS: Final = 2  # between the last row and the time up to which rows are compared

@@ -34,8 +34,8 @@ from webots_mcp.store.reading.frame_summary import MOST_VALUES, change_points, s
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.reading.unread import Unread
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.runs import RunInfo
-from webots_mcp.store.signals import RegisteredSignal
 
 MOST_SEARCHED: Final = 10  # newest runs of each group in which events are searched
 _SHARE: Final = "share of "

@@ -19,7 +19,7 @@ from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.store.chunks import Statistics
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_summary import FULL_ROWS, summary_of
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _FEW_UNEVEN: Final = 1e-3  # of the rows of a long run: so few hardly move a mean
 _SAME_INTERVAL: Final = 0.01  # of the interval

@@ -18,9 +18,9 @@ from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import TimeRange, unrecorded, whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject, full_rate_parts, in_one_snapshot
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import run_info
-from webots_mcp.store.signals import RegisteredSignal
 
 SCORE_DEADLINE_S: Final = 60.0
 _STORED: Final = (

@@ -56,8 +56,8 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     shown_time,
 )
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.series import STATES_SHARE, TURNS_COUNTED, WEIGHTED, signals_left
-from webots_mcp.store.signals import RegisteredSignal
 
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
 

@@ -30,14 +30,6 @@ TEXT_PX: Final = 11.0  # the size of usual letters
 _LONGEST_NAME: Final = 24
 _CELL_PX: Final = 24
 _SHOWN_TEXTS: Final = 3
-_HATCHES: Final = (
-    '<defs><pattern id="hatch-gap" width="6" height="6" patternUnits="userSpaceOnUse">'
-    '<path d="M-1 7L7-1M-1 1L1-1M5 7L7 5" stroke="#A0A0A0" stroke-width=".8"/></pattern>'
-    '<pattern id="hatch-unread" width="7" height="7" patternUnits="userSpaceOnUse">'
-    f'<path d="M0 0L7 7M0 7L7 0" stroke="{LINES[1]}" stroke-opacity=".6" stroke-width=".8"/>'
-    '</pattern><pattern id="hatch-dots" width="6" height="6" patternUnits="userSpaceOnUse">'
-    '<circle cx="3" cy="3" r="1" fill="#333333"/></pattern></defs>'
-)
 ImageFormat = Literal["png", "svg"]
 
 
@@ -185,10 +177,19 @@ class Canvas:
         families = "DejaVu Sans, Segoe UI, Helvetica Neue, Arial, Liberation Sans, Aileron"
         families += ", sans-serif"
         ground = f'<rect width="100%" height="100%" fill="{self.theme.ground}"/>'
+        hatches = (
+            '<defs><pattern id="hatch-gap" width="6" height="6" patternUnits="userSpaceOnUse">'
+            '<path d="M-1 7L7-1M-1 1L1-1M5 7L7 5" stroke="#A0A0A0" stroke-width=".8"/></pattern>'
+            '<pattern id="hatch-unread" width="7" height="7" patternUnits="userSpaceOnUse"><path '
+            f'd="M0 0L7 7M0 7L7 0" stroke="{LINES[1]}" stroke-opacity=".6" stroke-width=".8"/>'
+            '</pattern><pattern id="hatch-dots" width="6" height="6" '
+            'patternUnits="userSpaceOnUse"><circle cx="3" cy="3" r="1" '
+            'fill="#333333"/></pattern></defs>'
+        )
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
             f'viewBox="0 0 {width} {height}" font-family="{families}">'
-            f"{_HATCHES}{ground}{''.join(self._parts)}</svg>"
+            f"{hatches}{ground}{''.join(self._parts)}</svg>"
         )
 
     def picture(self, image_format: ImageFormat, caption: str, notes: Sequence[str]) -> PlotImage:

@@ -19,13 +19,13 @@ from webots_mcp.judging.verdicts import Verdicts, cause_of
 from webots_mcp.plotting.canvas import short
 from webots_mcp.plotting.colours import EVENT_COLOURS
 from webots_mcp.plotting.intervals import Interval, Lane
-from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.reading.catalogue import one_signal, signals_of
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
+from webots_mcp.store.registered_signals import RegisteredSignal
+from webots_mcp.store.run_parameters import differing, parameters_of
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.series import MOST_POINTS, History, RunHistory, query_history
-from webots_mcp.store.signals import RegisteredSignal
 
 Known = dict[str, RegisteredSignal]
 MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze

@@ -18,7 +18,7 @@ from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.plotting.plotted_runs import PlottedRun
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.segment import Deadline
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 
 @dataclass(frozen=True)

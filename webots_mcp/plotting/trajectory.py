@@ -57,7 +57,7 @@ from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _SHAPES: Final = ("circle", "cross", "plus", "triangle", "star")  # the first is around the others
 

@@ -32,7 +32,7 @@ from webots_mcp.plotting.painting import (
 )
 from webots_mcp.plotting.signal_plot import line_through
 from webots_mcp.signals.naming import listed, nearest_first
-from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, trials_of
+from webots_mcp.store.trial_sets import TrialRecord, best_of, fetch_trial_set, trials_of
 
 _BELOW_PX: Final = 42.0
 _RING: Final[dict[str, Any]] = {"fill": "none", "stroke": LINES[1], "stroke_width": 2.4}

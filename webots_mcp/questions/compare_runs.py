@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
+from webots_mcp.answers.answer_models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     LONGEST_NAME,
@@ -29,7 +30,6 @@ from webots_mcp.answers.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.answers.models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
@@ -60,10 +60,10 @@ from webots_mcp.questions.arguments import (
 from webots_mcp.questions.declaring import READS, SETS, question
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.signals.naming import listed
-from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
+from webots_mcp.store.trial_sets import scored_runs
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
@@ -82,7 +82,11 @@ DIFFERENCE_COLUMNS: Final = (
     "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
     "interval", "deviation_different", "deviation_interval", "min", "max",
 )  # fmt: skip
-CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
+PARTED_COLUMNS: Final = (
+    "signal", "unit", "start_s", "values", "by", "largest", "largest_at_s", "tolerance", "beyond_s",
+    "row_count",
+)  # fmt: skip
+CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "start_s", "count", "more")
 _GOING_ON: Final = "going on"
 _LEGEND: Final = {  # what columns of a comparison mean, where their names do not say it
     "range": "range, mean_range: minimum and maximum over the runs of a group",
@@ -248,7 +252,7 @@ def _first_run(recording: RecordingAccess, set_id: int) -> int:
 @question(
     "Annotate a run",
     SETS,
-    command="label",
+    command="annotate",
     positional=("run_id", "label"),
     options={"run_id": "RUN", "label": "TEXT"},
     example="4 baseline --note 'before the new gait'",
@@ -352,13 +356,13 @@ def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     left, worst = len(found.parted) - len(rows), found.worst
     return {
         "verdict": cut_for_a_model(found.verdict, _SIZES.verdict_characters),
-        "unlike": known or None,
+        "different_before": known or None,
         "compared": {"row_count": found.rows, "signal_count": found.signals,
-                     "from_s": seconds(found.from_s), "until_s": seconds(found.until_s)},
-        "parted": without_empty(("signal", *names), rows),
+                     "start_s": seconds(found.from_s), "end_s": seconds(found.until_s)},
+        "diverging": without_empty(PARTED_COLUMNS, rows),
         "growth": worst and {"signal": short_name(worst.signal), **worst.growth},
         "notes": notes,
-        "hint": f"{left} more signals part: limit or signals for others" if left else None,
+        "hint": f"{left} more signals diverge: limit or signals for others" if left else None,
     }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import anyio
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp.answers.models import CommandAnswer, RunAnswer
+from webots_mcp.answers.answer_models import CommandAnswer, RunAnswer
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
@@ -263,7 +263,7 @@ def _answer(
         **header,
         action="launch",
         outcome="done" if first else "claimed",
-        waited_s=round(time.monotonic() - started_s, 3),
+        waited_wall_s=round(time.monotonic() - started_s, 3),
         result=_described(launched),
         route="process",
         evidence=f"{first.robot} records: run {first.run_id}" if first else None,

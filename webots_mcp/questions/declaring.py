@@ -31,7 +31,7 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
-from webots_mcp.answers.models import Answer, ShownPicture
+from webots_mcp.answers.answer_models import Answer, ShownPicture
 from webots_mcp.answers.shortening import Client, compact_json, reader
 from webots_mcp.answers.summaries import summary_of
 from webots_mcp.errors import (

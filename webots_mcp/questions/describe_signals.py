@@ -7,8 +7,8 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import SignalMeaningsAnswer
 from webots_mcp.answers.budget import fitting, short_name, some, without_empty
-from webots_mcp.answers.models import SignalMeaningsAnswer
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import LONGEST_NAME, AnyNames, RobotName
 from webots_mcp.questions.declaring import CHANGES, READS, question
@@ -23,7 +23,7 @@ from webots_mcp.signals.meaning import (
 from webots_mcp.store.meanings import meanings_of, set_meanings, undo_meanings
 from webots_mcp.store.reading.catalogue import catalogue, resolve_signals
 from webots_mcp.store.recording import RecordingAccess, RobotView
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 MEANING_COLUMNS: Final = (
     "signal", "quantity", "role", "unit", "side", "target_of", "same_as", "low", "high", "source",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     DiagnosisAnswer,
 )
 from webots_mcp.answers.shortening import (

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 from anyio import to_thread
 from pydantic import Field, WithJsonSchema
 
-from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Cursor, RobotName
@@ -30,10 +30,6 @@ _NO_SUPERVISOR: Final = (
     "No live controller can read the scene of {}. Set the field 'supervisor' of a Robot node to "
     "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
     "by 'webots-mcp init --observer WORLD'."
-)
-_NONE_LIVE: Final = (
-    "No controller of {} is live (robot {!r}: {}). Start the simulation, then call again. "
-    "webots_get_world_info has what was recorded."
 )
 
 
@@ -199,7 +195,10 @@ def _find_supervisor(recording: RecordingAccess, robot: str | None) -> str:
             if meant and not any(each.live for each, _ in meant):
                 last, _ = max(meant, key=lambda pair: pair[1].last_seen_wall_time_s)
                 why = view_robot(connection, last.name).status.why
-                raise CommandRefusedError(_NONE_LIVE.format(where, last.name, why))
+                raise CommandRefusedError(
+                    f"No controller of {where} is live (robot {last.name!r}: {why}). Start the "
+                    "simulation, then call again. webots_get_world_info has what was recorded."
+                )
             view_robot(
                 connection, robot
             )  # raises where nothing is recorded, and says how to record

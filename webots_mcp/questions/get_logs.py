@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import AnswerTable, LogsAnswer
 from webots_mcp.answers.budget import fitting
-from webots_mcp.answers.models import AnswerTable, LogsAnswer
 from webots_mcp.answers.shortening import cut_text, is_for_a_person
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
@@ -33,13 +33,7 @@ from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.robots import list_robots
 
-_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
-_FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
 _ANY_LINE: Final = LogFilter(None, LogWindow(-math.inf, math.inf), "", "debug")
-_BELOW_LEVEL: Final = (
-    "no robot has recorded yet, and no line of Webots' console has the level {} or above: these "
-    "have a lower one"
-)
 _NO_RUN_YET: Final = (
     "lines without a run_id came from Webots' console before a run began: a controller that never "
     "began one may have failed there"
@@ -105,8 +99,12 @@ def webots_get_logs(
             # What a controller prints as it fails has no level of its own.
             any_level = replace(asked, lowest_level=_ANY_LINE.lowest_level)
             shown = waiting or waiting_lines(connection, any_level, lines)
+        below_level = (
+            "no robot has recorded yet, and no line of Webots' console has the level {} or "
+            "above: these have a lower one"
+        )
         hint = (
-            _BELOW_LEVEL.format(lowest)
+            below_level.format(lowest)
             if shown
             else (
                 "no robot has recorded yet, and no line of Webots' console matches: leave out the "
@@ -115,7 +113,7 @@ def webots_get_logs(
         )
         return LogsAnswer(
             lines=_table(_newest_fitting(shown), time_of_day=time_of_day) if shown else None,
-            matching=len(waiting),
+            total=len(waiting),
             hint=_NO_RUN_YET if waiting else hint,
         )
 
@@ -136,10 +134,16 @@ def _row(line: LogLine) -> dict[str, object]:
 
 
 def _table(lines: list[LogLine], *, time_of_day: bool) -> AnswerTable:
-    columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
+    columns: list[str] = [
+        *(
+            ("id", "sim_time_s", "level", "run_id", "message")
+            if is_for_a_person()
+            else ("sim_time_s", "level", "message", "run_id")
+        )
+    ]
     if time_of_day:
-        columns.insert(columns.index("sim_time_s") + 1, "time")
-    rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]
+        columns.insert(columns.index("sim_time_s") + 1, "wall_time")
+    rows = [_row(line) | {"wall_time": wall_clock(line.wall_time_s)} for line in lines]
     return AnswerTable(columns=columns, rows=[[row[name] for name in columns] for row in rows])
 
 
@@ -161,7 +165,7 @@ def _answer(
     return LogsAnswer(
         **view.header(),
         lines=_table(shown, time_of_day=time_of_day),
-        matching=matching,
+        total=matching,
         cursor=recorded[0].id if older and recorded else None,
         hint="; ".join(hint for hint in hints if hint) or None,
     )

@@ -9,6 +9,17 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    AnswerPart,
+    ChangeSeries,
+    HistoryAnswer,
+    NumberSeries,
+    RowColumns,
+    RunSeries,
+    RunTrendTables,
+    SignalsAnswer,
+    TrendsAnswer,
+)
 from webots_mcp.answers.budget import (
     answer_about,
     figure,
@@ -22,17 +33,6 @@ from webots_mcp.answers.budget import (
     shown,
     some,
     without_empty,
-)
-from webots_mcp.answers.models import (
-    AnswerPart,
-    ChangeSeries,
-    HistoryAnswer,
-    NumberSeries,
-    RowColumns,
-    RunSeries,
-    RunTrendTables,
-    SignalsAnswer,
-    TrendsAnswer,
 )
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.answers.budget import (
-    fitting,
-    room_tokens,
-)
-from webots_mcp.answers.models import (
+from webots_mcp.answers.answer_models import (
     AnswerTable,
     RobotsAnswer,
     WorldAnswer,
+)
+from webots_mcp.answers.budget import (
+    fitting,
+    room_tokens,
 )
 from webots_mcp.answers.shortening import (
     cut_for_a_model,
@@ -59,14 +59,15 @@ from webots_mcp.store.run_rows import (
 )
 from webots_mcp.store.sessions import SessionRecord, companions, fetch_session
 
-_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
-_PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
-_RECORDER_COLUMNS: Final = (
+BODY_COLUMNS: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
+PLACE_COLUMNS: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
+RECORDER_COLUMNS: Final = (
     "row_count", "why", "pace", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
 )  # fmt: skip
 BY_OBSERVER: Final = "the observer, from customData: it has no bridge and takes no commands"
-_ROBOT_COLUMNS: Final = (
-    "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
+ROBOT_COLUMNS: Final = (
+    "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "run_count",
+    "action_count",
 )  # fmt: skip
 
 
@@ -150,7 +151,7 @@ def webots_get_world_info(
             real_time_factor=_pace(view, run),
             supervisor=session.supervisor if session else None,
             run=_run(view, run),
-            runs_recorded=count_runs(view.connection, view.robot.id),
+            run_count=count_runs(view.connection, view.robot.id),
             controller=_controller(view, session),
             devices=_devices(view.robot.devices),
             other_robots=AnswerTable(columns=["robot", "kind", "pause_state"], rows=shown)
@@ -168,9 +169,9 @@ def webots_get_world_info(
 
 def _robots(views: list[RobotView], *, told: bool) -> AnswerTable:
     """Return a row for each robot; counts of losses only if there are any, or for a person."""
-    columns, rows = [*_ROBOT_COLUMNS], [_row(view) for view in views]
+    columns, rows = [*ROBOT_COLUMNS], [_row(view) for view in views]
     recorders = [_recorder(view) for view in views]
-    for name in _RECORDER_COLUMNS:
+    for name in RECORDER_COLUMNS:
         values = [recorder[name] for recorder in recorders]
         if any(values) and (told or name not in ("row_count", "why")):
             columns.append(name)
@@ -186,7 +187,7 @@ def _recorder(view: RobotView) -> dict[str, Any]:
     return {
         "row_count": view.run.row_count if view.run else 0,
         "why": view.header().get("why"),
-        "pace": view.run and pace_of(view.connection, "it", view.run.id),
+        "pace": view.run and pace_of(view.connection, view.robot.name, view.run.id),
         "waiting_in": None,
         **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped if session else 0,
@@ -200,9 +201,10 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
         return {}
     bodies = [*world.content.get("robots", ()), *world.content.get("solids", ())]
     shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
+    # as they differ
     used = [
         column
-        for column in (*_TOLD_IN_WORLD, *_PLACE)
+        for column in (*BODY_COLUMNS, *PLACE_COLUMNS)
         if any(body.get(column) is not None for body in shown)
     ]
     rows = fitting([_in_world(body, used) for body in shown], budget_tokens)
@@ -278,7 +280,7 @@ def _run(view: RobotView, run: RunRecord) -> dict[str, Any]:
     return {
         "id": run.id,
         "began_by": run.start_reason,
-        "began_ago_s": view.age_s(run.started_wall_time_s),
+        "began_ago_wall_s": view.age_s(run.started_wall_time_s),
         "sim_duration_s": round(run.last_sim_time_s - run.started_sim_time_s, 3),
         "row_count": run.row_count,
         **ended,

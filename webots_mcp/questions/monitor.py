@@ -14,6 +14,7 @@ from anyio import to_thread
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
+from webots_mcp.answers.answer_models import MonitorAnswer
 from webots_mcp.answers.budget import (
     answer_about,
     newest_runs,
@@ -21,7 +22,6 @@ from webots_mcp.answers.budget import (
     room_tokens,
 )
 from webots_mcp.answers.event_tables import fitting_events, not_shown_of, verdicts_of
-from webots_mcp.answers.models import MonitorAnswer
 from webots_mcp.answers.movement import movement
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.errors import InvalidInputError
@@ -142,7 +142,7 @@ def _report(view: RobotView, wall_start_s: float, window_s: float) -> MonitorAns
         view,
         MonitorAnswer,
         lambda: {
-            "window_s": round(window_s, 2),
+            "window_wall_s": round(window_s, 2),
             **_found(view.connection, view, wall_start_s),
         },
     )

@@ -14,8 +14,8 @@ from anyio import to_thread
 from anyio.lowlevel import RunVar
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import AnswerTable, SqlAnswer
 from webots_mcp.answers.budget import LONGEST_NAME, fitting, header_of_only, room_tokens
-from webots_mcp.answers.models import AnswerTable, SqlAnswer
 from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import ShownLimit
@@ -33,10 +33,6 @@ from webots_mcp.store.sql import (
     require_select,
 )
 
-_LESS: Final = (
-    "retention has deleted {} states (run.purged_rows), which no table or view of states has: "
-    "robot_statistics, webots_query_history and webots_get_trends have what chunks hold of them"
-)
 _turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
 
 
@@ -112,7 +108,11 @@ async def webots_query_sql(
     more = len(found.columns) > most_columns
     wide = f"only the first {_SIZES.columns} columns are shown" if more else None
     less = (
-        _LESS.format(deleted)
+        (
+            f"retention has deleted {deleted} states (run.purged_rows), which no table or view of "
+            "states has: robot_statistics, webots_query_history and webots_get_trends have what "
+            "chunks hold of them"
+        )
         if deleted
         and re.search(r"\b(state|all_state|robot_now|robot_trajectory)\b", sql, re.IGNORECASE)
         else None

@@ -11,18 +11,18 @@ from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    AnswerTable,
+    FullStateAnswer,
+    SensorsAnswer,
+    StateAnswer,
+)
 from webots_mcp.answers.budget import (
     ANSWER_TOKENS,
     LARGE_ANSWER_TOKENS,
     detailed,
     fitting,
     some,
-)
-from webots_mcp.answers.models import (
-    AnswerTable,
-    FullStateAnswer,
-    SensorsAnswer,
-    StateAnswer,
 )
 from webots_mcp.answers.shortening import (
     STATE_BUDGET_TOKENS,
@@ -322,7 +322,7 @@ def _events(view: RobotView) -> AnswerTable:
         for event in reversed(events)
     ]
     shown = fitting(rows, _SIZES.events_tokens)[::-1]
-    return AnswerTable(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
+    return AnswerTable(columns=["start_s", "kind", "name", "details"], rows=shown)
 
 
 def _health(view: RobotView) -> dict[str, Any] | None:
@@ -334,12 +334,12 @@ def _health(view: RobotView) -> dict[str, Any] | None:
         return None
     error = cut_text(session.last_error, _SIZES.error_characters) if session.last_error else None
     return {
-        "rows_recorded": view.run.row_count if view.run else 0,
+        "row_count": view.run.row_count if view.run else 0,
         **({"kept_at_full_rate": kept} if (kept := _kept(view)) else {}),
         **rows_waiting(view.connection, session),
         "rows_dropped": _dropped(view, session.rows_dropped),
         "last_error": error,
-        "heartbeat_age_s": round(session.silent_s(view.now_s), 2),
+        "heartbeat_age_wall_s": round(session.silent_s(view.now_s), 2),
         "polls_commands": session.last_poll_wall_time_s is not None,
         **({"recorded_by": BY_OBSERVER} if view.robot.kind == CUSTOM_DATA else {}),
         "controller": session.controller,

@@ -15,6 +15,7 @@ from anyio import to_thread
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
 from webots_mcp.analysis.summary import Best, Ranked, Ranking
+from webots_mcp.answers.answer_models import TrialsAnswer
 from webots_mcp.answers.budget import (
     condensed,
     figure,
@@ -24,7 +25,6 @@ from webots_mcp.answers.budget import (
     notes_of,
     shown,
 )
-from webots_mcp.answers.models import TrialsAnswer
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.contract import MAX_RUN_S
@@ -32,16 +32,20 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
+from webots_mcp.questions.controller_parameters import settable
 from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
-from webots_mcp.questions.parameters import settable
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.parameter import require_known
 from webots_mcp.steering.run_command import ACTION, known_names, require_possible
 from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
-from webots_mcp.store.parameters import (
-    Declared,
+from webots_mcp.store.reading.segment import in_one_snapshot
+from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
+from webots_mcp.store.requests import permit
+from webots_mcp.store.robots import robot_name
+from webots_mcp.store.run_parameters import Declared
+from webots_mcp.store.trial_sets import (
     TrialRecord,
     TrialSetRecord,
     best_of,
@@ -55,18 +59,9 @@ from webots_mcp.store.parameters import (
     stop_trial_set,
     trials_of,
 )
-from webots_mcp.store.reading.segment import in_one_snapshot
-from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
-from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import robot_name
 
 _Value = float | int | bool | str
 CANCELLED: Final = "it was cancelled"
-_IN_SIMULATORS: Final = (
-    "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
-)
-_FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
-_RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
 
 
 @dataclass(frozen=True)
@@ -291,7 +286,11 @@ def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, can
 
 def _goes_on(found: TrialSetRecord) -> str:
     """Return how to continue a set that no robot's simulation runs."""
-    return _IN_SIMULATORS if "world" in json.loads(found.plan) else _FROM_ELSEWHERE
+    return (
+        "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
+        if "world" in json.loads(found.plan)
+        else "came from another recording, and its robot did not: begin a new set"
+    )
 
 
 def _stop(recording: RecordingAccess, set_id: int, reason: str | None) -> None:
@@ -361,6 +360,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
     rows = fitting(_rows(ranking, trials), _SIZES.table_tokens)
     repeats = [] if state == "under way" else repeats_noted(connection, found.id)
     left_out = len(ranking.sets) - len(rows)
+    rank_lower = "that rank lower are not shown: webots_query_sql has all in table trial"
     return {
         "trial_set": found.id,
         "state": state,
@@ -375,7 +375,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
         "verdict": ranking.verdict if over else None,
         "notes": notes_of(
             [
-                *[f"{left_out} sets {_RANK_LOWER}"] * (left_out > 0),
+                *[f"{left_out} sets {rank_lower}"] * (left_out > 0),
                 *repeats,
                 *unseen(connection, (each.run_id for each in trials if each.score is not None)),
             ]

@@ -13,16 +13,16 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    CommandAnswer,
+    CommandsAnswer,
+)
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     condensed,
     fitting,
     seconds,
     short_name,
-)
-from webots_mcp.answers.models import (
-    CommandAnswer,
-    CommandsAnswer,
 )
 from webots_mcp.answers.shortening import cut_text, is_for_a_person, shorten, tokens_of
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
@@ -34,14 +34,10 @@ from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 COMMAND_COLUMNS: Final = (
-    "id", "action", "params", "outcome", "run_id", "sim_time_s", "asked_ago_s", "took_s", "result",
-    "error",
+    "id", "action", "params", "outcome", "run_id", "sim_time_s", "asked_ago_wall_s", "took_wall_s",
+    "result", "error",
 )  # fmt: skip
 _WAIT_S: Final = 10.0
-_MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
-    'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, 201, 200) '
-    "FROM session, json_each(actions) WHERE session.id = {} AND key = 'NAME'\") has more of one"
-)
 NO_BRIDGE: Final = "this robot has no bridge: it takes no commands, and has no parameters"
 
 
@@ -150,16 +146,14 @@ def webots_list_commands(
         return _answer(view, commands, limit)
 
 
-_RUN_OF: Final = (
-    "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s <= ? "
-    "ORDER BY started_wall_time_s DESC, id DESC LIMIT 1"
-)
-
-
 def _run_of(connection: sqlite3.Connection, command: QueuedCommand) -> int | None:
     """Return the run that went on when a command was claimed, else created."""
     at_s = command.claimed_wall_time_s or command.created_wall_time_s
-    found = connection.execute(_RUN_OF, (command.robot_id, at_s)).fetchone()
+    found = connection.execute(
+        "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s <= ? "
+        "ORDER BY started_wall_time_s DESC, id DESC LIMIT 1",
+        (command.robot_id, at_s),
+    ).fetchone()
     return found[0] if found else None
 
 
@@ -191,7 +185,19 @@ def _answer(view: RobotView, commands: list[QueuedCommand], limit: int) -> Comma
     has_bridge = view.session is None or view.session.has_bridge
     nothing = "no such command was sent to this robot yet" if has_bridge else NO_BRIDGE
     hints = [nothing] * (not commands)
-    hints += [_MORE_OF_ONE.format(view.session.id)] if view.session and shown != actions else []
+    # in pieces as long as one cell of an answer may be
+    hints += (
+        [
+            (
+                'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, '
+                "201, 200) "
+                f"FROM session, json_each(actions) WHERE session.id = {view.session.id} AND key = "
+                "'NAME'\") has more of one"
+            )
+        ]
+        if view.session and shown != actions
+        else []
+    )
     hints += [f"{len(shown)} of {len(actions)} actions are shown"] * (len(shown) < len(actions))
     return CommandsAnswer(
         **view.header(),

@@ -19,8 +19,6 @@ _WORDS: Final = (
     "bumper", "distance", "range", "radar", "sonar", "light", "altimeter", "camera", "odometry",
     "battery", "force", "contact", "scan",
 )  # fmt: skip
-_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
-_WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:
@@ -65,4 +63,4 @@ def _paths(value: Any, path: str = "") -> Iterator[str]:
 
 
 def _words(name: str) -> set[str]:
-    return set(_WORD.findall(_HUMP.sub(" ", name).lower()))
+    return set(re.findall(r"[^\W\d_]+|\d+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()))

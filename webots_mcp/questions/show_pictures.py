@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import CommandAnswer, RunAnswer, ShownPicture
 from webots_mcp.answers.budget import notes_of, seconds, some
-from webots_mcp.answers.models import CommandAnswer, RunAnswer, ShownPicture
 from webots_mcp.answers.shortening import compact_json
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
@@ -69,16 +69,6 @@ class PictureLimits:
 _LIMITS: Final = PictureLimits()
 
 
-_ONE_FRESH: Final = (
-    "fresh=true takes one picture now, so it excludes at_s, frames and run_id. Leave those out, or "
-    "leave fresh out to show recorded pictures."
-)
-_READ_ONLY: Final = (
-    "fresh=true needs a command to the controller, and a --read-only server sends none. Leave "
-    "fresh out to show recorded pictures."
-)
-
-
 @question("Get the camera picture", READS)
 async def webots_get_camera(
     recording: RecordingAccess,
@@ -107,7 +97,17 @@ async def webots_get_camera(
         past = partial(_show_recorded, recording, camera, at_s, frames, robot, run_id)
         return await to_thread.run_sync(past)
     if recording.read_only or at_s is not None or run_id is not None or frames != 1:
-        raise InvalidInputError(_READ_ONLY if recording.read_only else _ONE_FRESH)
+        raise InvalidInputError(
+            (
+                "fresh=true needs a command to the controller, and a --read-only server sends "
+                "none. Leave fresh out to show recorded pictures."
+            )
+            if recording.read_only
+            else (
+                "fresh=true takes one picture now, so it excludes at_s, frames and run_id. Leave "
+                "those out, or leave fresh out to show recorded pictures."
+            )
+        )
     dispatcher = Dispatcher(recording, caller.report)
     answer = await dispatcher.ask(robot, "take_frame", _LIMITS.wait_s, {"camera": camera})
     return await to_thread.run_sync(_show, recording, answer)
@@ -158,7 +158,7 @@ def _single(
     picture, note = _load_picture(image.file(recording.data_dir))
     return picture, {
         "picture_sim_time_s": seconds(image.sim_time_s),
-        "picture_age_s": view.age_s(image.wall_time_s),
+        "picture_age_wall_s": view.age_s(image.wall_time_s),
         "width_px": image.width,
         "height_px": image.height,
         "file": str(recording.data_dir / image.path),
@@ -254,9 +254,9 @@ def _show_frame(recording: RecordingAccess, answer: RunAnswer, why: str) -> None
     frame = None
     if ran.get("run_id") is not None:
         with recording.reader() as connection:
-            found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
+            found = camera_frames(connection, ran["run_id"], at_s=ran["end_s"])
         frame = next(
-            (each for each in found if abs(each.sim_time_s - ran["to_s"]) < _LIMITS.same_s), None
+            (each for each in found if abs(each.sim_time_s - ran["end_s"]) < _LIMITS.same_s), None
         )
     if frame is None:
         answer.picture = {"missing": why}

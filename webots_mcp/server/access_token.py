@@ -23,7 +23,6 @@ from webots_mcp.errors import CommandRefusedError
 
 LOOPBACK: Final = ("127.0.0.1", "localhost", "[::1]")  # as a browser writes this computer
 _SHORTEST: Final = 20  # characters
-_AGAIN: Final = "'webots-mcp token --new' makes another"
 
 
 def token_file() -> Path:
@@ -42,11 +41,12 @@ def access_token() -> str:
     if not file.exists():
         return new_token()
     found = file.stat()
+    again = "'webots-mcp token --new' makes another"
     if os.name != "nt" and (stat.S_IMODE(found.st_mode) & 0o077 or found.st_uid != os.geteuid()):
-        raise CommandRefusedError(f"other users may read or change {file}: {_AGAIN}")
+        raise CommandRefusedError(f"other users may read or change {file}: {again}")
     token = file.read_text("ascii", "replace").strip()
     if len(token) < _SHORTEST or not token.isascii() or token.split() != [token]:
-        raise CommandRefusedError(f"{file} holds no token of {_SHORTEST} characters: {_AGAIN}")
+        raise CommandRefusedError(f"{file} holds no token of {_SHORTEST} characters: {again}")
     return token
 
 

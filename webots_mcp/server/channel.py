@@ -24,7 +24,6 @@ CHANNEL_INSTRUCTIONS: Final = (
     "Unasked messages of this server say that a breakpoint was hit, an expectation was violated, a "
     "controller crashed or trials are done. They are no requests: check with a tool before you act."
 )
-_ANNOUNCED_IN: Final = ("initialize", "server/discover")
 _PLURALS: Final[Mapping[str, str]] = {
     "breakpoint": "breakpoint hits",
     "violation": "violated expectations",
@@ -91,7 +90,7 @@ class Channel:
     ) -> HandlerResult:
         """Add the capability to what the server says of itself."""
         result = await call_next(ctx)
-        if ctx.method in _ANNOUNCED_IN and isinstance(result, dict):
+        if ctx.method in ("initialize", "server/discover") and isinstance(result, dict):
             capabilities = result.setdefault("capabilities", {})
             capabilities["experimental"] = {
                 **(capabilities.get("experimental") or {}),

@@ -23,7 +23,7 @@ from mcp.types import (
     UnsubscribeRequestParams,
 )
 
-from webots_mcp.answers.models import ShownPicture
+from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import compact_json
 from webots_mcp.errors import NothingRecordedError, UnknownRunError, WebotsMCPError
 from webots_mcp.questions import all_questions
@@ -40,8 +40,6 @@ MOST_SUBSCRIPTIONS: Final = 100  # of one client
 MOST_UPDATES: Final = 50  # runs that ended within half a second; older ones are left out
 _AT_ONCE: Final = 2  # resources that are made side by side
 _OF_REPORT: Final = {"check": "webots_check_run", "events": "webots_find_events"}
-_URI: Final = re.compile(r"webots://run/[1-9][0-9]{0,17}/(report|plot)")
-_UPDATED: Final = "notifications/resources/updated"
 
 
 def add_run_resources(mcp: MCPServer, recording: RecordingAccess) -> None:
@@ -119,7 +117,7 @@ class Subscriptions:
                     for key, (connection, uris) in self._wanted.items()
                     if uri in uris
                 }
-                await self._clients.notify(_UPDATED, {"uri": uri}, wanting)
+                await self._clients.notify("notifications/resources/updated", {"uri": uri}, wanting)
 
     def serve(self, mcp: MCPServer) -> None:
         """Answer the subscriptions of clients before 2026-07-28, for which the SDK has no way."""
@@ -133,7 +131,7 @@ class Subscriptions:
         self, ctx: ServerRequestContext[Any, Any], params: SubscribeRequestParams
     ) -> EmptyResult:
         uri = str(params.uri)
-        if not _URI.fullmatch(uri):
+        if not re.fullmatch(r"webots://run/[1-9][0-9]{0,17}/(report|plot)", uri):
             known = " and ".join((REPORT_URI, PLOT_URI))
             raise MCPError(INVALID_PARAMS, f"{uri[:200]!r} never changes; these do: {known}")
         connection = connection_of(ctx)

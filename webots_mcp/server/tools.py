@@ -32,7 +32,7 @@ from mcp.types import (
 )
 from pydantic import ValidationError
 
-from webots_mcp.answers.models import ShownPicture
+from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import compact_json, cut_text
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.questions.declaring import Caller, Question, Reply

@@ -15,10 +15,6 @@ from typing import Final, NamedTuple
 from webots_mcp.setup.file_change import FileChange, read
 
 PLUGIN: Final = Path(__file__).parent / "plugin"
-_BEGIN: Final = "<!-- webots-mcp: its lines begin here -->"
-_END: Final = "<!-- webots-mcp {}: updated by 'webots-mcp init --skills' until you change it -->\n"
-_OURS: Final = r"(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->(?:\r?\n)?{}"
-_KEPT: Final = "it is kept, as you wrote or changed it: remove {} to get that of this version"
 
 
 class ManagedText(NamedTuple):
@@ -37,18 +33,28 @@ class ManagedText(NamedTuple):
         """
         before = read(self.file)
         held = (before or b"").decode("utf-8")
-        edges = (r"\A", r"\Z") if self.is_whole else (rf"{_BEGIN}\r?\n", "")
-        ours = re.search(_OURS.format(*edges), held)
-        begin, end = "" if self.is_whole else f"{_BEGIN}\n", _END.format(_digest(self.text))
+        begin_text = "<!-- webots-mcp: its lines begin here -->"
+        edges = (r"\A", r"\Z") if self.is_whole else (rf"{begin_text}\r?\n", "")
+        ours_text = r"(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->(?:\r?\n)?{}"
+        ours = re.search(ours_text.format(*edges), held)
+        begin, end = (
+            "" if self.is_whole else f"{begin_text}\n",
+            (
+                f"<!-- webots-mcp {_digest(self.text)}: updated by 'webots-mcp init --skills' "
+                "until you change it -->\n"
+            ),
+        )
         line_end = "\r\n" if "\r\n" in held else "\n"
         wanted = f"{begin}{self.text}{end}".replace("\n", line_end)
         if not held.strip():
             after = wanted
         elif ours is not None and _digest(ours[1].replace("\r\n", "\n")) == ours[2]:
             after = held[: ours.start()] + wanted + held[ours.end() :]
-        elif self.is_whole or _BEGIN in held:
+        elif self.is_whole or begin_text in held:
             what = "the file" if self.is_whole else "what stands between its marks"
-            return FileChange(self.file, before, held.encode()), _KEPT.format(what)
+            return FileChange(self.file, before, held.encode()), (
+                f"it is kept, as you wrote or changed it: remove {what} to get that of this version"
+            )
         else:
             apart = line_end if held.endswith("\n") else 2 * line_end
             after = f"{held}{apart}{wanted}"

@@ -23,8 +23,8 @@ from webots_mcp.standin.controller_path import LIBRARY  # first: the others impo
 from webots_mcp.standin.errors import RequestAfterEndError as ControllerEndedError
 from webots_mcp.standin.errors import StandInError, WorldError, WouldBlockError
 from webots_mcp.standin.in_process import InProcessRobot, InProcessSimulation, InProcessSupervisor
-from webots_mcp.standin.simulation import StandInSimulation as Simulation
 from webots_mcp.standin.simulator import Mode
+from webots_mcp.standin.stand_in_simulation import StandInSimulation as Simulation
 
 __all__ = [
     "LIBRARY",

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from webots_mcp.standin import Simulation, StandInError
-from webots_mcp.standin.simulation import ConsoleRecorder
+from webots_mcp.standin.stand_in_simulation import ConsoleRecorder
 
 _ALL_ENDED_S = 1.0
 """How long no controller may run before the simulation ends. A reload takes milliseconds."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from controller.session import Message
+from controller.simulator_link import Message
 
 from webots_mcp.standin.controller_answers import answer, step_over
 from webots_mcp.standin.errors import WorldError

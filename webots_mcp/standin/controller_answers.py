@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
 
-from controller.session import Message
+from controller.simulator_link import Message
 
 from webots_mcp.standin.arena import Body
 from webots_mcp.standin.devices import FetchedSensor

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final, Protocol
 
-from controller.session import Inbox, Message, pack
+from controller.simulator_link import Inbox, Message, pack
 
 from webots_mcp.standin.base_simulation import ControllerEndpoint
 from webots_mcp.standin.controller_path import LIBRARY

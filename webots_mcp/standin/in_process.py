@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from controller.robot import Robot, Supervisor
-from controller.session import Message
+from controller.simulator_link import Message
 
 from webots_mcp.contract import bundled
 from webots_mcp.standin.base_simulation import BaseSimulation, ControllerEndpoint

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
+from webots_mcp.answers.answer_models import CommandAnswer, RunAnswer
 from webots_mcp.answers.budget import RESULT_BUDGET_TOKENS, detailed, figure, seconds, shown, table
 from webots_mcp.answers.event_tables import fitting_events, not_shown_of
-from webots_mcp.answers.models import CommandAnswer, RunAnswer
 from webots_mcp.answers.movement import movement
 from webots_mcp.answers.shortening import WHOLE, cut_text, shorten
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
@@ -81,7 +81,7 @@ def command_answer(view: RobotView, command: QueuedCommand, waited_s: float) -> 
         "command_id": command.id,
         "action": command.action,
         "outcome": command.status,
-        "waited_s": waited_s,
+        "waited_wall_s": waited_s,
         "error": cut_text(command.error or "", 2_000) if failed else None,
         "hint": _hint(view, command),
     }
@@ -192,10 +192,10 @@ def _run_facts(view: RobotView, command: QueuedCommand) -> dict[str, Any]:
     facts |= {
         "ran": {
             "run_id": progress.run_id,
-            "from_s": seconds(progress.from_s),
-            "to_s": seconds(progress.to_s),
+            "start_s": seconds(progress.from_s),
+            "end_s": seconds(progress.to_s),
             "advanced_s": seconds(progress.advanced_s),
-            "factor": figure(progress.factor),
+            "real_time_factor": figure(progress.factor),
         },
         "values": shown(result.get("values")) if result.get("values") else None,
         "mode": result.get("mode"),

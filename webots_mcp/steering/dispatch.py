@@ -17,7 +17,7 @@ from typing import Any, Final
 import anyio
 from anyio import to_thread
 
-from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.contract import LOOPING
 from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command
 from webots_mcp.steering.command_answer import command_answer, correct_mode

@@ -14,7 +14,7 @@ from typing import Any, Final
 import anyio
 from anyio import to_thread
 
-from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.contract import HEARTBEAT_LATE_S
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator.instances import instance_at
@@ -86,7 +86,7 @@ class Request:
             claiming_s=claiming_s,
             block_noticed_s=block_noticed_s,
         )
-        answer.waited_s = self._waited_s
+        answer.waited_wall_s = self._waited_s
         return answer
 
     async def _permit(
@@ -330,7 +330,7 @@ class Attempt(Request):
             **header,
             action=self.order,
             outcome="done",
-            waited_s=self._waited_s,
+            waited_wall_s=self._waited_s,
             route=route,
             evidence=evidence,
         )

@@ -29,11 +29,9 @@ from webots_mcp.steering.trial_plan import TrialPlan, WorldPlan
 from webots_mcp.steering.trial_watch import End, TrialWatch
 from webots_mcp.store.logs import LogFilter, LogWindow, newest_lines
 from webots_mcp.store.merging import settled
-from webots_mcp.store.parameters import (
-    TrialResult,
-)
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.runs import run_info
+from webots_mcp.store.trial_sets import TrialResult
 
 CONSOLE: Final = "simulator.log"
 CommandOfWorld = Callable[[str], CommandLine]

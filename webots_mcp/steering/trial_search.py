@@ -17,9 +17,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.steering.trial_plan import ParameterRange, TrialPlan
-from webots_mcp.store.parameters import (
-    TrialRecord,
-)
+from webots_mcp.store.trial_sets import TrialRecord
 
 if TYPE_CHECKING:
     import optuna

@@ -28,7 +28,10 @@ from webots_mcp.steering.trial_plan import WorldPlan
 from webots_mcp.steering.trial_run import Simulators, StoppedError, TrialAttempt, recorded_result
 from webots_mcp.steering.trial_search import next_parameters
 from webots_mcp.store.merging import merge
-from webots_mcp.store.parameters import (
+from webots_mcp.store.policy import LAUNCH
+from webots_mcp.store.recording import Job, RecordingAccess
+from webots_mcp.store.requests import permit
+from webots_mcp.store.trial_sets import (
     TrialRecord,
     TrialResult,
     add_trial,
@@ -41,9 +44,6 @@ from webots_mcp.store.parameters import (
     take_up,
     trials_of,
 )
-from webots_mcp.store.policy import LAUNCH
-from webots_mcp.store.recording import Job, RecordingAccess
-from webots_mcp.store.requests import permit
 
 FOLDER: Final = "trials"
 TrialReport = Callable[[TrialRecord, TrialResult], object]

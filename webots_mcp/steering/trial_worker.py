@@ -24,27 +24,26 @@ from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, withdraw_if_blocked
 from webots_mcp.steering.run_command import ACTION
 from webots_mcp.steering.target import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, stored_plan
-from webots_mcp.store.parameters import (
+from webots_mcp.store.recording import Job, RecordingAccess, RobotView
+from webots_mcp.store.requests import permit
+from webots_mcp.store.robot_status import find_block
+from webots_mcp.store.robots import robot_name
+from webots_mcp.store.run_parameters import described, parameters_of
+from webots_mcp.store.trial_sets import (
     TrialRecord,
     TrialResult,
     TrialSetRecord,
     begin_trial,
     borrow_parameters,
-    described,
     fetch_trial_set,
     finish_trial,
     lay_down,
     next_trial,
-    parameters_of,
     put_back,
     stop_trial_set,
     take_up,
     trials_of,
 )
-from webots_mcp.store.recording import Job, RecordingAccess, RobotView
-from webots_mcp.store.requests import permit
-from webots_mcp.store.robot_status import find_block
-from webots_mcp.store.robots import robot_name
 
 OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
 _ASKER: Final = "trials"

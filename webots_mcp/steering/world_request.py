@@ -11,7 +11,7 @@ from typing import Any, Final
 import anyio
 from anyio import to_thread
 
-from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.simulator.instances import instance_at
 from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, newest_in, starts_since
@@ -192,7 +192,7 @@ class WorldRequest(Request):
             )
         if self.launcher.running is not None:
             self.launcher.running.world = world
-        answer.waited_s = self._waited_s
+        answer.waited_wall_s = self._waited_s
         return answer
 
     def _begun_in(self, situation: Situation, world: Path, before: int) -> SessionStart | None:
@@ -223,5 +223,5 @@ class WorldRequest(Request):
     def _answer(self, action: str, route: str, evidence: str) -> CommandAnswer:
         waited_s = self._waited_s
         return CommandAnswer(
-            action=action, outcome="done", waited_s=waited_s, route=route, evidence=evidence
+            action=action, outcome="done", waited_wall_s=waited_s, route=route, evidence=evidence
         )

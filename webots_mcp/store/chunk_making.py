@@ -51,9 +51,15 @@ from webots_mcp.store.chunks import (
     watermark,
 )
 from webots_mcp.store.recording import RecordingAccess, is_over_a_value
+from webots_mcp.store.registered_signals import (
+    RegisteredSignal,
+    enter_signals,
+    may_widen,
+    registered,
+    seen_in,
+)
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.run_rows import reading_texts
-from webots_mcp.store.signals import RegisteredSignal, enter_signals, may_widen, registered, seen_in
 
 GROUP_ROWS: Final = 1024
 MIN_ROWS_AT_END: Final = 32  # fewer rows at the end of a run are not put into chunks

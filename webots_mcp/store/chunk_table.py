@@ -28,17 +28,12 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts
-from webots_mcp.store.signals import registered
+from webots_mcp.store.registered_signals import registered
 
 Kind = Literal["null", "bool", "int", "num", "text"]
 
 MOST_NEW_ROWS: Final = 20_000  # that are in no chunk: they are parsed, and stay in memory
 _NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
-_INCOMPLETE: Final = (
-    "SELECT EXISTS (SELECT 1 FROM row_group WHERE run_id = ? AND is_complete = 1 "
-    "AND start_sim_time_s < ? AND end_sim_time_s >= ? "
-    "AND (lost_value_count > 0 OR stored_row_count < row_count))"
-)
 
 
 @dataclass(frozen=True)
@@ -93,9 +88,14 @@ def _part(
         {"run": run_id},
     ).fetchone()
     asked = (run_id, segment.end_s, segment.start_s)
+    query = (
+        "SELECT EXISTS (SELECT 1 FROM row_group WHERE run_id = ? AND is_complete = 1 "
+        "AND start_sim_time_s < ? AND end_sim_time_s >= ? "
+        "AND (lost_value_count > 0 OR stored_row_count < row_count))"
+    )
     if (
         waiting > MOST_NEW_ROWS
-        or connection.execute(_INCOMPLETE, asked).fetchone()[0]
+        or connection.execute(query, asked).fetchone()[0]
         or full_rate_parts(connection, run_id, segment.start_s, segment.end_s)
     ):
         return None

@@ -39,7 +39,6 @@ _CHECKSUM_BYTES: Final = 4  # CRC-32: a decompressor is not asked what it makes 
 EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NUMBERS: Final = frozenset({int, float})
-_HOW_TO_INSTALL: Final = "install it: pip install --only-binary pcodec 'pcodec>=1.0'"
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
 SIM_TIMES: Final = 0  # in the place of a signal's id
@@ -53,7 +52,6 @@ IS_MARK: Final = (  # no other program's value, beyond which no row would be loo
     f"typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= {NEWEST_STATE_ID}"
 )
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
-_VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
 _FEW: Final = 0.25  # of the groups between two: they are asked for one by one
 _SEEN: Final = ("signal", "row_group", "chunk", "watermark")
 _COPIED: Final = ("robot", "session", "run", *_SEEN)
@@ -163,8 +161,9 @@ def decode(encoded: EncodedChunk, rows: int) -> Decoded:
             return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
     except ModuleNotFoundError as error:
+        how_to_install = "install it: pip install --only-binary pcodec 'pcodec>=1.0'"
         raise UnsupportedChunkError(
-            f"chunks need {error.name}, which is missing: {_HOW_TO_INSTALL}"
+            f"chunks need {error.name}, which is missing: {how_to_install}"
         ) from None
     except DamagedChunkError:
         raise
@@ -573,10 +572,14 @@ def values_in(
         signal_id: Of which signal; or times or ids.
         wanted: How many rows each group has, by its id.
     """
-    query, asked = _VALUES, [run_id, signal_id, min(wanted, default=0), max(wanted, default=-1)]
+    values_query = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
+    query, asked = (
+        values_query,
+        [run_id, signal_id, min(wanted, default=0), max(wanted, default=-1)],
+    )
     if len(wanted) < _FEW * (asked[3] - asked[2]):
         query, asked = (
-            f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))",
+            f"{values_query} AND group_id IN (SELECT value FROM json_each(?))",
             [*asked, json.dumps([*wanted])],
         )
     for group_id, *encoded in connection.execute(query, asked):

@@ -21,7 +21,7 @@ from webots_mcp.analysis.arrays import Array, Indexes, np
 from webots_mcp.analysis.summary import Ranked
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.extras.plugins import ExportFormat, export_formats, load
+from webots_mcp.extras.plugin_registry import ExportFormat, export_formats, load
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, flatten
 from webots_mcp.store.chunk_table import ColumnCells, Kind, RunColumns, chunk_table
 from webots_mcp.store.chunks import (
@@ -38,13 +38,13 @@ from webots_mcp.store.chunks import (
     signals_in,
     values_in,
 )
-from webots_mcp.store.parameters import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 from webots_mcp.store.reading.frame import deleted_part
 from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.segment import full_rate_parts
 from webots_mcp.store.reading.unread import Unread
+from webots_mcp.store.registered_signals import RegisteredSignal, registered
 from webots_mcp.store.run_rows import put_back
-from webots_mcp.store.signals import RegisteredSignal, registered
+from webots_mcp.store.trial_sets import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 
 # Rows to be exported: those of a range, flattened, and trials; one value per dotted name.
 #

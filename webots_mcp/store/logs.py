@@ -37,11 +37,6 @@ _COMPANIONS: Final = (
     "SELECT id FROM session WHERE robot_id <> :robot_id "
     "AND instance IN (SELECT instance FROM session WHERE robot_id = :robot_id)"
 )
-_RUNS_BESIDE: Final = (
-    f"SELECT o.id FROM run r JOIN run o ON o.session_id IN ({_COMPANIONS}) WHERE r.id = :run_id "
-    "AND o.started_wall_time_s <= coalesce(r.ended_wall_time_s, 9e99) "
-    "AND coalesce(o.ended_wall_time_s, 9e99) >= r.started_wall_time_s"
-)
 _CONSOLE_OF: Final = f"(source IN {OF_CONSOLE} AND +run_id IN ({{}}))"
 _BESIDE_ROBOT: Final = (
     "FROM log WHERE (+run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) OR "
@@ -62,22 +57,6 @@ _MOST_LOGGED: Final = 500
 _COMPARED_S: Final = 60.0  # a line that is as late is not taken for what a bridge recorded
 _MESSAGE: Final = 10_000  # characters, as of a bridge's row
 _NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
-_SESSIONS: Final = (
-    "SELECT id, robot_id, controller FROM session WHERE instance = ? "
-    f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_MOST_SESSIONS}"
-)
-_SIM_TIME: Final = (
-    "SELECT coalesce((SELECT sim_time_s FROM state WHERE run_id = :run AND wall_time_s <= :wall "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1), "
-    "iif(last_wall_time_s <= :wall, last_sim_time_s, started_sim_time_s)) FROM run WHERE id = :run"
-)
-_IS_FOLLOWED: Final = (
-    "SELECT EXISTS (SELECT 1 FROM console_line WHERE instance = ? AND wall_time_s >= ?)"
-)
-_FORGET_OLDEST: Final = (
-    "DELETE FROM console_line WHERE instance = :instance AND id <= (SELECT id FROM console_line "
-    f"WHERE instance = :instance ORDER BY id DESC LIMIT 1 OFFSET {MOST_WAITING})"
-)
 
 
 @dataclass(frozen=True)
@@ -216,6 +195,11 @@ def count_lines(connection: sqlite3.Connection, asked: LogFilter) -> int:
 
 def _rows_of(connection: sqlite3.Connection, asked: LogFilter) -> str:
     # The newest lines are at the end of the table, so it is not read run by run.
+    query = (
+        f"SELECT o.id FROM run r JOIN run o ON o.session_id IN ({_COMPANIONS}) "
+        "WHERE r.id = :run_id AND o.started_wall_time_s <= coalesce(r.ended_wall_time_s, 9e99) "
+        "AND coalesce(o.ended_wall_time_s, 9e99) >= r.started_wall_time_s"
+    )
     alone, with_others = (
         (
             (
@@ -227,7 +211,7 @@ def _rows_of(connection: sqlite3.Connection, asked: LogFilter) -> str:
         if asked.run_id is None
         else (
             f"FROM log WHERE run_id = :run_id {_MATCHING}",
-            f"FROM log WHERE (run_id = :run_id OR {_CONSOLE_OF.format(_RUNS_BESIDE)}) {_MATCHING}",
+            f"FROM log WHERE (run_id = :run_id OR {_CONSOLE_OF.format(query)}) {_MATCHING}",
         )
     )
     if asked.robot_id is None:
@@ -354,9 +338,8 @@ class ConsoleRows:
 
     def is_recorded(self, connection: sqlite3.Connection) -> bool:
         """Whether lines of this Webots wait for a run: then a process follows its console."""
-        return bool(
-            connection.execute(_IS_FOLLOWED, (self._instance, self._started_s)).fetchone()[0]
-        )
+        query = "SELECT EXISTS (SELECT 1 FROM console_line WHERE instance = ? AND wall_time_s >= ?)"
+        return bool(connection.execute(query, (self._instance, self._started_s)).fetchone()[0])
 
     def write(self, connection: sqlite3.Connection, lines: Sequence[Said]) -> None:
         """Write lines that no bridge has recorded, and those that have waited until now.
@@ -381,9 +364,13 @@ class ConsoleRows:
     def _runs(self, connection: sqlite3.Connection) -> list[_Run]:
         """The newest runs of this Webots, the newest of them first."""
         since_s = self._started_s - _EARLY_S
+        query = (
+            "SELECT id, robot_id, controller FROM session WHERE instance = ? "
+            f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_MOST_SESSIONS}"
+        )
         found = connection.execute(
             "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s, "
-            f"r.last_wall_time_s FROM ({_SESSIONS}) s JOIN run r ON r.session_id = s.id JOIN "
+            f"r.last_wall_time_s FROM ({query}) s JOIN run r ON r.session_id = s.id JOIN "
             "robot b ON b.id = s.robot_id WHERE r.started_wall_time_s >= ? ORDER BY r.id DESC "
             f"LIMIT {_MOST_RUNS}",
             (self._instance, since_s),
@@ -428,7 +415,12 @@ class ConsoleRows:
             f"INSERT INTO console_line (instance, {_CONSOLE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?)",
             (self._instance, *values),
         )
-        left_out = connection.execute(_FORGET_OLDEST, {"instance": self._instance}).rowcount
+        query = (
+            "DELETE FROM console_line WHERE instance = :instance AND id <= (SELECT id "
+            "FROM console_line WHERE instance = :instance ORDER BY id DESC "
+            f"LIMIT 1 OFFSET {MOST_WAITING})"
+        )
+        left_out = connection.execute(query, {"instance": self._instance}).rowcount
         self._left_out += left_out
         self.waits = True
 
@@ -565,5 +557,11 @@ def _sim_time_s(connection: sqlite3.Connection, run: _Run, wall_time_s: float) -
     """Simulation time of a run at that wall time, as far as rows tell it."""
     if wall_time_s <= run.started_wall_time_s:
         return run.started_sim_time_s
-    found = connection.execute(_SIM_TIME, {"run": run.id, "wall": wall_time_s}).fetchone()
+    query = (
+        "SELECT coalesce((SELECT sim_time_s FROM state WHERE run_id = :run "
+        "AND wall_time_s <= :wall ORDER BY sim_time_s DESC, id DESC "
+        "LIMIT 1), iif(last_wall_time_s <= :wall, last_sim_time_s, started_sim_time_s)) FROM run "
+        "WHERE id = :run"
+    )
+    found = connection.execute(query, {"run": run.id, "wall": wall_time_s}).fetchone()
     return float(found[0])

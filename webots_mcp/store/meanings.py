@@ -22,7 +22,7 @@ from webots_mcp.signals.meaning import (
     meanings_by_name,
 )
 from webots_mcp.signals.naming import nearest_first
-from webots_mcp.store.signals import RegisteredSignal, stored_roles
+from webots_mcp.store.registered_signals import RegisteredSignal, stored_roles
 
 OF_TOOLS: Final = ("mcp", "cli")  # a person or an assistant has set it, the newest counts
 OF_PROJECT: Final = "project"
@@ -36,26 +36,10 @@ _BY_WHOM: Final = {
     OF_PROJECT: "declared in webots-mcp.toml",
     OF_CODE: "declared by the controller's code",
 }
-_SET: Final = (
-    f"INSERT INTO meaning (robot_id, name, {', '.join(MEANING_FIELDS)}, source, set_wall_time_s, "
-    f"set_by) VALUES (?, ?, {', '.join('?' * len(MEANING_FIELDS))}, 'declared', ?, ?)"
-)
 _FORGET: Final = (
     "DELETE FROM meaning WHERE robot_id = ? AND name = ? AND source = 'declared' AND {}"
 )
 _BY_TOOL: Final = "set_by IN ('mcp', 'cli')"
-_BY_CODE: Final = f"set_by = '{OF_CODE}'"
-_DECLARED: Final = (
-    "SELECT DISTINCT name FROM meaning WHERE (robot_id = :robot OR (robot_id IS NULL AND "
-    "robot_name IN ('*', (SELECT name FROM robot WHERE id = :robot)))) AND source = 'declared' "
-    "ORDER BY name"
-)
-_STORED: Final = (
-    f"SELECT set_by, source, why, name, {', '.join(MEANING_FIELDS)} FROM meaning WHERE "
-    "robot_id = :robot OR (robot_id IS NULL AND robot_name IN ('*', (SELECT name FROM robot "
-    "WHERE id = :robot))) ORDER BY robot_name IS NULL DESC, robot_name = '*', "
-    "set_wall_time_s DESC, id DESC"
-)
 
 
 class StoredMeaning(NamedTuple):
@@ -120,7 +104,13 @@ def stored_meanings(connection: sqlite3.Connection, robot_id: int) -> list[Store
     Of equally strong ones, a name comes before patterns, and of those the longer one first. What no
     version of webots-mcp writes is left out.
     """
-    rows = connection.execute(_STORED, {"robot": robot_id}).fetchall()
+    rows = connection.execute(
+        f"SELECT set_by, source, why, name, {', '.join(MEANING_FIELDS)} FROM meaning WHERE "
+        "robot_id = :robot OR (robot_id IS NULL AND robot_name IN ('*', (SELECT name FROM robot "
+        "WHERE id = :robot))) ORDER BY robot_name IS NULL DESC, robot_name = '*', "
+        "set_wall_time_s DESC, id DESC",
+        {"robot": robot_id},
+    ).fetchall()
     found = [
         StoredMeaning(set_by, StatedMeaning(said, source, why or _BY_WHOM.get(set_by, source)))
         for set_by, source, why, *values in rows
@@ -146,7 +136,12 @@ def set_meanings(
     with transaction(connection):
         for each in declared:
             connection.execute(_FORGET.format(_BY_TOOL), (robot_id, each.name))
-            connection.execute(_SET, (robot_id, *each, now_s, set_by))
+            connection.execute(
+                f"INSERT INTO meaning (robot_id, name, {', '.join(MEANING_FIELDS)}, source, "
+                f"set_wall_time_s, set_by) VALUES (?, ?, {', '.join('?' * len(MEANING_FIELDS))}, "
+                "'declared', ?, ?)",
+                (robot_id, *each, now_s, set_by),
+            )
 
 
 def undo_meanings(connection: sqlite3.Connection, robot_id: int, names: Iterable[str]) -> list[str]:
@@ -168,7 +163,15 @@ def undo_meanings(connection: sqlite3.Connection, robot_id: int, names: Iterable
             nothing is forgotten.
     """
     with transaction(connection):
-        known = [name for (name,) in connection.execute(_DECLARED, {"robot": robot_id}).fetchall()]
+        known = [
+            name
+            for (name,) in connection.execute(
+                "SELECT DISTINCT name FROM meaning WHERE (robot_id = :robot OR (robot_id IS NULL "
+                "AND robot_name IN ('*', (SELECT name FROM robot WHERE id = :robot)))) "
+                "AND source = 'declared' ORDER BY name",
+                {"robot": robot_id},
+            ).fetchall()
+        ]
         wanted: dict[str, None] = {}
         for asked in names:
             found = [name for name in known if name == asked or fits_pattern(asked, name)]
@@ -184,7 +187,7 @@ def undo_meanings(connection: sqlite3.Connection, robot_id: int, names: Iterable
 
 
 def _forget(connection: sqlite3.Connection, robot_id: int, name: str) -> None:
-    for whose in (_BY_TOOL, _BY_CODE):
+    for whose in (_BY_TOOL, f"set_by = '{OF_CODE}'"):
         if connection.execute(_FORGET.format(whose), (robot_id, name)).rowcount:
             return
     raise InvalidInputError(

@@ -47,10 +47,10 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.export import Progress
 from webots_mcp.store.journal_intake import ingest_journals
-from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.registered_signals import enter_signals
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
-from webots_mcp.store.signals import enter_signals
+from webots_mcp.store.trial_sets import fetch_trial_set, is_at_work
 
 # With one run come those of its time, and those that its session's commands were sent for.
 _NEW_REQUESTS: Final = (
@@ -58,11 +58,6 @@ _NEW_REQUESTS: Final = (
     "WHERE n.uuid = s.uuid) AND (:run IS NULL OR run_id = :run OR id IN (SELECT request_id FROM "
     "source.command WHERE session_id = (SELECT session_id FROM source.run WHERE id = :run))) "
     "ORDER BY id"
-)
-_RUN_OF_REQUESTS: Final = (
-    "UPDATE main.request SET run_id = (SELECT n.id FROM source.request s JOIN source.run r "
-    "ON r.id = s.run_id JOIN main.run n ON n.uuid = r.uuid WHERE s.uuid = request.uuid) "
-    "WHERE run_id IS NULL AND uuid IN (SELECT uuid FROM source.request)"
 )
 _OF_MEANING: Final = ", ".join(
     ("name", "source", *MEANING_FIELDS, "set_wall_time_s", "set_by", "why")
@@ -156,7 +151,13 @@ def merge(
             with transaction(connection):
                 _ingest_run_rows(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
-            connection.execute(_RUN_OF_REQUESTS)
+            query = (
+                "UPDATE main.request SET run_id = (SELECT n.id FROM source.request s "
+                "JOIN source.run r ON r.id = s.run_id JOIN main.run n ON n.uuid = r.uuid "
+                "WHERE s.uuid = request.uuid) WHERE run_id IS NULL AND uuid IN (SELECT uuid "
+                "FROM source.request)"
+            )
+            connection.execute(query)
             _ingest_trials(connection, run_id)
         return dict(
             connection.execute(

@@ -72,7 +72,6 @@ _PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
 ASKS: Final = "ask"
 _HOLDS_FOR: Final = ("everyone", "assistants")
 _KEYS: Final = (*_PATTERNS, "parameters", LAUNCH, "holds_for")
-_FIRST: Final = "put the patterns with ? before the others"
 _ASK: Final = (
     "Do not look for another way to the same: the person whose project it is can change that line, "
     "and it holds from the next request on"
@@ -336,6 +335,7 @@ def _faults(allow: Any) -> Iterator[tuple[str, str]]:
     if not isinstance(allow, dict):
         yield ALLOW, "allow must be a table: [allow]"
         return
+    reason = "put the patterns with ? before the others"
     for key, value in cast("dict[str, Any]", allow).items():
         if key not in _KEYS:
             yield key, f"allow.{key} is unknown; there is {', '.join(_KEYS)}"
@@ -344,7 +344,10 @@ def _faults(allow: Any) -> Iterator[tuple[str, str]]:
         elif key in ("fields", "nodes") and any(each.startswith("!") for each in value):
             yield key, f"{key} cannot forbid, as a node has many names: list what is allowed"
         elif key in ("fields", "nodes") and _asks_behind_what_is_allowed(value):
-            yield key, f"{key} must ask first and allow then, as a node has many names: {_FIRST}"
+            yield (
+                key,
+                f"{key} must ask first and allow then, as a node has many names: {reason}",
+            )
         elif key == LAUNCH and not (isinstance(value, bool) or value == ASKS):
             yield key, f'launch must be true, false or "ask", not {value!r:.80}'
         elif key == "holds_for" and value not in _HOLDS_FOR:

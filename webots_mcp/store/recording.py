@@ -74,19 +74,6 @@ GETTING_STARTED: Final = (
 )
 
 _MOST_IDLE: Final = 8  # connections: each may hold 2 MB of pages
-_FROZEN: Final = "the file cannot be written from here: read as it is on the disk"
-_BEHIND: Final = (
-    "newer rows of {} are not in the database yet: ask again, or start 'webots-mcp serve' (not "
-    "--read-only), which takes them in"
-)
-_LEFT: Final = (
-    "{} of controllers that have ended wait in files next to the database (...-waiting-...) and "
-    "are not in this answer: ask again, or start 'webots-mcp serve' (not --read-only)"
-)
-_NOT_IN: Final = (
-    "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
-    "writable folder and open the copy with webots-mcp serve to include them"
-)
 _ENDED: Final = {
     "crashed": "its controller crashed or was killed",
     "finished": "its controller finished",
@@ -431,7 +418,12 @@ def storage(connection: sqlite3.Connection) -> dict[str, Any]:
         said.append(f"{held}: {FREE_THE_LOG}")
     if isinstance(connection, FrozenConnection):
         waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
-        said.insert(0, f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}")
+        frozen_text = "the file cannot be written from here: read as it is on the disk"
+        not_in = (
+            "; without the rows in {} waiting files next to it (...-waiting-...): copy all of "
+            "them to a writable folder and open the copy with webots-mcp serve to include them"
+        )
+        said.insert(0, f"{frozen_text}{not_in.format(len(waiting)) if waiting else ''}")
     elif beside := waiting_rows_note(connection):
         said.insert(0, beside)
     return {"storage": "; ".join(said)} if said else {}
@@ -444,9 +436,18 @@ def waiting_rows_note(connection: sqlite3.Connection) -> str:
         return ""
     said: list[str] = []
     if rows := sum(map(count_rows, left_waiting(Path(file)))):
-        said.append(_LEFT.format(counted(rows, "row")))
+        left_text = (
+            "{} of controllers that have ended wait in files next to the database "
+            "(...-waiting-...) and are not in this answer: ask again, or start 'webots-mcp "
+            "serve' (not --read-only)"
+        )
+        said.append(left_text.format(counted(rows, "row")))
     if behind := journals_behind(connection, Path(file)):
-        said.append(_BEHIND.format(", ".join(behind)))
+        behind_text = (
+            "newer rows of {} are not in the database yet: ask again, or start 'webots-mcp "
+            "serve' (not --read-only), which takes them in"
+        )
+        said.append(behind_text.format(", ".join(behind)))
     return "; ".join(said)
 
 

@@ -35,10 +35,6 @@ _SECRET: Final = re.compile(
 )
 _PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")  # of an address
 _LEFT_OUT: Final = "(left out)"
-_LIVE: Final = (
-    "SELECT world FROM run WHERE ended_wall_time_s IS NULL AND world IS NOT NULL UNION SELECT "
-    "controller FROM session WHERE ended_wall_time_s IS NULL AND controller IS NOT NULL"
-)
 AGREED: Final = "the person agreed"
 _ASKED: Final = "the person is asked"
 _END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
@@ -189,7 +185,12 @@ class OpenRequest:
         """Those that bind who asks; what only reads goes on while one is invalid."""
         if not self._reads:  # which is begun in the event loop
             with suppress(NoDatabaseError), self.recording.reader() as connection:
-                files += tuple(file for (file,) in connection.execute(_LIVE).fetchall())
+                query = (
+                    "SELECT world FROM run WHERE ended_wall_time_s IS NULL AND world IS NOT NULL "
+                    "UNION SELECT controller FROM session WHERE ended_wall_time_s IS NULL "
+                    "AND controller IS NOT NULL"
+                )
+                files += tuple(file for (file,) in connection.execute(query).fetchall())
         found = policies_of(self.recording.database, self.recording.data_dir, files)
         try:
             return [each for each in found if each.holds_for(self._by.transport)]

@@ -24,11 +24,6 @@ SERVE: Final = "serve"
 KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
-_SET: Final = (
-    "INSERT OR REPLACE INTO retention_limit "
-    "(kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?)"
-)
 _BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
 NO_LIMIT: Final = "all"  # is kept
@@ -168,7 +163,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, StoredLimit]:
         except (KeyError, TypeError, InvalidInputError) as error:
             raise InvalidInputError(
                 f"the row {kind!r} of the table retention_limit is not a limit ({error}): set it "
-                "again with 'webots-mcp retain'"
+                "again with 'webots-mcp retention'"
             ) from error
         settings[name] = StoredLimit(value, set_by, set_s)
     return settings
@@ -189,6 +184,11 @@ def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> Non
     if not asked:
         return
     now_s = time.time()
+    query = (
+        "INSERT OR REPLACE INTO retention_limit "
+        "(kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s) "
+        "VALUES (?, ?, ?, ?, ?, ?, ?)"
+    )
     with transaction(connection):
         for name, value in asked.items():
             kind = _KIND_OF[name]
@@ -196,9 +196,9 @@ def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> Non
                 connection.execute("DELETE FROM retention_limit WHERE kind = ?", (kind,))
             elif isinstance(value, Limit):
                 limit = (value.size_bytes, value.rows, value.age_s, None)
-                connection.execute(_SET, (kind, *limit, set_by, now_s))
+                connection.execute(query, (kind, *limit, set_by, now_s))
             else:
-                connection.execute(_SET, (kind, None, None, None, value, set_by, now_s))
+                connection.execute(query, (kind, None, None, None, value, set_by, now_s))
 
 
 def ask(connection: sqlite3.Connection, asked: Asked) -> list[str]:
@@ -224,7 +224,7 @@ def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
         option = option_of(_KIND_OF[name])
         found.append(
             f"{option} {_text(value)} is not in force: the database keeps {_said(setting)}; "
-            f"'webots-mcp retain {option} ...' changes it"
+            f"'webots-mcp retention {option} ...' changes it"
         )
     return found
 

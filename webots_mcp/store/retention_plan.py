@@ -35,20 +35,9 @@ _WALL_TIME: Final = (
     "max(CASE WHEN CAST(wall_time_s AS REAL) < 1e11 THEN CAST(wall_time_s AS REAL) END)"
 )
 _SUMS: Final = f"run_id, min(id), max(id), {{payloads}}, count(*), {_WALL_TIME}"
-_IN_NO_GROUP: Final = (
-    f"SELECT {_SUMS} FROM state WHERE run_id = :run AND sim_time_s >= coalesce((SELECT "
-    "max(end_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1), -9e999) "
-    "AND id > coalesce((SELECT max(max_state_id) FROM row_group WHERE run_id = :run "
-    "AND is_complete = 1), 0)"
-)
-_BLOCKS: Final = f"SELECT {_SUMS} FROM {{table}} WHERE id > 0 {{own}} GROUP BY id / {{ids}}, run_id"
-_ROWS: Final = "SELECT id FROM {table} WHERE +run_id = ? AND id BETWEEN ? AND ? {own} ORDER BY id"
 # The frames of full-rate segments count with their rows, and go with them.
 _OWN: Final = f"AND kind <> '{KEPT_FRAME}'"
 _FILE_BYTES: Final = "iif(size_bytes BETWEEN 0 AND 1e12, size_bytes, 0)"
-_FRAMES: Final = (
-    f"SELECT run_id, sum({_FILE_BYTES}) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
-)
 # Those that were created during a kept run stay with it.
 OLD_COMMANDS: Final = (
     f"FROM command c WHERE robot_id = :robot_id AND status IN {FINAL_STATUSES} "
@@ -210,7 +199,8 @@ def ids_of(connection: sqlite3.Connection, portion: Portion) -> list[int]:
                 return sorted(map(int, values.numbers.tolist()))[-portion.rows :]
     own = _OWN if portion.table == "image" else ""
     bounds = (portion.run_id, portion.first_id, portion.last_id)
-    query = _ROWS.format(table=portion.table, own=own)
+    rows_query = "SELECT id FROM {table} WHERE +run_id = ? AND id BETWEEN ? AND ? {own} ORDER BY id"
+    query = rows_query.format(table=portion.table, own=own)
     return [row_id for (row_id,) in connection.execute(query, bounds).fetchall()]
 
 
@@ -236,13 +226,19 @@ def _portions(
     found: dict[str, list[Portion]] = {table: [] for table in TABLES}
     for portion in (*_grouped(connection, runs), *_in_no_group(connection, runs)):
         found[portion.table].append(portion)
+    blocks_query = (
+        f"SELECT {_SUMS} FROM {{table}} WHERE id > 0 {{own}} GROUP BY id / {{ids}}, run_id"
+    )
     for table, ids in _BLOCK_IDS.items():
         own = _OWN if table == "image" else ""
         payloads = _payloads(connection, table)
-        query = _BLOCKS.format(table=table, own=own, payloads=payloads, ids=ids)
+        query = blocks_query.format(table=table, own=own, payloads=payloads, ids=ids)
         rows = connection.execute(query).fetchall()
         found[table] = [_portion(connection, table, row) for row in rows if row[0] in runs]
-    frame_bytes: dict[int, float] = dict(connection.execute(_FRAMES).fetchall())
+    frames_query = (
+        f"SELECT run_id, sum({_FILE_BYTES}) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
+    )
+    frame_bytes: dict[int, float] = dict(connection.execute(frames_query).fetchall())
     found["kept_state"] = _with_frames(found["kept_state"], frame_bytes)
     for portions in found.values():
         portions.sort(key=lambda each: -each.last_id)
@@ -271,7 +267,13 @@ def _grouped(connection: sqlite3.Connection, runs: dict[int, RetainedRun]) -> It
 
 def _in_no_group(connection: sqlite3.Connection, runs: dict[int, RetainedRun]) -> Iterator[Portion]:
     """Yield the states of each run that are in no group yet, which are its newest."""
-    query = _IN_NO_GROUP.format(payloads=_payloads(connection, "state"))
+    in_no_group_query = (
+        f"SELECT {_SUMS} FROM state WHERE run_id = :run AND sim_time_s >= coalesce((SELECT "
+        "max(end_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1), -9e999) "
+        "AND id > coalesce((SELECT max(max_state_id) FROM row_group WHERE run_id = :run "
+        "AND is_complete = 1), 0)"
+    )
+    query = in_no_group_query.format(payloads=_payloads(connection, "state"))
     for run_id in runs:
         row = connection.execute(query, {"run": run_id}).fetchone()
         if row[0] is not None:

@@ -79,14 +79,6 @@ SILENT: Final = (
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
     "simulation these look alike"
 )
-_WAITING: Final = (
-    "the database takes no rows: those of its controller wait in {0} next to it, for {1} now "
-    "(is the disk full, or does another program hold a lock?); what is shown here is older"
-)
-_LEFT_WAITING: Final = (
-    "its last rows wait in {} next to the database, until a server that may write there (not "
-    "--read-only) takes them in: what is shown here is older"
-)
 WAITING_IN_STEP: Final = (
     "its loop waits in step(): paused by hand in Webots or at a breakpoint, another controller "
     "holds the world up, or an extern one is missing; from inside the simulation these look alike"
@@ -101,7 +93,6 @@ PRESS_PLAY: Final = (
     "press play in Webots if it is paused there: only a person can resume it while the controller "
     "is inside step(); else check what its loop is waiting for"
 )
-_FREE_IT: Final = "mend that line, or end the controller and start it again"
 
 
 class Status(NamedTuple):
@@ -149,7 +140,11 @@ def _decide_dead(
     why = why_ended(connection, session)
     if (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
-        why = "; ".join(filter(None, (why, _LEFT_WAITING.format(backlog.file_name))))
+        left_waiting = (
+            "its last rows wait in {} next to the database, until a server that may write there "
+            "(not --read-only) takes them in: what is shown here is older"
+        )
+        why = "; ".join(filter(None, (why, left_waiting.format(backlog.file_name))))
     return _stopped(session, moved_s, now_s, why)
 
 
@@ -170,7 +165,12 @@ def _decide_alive(
         return Status(RUNNING, hang) if is_slow else _stopped(session, moved_s, now_s, hang)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
-        why = _WAITING.format(backlog.file_name, age_in_words(now_s - backlog.oldest_wall_time_s))
+        waited = age_in_words(now_s - backlog.oldest_wall_time_s)
+        why = (
+            f"the database takes no rows: those of its controller wait in {backlog.file_name} "
+            f"next to it, for {waited} now (is the disk full, or does another program hold a "
+            "lock?); what is shown here is older"
+        )
         if session.age_s(moved_s, now_s) <= pace_s:
             return Status(RUNNING, why)
         return _stopped(session, moved_s, now_s, why)
@@ -247,6 +247,7 @@ def _block_in_code(
     stacks = find_stacks(connection, session, now_s)
     if stacks is None:
         return None
+    free_it = "mend that line, or end the controller and start it again"
     if stacks.is_in_step:
         for other in companions(connection, session, now_s):
             if (hang := find_hang(connection, other, now_s)) is None:
@@ -254,7 +255,7 @@ def _block_in_code(
             if not is_sure_to_hang(connection, other, now_s):
                 return None
             held_up = _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
-            return BlockedLoop(held_up, _FREE_IT)
+            return BlockedLoop(held_up, free_it)
         if session.silent_s(now_s) < _LIMITS.slow_steps * usual_step_s(connection, session):
             return None
         return BlockedLoop(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
@@ -267,9 +268,7 @@ def _block_in_code(
         return None
     hang = find_hang(connection, session, now_s)
     return (
-        BlockedLoop(hang, _FREE_IT)
-        if hang and is_sure_to_hang(connection, session, now_s)
-        else None
+        BlockedLoop(hang, free_it) if hang and is_sure_to_hang(connection, session, now_s) else None
     )
 
 

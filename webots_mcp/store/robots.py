@@ -21,16 +21,6 @@ from webots_mcp.store.run_rows import (
 )
 from webots_mcp.store.sessions import SessionRecord, newest_session
 
-# Of the newest Webots, unless a controller has begun to record since. What a controller printed
-# comes first: its traceback ends with the reason, and Webots itself only says that it exited.
-_CONSOLE_TROUBLE: Final = (
-    "WITH trouble AS (SELECT id, instance, source, message FROM console_line WHERE level IN "
-    "('warning', 'error', 'critical') AND wall_time_s > "
-    "(SELECT coalesce(max(started_wall_time_s), 0) FROM session)) "
-    "SELECT substr(message, 1, 200) FROM trouble WHERE id IN (SELECT max(id) FROM trouble WHERE "
-    "instance = (SELECT instance FROM trouble ORDER BY id DESC LIMIT 1) GROUP BY source) "
-    "ORDER BY source = 'console' DESC, id"
-)
 _SHOWN_NAMES: Final = 20
 
 
@@ -99,7 +89,19 @@ def console_trouble(connection: sqlite3.Connection) -> str | None:
     A controller that fails before its bridge exists leaves nothing else. What was said before the
     newest session began is left out: a controller has recorded since.
     """
-    said = [repr(message) for (message,) in connection.execute(_CONSOLE_TROUBLE).fetchall()]
+    # Of the newest Webots, unless a controller has begun to record since. What a controller printed
+    # comes first: its traceback ends with the reason, and Webots itself only says that it exited.
+    said = [
+        repr(message)
+        for (message,) in connection.execute(
+            "WITH trouble AS (SELECT id, instance, source, message FROM console_line "
+            "WHERE level IN ('warning', 'error', 'critical') "
+            "AND wall_time_s > (SELECT coalesce(max(started_wall_time_s), 0) FROM session)) "
+            "SELECT substr(message, 1, 200) FROM trouble WHERE id IN (SELECT max(id) FROM trouble "
+            "WHERE instance = (SELECT instance FROM trouble ORDER BY id DESC LIMIT 1) "
+            "GROUP BY source) ORDER BY source = 'console' DESC, id"
+        ).fetchall()
+    ]
     if not said:
         return None
     return (

@@ -199,9 +199,6 @@ def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
     )
 
 
-_NO_RUN: Final = "No run {} is recorded, because no controller has recorded a run yet."
-
-
 def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None) -> str:
     ids = [
         row[0]
@@ -216,7 +213,7 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
         return (
             f"No run {run_id} is recorded. Use one of the newest runs: {known}."
             if ids
-            else _NO_RUN.format(run_id)
+            else f"No run {run_id} is recorded, because no controller has recorded a run yet."
         )
     query = "SELECT name FROM robot JOIN run ON run.robot_id = robot.id WHERE run.id = ?"
     owner = connection.execute(query, (run_id,)).fetchone()
@@ -280,13 +277,16 @@ def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | No
         return None
     share = own_ms / max(own_ms + wait_ms, 1e-9)
     if share >= _SETS_PACE:
-        why = "the controller, not the physics, sets the pace"
+        why = "the controller sets the pace, not the physics"
     elif share > 1 - _SETS_PACE:
         why = "controller and Webots (or another controller) take turns"
     else:
-        why = "Webots, real time or another controller sets the pace, not this one"
-    needs = f"{robot} needs {own_ms:.4g} of each {own_ms + wait_ms:.4g} ms"
-    return f"{needs}: {why} (mean of {steps} steps)"
+        why = "not the bottleneck: Webots, real time or another controller sets the pace"
+    step_ms = own_ms + wait_ms
+    return (
+        f"{robot}: controller load {100 * share:.2g} % of {step_ms:.4g} ms per step; {why} "
+        f"(mean of {steps} steps)"
+    )
 
 
 def select(value: Any, path: str) -> Any:
@@ -403,11 +403,6 @@ class StoredImage:
 
 
 _COLUMNS: Final = columns_of(StoredImage)
-_FRAMES: Final = (
-    f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
-    "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
-    "ORDER BY {order}, id DESC LIMIT :count"
-)
 
 
 def inside(data_dir: Path, path: str) -> Path:
@@ -485,7 +480,12 @@ def camera_frames(
     """
     order = "sim_time_s DESC" if at_s is None else "abs(sim_time_s - :at_s)"
     values = {"run_id": run_id, "device": device, "kind": None, "at_s": at_s, "count": 1}
-    query = _FRAMES.format(order=order)
+    frames_query = (
+        f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
+        "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
+        "ORDER BY {order}, id DESC LIMIT :count"
+    )
+    query = frames_query.format(order=order)
     found = connection.execute(query, values).fetchall()
     if found and count > 1:
         of = {"device": found[0][5], "kind": found[0][4], "count": count}

@@ -13,9 +13,9 @@ from webots_mcp.database.pauses import paused_s
 from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.parameter import Value
-from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
+from webots_mcp.store.run_parameters import HAD_VALUES, as_filter, notable_parameters
 from webots_mcp.store.run_rows import OWN_MS, STEP_WAIT_MS, fetch_run
 
 MOST_RUNS: Final = 200

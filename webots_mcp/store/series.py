@@ -33,7 +33,7 @@ from webots_mcp.store.reading.frame_summary import (
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
-from webots_mcp.store.signals import RegisteredSignal, cleaned
+from webots_mcp.store.registered_signals import RegisteredSignal, cleaned
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
@@ -44,13 +44,7 @@ TURNS_COUNTED: Final = (
 WEIGHTED: Final = "means and deviations are weighted by time"
 STATES_SHARE: Final = 0.5  # of the time, where numbers are asked for as well
 
-_NEWEST_WALL: Final = (
-    "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
-)
 MOST_ROWS: Final = 1000
-_STATES: Final = "SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))"
-_KEPT_STATES: Final = "SELECT id, data FROM kept_state WHERE id IN (SELECT value FROM json_each(?))"
 
 
 @dataclass(frozen=True)
@@ -226,6 +220,10 @@ def _run_history(
     cuts_s = [frame.cut_at_s, None if kept is None else kept.cut_at_s, changes.unread_from_s]
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     rhythm = rhythm_in(frame)
+    query = (
+        "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
+        "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
+    )
     return RunHistory(
         run_id=segment.run_id,
         start_s=segment.start_s,
@@ -242,7 +240,7 @@ def _run_history(
         gaps=rhythm.gaps,
         cut_at_s=min((each for each in cuts_s if each is not None), default=None),
         unread=(*_unread(frame), *signals_left(left)),
-        age_s=time.time() - connection.execute(_NEWEST_WALL, (segment.run_id,)).fetchone()[0],
+        age_s=time.time() - connection.execute(query, (segment.run_id,)).fetchone()[0],
     )
 
 
@@ -447,7 +445,10 @@ def _states_by_id(
     listed = json.dumps([abs(row_id) for row_id in ids])
     return {
         sign * row_id: flatten(parse(data))
-        for query, sign in ((_STATES, 1), (_KEPT_STATES, -1))
+        for query, sign in (
+            ("SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))", 1),
+            ("SELECT id, data FROM kept_state WHERE id IN (SELECT value FROM json_each(?))", -1),
+        )
         if any(row_id * sign > 0 for row_id in ids)
         for row_id, data in connection.execute(query, (listed,))
     }

@@ -94,33 +94,16 @@ class SessionRecord:
 _COLUMNS: Final = columns_of(SessionRecord)
 
 
-_NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
-
-
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
-
-
-_COMPANIONS: Final = (
-    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance "
-    "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
-)
-
-
-_LEFT_HOLDING: Final = (
-    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND pause_state = '{PAUSED}' "
-    "AND last_seen_wall_time_s >= :started AND id = (SELECT max(id) FROM session n "
-    "WHERE n.robot_id = session.robot_id) ORDER BY id DESC LIMIT 1"
-)
-
-
 def newest_session(connection: sqlite3.Connection, robot_id: int) -> SessionRecord | None:
     """Return the latest session of a robot, alive or not."""
-    return _session(connection.execute(_NEWEST, (robot_id,)).fetchone())
+    query = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+    return _session(connection.execute(query, (robot_id,)).fetchone())
 
 
 def fetch_session(connection: sqlite3.Connection, session_id: int) -> SessionRecord | None:
     """Return the session with an id."""
-    return _session(connection.execute(_BY_ID, (session_id,)).fetchone())
+    query = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
+    return _session(connection.execute(query, (session_id,)).fetchone())
 
 
 def companions(
@@ -128,7 +111,11 @@ def companions(
 ) -> list[SessionRecord]:
     """Return the other living sessions in the same simulation."""
     values = {"instance": session.instance, "id": session.id}
-    rows = connection.execute(_COMPANIONS, values).fetchall()
+    query = (
+        f"SELECT {_COLUMNS} FROM session WHERE instance = :instance "
+        "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
+    )
+    rows = connection.execute(query, values).fetchall()
     return [found for row in rows if (found := _session(row)) and found.is_alive(now_s)]
 
 
@@ -137,7 +124,12 @@ def left_holding(
 ) -> SessionRecord | None:
     """Return the newest session of the simulation if it ended while it held its loop."""
     values = {"instance": session.instance, "started": session.started_wall_time_s}
-    found = _session(connection.execute(_LEFT_HOLDING, values).fetchone())
+    query = (
+        f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND pause_state = '{PAUSED}' "
+        "AND last_seen_wall_time_s >= :started AND id = (SELECT max(id) FROM session n "
+        "WHERE n.robot_id = session.robot_id) ORDER BY id DESC LIMIT 1"
+    )
+    found = _session(connection.execute(query, values).fetchone())
     return found if found is not None and not found.is_alive(now_s) else None
 
 

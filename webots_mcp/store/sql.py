@@ -80,13 +80,6 @@ _BOOKKEEPING_COLUMNS: Final = (
     "mode_before_pause",
     "is_chunked",
 )
-_RULES: Final = (
-    "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
-    "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
-    "fast by run_id and sim_time_s; for a long one use robot_statistics (min, max, mean of about "
-    "1,024 rows each, also of purged ones; not of rows in no chunk: the newest of a run that goes "
-    "on, up to 1,023, and the last of an ended one where they are fewer than 256)."
-)
 
 
 @dataclass(frozen=True)
@@ -449,7 +442,15 @@ def describe_schema(connection: sqlite3.Connection) -> str:
             listed[same] = _listed(columns[name], dict(e for e in found if e not in listed_before))
             listed_before.update(found)
     lines = (f"{', '.join(alike)}: {listed[same]}" for same, alike in names.items())
-    return "\n".join((_RULES, *lines, _bookkeeping()))
+    rules = (
+        "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
+        "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a "
+        "run is fast by run_id and sim_time_s; for a long one use robot_statistics (min, max, "
+        "mean of about 1,024 rows each, also of purged ones; not of rows in no chunk: the newest "
+        "of a run that goes on, up to 1,023, and the last of an ended one where they are fewer "
+        "than 256)."
+    )
+    return "\n".join((rules, *lines, _bookkeeping()))
 
 
 def _listed(columns: list[str], comments: dict[str, str]) -> str:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from webots_mcp.testing.recorded_command import RecordedCommand
     from webots_mcp.testing.recorded_signal import RecordedSignal
-    from webots_mcp.testing.recording import RobotRecording
-    from webots_mcp.testing.simulation import (
+    from webots_mcp.testing.recorded_simulation import (
         RecordedSimulation,
         Rehearsal,
         RobotFactory,
         SimulationFactory,
     )
+    from webots_mcp.testing.robot_recording import RobotRecording
 
 __all__ = [
     "RecordedCommand",
@@ -32,12 +32,12 @@ __all__ = [
 ]
 
 _MODULES = {"RecordedCommand": "recorded_command", "RecordedSignal": "recorded_signal",
-            "RobotRecording": "recording"}  # fmt: skip
+            "RobotRecording": "robot_recording"}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = import_module(f"{__name__}.{_MODULES.get(name, 'simulation')}")
+    module = import_module(f"{__name__}.{_MODULES.get(name, 'recorded_simulation')}")
     globals()[name] = value = getattr(module, name)
     return value

@@ -22,7 +22,7 @@ from tests.bridge.conftest import (
 from tests.waiting import wait_for
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.claimed_commands import ClaimedCommand, Progress
 from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 

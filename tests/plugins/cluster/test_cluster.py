@@ -30,7 +30,7 @@ from webots_mcp.plugins.cluster.dask_cluster import (
     packed,
 )
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.store.parameters import TrialResult
+from webots_mcp.store.trial_sets import TrialResult
 
 Write = Callable[[str], Path]
 

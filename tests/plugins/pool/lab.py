@@ -17,8 +17,8 @@ from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.plugins.pool.fetching import FetchResult, fetch
 from webots_mcp.plugins.pool.pool_contents import RunFilter, open_pool, resolve_filter
 from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 POSTGRES = pytest.param("postgres", marks=pytest.mark.slow)
 IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", POSTGRES], indirect=True)

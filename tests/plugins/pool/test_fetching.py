@@ -28,11 +28,11 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.trends import trends
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.parameters import find_trial_set, trials_of
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention
 from webots_mcp.store.runs import run_info
+from webots_mcp.store.trial_sets import find_trial_set, trials_of
 
 OF_RUN = ("kept_stretch", "kept_state", "log", "event", "image", "parameter_value", "state")
 LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id", "path",

@@ -19,7 +19,7 @@ import pytest
 from tests.simulator.webots_program import put_on_path
 from webots_mcp.contract import host_name
 from webots_mcp.plugins.prove.bench import Bench, run_check
-from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED, check_launch
+from webots_mcp.plugins.prove.fact_checks import CHECKS, NOT_TRIED, check_launch
 from webots_mcp.simulator.installations import HOME_VARIABLE
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")

@@ -54,7 +54,7 @@ def in_processes(project: Path) -> tuple[str, ...]:
 def test_processes_of_their_own_repeat_to_the_last_digit(project: Path, repeat: Repeat) -> None:
     answer = repeat(*in_processes(project), "-n", "2", "--for", "1", "--json")
     found = answer["process"]
-    assert (found["run_ids"], found["parted"]) == ([1, 2], [])
+    assert (found["run_ids"], found["diverging"]) == ([1, 2], [])
     assert "2 runs: equal to the last digit in the 62 rows and 2 signals" in found["verdict"]
 
 
@@ -62,7 +62,7 @@ def test_noise_of_a_controller_is_found_in_processes_too(project: Path, repeat: 
     controller = project / "controllers" / "rover" / "rover.py"
     controller.write_text(CONTROLLER.replace(*NOISY))
     answer = repeat(*in_processes(project), "-n", "3", "--for", "1", "--json")
-    assert answer["process"]["parted"] == [2, 3]
+    assert answer["process"]["diverging"] == [2, 3]
     for each in answer["process"]["repeats"]:
         assert each["verdict"].startswith("equal to the last digit until 0.416 s; then noise by ")
         signal, *growth = each["growth"].values()

@@ -15,8 +15,8 @@ from tests.steering.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.questions.run_trials import set_facts
 from webots_mcp.steering.trial_plan import ParameterRange, Search, TrialPlan
 from webots_mcp.steering.trial_search import next_parameters
-from webots_mcp.store.parameters import TrialRecord
 from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.trial_sets import TrialRecord
 
 Write = Callable[[str], Path]
 PARAMETERS = "SELECT parameters FROM trial ORDER BY number"

@@ -14,7 +14,7 @@ import pytest
 from tests.memory import memory_connection
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export import TrialTable, export
-from webots_mcp.store.parameters import TrialResult, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 TRIED: list[tuple[dict[str, Any], float | None]] = [
     ({"kp": 1, "gait": "trot", "score": True}, 4.0),

@@ -89,7 +89,7 @@ def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
     assert states.startswith(
         "--keep-states 5.0 MB is not in force: the database keeps 80.0 MB (set by retain, "
     )
-    assert states.endswith("'webots-mcp retain --keep-states ...' changes it")
+    assert states.endswith("'webots-mcp retention --keep-states ...' changes it")
     assert in_force(db).state.size_bytes == 80 * MB
 
 

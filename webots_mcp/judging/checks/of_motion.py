@@ -27,7 +27,7 @@ from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, words_o
 from webots_mcp.signals.register import PLACES
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.segment import just_after
-from webots_mcp.store.signals import RegisteredSignal, stored_roles
+from webots_mcp.store.registered_signals import RegisteredSignal, stored_roles
 
 APART_S: Final = 3.0  # command and measurement for so long
 NO_COMMAND: Final = (

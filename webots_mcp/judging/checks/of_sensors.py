@@ -17,7 +17,7 @@ from webots_mcp.judging.verdicts import Fault
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT, Meaning
 from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, find_targets, listed
 from webots_mcp.store.reading.frame import Frame
-from webots_mcp.store.signals import RegisteredSignal, stored_roles
+from webots_mcp.store.registered_signals import RegisteredSignal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end

@@ -17,7 +17,7 @@ from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, places_in
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.reading.frame import Frame
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _ROUNDING: Final = 1e-9  # of the largest value: less noise is that of floating-point numbers
 TIMES: Final = 3.0  # the noise after, of the noise before

@@ -41,7 +41,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     just_after,
 )
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _ERRORS: Final = ("error", "critical")  # levels of log lines
 MOST_AROUND: Final = 6  # values that are reported with an event

@@ -16,7 +16,7 @@ from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, in_metres
 from webots_mcp.signals.naming import SOLIDS, WORLD, words_of
 from webots_mcp.store.reading.frame import Frame
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 UPRIGHT_RAD: Final = math.radians(30)  # below it a robot stands ...
 FALLEN_RAD: Final = math.radians(60)  # ... beyond this it has tipped over ...

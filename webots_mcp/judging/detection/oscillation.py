@@ -37,7 +37,7 @@ from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.naming import counted, in_snake_case
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.reading.segment import just_after
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
 GROWS: Final = 2.0  # times the amplitude at one end: then both are reported

@@ -29,7 +29,7 @@ from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after
-from webots_mcp.store.signals import RegisteredSignal, roles_of, stored_roles
+from webots_mcp.store.registered_signals import RegisteredSignal, roles_of, stored_roles
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
 TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt

@@ -28,7 +28,7 @@ from webots_mcp.signals.naming import find_targets, listed
 from webots_mcp.store.reading.catalogue import other_form
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.reading.segment import just_after
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 LEAST_CHANGES: Final = 10  # of who mostly changes
 FROZEN_SHARE: Final = 0.15  # of `flat_s`: who is noisy otherwise counts from so long on

@@ -18,7 +18,7 @@ from webots_mcp.judging.detection.search import EventKind, Search, in_metres, pl
 from webots_mcp.judging.detection.standstill import ON_THE_SPOT
 from webots_mcp.signals.meaning import words_in
 from webots_mcp.signals.naming import METRES, unit_in
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 SLIP_S: Final = 3.0  # for so long
 _ALIKE: Final = 0.05  # of the faster side: wheels that differ by less drive straight on

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, runs_of
-from webots_mcp.analysis.standstill import (
+from webots_mcp.analysis.still_intervals import (
     MOST_AROUND,
     NEARLY,
     find_standstills,

@@ -21,7 +21,7 @@ from webots_mcp.judging.detection.kinds import (
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.meaning import HOLDING, Meaning, targets_in, words_in
 from webots_mcp.signals.naming import METRES
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 OFF_S: Final = 3.0  # away for so long, without coming nearer
 OFF_SHARE: Final = 0.1  # of the largest step or size of the target

@@ -40,8 +40,8 @@ from webots_mcp.steering.trial_run import (
     webots,
 )
 from webots_mcp.store.merging import pack, unpack
-from webots_mcp.store.parameters import TrialResult
 from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.trial_sets import TrialResult
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000
@@ -52,7 +52,6 @@ _COUNT_EVERY_S: Final = 2.0
 _WITHOUT_WORKERS_S: Final = 60.0
 _BUNDLE: Final = "recording.zip"
 _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
-_SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
 
 
 # -- functions that workers run ---------------------------------------------------------------
@@ -100,10 +99,11 @@ def missing_requirement(needs: WorkerRequirements) -> str | None:
     """Return why this machine cannot run a trial; None if it can."""
     if needs.version != VERSION:
         return f"it has webots-mcp {VERSION}, not {needs.version}"
+    shared = "all workers need the project under the same path, such as in a shared folder"
     if not Path(needs.world).is_file():
-        return f"there is no file {needs.world}: {_SHARED}"
+        return f"there is no file {needs.world}: {shared}"
     if digest_of(needs.world) != needs.digest:
-        return f"{needs.world}, or its controllers, are not the same there: {_SHARED}"
+        return f"{needs.world}, or its controllers, are not the same there: {shared}"
     try:
         needs.command(needs.world)
         if needs.ship_to is not None:

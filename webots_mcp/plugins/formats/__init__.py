@@ -1,6 +1,6 @@
 """Export formats that need extra packages: Parquet, MCAP and recordings of Rerun."""
 
-from webots_mcp.extras.plugins import ExportFormat, Plugin
+from webots_mcp.extras.plugin_registry import ExportFormat, Plugin
 
 PLUGIN = Plugin(
     formats=(

@@ -26,8 +26,8 @@ from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Segment
+from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, EventRecord, StoredImage, columns_of
-from webots_mcp.store.signals import RegisteredSignal
 
 # What is counted, in the order in which it is reported.
 KINDS: Final = (
@@ -37,10 +37,6 @@ _PATH_POSES: Final = 1000  # Minimum of poses in the path of a longer run.
 _IN_SEGMENT: Final = (
     "sim_time_s >= :start_s AND sim_time_s < :end_s "
     "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
-)
-_PAGE: Final = (
-    f"SELECT {{columns}} FROM {{table}} WHERE run_id = :run_id AND {_IN_SEGMENT} "
-    "AND (sim_time_s > :start_s OR id > :after_id) ORDER BY sim_time_s, id LIMIT :limit"
 )
 # A command belongs to the run of its robot during which it was claimed, else created. A command
 # that was never claimed gets the time of the newest state before it.
@@ -215,7 +211,11 @@ class Contents:
         return {name: str(value) for name, value in facts.items() if value is not None}
 
     def _pages(self, table: str, row: type[_Row]) -> Iterator[_Row]:
-        query = _PAGE.format(columns=columns_of(row), table=table)
+        page_query = (
+            f"SELECT {{columns}} FROM {{table}} WHERE run_id = :run_id AND {_IN_SEGMENT} "
+            "AND (sim_time_s > :start_s OR id > :after_id) ORDER BY sim_time_s, id LIMIT :limit"
+        )
+        query = page_query.format(columns=columns_of(row), table=table)
         for segment in self.wanted.segments:
             place: dict[str, Any] = {**_bounds(segment), "after_id": 0, "limit": CHUNK_ROWS}
             while page := [row(*each) for each in self.connection.execute(query, place).fetchall()]:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from webots_mcp.plugins.formats.contents import Contents
 from webots_mcp.plugins.formats.mcap_topics import WORLD_FRAME, Topics
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _MOST_PLOTTED: Final = 8
 _MOST_CAMERAS: Final = 4

@@ -4,8 +4,6 @@ A server on loopback answers the page with the same questions as the tools, on c
 cannot write. Its buttons send the same commands as the tools.
 """
 
-from webots_mcp.extras.plugins import Plugin, PluginCommand
+from webots_mcp.extras.plugin_registry import Plugin, PluginCommand
 
-PLUGIN = Plugin(
-    commands=(PluginCommand("view", "What is recorded now", f"{__name__}.view_command:view"),)
-)
+PLUGIN = Plugin(commands=(PluginCommand("view", "Watch", f"{__name__}.view_command:view"),))

@@ -34,12 +34,12 @@ from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.ages import age_in_words
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
-from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robot_status import RUNNING
 from webots_mcp.store.robots import list_robots, nothing_recorded, without_observers
+from webots_mcp.store.run_parameters import described
 from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
 from webots_mcp.store.runs import RunInfo, list_runs
 
@@ -76,10 +76,6 @@ Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 
 _log: Final = logging.getLogger(__name__)
 _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
-_DEFECT: Final = (
-    "a defect of webots-mcp, or rows that it did not write; webots-mcp view has written more about "
-    "it to its terminal"
-)
 _OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
 """Marks of ended runs by database, run and start. The result of a check of them is final."""
 _CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp lights")
@@ -209,7 +205,11 @@ def problem(error: Exception) -> dict[str, Any]:
     waits = isinstance(error, (NoDatabaseError, NothingRecordedError))
     why = str(error)
     if not isinstance(error, WebotsMCPError):
-        why = f"{_DEFECT} ({type(error).__name__}: {why[: _LIMITS.line_characters]})"
+        defect = (
+            "a defect of webots-mcp, or rows that it did not write; webots-mcp view has written "
+            "more about it to its terminal"
+        )
+        why = f"{defect} ({type(error).__name__}: {why[: _LIMITS.line_characters]})"
     unknown: list[str] = []
     if waits or isinstance(error, (UnknownRobotError, UnknownRunError)):
         unknown = ["run", "beside", "view", "at"]

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import anyio
 
-from webots_mcp.answers.models import CommandAnswer
+from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.contract import VERSION
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.questions.parameters import set_parameters
+from webots_mcp.questions.controller_parameters import set_parameters
 from webots_mcp.signals.parameter import Value
 from webots_mcp.simulator.orders import Order
 from webots_mcp.steering.dispatch import Dispatcher

@@ -5,7 +5,7 @@ of a row is the UUID of its recording plus its key there. `pool_interface` defin
 do; `pool_contents` opens one of the two kinds, `postgres_pool` and `parquet_pool`.
 """
 
-from webots_mcp.extras.plugins import Plugin, PluginCommand
+from webots_mcp.extras.plugin_registry import Plugin, PluginCommand
 
 PLUGIN = Plugin(
     commands=tuple(

@@ -38,10 +38,6 @@ _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value
 _OF_GROUP: Final = {
     "stored_row_count": "0", "stored_row_bytes": "0", "chunk_bytes": "0", "is_complete": "1",
 }  # fmt: skip
-_LEFT: Final = (
-    f"FROM state s, chunk c WHERE c.group_id = row_group.id AND c.signal_id = {STATE_IDS} "
-    "AND s.run_id = row_group.run_id AND s.id BETWEEN c.min AND c.max"
-)
 
 
 @dataclass
@@ -144,6 +140,10 @@ class _Fetcher:
             copied: Called with the number of copied states.
         """
         ids = [run.run_id for run in runs]
+        query = (
+            f"FROM state s, chunk c WHERE c.group_id = row_group.id AND c.signal_id = {STATE_IDS} "
+            "AND s.run_id = row_group.run_id AND s.id BETWEEN c.min AND c.max"
+        )
         with _folder(self._data_dir) as folder:
             with small_recording(folder) as small:
                 copy = _Copy(self._pool, runs[0].recording_uuid, small)
@@ -159,9 +159,9 @@ class _Fetcher:
                 copy.rows("chunk", "run_id", lacking)
                 # A group with damaged times has no chunks.
                 small.execute(
-                    f"UPDATE row_group SET stored_row_count = (SELECT count(*) {_LEFT}), "
+                    f"UPDATE row_group SET stored_row_count = (SELECT count(*) {query}), "
                     "stored_row_bytes = "
-                    f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {_LEFT}), 0), "
+                    f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {query}), 0), "
                     "chunk_bytes = coalesce((SELECT sum(coalesce(length(numbers), 0) "
                     "+ coalesce(length(codes), 0) + coalesce(length(labels), 0)) "
                     "FROM chunk WHERE group_id = row_group.id), 0)"

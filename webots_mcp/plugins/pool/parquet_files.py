@@ -41,7 +41,6 @@ RUNS: Final = "_runs"
 PROGRESS: Final = "_progress"
 CHUNK: Final = "chunk"
 VALUES: Final = "value"  # Table with a column for each signal, instead of chunks.
-NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # Engines read it as null.
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _IDS_IN_BLOCK: Final = 4096
@@ -111,7 +110,8 @@ def day_of(wall_time_s: SQLValue) -> str:
     try:
         return (_EPOCH + timedelta(seconds=cast("float", wall_time_s))).date().isoformat()
     except (TypeError, OverflowError, ValueError):  # Null, or a year outside 1 to 9999.
-        return NO_DAY
+        no_day = "__HIVE_DEFAULT_PARTITION__"  # Engines read it as null.
+        return no_day
 
 
 def by_block(table: ShippedTable, rows: Iterable[PoolRow]) -> Mapping[str, list[PoolRow]]:

@@ -233,7 +233,7 @@ def ship(
         bool,
         Parameter(
             "--full",
-            help="Ship all states; else only those of kept stretches, and the chunks of all.",
+            help="Ship all states; else only those of full-rate segments, and the chunks of all.",
         ),
     ] = False,
     pictures: Annotated[
@@ -258,9 +258,9 @@ def ship(
     is not sent again, so that this may be killed and started again at any time; a run that another
     recording has shipped stays that one's.
 
-    Runs, commands, events, log lines, parameters, trials, chunks and kept stretches are shipped,
-    with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
-    from the URL.
+    Runs, commands, events, log lines, parameters, trials, chunks and full-rate segments are
+    shipped, with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file,
+    never from the URL.
     """
     from webots_mcp.plugins.pool.pool_contents import is_postgres, open_pool
     from webots_mcp.plugins.pool.pool_interface import redacted

@@ -48,7 +48,7 @@ def prove(
     anything is otherwise.
     """
     from webots_mcp.contract import VERSION
-    from webots_mcp.plugins.prove.checks import CHECKS
+    from webots_mcp.plugins.prove.fact_checks import CHECKS
     from webots_mcp.simulator.installations import find_webots
     from webots_mcp.simulator.starting import Start
 
@@ -79,7 +79,7 @@ def prove(
 def _run_checks(only: list[str] | None, patience_s: int, *, as_json: bool) -> list[dict[str, Any]]:
     """Run the checks, print each outcome in a line, and return the outcomes."""
     from webots_mcp.plugins.prove.bench import Bench, run_check
-    from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
+    from webots_mcp.plugins.prove.fact_checks import CHECKS, NOT_TRIED
 
     found = list[dict[str, Any]]()
     with tempfile.TemporaryDirectory(prefix="webots-mcp-", ignore_cleanup_errors=True) as folder:

@@ -3,9 +3,9 @@
 Jinja2 is imported with the first report.
 """
 
-from webots_mcp.extras.plugins import Plugin, PluginCommand
+from webots_mcp.extras.plugin_registry import Plugin, PluginCommand
 
 PLUGIN = Plugin(
-    commands=(PluginCommand("report", "The past", f"{__name__}.report_command:report"),),
+    commands=(PluginCommand("report", "Ask", f"{__name__}.report_command:report"),),
     questions=(f"{__name__}.making",),
 )

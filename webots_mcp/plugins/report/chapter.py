@@ -41,9 +41,9 @@ from webots_mcp.store.logs import (
     count_lines,
     newest_lines,
 )
-from webots_mcp.store.parameters import described
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.run_parameters import described
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_info
 from webots_mcp.store.sessions import SessionRecord, fetch_session

@@ -17,7 +17,7 @@ from webots_mcp.plugins.report.chapter import Chapter, EventContext
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 MOST_SIGNALS: Final = 16
 _ROOM: Final = Room(points=500, panels=12, lanes=8, rows=16)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import NotedAnswer
 from webots_mcp.answers.budget import notes_of
-from webots_mcp.answers.models import NotedAnswer
 from webots_mcp.contract import VERSION
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
@@ -315,10 +315,14 @@ def write_report(file: Path, html: bytes, *, overwrite: bool = False) -> None:
 class ReportAnswer(NotedAnswer):
     """A report that was written."""
 
-    file: str | None = None
-    size_bytes: int | None = None
-    holds: dict[str, int] | None = Field(default=None, description="How many of each.")
-    left_out: list[str] | None = Field(default=None, description="What had no room, and why.")
+    file: str | None = Field(default=None, description="Path of the file.")
+    size_bytes: int | None = Field(default=None, description="Size of the file.")
+    holds: dict[str, int] | None = Field(
+        default=None, description="Number of figures, pictures and rows of each table."
+    )
+    left_out: list[str] | None = Field(
+        default=None, description="What did not fit into the file, and why."
+    )
 
 
 @question("Write a report", DESTROYS, tier="all")

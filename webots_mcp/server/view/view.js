@@ -217,7 +217,7 @@ function showChecks(facts) {
   const rows = rowsOf(facts.checks);
   const judged = rows.filter((row) => row.outcome !== "not applicable");
   const others = rows.filter((row) => row.outcome === "not applicable").map((row) => row.check);
-  if (judged.length) showTable(place, "Checks", judged, ["check", "outcome", "evidence", "since_s"]);
+  if (judged.length) showTable(place, "Checks", judged, ["check", "outcome", "evidence", "start_s"]);
   if (facts.passed?.length) made("p", `Passed: ${facts.passed.join(", ")}.`, place);
   if (others.length) made("p", `Not applicable: ${others.join(", ")}.`, place);
   place.hidden = !place.childElementCount;

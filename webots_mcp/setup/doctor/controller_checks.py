@@ -26,8 +26,8 @@ from webots_mcp.simulator.project import (
     writes_states,
 )
 from webots_mcp.store.recording import RobotView
+from webots_mcp.store.registered_signals import registered
 from webots_mcp.store.robots import live_observer
-from webots_mcp.store.signals import registered
 
 _NO_PROJECT: Final = (
     "this folder is in no Webots project: run 'webots-mcp doctor' in the folder of one"

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 
-_SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
 
 
@@ -100,21 +99,22 @@ def _is_unclear(view: RobotView) -> bool:
 def _judged(view: RobotView) -> Diagnosis:
     name, status = view.robot.name, view.status
     seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
+    see_page = "see docs/troubleshooting.md#simulation"
     if view.session is None or not view.robot.live:
         if status.why == UNSEEN:
-            return warning(seen, _SEE_PAGE)
+            return warning(seen, see_page)
         if view.session and (view.session.end_reason or "crashed") in ("crashed", "reload"):
             return wrong(seen, "see 'webots-mcp logs --level error', mend the controller and start "
                          "it again")  # fmt: skip
         return ok(seen)
-    hangs = f"mend that line; else {_SEE_PAGE}" if "silent for " in (status.why or "") else None
+    hangs = f"mend that line; else {see_page}" if "silent for " in (status.why or "") else None
     if status.is_moving:
         return Diagnosis("warning" if status.why else "ok", seen, hangs)
     if status.text == PAUSED:
         return warning(seen, f"webots-mcp resume --robot {name}")
     if (status.why or "").startswith(SEEN_PAUSED):
         return warning(seen, "webots_simulation_control('resume'), or press play")
-    return wrong(seen, hangs or _SEE_PAGE)
+    return wrong(seen, hangs or see_page)
 
 
 def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:

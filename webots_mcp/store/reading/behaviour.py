@@ -7,7 +7,7 @@ from typing import Final
 
 from webots_mcp.signals.meaning import Meaning, meaning_by_behaviour
 from webots_mcp.store.reading.frame import Frame
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _PARTS: Final = 4  # of a run, whose rows are read
 _ROWS: Final = 512  # of each part

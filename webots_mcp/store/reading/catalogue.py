@@ -28,16 +28,11 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
 )
 from webots_mcp.store.reading.unchunked_rows import has_few_new_rows, rows_in_no_chunk
-from webots_mcp.store.signals import RegisteredSignal, cleaned, registered, seen_with
+from webots_mcp.store.registered_signals import RegisteredSignal, cleaned, registered, seen_with
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
 _MOST_OFFERED: Final = 5
 _ONLY_FIRST: Final = f"Only the first {MAX_SIGNALS} names of a robot are kept"
-
-_NEW_ROWS: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "ORDER BY sim_time_s {order}, id {order} LIMIT ?"
-)
 
 
 @dataclass(frozen=True)
@@ -115,8 +110,12 @@ def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
         return rows_in_no_chunk(connection, run_id, (-math.inf, math.inf), at, Deadline())[0]
     asked = (run_id, at.end_s, at.last_state_id, SAMPLED_ROWS // 2)
     rows = dict[int, tuple[object, ...]]()
+    query = (
+        f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+        "ORDER BY sim_time_s {order}, id {order} LIMIT ?"
+    )
     for order in ("ASC", "DESC"):
-        for row in connection.execute(_NEW_ROWS.format(order=order), asked):
+        for row in connection.execute(query.format(order=order), asked):
             rows[row[0]] = row
     columns = StateColumns()
     columns.add(list(rows.values()))

@@ -52,20 +52,9 @@ from webots_mcp.store.reading.unread import Unread
 _FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
 
 _IN: Final = "run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
-_STATES: Final = f"SELECT {STATE_COLUMNS} FROM state WHERE {_IN} ORDER BY sim_time_s, id"
 _KEPT: Final = (
     "SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state "
     f"WHERE {_IN} ORDER BY sim_time_s, id LIMIT ?"
-)
-# Where a run begins, and where what is left of it does: what is oldest goes first.
-_LOST: Final = (
-    "SELECT started_sim_time_s, (SELECT min(start_sim_time_s) FROM row_group WHERE run_id = r.id "
-    "AND is_complete = 1), (SELECT min(sim_time_s) FROM state WHERE run_id = r.id) FROM run r "
-    f"WHERE id = ? AND {HAS_LOST_ROWS}"
-)
-_SIGNALS: Final = (
-    "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
-    "AND typeof(s.name) = 'text'"
 )
 
 
@@ -466,7 +455,13 @@ def _source_of(
     groups: Array = np.zeros((0, 5))
     if full_rate and segment.full_rate:
         columns = StateColumns()
-        cut_at_s = read_rows(connection, _STATES, (run_id, *span), columns, deadline)
+        cut_at_s = read_rows(
+            connection,
+            f"SELECT {STATE_COLUMNS} FROM state WHERE {_IN} ORDER BY sim_time_s, id",
+            (run_id, *span),
+            columns,
+            deadline,
+        )
         if cut_at_s is None:
             cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
     else:
@@ -475,7 +470,11 @@ def _source_of(
         groups = groups_as_array(connection, run_id, *span)
         if every_call and cut_at_s is None:
             cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
-    names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
+    query = (
+        "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
+        "AND typeof(s.name) = 'text'"
+    )
+    names = dict(connection.execute(query, (run_id,)).fetchall())
     source = FrameSource(connection, run_id, groups, columns, names)
     source.derived = _observed_pose(connection, segment, columns, deadline)
     if lost := deleted_part(connection, segment):
@@ -505,7 +504,13 @@ def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> 
 
 def deleted_part(connection: sqlite3.Connection, segment: Segment) -> Unread | None:
     """The part of a segment whose rows and chunks retention has deleted."""
-    row = connection.execute(_LOST, (segment.run_id,)).fetchone()
+    # Where a run begins, and where what is left of it does: what is oldest goes first.
+    row = connection.execute(
+        "SELECT started_sim_time_s, (SELECT min(start_sim_time_s) FROM row_group "
+        "WHERE run_id = r.id AND is_complete = 1), (SELECT min(sim_time_s) FROM state "
+        f"WHERE run_id = r.id) FROM run r WHERE id = ? AND {HAS_LOST_ROWS}",
+        (segment.run_id,),
+    ).fetchone()
     if row is None:
         return None
     start_s, *left = (time_s for time_s in row if isinstance(time_s, int | float))

@@ -35,9 +35,6 @@ from webots_mcp.store.reading.observed_pose import Derived
 from webots_mcp.store.reading.unread import Unread
 
 MOST_CACHED_BYTES: Final = 160_000_000  # of arrays that one frame keeps
-_PATH: Final = (
-    "SELECT path FROM signal WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND name = ?"
-)
 _OF_ITEMS: Final = (
     "SELECT id, json_extract(data, ?), json_array_length(data, ?) FROM {} "
     "WHERE run_id = ? AND id BETWEEN ? AND ? AND json_valid(data)"
@@ -179,7 +176,11 @@ class FrameSource:
         ((_, ids),) = self._of_parts(STATE_IDS, [place])
         wanted = ids.numbers.astype(np.intp).tolist()
         span = (float(self.starts_s[place]), float(self.ends_s[place]))
-        paths = self.connection.execute(_PATH, (self.run_id, f"{array}.{REDUCTIONS[0]}")).fetchone()
+        paths = self.connection.execute(
+            "SELECT path FROM signal WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) "
+            "AND name = ?",
+            (self.run_id, f"{array}.{REDUCTIONS[0]}"),
+        ).fetchone()
         path = f"{paths[0] if paths else _path_of(array)}[{at}]"
         found: dict[int, tuple[Any, Any]] = {}
         for query, sign in ((_ITEMS, 1), (_KEPT_ITEMS, -1)):

@@ -36,12 +36,11 @@ from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, ZoneMap, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts, just_after
-from webots_mcp.store.signals import RegisteredSignal
+from webots_mcp.store.registered_signals import RegisteredSignal
 
 _MAY_TURN: Final = frozenset((None, *ANGLES))  # quantities of what may be an angle by its values
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
 _ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
-_NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
 _DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before a border is behind
 MOST_VALUES: Final = 20
 _FIRST_ROWS_BACK: Final = 1024  # that are looked at before a row, then each time more before those
@@ -293,7 +292,7 @@ def _step(first_s: float, last_s: float, max_points: int, least_s: float) -> flo
 
 def _round_steps(at_least_s: float) -> Iterator[float]:
     for exponent in count(math.floor(math.log10(at_least_s))):
-        for nice in _NICE:
+        for nice in (1, 1.5, 2, 3, 4, 5, 6, 8):
             yield nice * 10**exponent if exponent >= 0 else nice / 10**-exponent
 
 

@@ -18,7 +18,7 @@ from webots_mcp.contract import OBSERVER, WORLD_EVENT
 from webots_mcp.signals.naming import OBSERVED, WORLD, find_position
 from webots_mcp.signals.register import kind_of, unit_of
 from webots_mcp.store.chunks import IS_ABSENT, IS_NUMBER, Decoded, StateColumns, signals_in
-from webots_mcp.store.signals import RegisteredSignal, registered, seen_with, with_roles
+from webots_mcp.store.registered_signals import RegisteredSignal, registered, seen_with, with_roles
 
 Derived = Mapping[str, Callable[[Array], Decoded]]
 """Signals that no row of a run holds, by name: their values at some simulation times."""
@@ -28,30 +28,6 @@ _ANGLES: Final = ("heading_rad", "roll_rad", "pitch_rad")
 _PARTS: Final = ("x_m", "y_m", "z_m", *_ANGLES)
 _LONGEST_GAP_S: Final = 1.0  # between two rows of an observer; more of one that looks seldom
 _GAP_INTERVALS: Final = 3.0
-# The observer's run that lasted longest at the same time, in the same simulation.
-_BESIDE: Final = (
-    "SELECT b.name, o.id, own.name FROM run r JOIN robot own ON own.id = r.robot_id "
-    "JOIN session me ON me.id = r.session_id JOIN session s ON s.instance = me.instance "
-    f"JOIN robot b ON b.id = s.robot_id AND b.kind = '{OBSERVER}' "
-    "JOIN run o ON o.session_id = s.id "
-    f"WHERE r.id = ? AND own.kind <> '{OBSERVER}' "
-    "AND o.started_wall_time_s <= r.last_wall_time_s "
-    "AND o.last_wall_time_s >= r.started_wall_time_s "
-    "ORDER BY min(o.last_wall_time_s, r.last_wall_time_s) "
-    "- max(o.started_wall_time_s, r.started_wall_time_s) DESC, o.id DESC LIMIT 1"
-)
-_HAS_OBSERVER: Final = f"SELECT 1 FROM robot WHERE kind = '{OBSERVER}' LIMIT 1"
-# The newest description of the world that has the robot; a name is left out where it is the key.
-_KEY: Final = (
-    "SELECT min(r.value ->> '$.key'), count(*) FROM event e, "
-    "json_each(CASE WHEN json_valid(e.data) THEN e.data ELSE '{}' END, '$.robots') r "
-    "WHERE e.run_id IN (SELECT id FROM run WHERE session_id = "
-    f"(SELECT session_id FROM run WHERE id = :run)) AND e.kind = '{WORLD_EVENT}' "
-    "AND e.run_id <= :run "
-    "AND coalesce(r.value ->> '$.name', r.value ->> '$.key') = :name "
-    "GROUP BY e.id ORDER BY e.id DESC LIMIT 1"
-)
-_ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
 
 
 class ObservedRobot(NamedTuple):
@@ -81,19 +57,45 @@ def find_observed(
     Returns:
         None where the run has a position, or no observer saw the robot meanwhile.
     """
-    if connection.execute(_HAS_OBSERVER).fetchone() is None:
+    if (
+        connection.execute(f"SELECT 1 FROM robot WHERE kind = '{OBSERVER}' LIMIT 1").fetchone()
+        is None
+    ):
         return None
-    row = connection.execute(_BESIDE, (run_id,)).fetchone()
+    # The observer's run that lasted longest at the same time, in the same simulation.
+    row = connection.execute(
+        "SELECT b.name, o.id, own.name FROM run r JOIN robot own ON own.id = r.robot_id "
+        "JOIN session me ON me.id = r.session_id JOIN session s ON s.instance = me.instance "
+        f"JOIN robot b ON b.id = s.robot_id AND b.kind = '{OBSERVER}' "
+        "JOIN run o ON o.session_id = s.id "
+        f"WHERE r.id = ? AND own.kind <> '{OBSERVER}' "
+        "AND o.started_wall_time_s <= r.last_wall_time_s "
+        "AND o.last_wall_time_s >= r.started_wall_time_s "
+        "ORDER BY min(o.last_wall_time_s, r.last_wall_time_s) "
+        "- max(o.started_wall_time_s, r.started_wall_time_s) DESC, o.id DESC LIMIT 1",
+        (run_id,),
+    ).fetchone()
     if row is None or _has_position(connection, run_id, columns):
         return None
     observer, observer_run_id, name = row
     asked = {"run": observer_run_id, "name": name}
-    key, count = connection.execute(_KEY, asked).fetchone() or (None, 0)
+    # The newest description of the world that has the robot; a name is left out where it is the
+    # key.
+    key, count = connection.execute(
+        "SELECT min(r.value ->> '$.key'), count(*) FROM event e, "
+        "json_each(CASE WHEN json_valid(e.data) THEN e.data ELSE '{}' END, '$.robots') r "
+        "WHERE e.run_id IN (SELECT id FROM run WHERE session_id = "
+        f"(SELECT session_id FROM run WHERE id = :run)) AND e.kind = '{WORLD_EVENT}' "
+        "AND e.run_id <= :run "
+        "AND coalesce(r.value ->> '$.name', r.value ->> '$.key') = :name "
+        "GROUP BY e.id ORDER BY e.id DESC LIMIT 1",
+        asked,
+    ).fetchone() or (None, 0)
     return ObservedRobot(observer, observer_run_id, str(key)) if count == 1 else None
 
 
 def _has_position(connection: sqlite3.Connection, run_id: int, columns: StateColumns) -> bool:
-    (robot_id,) = connection.execute(_ROBOT, (run_id,)).fetchone()
+    (robot_id,) = connection.execute("SELECT robot_id FROM run WHERE id = ?", (run_id,)).fetchone()
     known = seen_with(registered(connection, robot_id), robot_id, columns)
     stored = signals_in(connection, run_id)
     held = [

@@ -44,48 +44,8 @@ from webots_mcp.store.reading.segment import (
     shown_time,
 )
 
-_LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
-_FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?"
-
-# Of the rows of a throttled recording those that a breakpoint's hit let through: so many at least,
-# and how many rows there are, counted no further than matters.
-_HITS: Final = (
-    "SELECT count(*) FROM (SELECT 1 FROM event WHERE run_id = :run AND sim_time_s >= :start "
-    "AND sim_time_s < :end AND kind IN ('breakpoint', 'violation') "
-    "GROUP BY sim_time_s LIMIT :most)"
-)
-_IS_THROTTLED: Final = (
-    "SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.id = ? AND s.throttle_interval > 1"
-)
-_RECORDED: Final = (
-    "SELECT s.throttle_interval, EXISTS (SELECT 1 FROM event WHERE run_id = r.id "
-    "AND kind = 'dropped') FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?"
-)
 _MOST_HITS: Final = 1000
 _LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
-_LOST: Final = (
-    f"SELECT started_sim_time_s, last_sim_time_s FROM run r WHERE id = ? AND {HAS_LOST_ROWS}"
-)
-_RUN_BEFORE: Final = (
-    "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "
-    "start_reason FROM run WHERE id = ?"
-)
-_BOUND: Final = (
-    "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state WHERE run_id = :run "
-    "UNION ALL SELECT {0}(sim_time_s) FROM kept_state WHERE run_id = :run UNION ALL SELECT "
-    "{0}({1}_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1)"
-)
-_RUNS_IN: Final = (
-    "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
-    "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
-    "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?"
-)
-# Whether all rows of a run that has ended were recorded within these wall times.
-_LIES_IN: Final = (
-    "SELECT coalesce(started_wall_time_s >= ? AND ended_wall_time_s < ? "
-    "AND last_wall_time_s <= ended_wall_time_s, 0) FROM run WHERE id = ?"
-)
 # What was stored just before a bound and is shown as of it; commands know no run but their robot's.
 _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
     " UNION ALL ".join(
@@ -101,7 +61,6 @@ _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
 )
 USE_EVERY_ROW: Final = "; ask for such a segment alone to use every row"
 MOST_RUNS: Final = 1000  # that one range in wall time may hold
-_IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
 _LONGEST_SHOWN: Final = 80
 
 
@@ -110,7 +69,10 @@ def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -
     if (run := frame_of_purged(connection, run_id)) is not None:
         place = int(run.places([sim_time_s])[0])
         return float(run.rows(place - 1, place).times[0]) if place else None
-    before_s: float | None = connection.execute(_LAST_BEFORE, (run_id, sim_time_s)).fetchone()[0]
+    before_s: float | None = connection.execute(
+        "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?",
+        (run_id, sim_time_s),
+    ).fetchone()[0]
     return before_s
 
 
@@ -119,7 +81,10 @@ def _row_from(connection: sqlite3.Connection, run_id: int, sim_time_s: float) ->
     if (run := frame_of_purged(connection, run_id)) is not None:
         place = int(run.places([sim_time_s])[0])
         return float(run.rows(place, place + 1).times[0]) if place < len(run) else None
-    from_s: float | None = connection.execute(_FIRST_FROM, (run_id, sim_time_s)).fetchone()[0]
+    from_s: float | None = connection.execute(
+        "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?",
+        (run_id, sim_time_s),
+    ).fetchone()[0]
     return from_s
 
 
@@ -160,10 +125,24 @@ def hit_notes(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> Iterator[str]:
     """That means lean towards the rows that a breakpoint's hits have added to a throttled run."""
-    if connection.execute(_IS_THROTTLED, (run_id,)).fetchone() is None:
+    if (
+        connection.execute(
+            "SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
+            "WHERE r.id = ? AND s.throttle_interval > 1",
+            (run_id,),
+        ).fetchone()
+        is None
+    ):
         return
     values = {"run": run_id, "start": start_s, "end": end_s, "most": _MOST_HITS}
-    (hits,) = connection.execute(_HITS, values).fetchone()
+    # Of the rows of a throttled recording those that a breakpoint's hit let through: so many at
+    # least, and how many rows there are, counted no further than matters.
+    (hits,) = connection.execute(
+        "SELECT count(*) FROM (SELECT 1 FROM event WHERE run_id = :run AND sim_time_s >= :start "
+        "AND sim_time_s < :end AND kind IN ('breakpoint', 'violation') "
+        "GROUP BY sim_time_s LIMIT :most)",
+        values,
+    ).fetchone()
     most = _LEAST_ROWS_PER_HIT * hits
     rows = rows_in("state", connection, run_id, (start_s, end_s), most)
     if (run := frame_of_purged(connection, run_id)) is not None:
@@ -183,7 +162,11 @@ def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
 
 def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
     """What of the published states is not in a run's rows; None where all of them are."""
-    row = connection.execute(_RECORDED, (run_id,)).fetchone()
+    row = connection.execute(
+        "SELECT s.throttle_interval, EXISTS (SELECT 1 FROM event WHERE run_id = r.id "
+        "AND kind = 'dropped') FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?",
+        (run_id,),
+    ).fetchone()
     interval, dropped = row or (None, False)  # of a robot that cannot be read nothing is known
     if interval == 1:
         return "rows were dropped, so their values are missing" if dropped else None
@@ -308,7 +291,10 @@ def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float,
     Rows that retention deleted count: their chunks are there, or a frame says what is not.
     """
     rows = _row_bounds(connection, run_id)
-    lost = connection.execute(_LOST, (run_id,)).fetchone()
+    lost = connection.execute(
+        f"SELECT started_sim_time_s, last_sim_time_s FROM run r WHERE id = ? AND {HAS_LOST_ROWS}",
+        (run_id,),
+    ).fetchone()
     if lost is None:
         return rows
     return lost[0], rows[1] if rows else lost[1]
@@ -316,8 +302,14 @@ def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float,
 
 def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times of a run's first and newest row; None without any."""
+    query = (
+        "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state "
+        "WHERE run_id = :run UNION ALL SELECT {0}(sim_time_s) FROM kept_state "
+        "WHERE run_id = :run UNION ALL SELECT {0}({1}_sim_time_s) FROM row_group "
+        "WHERE run_id = :run AND is_complete = 1)"
+    )
     bounds = [
-        connection.execute(_BOUND.format(*which), {"run": run_id}).fetchone()[0]
+        connection.execute(query.format(*which), {"run": run_id}).fetchone()[0]
         for which in (("min", "start"), ("max", "end"))
     ]
     return None if bounds[0] is None else (bounds[0], bounds[1])
@@ -404,7 +396,11 @@ def _too_young(
     """That the run has not lasted for `last_s`, and which run came before it."""
     if last_s is None or moment_of(last_s) <= age_s:
         return []
-    before, began_by = connection.execute(_RUN_BEFORE, (subject.run_id,)).fetchone()
+    before, began_by = connection.execute(
+        "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "
+        "start_reason FROM run WHERE id = ?",
+        (subject.run_id,),
+    ).fetchone()
     young = f"run {subject.run_id} (started by {began_by}) has lasted only {_seconds(age_s)} s"
     return [young if before is None else f"{young}; the time before is in run {before}"]
 
@@ -426,7 +422,15 @@ def _in_wall_time(
     wall_end_s: float,
 ) -> TimeRange:
     wanted = (subject.robot_id, wall_end_s, wall_start_s, run_id, run_id, MOST_RUNS + 1)
-    runs = [run for (run,) in connection.execute(_RUNS_IN, wanted).fetchall()]
+    runs = [
+        run
+        for (run,) in connection.execute(
+            "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
+            "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
+            "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?",
+            wanted,
+        ).fetchall()
+    ]
     notes: list[str] = []
     walls = (wall_start_s, wall_end_s)
     cuts = (_cut(connection, run, *walls) for run in reversed(runs[:MOST_RUNS]))
@@ -450,7 +454,12 @@ def _cut(
         run_id, recorded[0], just_after(recorded[1]), wall_start_s, wall_end_s,
         open_start=True, open_end=True,
     )  # fmt: skip
-    if connection.execute(_LIES_IN, (wall_start_s, wall_end_s, run_id)).fetchone()[0]:
+    # Whether all rows of a run that has ended were recorded within these wall times.
+    if connection.execute(
+        "SELECT coalesce(started_wall_time_s >= ? AND ended_wall_time_s < ? "
+        "AND last_wall_time_s <= ended_wall_time_s, 0) FROM run WHERE id = ?",
+        (wall_start_s, wall_end_s, run_id),
+    ).fetchone()[0]:
         return _rated(connection, whole)
     frame = read_frame(connection, whole, Deadline())
     if frame.cut_at_s is not None:  # who reads the rows says what there is no time for
@@ -495,7 +504,9 @@ def _iso_seconds(text: str) -> float:
 
 def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None:
     """All rows of a run that has lost some from `state`; None where that table has all of them."""
-    if not connection.execute(_IS_PURGED, (run_id,)).fetchone():
+    if not connection.execute(
+        "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0", (run_id,)
+    ).fetchone():
         return None
     return read_frame(connection, Segment(run_id, -math.inf, math.inf), Deadline())
 

@@ -37,18 +37,7 @@ _FULL_RATE_SEGMENTS: Final = (
     f"AND typeof(start_sim_time_s) {_IS_NUMBER} AND typeof(end_sim_time_s) {_IS_NUMBER} "
     "ORDER BY start_sim_time_s DESC LIMIT ?"
 )
-# Of a stretch that was not ended, up to when its rows are there, which are written in order; and
-# whether rows that the throttle let through follow each other after that. NULL where it is whole.
-_WRITTEN: Final = (
-    "SELECT CASE WHEN (SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run "
-    "AND sim_time_s > time_s AND sim_time_s <= :end LIMIT 2)) = 2 THEN time_s END FROM ("
-    "SELECT coalesce(max(sim_time_s), :start) AS time_s FROM kept_state "
-    "WHERE run_id = :run AND sim_time_s BETWEEN :start AND :end) "
-    "WHERE EXISTS (SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.id = :run AND r.last_sim_time_s < :end AND s.throttle_interval > 1)"
-)
 _IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
-_ROWS: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
 
 
 def shown_time(time_s: float) -> float:
@@ -252,7 +241,18 @@ def _as_written(
 ) -> FullRateSegment:
     """A controller that is killed leaves a stretch whose first rows are there, and not the last."""
     values = {"run": run_id, "start": stretch.start_s, "end": stretch.end_s}
-    (until_s,) = connection.execute(_WRITTEN, values).fetchone() or (None,)
+    # Of a stretch that was not ended, up to when its rows are there, which are written in order;
+    # and whether rows that the throttle let through follow each other after that. NULL where it is
+    # whole.
+    (until_s,) = connection.execute(
+        "SELECT CASE WHEN (SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run "
+        "AND sim_time_s > time_s AND sim_time_s <= :end LIMIT 2)) = 2 THEN time_s END FROM ("
+        "SELECT coalesce(max(sim_time_s), :start) AS time_s FROM kept_state "
+        "WHERE run_id = :run AND sim_time_s BETWEEN :start AND :end) "
+        "WHERE EXISTS (SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
+        "WHERE r.id = :run AND r.last_sim_time_s < :end AND s.throttle_interval > 1)",
+        values,
+    ).fetchone() or (None,)
     if until_s is None:
         return stretch
     reason = f"{stretch.reason}; rows after {until_s:.3f} s are not written"
@@ -293,7 +293,8 @@ def rows_in(
         most: Where counting ends.
     """
     asked = (run_id, *span, most)
-    return int(connection.execute(_ROWS.format(table=table), asked).fetchone()[0])
+    query = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
+    return int(connection.execute(query.format(table=table), asked).fetchone()[0])
 
 
 @dataclass(frozen=True)

@@ -16,23 +16,11 @@ from webots_mcp.store.run_rows import reading_texts
 FEW_ROWS: Final = 4096  # without a maintainer there may be more; those are sampled for new names
 ROWS_AT_ONCE: Final = 1024  # between two checks of the deadline
 _IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
-_NEWEST_IN: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND {_IN} AND (sim_time_s, id) > (?, ?) "
-    "ORDER BY sim_time_s, id"
-)
 _LATE: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
     "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
 )
 _LATE_BY_TIME: Final = _LATE.replace("+run_id", "run_id")
-_IDS_AND_ROWS: Final = (  # how many ids each of the two ways to find late rows goes through
-    "SELECT coalesce((SELECT max(id) FROM state), 0) - ?, (SELECT coalesce(sum(row_count), 0) "
-    "FROM row_group WHERE run_id = ? AND is_complete = 1)"
-)
-_FEWER_THAN: Final = (
-    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
-    "LIMIT ?)"
-)
 
 
 def rows_in_no_chunk(
@@ -58,20 +46,40 @@ def rows_in_no_chunk(
     columns, cut_s = StateColumns(), None
     if at.end_s != float("-inf"):  # without a chunk no row is late, and this would read the file
         late = (run_id, at.max_state_id, *span, *place)
-        ids, rows = connection.execute(_IDS_AND_ROWS, (at.max_state_id, run_id)).fetchone()
+        # how many ids each of the two ways to find late rows goes through
+        ids, rows = connection.execute(
+            "SELECT coalesce((SELECT max(id) "
+            "FROM state), 0) - ?, (SELECT coalesce(sum(row_count), 0) FROM row_group "
+            "WHERE run_id = ? AND is_complete = 1)",
+            (at.max_state_id, run_id),
+        ).fetchone()
         query = _LATE if ids <= rows else _LATE_BY_TIME
         cut_s = read_rows(connection, query, late, columns, deadline)
     if cut_s is None and span[1] >= at.end_s:
         # SQLite would go through all rows from the start of the range rather than from the place.
         after = (max(span[0], at.end_s), span[1])
-        cut_s = read_rows(connection, _NEWEST_IN, (run_id, *after, *place), columns, deadline)
+        cut_s = read_rows(
+            connection,
+            f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND {_IN} "
+            "AND (sim_time_s, id) > (?, ?) ORDER BY sim_time_s, id",
+            (run_id, *after, *place),
+            columns,
+            deadline,
+        )
     return columns, cut_s
 
 
 def has_few_new_rows(connection: sqlite3.Connection, run_id: int, at: ChunkProgress) -> bool:
     """Return whether few rows of a run follow those in chunks, so that all of them can be read."""
     asked = (run_id, at.end_s, at.last_state_id, FEW_ROWS + 1)
-    return bool(connection.execute(_FEWER_THAN, asked).fetchone()[0] <= FEW_ROWS)
+    return bool(
+        connection.execute(
+            "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? "
+            "AND (sim_time_s, id) > (?, ?) LIMIT ?)",
+            asked,
+        ).fetchone()[0]
+        <= FEW_ROWS
+    )
 
 
 def read_rows(

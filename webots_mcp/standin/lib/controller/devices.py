@@ -16,7 +16,7 @@ from math import cos, hypot, isinf, isnan, nan, sin, tan
 from pathlib import Path
 from typing import Any, Final, cast
 
-from . import session as library
+from . import simulator_link as library
 from .surface import Completed, integer, lacking, number, say, text, type_number
 
 _MEMORY: Final = [0.4375, -0.0625, 1.2890625, 0.734375]

@@ -11,10 +11,10 @@ import threading
 from collections.abc import Callable
 from typing import Any, ClassVar, Final
 
-from . import session as library
+from . import simulator_link as library
 from .devices import CLASS_OF, Device
 from .scene import Node, node_of
-from .session import ControllerSession, NodeFacts, SimulatorLink, SocketLink
+from .simulator_link import ControllerSession, NodeFacts, SimulatorLink, SocketLink
 from .surface import Completed, integer, lacking, number, say, text
 
 _NULL_NODE: Final = (0, "", "", "", -1)

@@ -9,7 +9,7 @@ from functools import partial
 from math import nan
 from typing import Any, Final, cast
 
-from .session import ControllerSession, NodeFacts
+from .simulator_link import ControllerSession, NodeFacts
 from .surface import Completed, integer, lacking, number, numbers, say, text, type_number
 
 _LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}

@@ -35,10 +35,10 @@ from webots_mcp.standin import (
 from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.robots import resolve_robot
-from webots_mcp.testing.recording import RobotRecording
+from webots_mcp.testing.robot_recording import RobotRecording
 
 if TYPE_CHECKING:
-    from controller.session import Message
+    from controller.simulator_link import Message
 
 HOLD_LIMIT_S: Final = 2.0
 """How long a pause may hold a loop that nobody can resume, in wall time."""

@@ -134,7 +134,7 @@ class WorldAnswer(Answer):
     )
     supervisor: bool | None = said("Whether the robot may control the simulation.")
     run: dict[str, Any] | None = said("The run: how it began and ended, its duration and its rows.")
-    runs_recorded: int | None = said("Number of recorded runs of the robot.")
+    run_count: int | None = said("Number of recorded runs of the robot.")
     controller: dict[str, Any] | None = said(
         "The file, the code and the versions of the controller."
     )
@@ -172,7 +172,7 @@ class LogsAnswer(Answer):
     """Log lines, oldest first."""
 
     lines: AnswerTable | None = said("Log lines, oldest first.")
-    matching: int | None = said("Number of matching lines; with a cursor, of the older ones.")
+    total: int | None = said("Number of matching lines; with a cursor, of the older ones.")
     cursor: int | None = said("Cursor to ask with for older lines.")
 
 
@@ -182,7 +182,7 @@ class CommandAnswer(Answer):
     command_id: int | None = said("Number of the command.")
     action: str | None = said("Name of the action that was asked for.")
     outcome: str | None = said("done, failed, expired, cancelled, lost, or claimed (under way).")
-    waited_s: float | None = said("Wall-clock seconds that the call waited.")
+    waited_wall_s: float | None = said("Wall-clock seconds that the call waited.")
     result: Any = said("What the controller returned.")
     error: str | None = said("What the controller or the bridge reported.")
     route: str | None = said("What steered: bridge, websocket (of Webots), keyboard or process.")
@@ -396,7 +396,7 @@ class EventsAnswer(NotedAnswer):
         "Events in order of time; a column with @ holds that signal's value when the event began."
     )
     verdicts: KindVerdicts | None = said("What became of each kind that was searched for.")
-    from_s: float | None = said("Begin of the range, where that is not the begin of the run.")
+    start_s: float | None = said("Begin of the range, where that is not the begin of the run.")
     not_shown: dict[str, str] | None = said(
         "Number of events of each kind that are not shown, and when they began."
     )
@@ -431,7 +431,7 @@ class TimelineAnswer(NotedAnswer):
 class MonitorAnswer(NotedAnswer):
     """What was recorded in a window of wall time: of exactly those rows."""
 
-    window_s: float | None = said("Wall-clock seconds that were watched.")
+    window_wall_s: float | None = said("Wall-clock seconds that were watched.")
     row_count: int | None = said("Number of rows recorded in the window.")
     movement: dict[str, Any] | None = said(
         "From where to where the robot moved, with path and displacement in metres."
@@ -517,11 +517,11 @@ class ComparisonAnswer(NotedAnswer):
     """Runs beside each other; the first group is the reference."""
 
     verdict: str | None = said("Where the two runs diverge, with first_difference.")
-    unlike: dict[str, list[Any]] | None = said(
+    different_before: dict[str, list[Any]] | None = said(
         "Properties in which the two runs differed from the beginning."
     )
     compared: dict[str, Any] | None = said("Rows that both runs have at the same simulation time.")
-    parted: AnswerTable | None = said(
+    diverging: AnswerTable | None = said(
         "Signals in the order in which they diverge; beyond_s is when they exceed the tolerance."
     )
     growth: dict[str, Any] | None = said("Largest difference of the signal that diverges most.")

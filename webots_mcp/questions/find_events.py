@@ -8,9 +8,9 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
+from webots_mcp.answers.answer_models import EventsAnswer, TimelineAnswer
 from webots_mcp.answers.budget import answer_about, notes_of, range_in, room_tokens, seconds
 from webots_mcp.answers.event_tables import events_table, fitting_events, not_shown_of, verdicts_of
-from webots_mcp.answers.models import EventsAnswer, TimelineAnswer
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.detection.event_options import EventOptions, both_of
@@ -160,7 +160,7 @@ def _found(
     return {
         "events": events,
         "verdicts": verdicts,
-        "from_s": _begin_of(view, asked),
+        "start_s": _begin_of(view, asked),
         "not_shown": not_shown_of(told),
         "cursor": told.cursor,
         "notes": notes,

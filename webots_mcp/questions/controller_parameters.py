@@ -12,15 +12,15 @@ from typing import Annotated, Any, Final, Literal
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    CommandAnswer,
+    ParametersAnswer,
+)
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
     fitting,
     seconds,
     without_empty,
-)
-from webots_mcp.answers.models import (
-    CommandAnswer,
-    ParametersAnswer,
 )
 from webots_mcp.answers.shortening import WHOLE, shorten
 from webots_mcp.questions.arguments import RobotName, RunId, TimeoutS, Value
@@ -31,8 +31,8 @@ from webots_mcp.questions.send_command import (
 from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
 from webots_mcp.steering.dispatch import Dispatcher, ProgressReport
 from webots_mcp.steering.target import find_target
-from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, described
 from webots_mcp.store.recording import RecordingAccess, RobotView
+from webots_mcp.store.run_parameters import COLUMNS, Declared, declared_by, described
 
 SET_WAIT_S: Final = 10.0
 _ACTION: Final = "set_parameters"

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Protocol, TypeVar, cast
 
-from controller.session import ADDRESS_FILE, Message
+from controller.simulator_link import ADDRESS_FILE, Message
 
 from webots_mcp.standin.base_simulation import BaseSimulation, ControllerEndpoint
 from webots_mcp.standin.controller_answers import description

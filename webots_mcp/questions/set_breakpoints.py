@@ -10,14 +10,14 @@ from typing import Annotated, Any, Final
 from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.answers.answer_models import (
+    BreakpointAnswer,
+    BreakpointsAnswer,
+)
 from webots_mcp.answers.budget import (
     fitting,
     header_of,
     table,
-)
-from webots_mcp.answers.models import (
-    BreakpointAnswer,
-    BreakpointsAnswer,
 )
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import BreakpointAction
@@ -37,11 +37,6 @@ BREAKPOINT_COLUMNS: Final = (
     "id", "condition", "action", "after_hits", "hit_count", "newest_hit_run_id", "newest_hit_s",
     "set_by", "off_because",
 )  # fmt: skip
-_NOT_ASKED: Final = (
-    "no controller of this robot runs to ask any: those that its code had set ended with it, those "
-    "of webots_breakpoint stay and are armed when it starts again"
-)
-_ASKED_NO_MORE: Final = "no controller of this robot runs, so none asks it any more"
 _LONGEST_CONDITION: Final = 300
 
 
@@ -116,7 +111,12 @@ def webots_list_breakpoints(
         more = f"{len(shown)} of {len(rows)}: webots_query_sql has all in table breakpoint"
         none = "this robot has none: webots_breakpoint sets one"
         hints = [more] * (len(shown) < len(rows))
-        hints += [none] * (not rows) + [_NOT_ASKED] * (not view.robot.live)
+        hints += [none] * (not rows) + [
+            (
+                "no controller of this robot runs to ask any: those that its code had set ended "
+                "with it, those of webots_breakpoint stay and are armed when it starts again"
+            )
+        ] * (not view.robot.live)
         return BreakpointsAnswer(
             **view.header(),
             breakpoints=table(BREAKPOINT_COLUMNS, shown),
@@ -141,7 +141,7 @@ async def webots_remove_breakpoint(
     reply, why_not = await _arm(recording, caller, name)
     hint = f"its controller may ask it until then: {why_not}" if why_not else None
     if not await to_thread.run_sync(_is_live, recording, name):
-        hint = _ASKED_NO_MORE
+        hint = "no controller of this robot runs, so none asks it any more"
     return BreakpointAnswer(
         **await to_thread.run_sync(header_of, recording, name),
         breakpoint_id=breakpoint_id,

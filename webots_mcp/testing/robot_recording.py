@@ -24,13 +24,13 @@ from webots_mcp.signals.conditions.compiler import read_expectation
 from webots_mcp.signals.parameter import Value as ParameterValue
 from webots_mcp.store.export import StateTable
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
-from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, find_subject, whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject
+from webots_mcp.store.registered_signals import cleaned, registered
+from webots_mcp.store.run_parameters import parameters_of
 from webots_mcp.store.run_rows import EventRecord, StateRecord, newest_events, runs_of
-from webots_mcp.store.signals import cleaned, registered
 from webots_mcp.testing.recorded_command import RecordedCommand
 from webots_mcp.testing.recorded_signal import RecordedSignal
 

@@ -23,11 +23,11 @@ from typing import Any, Final
 
 from PIL import Image
 
-from webots_mcp.answers.models import ShownPicture
+from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, RobotRow, require
-from webots_mcp.questions import breakpoints, control_simulation, edit_scene, show_pictures
+from webots_mcp.questions import control_simulation, edit_scene, set_breakpoints, show_pictures
 from webots_mcp.simulator import orders
 from webots_mcp.simulator.installations import find_webots
 from webots_mcp.simulator.instances import PORTS_TRIED
@@ -185,10 +185,10 @@ def running_run(bench: Bench) -> None:
 def running_breakpoint(bench: Bench) -> None:
     """A hit pauses at the very step; otherwise a step later."""
     goal = bench.before.state["rounds"] + 100
-    made = bench.ask(breakpoints.webots_breakpoint, condition=f"rounds >= {goal}")
+    made = bench.ask(set_breakpoints.webots_breakpoint, condition=f"rounds >= {goal}")
     bench.until(lambda: bench.row().state["rounds"] >= goal, "its step never came")
     _require_rounds(bench, bench.before, 100)
-    bench.ask(breakpoints.webots_remove_breakpoint, breakpoint_id=made["breakpoint_id"])
+    bench.ask(set_breakpoints.webots_remove_breakpoint, breakpoint_id=made["breakpoint_id"])
 
 
 def running_screenshot(bench: Bench) -> str:

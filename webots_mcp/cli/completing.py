@@ -1,0 +1,107 @@
+"""What a shell completes beyond names of commands and options: robots, runs, signals and kinds.
+
+The script of cyclopts knows commands, options, choices and files. Lines added to it ask
+`webots-mcp completion --values KIND` for names that are in the recording.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final, Literal
+
+if TYPE_CHECKING:
+    import sqlite3
+
+    from webots_mcp.store.recording import RecordingAccess
+
+ValueKind = Literal["robots", "runs", "signals", "kinds"]
+_MOST: Final = 500  # names that are offered
+_OPTIONS: Final = {
+    "robots": ("--robot",),
+    "runs": ("--run", "--runs"),
+    "signals": ("--signal", "--describe", "--undo"),
+    "kinds": ("--kind",),
+}
+_POSITIONALS: Final = {
+    "runs": ("check", "compare", "first-difference", "annotate", "report", "retention"),
+    "signals": ("history", "plot", "trends"),
+}
+_BASH: Final = """
+_webots_mcp_values() {
+  local cur="${COMP_WORDS[COMP_CWORD]}" prev="${COMP_WORDS[COMP_CWORD-1]}" kind="" IFS=$' \\t\\n'
+  case "$prev" in
+@options@
+  esac
+  if [[ -z "$kind" && "$cur" != -* && "$prev" != -* && "$COMP_CWORD" -gt 1 ]]; then
+    case "${COMP_WORDS[1]}" in
+@positionals@
+    esac
+  fi
+  if [[ -n "$kind" ]]; then
+    local -a where=()
+    local i
+    for ((i=2; i<COMP_CWORD-1; i++)); do
+      case "${COMP_WORDS[i]}" in
+        --data-dir|--database) where+=("${COMP_WORDS[i]}" "${COMP_WORDS[i+1]}");;
+      esac
+    done
+    IFS=$'\\n'
+    COMPREPLY=($(compgen -W "$("${COMP_WORDS[0]}" completion --values "$kind" "${where[@]}" \\
+      2>/dev/null)" -- "$cur"))
+    [[ ${#COMPREPLY[@]} -gt 0 ]] && return
+  fi
+  _webots_mcp
+}
+
+complete -F _webots_mcp_values webots-mcp
+"""
+
+
+def with_values(script: str, shell: str) -> str:
+    """Return the script of a shell, which offers names of the recording too (bash and fish)."""
+    if shell == "bash":
+        return script + _BASH.replace("@options@", _bash_cases(_OPTIONS, 4)).replace(
+            "@positionals@", _bash_cases(_POSITIONALS, 6)
+        )
+    if shell == "fish":
+        return script + "".join(map(_fish_line, _OPTIONS))
+    return script
+
+
+def _bash_cases(words_by_kind: dict[str, tuple[str, ...]], indent: int) -> str:
+    return "\n".join(
+        f"{'':{indent}}{'|'.join(words)}) kind={kind};;" for kind, words in words_by_kind.items()
+    )
+
+
+def _fish_line(kind: str) -> str:
+    options = " ".join(f"-l {option.removeprefix('--')}" for option in _OPTIONS[kind])
+    return f"complete -c webots-mcp {options} -x -a '(webots-mcp completion --values {kind})'\n"
+
+
+def values_of(kind: ValueKind, recording: RecordingAccess) -> list[str]:
+    """Return the names of a kind that are in a recording.
+
+    Raises:
+        NoDatabaseError: Nothing is recorded there.
+    """
+    if kind == "kinds":
+        from webots_mcp.judging.detection.events import kind_names
+
+        return kind_names()
+    with recording.reader() as connection:
+        return _recorded(kind, connection)[:_MOST]
+
+
+def _recorded(kind: ValueKind, connection: sqlite3.Connection) -> list[str]:
+    if kind == "robots":
+        from webots_mcp.store.robots import list_robots
+
+        return [robot.name for robot in list_robots(connection, time.time())]
+    if kind == "runs":
+        rows = connection.execute("SELECT id FROM run ORDER BY id DESC LIMIT ?", (_MOST,))
+        return [str(run_id) for (run_id,) in rows]
+    from webots_mcp.store.reading.catalogue import known_signals
+    from webots_mcp.store.reading.ranges import Scope, find_range
+
+    return sorted(known_signals(connection, find_range(connection, Scope())))

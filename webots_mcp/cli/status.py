@@ -1,0 +1,106 @@
+"""The command `status`: every robot on one screen, what it does, since when, and what is wrong.
+
+The limits and sizes of the recording follow with `--storage`.
+"""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Final
+
+from webots_mcp.cli.options import HERE, Json, Parameter, Where
+from webots_mcp.cli.terminal import (
+    is_verbose,
+    print_answer,
+    print_table,
+    printable,
+    terminal_width,
+)
+
+_MOST_MODES: Final = 10  # robots whose mode is looked up: each takes a query
+_COLUMNS: Final = ("robot", "status", "run_id", "sim_time_s", "mode", "mode_since_s", "kind")
+
+
+def status(
+    *,
+    storage: Annotated[
+        bool,
+        Parameter("--storage", negative=(), help="Also show sizes and limits of the recording."),
+    ] = False,
+    json: Json = False,
+    recorded: Where = HERE,
+) -> None:
+    """List the robots: live or not, what each does and since when, and any warnings."""
+    from webots_mcp.cli.asking import ask, show
+    from webots_mcp.questions.list_robots import webots_list_robots
+
+    reply = ask(webots_list_robots, {}, recorded)
+    answer = reply.data or {}
+    if json or "robots" not in answer:
+        return show(webots_list_robots, reply, recorded, as_json=json)
+    robots = _rows_of(answer["robots"])
+    print_answer({"summary": answer["summary"]})
+    shown = [row | _mode_of(row, recorded) for row in robots[:_MOST_MODES]]
+    shown += robots[_MOST_MODES:]
+    print()
+    print_table(_COLUMNS, [[row.get(name) for name in _COLUMNS] for row in shown])
+    warnings = [*_warnings(robots)]
+    if warnings:
+        print()
+    for warning in warnings:
+        _print_wrapped(warning)
+    print()
+    _print_wrapped(f"recording: {answer.get('database')}")
+    details = ("robots", "summary", "database", "retention")
+    rest = {name: value for name, value in answer.items() if name not in details}
+    if storage or is_verbose():
+        rest["retention"] = answer.get("retention")
+    elif "not_in_force" in (answer.get("retention") or {}):
+        rest["retention"] = {"not_in_force": answer["retention"]["not_in_force"]}
+    if rest:
+        print_answer(rest)
+
+
+def _rows_of(table: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    return [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+
+
+def _mode_of(robot: Mapping[str, Any], recorded: Where) -> dict[str, Any]:
+    """Return the value of the robot's signal `mode` and since when, if it has such a signal."""
+    from webots_mcp.cli.asking import ask
+    from webots_mcp.errors import WebotsMCPError
+    from webots_mcp.questions.history import webots_get_trends
+
+    if robot.get("run_id") is None:
+        return {}
+    try:
+        asked = {"robot": robot["robot"], "signals": ["mode"]}
+        (run,) = (ask(webots_get_trends, asked, recorded).data or {})["runs"]
+        states = _rows_of(run["states"])
+    except (WebotsMCPError, KeyError, ValueError):
+        return {}  # no such signal in this run
+    return {"mode": states[0].get("last"), "mode_since_s": states[0].get("since_s")}
+
+
+def _warnings(robots: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield what is wrong or slow with each robot, in a sentence."""
+    for robot in robots:
+        name = robot["robot"]
+        if why := robot.get("why"):
+            yield f"{name}: {why}"
+        if error := robot.get("last_error"):
+            yield f"warning: {name}: last error: {error}"
+        if dropped := robot.get("rows_dropped"):
+            yield f"warning: {name}: {dropped} rows could not be recorded"
+        if waiting := robot.get("rows_waiting"):
+            yield f"warning: {name}: {waiting} rows wait in {robot.get('waiting_in')}"
+        if is_verbose() and robot.get("pace"):
+            yield str(robot["pace"])
+
+
+def _print_wrapped(text: str) -> None:
+    width = terminal_width(sys.stdout)
+    for line in textwrap.wrap(printable(text), width, subsequent_indent="  "):
+        print(line)

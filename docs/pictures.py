@@ -176,7 +176,7 @@ def conversation(data_dir: Path) -> list[str]:
         checked, trends = anyio.run(demo.converse, data_dir, TURNS)
     table = checked["answer"]["checks"]
     failed = dict(zip(table["columns"], table["rows"][0], strict=True))
-    evidence, since = failed["evidence"].partition(";")[0], f"{failed['since_s']:.1f} s"
+    evidence, since = failed["evidence"].partition(";")[0], f"{failed['start_s']:.1f} s"
     (run,) = trends["answer"]["runs"]
     ((signal, course, *_),) = run["numbers"]["rows"]
     return [

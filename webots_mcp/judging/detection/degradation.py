@@ -64,8 +64,8 @@ def degradation_events(search: Search) -> Iterator[Event]:
     signals = [each for each in signals if each not in few]
     if few:
         why = (
-            f"{were_not_searched([each.name for each in few])}: noise is judged from {least_rows} "
-            "rows with a value on"
+            f"{were_not_searched([each.name for each in few])}: noise is judged only in "
+            f"{least_rows} rows or more"
         )
         if not signals:
             raise NotSearchableError(why, "undecided")

@@ -28,7 +28,7 @@ html_theme = "furo"
 html_title = f"webots-mcp {__version__}"
 html_extra_path = ["site"]  # its index.html leads to the first page
 html_copy_source = False
-html_search_scorer = "search_scorer.js"
+html_search_scorer = str(CHECKOUT / "docs" / "search_scorer.js")
 
 myst_heading_anchors = 4
 default_role = "code"  # docstrings write `names` as Markdown does

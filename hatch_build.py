@@ -1,10 +1,11 @@
-"""How the README is shown on the package index, where links into the checkout lead nowhere."""
+"""What a package has of the checkout: the README with other links, and the documentation."""
 
 import re
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 _PICTURE = re.compile(r"(?m)^!\[[^\]]*\]\((?!https?:)([^)\s]+)\)\n+")
@@ -27,6 +28,15 @@ class Readme(MetadataHookInterface):
         if source is not None and _GITHUB.fullmatch(source):
             shown += f"\n<!-- mcp-name: {registry_name(source)} -->\n"
         metadata["readme"] = {"content-type": "text/markdown", "text": shown}
+
+
+class Documentation(BuildHookInterface[Any]):
+    """Adds the pages to the wheel, where `webots-mcp help` finds them."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Add each page; an editable installation reads those of the checkout."""
+        pages = sorted((Path(self.root) / "docs").glob("*.md"))
+        build_data["force_include"] |= {str(p): f"webots_mcp/docs/{p.name}" for p in pages}
 
 
 def source_of(urls: dict[str, str]) -> str | None:

@@ -22,12 +22,20 @@ version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["*.md", "docs/*.md", "examples/*/README.md"]
-exclude_patterns = [".*", "build", "dist", "migrations", "tests", "webots_mcp"]
+include_patterns = [
+    "*.md",
+    "docs/*.md",
+    "docs/*/*.md",
+    "examples/*/README.md",
+    "tests/evaluations/README.md",
+]
+exclude_patterns = [".*", "build", "dist", "migrations", "webots_mcp"]
 html_theme = "furo"
 html_title = f"webots-mcp {__version__}"
 html_extra_path = ["site"]  # its index.html leads to the first page
 html_copy_source = False
+smartquotes = False  # it would make one dash of the two of an option
+# A symptom leads to what to do about it.
 html_search_scorer = str(CHECKOUT / "docs" / "search_scorer.js")
 
 myst_heading_anchors = 4

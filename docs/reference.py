@@ -6,6 +6,8 @@ import inspect
 import re
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import anyio
@@ -15,6 +17,7 @@ from webots_mcp import MemoryDatabase, testing
 from webots_mcp.answers.answer_models import Answer, AnswerPart
 from webots_mcp.answers.columns import COLUMNS
 from webots_mcp.cli import described
+from webots_mcp.cli.commands import COMMANDS, DATA, NOW, PAST, RUNS, SERVER, START, STEER
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.judging.detection.events import KINDS
@@ -24,6 +27,15 @@ from webots_mcp.signals.meaning import QUANTITIES, ROLES, SIDES, short_forms, un
 from webots_mcp.testing import pytest_plugin
 
 _COMMENT: Final = re.compile(r"/\*(.*?)\*/", re.DOTALL)
+DOCS: Final = Path(__file__).parent
+# Of docs/tools.md and of the help, by the pages in docs/tools and docs/command-line.
+HEADINGS: Final = {
+    "now": "What happens now", "past": "What happened before", "steering": "Steering",
+}  # fmt: skip
+COMMAND_GROUPS: Final = {
+    "start": START, "watch": NOW, "ask": PAST, "steer": STEER, "experiments": RUNS,
+    "recordings": DATA, "server": SERVER,
+}  # fmt: skip
 _TOC: Final = "```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n"
 
 
@@ -36,26 +48,50 @@ def navigation(index: str) -> str:
     )
 
 
-def tools(_page: str = "") -> str:
-    """Each tool as it describes itself to a client."""
+def subpages(folder: str) -> str:
+    """The tree of the pages in a folder next to a page, as its links name them."""
+    pages = "\n".join(sorted(f"{folder}/{file.stem}" for file in (DOCS / folder).glob("*.md")))
+    return f"```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
+
+
+def tools(heading: str | None = None) -> str:
+    """Each tool as it describes itself to a client.
+
+    Args:
+        heading: Only those that docs/tools.md lists below this heading.
+    """
+    wanted = None if heading is None else tools_below(heading)
     memory = MemoryDatabase()
     try:
         server = create_server(memory, memory.data_dir)
         listed = sorted(anyio.run(server.list_tools), key=lambda tool: tool.name)
     finally:
         memory.close()
-    return "## Reference\n\n" + "\n".join(map(_tool, listed))
+    shown = (tool for tool in listed if wanted is None or tool.name in wanted)
+    return "## Reference\n\n" + "\n".join(map(_tool, shown))
+
+
+def tools_below(heading: str) -> set[str]:
+    """The tools that the tables of docs/tools.md name below a heading."""
+    text = (DOCS / "tools.md").read_text("utf-8")
+    part = text.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"(?m)^\| (`webots_.*?`) \|", part)
+    return {name for row in rows for name in re.findall(r"webots_\w+", row)}
 
 
 def _tool(tool: Any) -> str:
     required = tool.input_schema.get("required", ())
-    rows = [
-        [f"`{name}`", _kind(schema), _default(schema, name in required),
-         schema.get("description", "")]
+    arguments = [
+        (f"`{name}` ({_kind(schema)}{', required' if name in required else ''})",
+         schema.get("description", "") + _default(schema))
         for name, schema in tool.input_schema["properties"].items()
     ]  # fmt: skip
-    table = _table(["parameter", "type", "default", "meaning"], rows) if rows else ""
-    return f"### {tool.name}\n\n{as_markdown(tool.description)}\n\n{table}"
+    return f"### {tool.name}\n\n{as_markdown(tool.description)}\n\n{_list(arguments)}"
+
+
+def _list(entries: list[tuple[str, str]]) -> str:
+    """Names with their meaning, which fit a telephone where a table would not."""
+    return "".join(f"- {name}: {escaped(' '.join(text.split()))}\n" for name, text in entries)
 
 
 def _kind(schema: dict[str, Any]) -> str:
@@ -72,10 +108,11 @@ def _kind(schema: dict[str, Any]) -> str:
     return " ".join([kind, *between])
 
 
-def _default(schema: dict[str, Any], required: bool) -> str:
-    if required:
-        return "required"
-    return f"`{schema['default']}`" if schema.get("default") is not None else ""
+def _default(schema: dict[str, Any]) -> str:
+    """The default, unless the description gives it."""
+    default = schema.get("default")
+    is_said = "default" in schema.get("description", "").lower()
+    return "" if default is None or is_said else f" Default: `{default}`."
 
 
 def fields(_page: str = "") -> str:
@@ -175,18 +212,23 @@ def meanings(_page: str = "") -> str:
     ))  # fmt: skip
 
 
-def commands(_page: str = "") -> str:
-    """Each command with its arguments, as `--help` has them."""
+def commands(group: str | None = None) -> str:
+    """Each command with its arguments, as `--help` has them.
+
+    Args:
+        group: Only the commands of this group of the help.
+    """
     shown = {
         name: (
             each.text,
-            [[f"`{typed}`", said] for typed, said in each.arguments.items()],
+            [(f"`{typed}`", said) for typed, said in each.arguments.items()],
         )
         for name, each in described().items()
+        if group in (None, COMMANDS[name].group)
     }
     return "## Reference\n\n" + "\n".join(
-        f"### {name}\n\n{as_markdown(text)}\n\n{_table(['argument', 'meaning'], rows)}"
-        for name, (text, rows) in sorted(shown.items())
+        f"### {name}\n\n{as_markdown(text)}\n\n{_list(arguments)}"
+        for name, (text, arguments) in sorted(shown.items())
     )
 
 
@@ -274,14 +316,26 @@ def _table(columns: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n"
 
 
+def _ignoring_page(make: Callable[[str], str], name: str, _page: str) -> str:
+    return make(name)
+
+
 ADDED: Final[dict[str, Callable[[str], str]]] = {
     "docs/index": navigation,
     "docs/check": checks,
     "docs/events": events,
     "docs/fields": fields,
     "docs/meanings": meanings,
-    "docs/tools": tools,
-    "docs/command-line": commands,
+    "docs/accuracy": lambda _page: subpages("accuracy"),
+    "docs/tools": lambda _page: subpages("tools"),
+    "docs/command-line": lambda _page: subpages("command-line"),
     "docs/database": tables,
     "docs/python": interface,
 }
+ADDED.update(
+    {f"docs/tools/{page}": partial(_ignoring_page, tools, name) for page, name in HEADINGS.items()}
+    | {
+        f"docs/command-line/{page}": partial(_ignoring_page, commands, name)
+        for page, name in COMMAND_GROUPS.items()
+    }
+)

@@ -1,8 +1,12 @@
-// The scores of Sphinx's search, with pages about problems first: who searches for "stuck" has one.
-const FIRST = ["docs/my-robot", "docs/troubleshooting"];
+// How the search of the site orders its results: pages that say what to do about a symptom come
+// first; the list of changes and what is generated from the code come last.
+const FIRST = /^docs\/(my-robot|troubleshooting)$/;
+const NEXT = /^docs\/(faq|events|check|first-steps)$/;
+const LAST = /^(CHANGELOG|CONTRIBUTING|docs\/(tools|command-line)\/.*|docs\/(fields|python|database))$/;
 
 var Scorer = {
-  score: ([page, title, anchor, description, score]) => score + (FIRST.includes(page) ? 20 : 0),
+  score: ([page, title, anchor, description, score, file]) =>
+    score + (FIRST.test(page) ? 200 : NEXT.test(page) ? 50 : LAST.test(page) ? -50 : 0),
   objNameMatch: 11,
   objPartialMatch: 6,
   objPrio: { 0: 15, 1: 5, 2: -5 },

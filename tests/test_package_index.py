@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -59,3 +63,23 @@ def test_the_readme_is_whole_but_for_its_links() -> None:
     plain = re.compile(r"\]\([^)]*\)|[\[\]!]")
     readme = (CHECKOUT / "README.md").read_text("utf-8")
     assert plain.sub("", shown({"Source": SOURCE})) == plain.sub("", readme)
+
+
+@pytest.mark.slow
+def test_a_wheel_has_each_page_of_the_documentation_where_the_help_finds_it(
+    tmp_path: Path,
+) -> None:
+    line = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(line, cwd=CHECKOUT, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        held = [Path(name) for name in archive.namelist()]
+        archive.extractall(tmp_path / "installed")
+    pages = {name.name for name in held if name.parent == Path("webots_mcp/docs")}
+    assert pages == {file.name for file in (CHECKOUT / "docs").glob("*.md")}
+    done = subprocess.run(
+        [sys.executable, "-m", "webots_mcp", "help", "scores"],
+        cwd=tmp_path / "installed", capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
+    )  # fmt: skip
+    assert done.stdout.startswith("## Scores\n"), done.stderr

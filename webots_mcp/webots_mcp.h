@@ -11,7 +11,7 @@
        wmcp_close(w);
 
    C99 or C++11, one file, nothing to link. It appends lines, each with one write(), to a journal in
-   the data folder (docs/journal.md), which servers and commands of webots-mcp take into the
+   the data folder (webots-mcp help journal), which servers and commands of webots-mcp take into the
    database. What was published survives a killed controller. No function waits, fails or stops the
    robot: what cannot be written is counted, tried again each second, and reported as an event
    "dropped". NULL does no harm as a wmcp, a name or a text. A wmcp is used by one thread at a time:

@@ -1,12 +1,14 @@
-"""Measures what docs/accuracy.md says, and writes it there: `python -m tests.accuracy [PART...]`.
+"""Measures how accurate answers are and writes docs/accuracy.md and the pages in docs/accuracy.
 
-A part that is not named stays as it was measured last. The README has the headlines of four.
+`python -m tests.accuracy [PART...]`: a part that is not named stays as it was measured last. The
+README has the headlines of four.
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
+import re
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -14,20 +16,25 @@ from pathlib import Path
 from typing import Final
 
 from tests.accuracy import cases, comparing, costs, events
-from tests.accuracy.page import FIGURES, PAGE, README, Part, headline, sections
+from tests.accuracy.page import FIGURES, PAGE, README, Part, headline, table
 from tests.benchmarks import recorders
 from tests.benchmarks.core import Bench
 
 PARTS: Final = (
-    Part("cases", "Situations that people met", cases.cases),
-    Part("events", "Events", events.events),
-    Part("checks", "Checks", events.checks),
-    Part("comparisons", "Comparisons of runs", comparing.comparisons),
-    Part("trials", "Trials", comparing.trials),
-    Part("kills", "What a kill costs", costs.kills),
-    Part("survival", "What a kill leaves of other recordings", recorders.survival),
-    Part("loop", "What recording costs", recorders.loop),
-    Part("answers", "Tokens", costs.answers),
+    Part("cases", "Public situations", "Does it hold for robots of others?", cases.cases),
+    Part("events", "Events", "Are events found, and are they true?", events.events),
+    Part("checks", "Checks", "Do checks find faults?", events.checks),
+    Part("comparisons", "Comparisons of runs", "Are differences real?", comparing.comparisons),
+    Part("trials", "Trials", "Is the best really better?", comparing.trials),
+    Part("kills", "Kills and interrupts", "Does a crash lose data?", costs.kills),
+    Part(
+        "survival",
+        "Kills of other recorders",
+        "How do other recorders survive?",
+        recorders.survival,
+    ),
+    Part("loop", "Cost of recording", "Does it slow the controller?", recorders.loop),
+    Part("answers", "Tokens", "Does it fill the assistant's context?", costs.answers),
 )
 # The parts whose figure is in the README, each with the question that it answers.
 SHOWN: Final = {
@@ -37,19 +44,33 @@ SHOWN: Final = {
     "answers": "Does it fill the assistant's context?",
 }
 _INTRODUCTION: Final = """\
-# How accurate, at what cost
+# Accuracy and cost
 
-What is said of a recording is found by rules, and rules err. This page says how often, and what
-recording costs. `python -m tests.accuracy` measures all of it and writes this page (an hour or
-two; `python -m tests.accuracy loop` only that part, `--effort 0.1` a tenth); no figure is
-written by hand. Durations are of one busy machine: compare ratios. Shares have the interval in
-parentheses that holds the true one nineteen times of twenty.
+Events, checks and verdicts come from rules, and rules err. This page says how often they do, and
+what recording costs.
 
-The first part is about robots and faults that other people reported. In the others the recordings
-are drawn, since only then is it known exactly what happened in them: their robots, noise and faults
-are the authors' idea of real ones, and the rules were made with other draws of the same kinds.
-`python -m tests.cases`, `python -m tests.judging.detection --wrong` and `python -m
-tests.judging.checks` show the single cases."""
+## Public situations
+
+`tests/cases` rebuilds situations from public reports as recordings, with the answer that an expert
+would give. The rules were made with the first two groups in view. The third group was labelled
+before its first question was asked: 2 points for the right answer, 1 for a helpful one, 0 for none,
+-1 for a false one. The first answers earned {first} of {most} points; then some rules were improved
+for whole classes of misses."""
+_SIMULATED: Final = """\
+## All figures
+
+The other recordings are simulated by us, because only then the truth is known exactly. Their
+robots, noise and faults are our idea of real ones. The rules were made with other draws of the same
+kinds. Each figure links to its conditions and tables."""
+_METHOD: Final = """\
+## How it is measured
+
+`python -m tests.accuracy` measures everything and writes these pages in an hour or two; no figure
+is written by hand. `python -m tests.accuracy loop` measures one part, and `--effort 0.1` takes a
+tenth of the time. Durations are those of one busy machine, so compare ratios. A share has its 95 %
+interval in parentheses. `python -m tests.cases`, `python -m tests.judging.detection --wrong` and
+`python -m tests.judging.checks` show single cases."""
+_RIGHT: Final = 2  # points of a situation that is answered rightly
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,35 +87,91 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"no part {', '.join(unknown)}: there is {', '.join(names)}")
     for part in PARTS:
         if part.name in (options.parts or names):
-            section = measured(part, options.effort)
-            known = sections(PAGE.read_text("utf-8")) if PAGE.exists() else {}
-            page = page_of(known | {part.title: section})
-            PAGE.write_text(page, "utf-8")
-            readme = README.read_text("utf-8")
-            README.write_text(FIGURES.sub(lambda _: figures(page), readme), "utf-8")  # noqa: B023
+            details = measured(part, options.effort)
+            part.file.write_text(details, "utf-8")
+            write_summaries()
     return 0
 
 
+def write_summaries() -> None:
+    """Write the page and the README's figures from the pages of the parts."""
+    known = stored()
+    PAGE.write_text(page_of(known), "utf-8")
+    readme = README.read_text("utf-8")
+    README.write_text(FIGURES.sub(lambda _: figures(known), readme), "utf-8")
+
+
+def stored() -> dict[str, str]:
+    """The page of each part as it was measured last, by the part's name."""
+    return {each.name: each.file.read_text("utf-8") for each in PARTS if each.file.exists()}
+
+
 def measured(part: Part, effort: float) -> str:
-    """The section of a part, as it comes out today."""
+    """The page of a part, as it comes out today."""
     with tempfile.TemporaryDirectory() as folder:
         return part.measured(Bench(Path(folder), effort, _show))
 
 
 def page_of(known: dict[str, str]) -> str:
-    """The page of all sections that there are."""
-    parts = [known[part.title] for part in PARTS if part.title in known]
-    return "\n\n".join([_INTRODUCTION, *parts]) + "\n"
+    """The page: the public situations first, then the figure of each part with its page."""
+    shown = [part for part in PARTS if part.name in known]
+    rows = [
+        (part.question, f"{headline(known[part.name])} [Details](accuracy/{part.name}.md)")
+        for part in shown
+    ]
+    texts = situations(known["cases"]) if "cases" in known else []
+    return (
+        "\n\n".join([*texts, _SIMULATED, _in_words(("question", "answer"), rows), _METHOD]) + "\n"
+    )
 
 
-def figures(page: str) -> str:
+def situations(details: str) -> list[str]:
+    """Say how many public situations are answered, and list those that are not.
+
+    Args:
+        details: The page of the part.
+    """
+    counts = re.search(
+        r"(\d+) of (\d+) healthy robots get no alarm, (\d+) of (\d+) problems are answered; "
+        r"(\d+)\s+situations that were labelled first earn (\d+) of (\d+) points",
+        headline(details),
+    )
+    assert counts is not None, headline(details)
+    quiet, healthy, answered, problems, labelled, points, most = counts.groups()
+    rows = re.findall(r"(?m)^\| (.+\(\[report\].+) \| (-?\d+) \| (-?\d+) \|$", details)
+    first = sum(int(points) for _, points, _ in rows)
+    missed = [(name, int(now)) for name, _, now in rows if int(now) < _RIGHT]
+    right = len(rows) - len(missed)
+    wrong = re.search(r"(?ms)^Answered wrongly:\n\n(.*?)\n\n", details)
+    texts = [
+        _INTRODUCTION.format(first=first, most=most),
+        table(
+            ("situations", "number", "answered rightly"),
+            [
+                ("healthy robots, about which any alarm is false", healthy, quiet),
+                ("problems, which must be found or reported as not searched", problems, answered),
+                (f"labelled first ({points} of {most} points)", labelled, str(right)),
+            ],
+        ),
+    ]
+    texts += [f"Answered wrongly in the first two groups:\n\n{wrong[1]}"] if wrong else []
+    if missed:
+        lines = "\n".join(f"- {name}: {now}" for name, now in missed)
+        texts.append(f"Not answered rightly in the third group, with the points:\n\n{lines}")
+    return texts
+
+
+def _in_words(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of sentences."""
+    return table(head, rows).replace("---:", "---")
+
+
+def figures(known: dict[str, str]) -> str:
     """What the README shows: a question for each of four parts, and the figure that answers it."""
-    known = sections(page)
-    titles = {part.name: part.title for part in PARTS}
     return "\n".join(
-        f"- **{question}** {headline(known[titles[name]])}"
+        f"- **{question}** {headline(known[name])}"
         for name, question in SHOWN.items()
-        if titles[name] in known
+        if name in known
     )
 
 

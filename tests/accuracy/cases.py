@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
@@ -16,6 +17,8 @@ from tests.cases.columns import TURN, Array, Random
 from tests.cases.public import FIRST_POINTS, PUBLIC, RIGHT, labels, score
 from tests.cases.rates import FAULTS, INTERVALS_S, NOISES, answer
 from tests.cases.situations import HEALTHY, PROBLEMS, Columns, Situation, failures, quiet, recorded
+from tests.cases.unfamiliar import FIRST_ANSWERS, ROBOTS, ask_faulty, ask_healthy
+from tests.cases.unfamiliar import INTERVALS_S as INTERVALS_OF_ROBOTS_S
 
 _MODULES = (healthy_robots, problems)  # which fill the registries
 _OTHER_INTERVALS_S: Final = (0.016, 0.064, 0.16)
@@ -30,6 +33,12 @@ right answer, 1 for one that helps, 0 for none, -1 for a false one (an alarm abo
 or a pass of the check that should have noticed). The first answers earned {first} of {most} points;
 some of their misses were then mended as classes. The right answers are in
 `tests/cases/public_labels.toml`."""
+_UNFAMILIAR: Final = """\
+{robots} robots of kinds that are in no other list, from a gantry to an underwater glider, were
+drawn healthy with a row each {rates}, and once with a fault each; what to answer was committed
+before the first question. An alarm about a healthy one is false; a fault is answered *right* if the
+check that has to warns or fails, names it and says when it began, *helpful* if one of the three is
+missing, *not judged* if the answer says that it cannot tell, and *denied* if that check passes."""
 _ALSO_DRAWN: Final = """\
 The healthy kinds were drawn again with a row each {rates}, with other noise: {runs} runs, of which
 {alarmed} raise an alarm{names}."""
@@ -67,12 +76,26 @@ def cases(bench: Bench) -> Iterator[str]:
         (_linked(name), str(FIRST_POINTS[name]), str(each.points)) for name, each in scores.items()
     ]
     yield table(("situation", "first", "now"), rows)
+    bench.say("cases: unfamiliar robots")
+    yield _unfamiliar()
     bench.say("cases: other rates")
     yield _other_rates()
     yield _growth()
     bench.say("cases: rates and noises")
     yield _RATES
     yield table(("fault", "a row each", *(f"{100 * each:g} %" for each in NOISES)), _rates())
+
+
+def _unfamiliar() -> str:
+    """Ask about robots of kinds that no rule was made with, healthy ones and ones with a fault."""
+    answers = Counter(
+        ask_healthy(name, interval_s)[0] for name in ROBOTS for interval_s in INTERVALS_OF_ROBOTS_S
+    )
+    answers += Counter(ask_faulty(name)[0] for name in ROBOTS)
+    rows = [(kind, str(first), str(answers[kind])) for kind, first in FIRST_ANSWERS.items()]
+    rates = ", ".join(f"{1000 * each:g}" for each in INTERVALS_OF_ROBOTS_S)
+    said = _UNFAMILIAR.format(robots=len(ROBOTS), rates=f"{rates} ms")
+    return f"{said}\n\n{table(('answer', 'first', 'now'), rows)}"
 
 
 def _growth() -> str:

@@ -193,29 +193,30 @@ def _rare(draws: int) -> list[list[str]]:
 
 
 _COMPARED: Final = """\
-`webots_compare_runs` of the runs before and after an edit of a controller: {pairs} pairs of
-groups in each line. A run is a drive whose speed and whose sensors' means scatter from run to
-run; an answer judges {figures} figures, levels and spreads of signals. Where runs keep to one of
-two lanes, all figures of a run depend on each other; the intervals of figures take them to be
-independent, and are too narrow there. In the second table the edit makes the robot faster, by a
-number of standard deviations between repeated runs."""
+`webots_compare_runs` compares the runs before and after an edit of a controller, with {pairs}
+pairs of groups in each line. In each run, the speed and the means of the sensors scatter. An
+answer judges {figures} figures: levels and spreads of signals. If runs keep to one of two lanes,
+the figures of a run depend on each other; the intervals below assume independence and are too
+narrow there. In the second table, the edit makes the robot faster by a number of standard
+deviations between repeated runs."""
 _POWER: Final = """\
-A comparison is made to claim little that is not there ({chance:g} in 1,000 answers). The price
-is in the second table: 3 runs of each prove nothing at all, and effects below two standard
+Comparisons are designed to claim a false difference in at most {chance:g} of 1,000 answers. The
+second table shows the price: 3 runs of each prove nothing, and effects below two standard
 deviations are mostly left open ("null"), not denied. `min_effect_sd` sets what counts as equal."""
 _OF_NOISE: Final = """\
-Level and spread have verdicts of their own. How often a front sensor that became noisier by an
-edit, and shows the same mean, is said to differ in its spread, and how often in its level:"""
+Level and spread have separate verdicts. In this table, an edit makes a front sensor noisier with
+the same mean. It shows how often the sensor is reported to differ in its spread, and in its
+level:"""
 _OF_RARE: Final = """\
-An event that most runs do not have is counted by run (Fisher's exact test). How often the runs
-after an edit are said to have it more or less often, where it is the only figure:"""
+An event that most runs do not have is counted by run (Fisher's exact test). This table shows how
+often a change is reported after an edit if this event is the only figure:"""
 
 
 def trials(bench: Bench) -> Iterator[str]:
     """Trial sets in which all parameters do alike, and sets in which one is better."""
     rankings = bench.count(2000)
-    cases = [(0.0, "all alike", sets) for sets in (2, 5)]
-    cases += [(0.0, "all alike, half of the trials fall over", 2)]
+    cases = [(0.0, "all equal", sets) for sets in (2, 5)]
+    cases += [(0.0, "all equal, half of the trials fall over", 2)]
     cases += [(sd, f"one ahead by {sd:g} deviations", 5) for sd in _EFFECTS_SD]
     rows, false = list[list[str]](), 0
     for better_sd, kind, sets in cases:
@@ -230,7 +231,7 @@ def trials(bench: Bench) -> Iterator[str]:
         rows.append(row)
     alike = rankings * sum(not each for each, *_ in cases) * len(_REPEATS[1:])
     yield (
-        f"Of sets that are alike, repeated {_REPEATS[1]} times or more, a best is confirmed in "
+        f"Of equal sets, repeated {_REPEATS[1]} times or more, a best is confirmed in "
         f"{false:,} of {alike:,} rankings."
     )
     yield _RANKED.format(rankings=f"{rankings:,}")
@@ -239,10 +240,10 @@ def trials(bench: Bench) -> Iterator[str]:
 
 
 _RANKED: Final = """\
-`is_best_confirmed` of trials whose scores are drawn, normal with a standard deviation of 1: how
-often it is true of the set that is better, and how often of one that is not, in {rankings}
-rankings each. It is meant to be wrong at most once in a hundred. Two or three repeats confirm
-nothing: 4 is what shows that scores differ, as the answer says itself."""
+The scores of these trials are drawn from a normal distribution with a standard deviation of 1.
+The table shows how often `is_best_confirmed` is true for the better set, and how often for
+another one, in {rankings} rankings each. It should be wrong at most once in a hundred. At least
+4 repeats are needed to confirm anything, as the answer says."""
 
 
 def _confirmed(

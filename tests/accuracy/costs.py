@@ -47,14 +47,13 @@ def kills(bench: Bench) -> Iterator[str]:
 
 
 _KILLED: Final = """\
-Controllers record into one database, without a server or with one that maintains it, and are
-killed one after the other at moments by chance, up to 0.3 s after they began; five commands wait
-for each. What they said to have published is compared with what is there afterwards. States that
-a lock kept out of the database wait in a file beside it and are taken in by the next process.
-The machine itself was not switched off: without `fsync` in the loop a power cut may cost the
-newest states."""
+Controllers record into one database, with or without a server. They are killed at random
+moments, up to 0.3 s after their start, while five commands wait for each. What they reported as
+published is compared with the database. States that a lock kept out of the database wait in a
+file next to it, and the next process ingests them. The machine was not switched off: without
+`fsync` in the loop, a power cut may cost the newest states."""
 _INTERRUPTED: Final = """\
-Ctrl-C, at every instruction of the bridge that writes, of which these were drawn:"""
+Ctrl-C is sent at instructions of the bridge's writing code, of which these were drawn:"""
 
 
 def _number(text: str) -> int:
@@ -99,8 +98,7 @@ def answers(bench: Bench) -> Iterator[str]:
 
 
 _READ: Final = """\
-Each question is asked of three recordings of which the accepted answers are stored (`python -m
-tests.golden`), in its usual form and in others. An answer has at most {budget} tokens by design,
-and up to {large} where `limit` or `max_points` asks for more. With
-`serve --tools core` the list has {tools} tools and {tokens} tokens. Tokens are counted by a rule
-of this package (`tokens_in`); each model has its own tokenizer, which was not asked."""
+Each question is asked of three recordings (`python -m tests.golden`), in its usual form and in
+others. An answer has at most {budget} tokens by design, or up to {large} with `limit` or
+`max_points`. With `serve --tools core`, the list has {tools} tools and {tokens} tokens. Tokens
+are counted by a rule of this package (`tokens_in`), not by the tokenizer of a model."""

@@ -33,8 +33,8 @@ MEASURES: Final[dict[Measure, tuple[str, str]]] = {
     "missing": ("missing", "a sensor gives no value"),
     "flat": ("flat", "a sensor is frozen"),
     "dropout": ("jump", "a sensor drops out"),
-    "leap": ("jump", "the robot is somewhere else"),
-    "swing": ("oscillation", "a value swings"),
+    "leap": ("jump", "the robot jumps"),
+    "swing": ("oscillation", "a value oscillates"),
     "gap": ("gap", "no rows"),
 }
 _OF_ONE_RATE: Final = ("hovering", "roaming", "wide")  # drawn with a rate of their own
@@ -56,7 +56,8 @@ def events(bench: Bench) -> Iterator[str]:
     )
     quiet = _sum(each for found in cells.values() for _, each in found if not each.incidents)
     yield (
-        f"{percent(clear.recall)} % of {clear.incidents:,} events in drawn recordings are found, "
+        f"{percent(clear.recall)} % of {clear.incidents:,} events in simulated recordings are "
+        "found, "
         f"{percent(clear.precision)} % of the reported ones are true; with much noise "
         f"{percent(noisy.recall)} % of {noisy.incidents:,} and {percent(noisy.precision)} %."
     )
@@ -91,22 +92,21 @@ CHECKED: Final = (
     "degradation",
 )  # kinds that labelled runs of checks show
 _EVENTS: Final = """\
-For each row interval and each level of noise recordings of {recordings} kinds are drawn, {cases}
-of each: drives, stops, docking, creeping, robots that are held, sensors that fail, values that
-swing, healthy ones and so on. The noise of a position is {places} in each coordinate, of a
-distance sensor {readings}, of a swing {swings} of its amplitude (standard deviations). *Found*
-is the share of what happened that is reported (recall), *true* the share of reports that
-happened (precision), both in per cent, then how often it happened; *off* is the median error of
-begin and end, in parentheses what nine in ten do not exceed (a dropout ends here in its last
-row, in an answer with the next one). In the {hours} hours of recordings in which a kind does not
-happen at all, {false} false events of a kind are reported per hour."""
+For each row interval and noise level, {cases} recordings of each of {recordings} kinds are
+simulated: drives, stops, docking, slow drift, robots that are held, failing sensors,
+oscillations, healthy robots and so on. The noise (standard deviation) is {places} for a position
+coordinate, {readings} for a distance sensor, and {swings} of the amplitude for an oscillation.
+*Found* is the share of events that are reported (recall), and *true* the share of reports that
+are right (precision), both in per cent, followed by the number of events. *Off* is the median
+error of start and end, with the 90th percentile in parentheses. In {hours} hours of recordings
+without an event of a kind, {false} false events of that kind are reported per hour."""
 
 _WHY: Final = """\
-The two weak places have a reason each. A dropout has to be {score:g} times as large as the steps
-of its signal usually are (a modified z-score), which noise of 50 mm makes {jump_m:.1f} m: a
-distance sensor that reads less than that drops out unseen. An answer that finds no jump names
-that size; one that finds some does not. With few rows and much noise nobody can tell a short
-stop from a slow drive; there the answer says that it may have missed some."""
+The two weak cases have these reasons. A dropout must be {score:g} times as large as the signal's
+usual steps (a modified z-score). With noise of 50 mm that is {jump_m:.1f} m, so a distance
+sensor that reads less drops out unnoticed. An answer without any jump names that size. With few
+rows and much noise, a short stop cannot be told from a slow drive; the answer then says that it
+may have missed some."""
 
 
 def _recordings() -> list[str]:
@@ -204,7 +204,7 @@ def checks(bench: Bench) -> Iterator[str]:
         sum(getattr(each, name) for each in judged.values()) for name in ("noticed", "runs")
     )
     yield (
-        f"{noticed} of {runs} runs with a fault are noticed by the check that has to; "
+        f"{noticed} of {runs} runs with a fault are noticed by the responsible check; "
         f"{fails} checks fail in {healthy.runs} healthy runs."
     )
     yield _CHECKS.format(warned=warned, runs=healthy.runs, checks=len(CHECKS))
@@ -224,9 +224,8 @@ def checks(bench: Bench) -> Iterator[str]:
 
 
 _CHECKS: Final = """\
-A healthy run drives, turns, stops as it was told and has sensors that work, with drifting
-odometry and an arm that lags; each fault is put into such a run. Of {runs} healthy runs, judged
-by {checks} checks each, {warned} checks warn. "Other checks that fail" beside a fault are not
-all wrong: a robot that is held also slips. What fails "moves when commanded" in a healthy run is
-a slow turn on the spot: one of 3 s at 0.3 to 0.4 rad/s is taken for being stuck, since turning
-is looked for in stretches of 2 s, of which two in a row have to show it."""
+A healthy run drives, turns and stops as commanded. Its sensors work, its odometry drifts, and an
+arm lags. Each fault is put into such a run. In {runs} healthy runs, judged by {checks} checks
+each, {warned} checks warn. "Other checks that fail" are not always wrong: a robot that is held
+also slips. A healthy run fails "moves when commanded" if it turns slowly in place for 3 s at 0.3
+to 0.4 rad/s: turning is searched in windows of 2 s, and two consecutive ones must show it."""

@@ -1,4 +1,4 @@
-"""The page: parts that are measured one by one, each with the figure that it comes to."""
+"""The pages: parts that are measured one by one, each with the figure that counts."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from webots_mcp import __version__
 
 CHECKOUT: Final = Path(__file__).parents[2]
 PAGE: Final = CHECKOUT / "docs" / "accuracy.md"
+DETAILS: Final = CHECKOUT / "docs" / "accuracy"  # a page for each part
 README: Final = CHECKOUT / "README.md"
 FIGURES: Final = re.compile(r"(?<=<!-- figures -->\n).*?(?=\n\n)", re.S)
 _CORES: Final = os.cpu_count()
@@ -26,14 +27,16 @@ _HEADLINE: Final = re.compile(r"(?m)^\*\*(.+)\*\*$")
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the page.
+    """A part of what is measured, which has a page of its own.
 
     Attributes:
+        question: What a user wants to know.
         measure: Gives paragraphs and tables; the first is one sentence with the figure that counts.
     """
 
     name: str
     title: str
+    question: str
     measure: Callable[[Bench], Iterator[str]]
 
     def measured(self, bench: Bench) -> str:
@@ -42,18 +45,17 @@ class Part:
         headline, *texts = self.measure(bench)
         took = f"{time.monotonic() - started_s:.0f} s"
         made = f"*Measured on {time.strftime('%Y-%m-%d')} in {took} on {_machine()}.*"
-        return "\n\n".join([f"## {self.title}", f"**{headline}**", *texts, made])
+        return "\n\n".join([f"# {self.title}", f"**{headline}**", *texts, made]) + "\n"
+
+    @property
+    def file(self) -> Path:
+        """The page of what was measured last."""
+        return DETAILS / f"{self.name}.md"
 
 
-def sections(page: str) -> dict[str, str]:
-    """The text of each part of a page by its title, with its heading."""
-    parts = re.split(r"(?m)^(?=## )", page)[1:]
-    return {part.splitlines()[0].removeprefix("## "): part.strip() for part in parts}
-
-
-def headline(section: str) -> str:
-    """The sentence with the figure that counts."""
-    (found,) = _HEADLINE.findall(section)
+def headline(details: str) -> str:
+    """The sentence of a page with the figure that counts."""
+    (found,) = _HEADLINE.findall(details)
     return found
 
 

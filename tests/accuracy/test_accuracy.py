@@ -8,35 +8,46 @@ from pathlib import Path
 
 import pytest
 
-from tests.accuracy.__main__ import PARTS, SHOWN, figures, page_of
-from tests.accuracy.page import FIGURES, PAGE, README, Part, sections, share
+from tests.accuracy.__main__ import PARTS, SHOWN, figures, page_of, situations, stored
+from tests.accuracy.page import DETAILS, FIGURES, PAGE, README, Part, share
 from tests.benchmarks.core import Bench
 from tests.judging.checks.labelled import FAULTS, WRITTEN
 from webots_mcp.judging.checks import CHECKS
 from webots_mcp.judging.detection.events import kind_names
 
 PAGE_TEXT = PAGE.read_text("utf-8")
-SECTIONS = sections(PAGE_TEXT)
+DETAILS_OF = stored()
 TINY = 0.01
 
 
 def test_the_page_is_made_of_all_parts_and_nothing_else() -> None:
-    assert list(SECTIONS) == [part.title for part in PARTS]
-    assert page_of(SECTIONS) == PAGE_TEXT
-    for section in SECTIONS.values():
-        assert re.search(r"(?m)^\*Measured on 20\d\d-\d\d-\d\d in \d+ s on .+\*$", section)
+    assert {file.stem for file in DETAILS.glob("*.md")} == {part.name for part in PARTS}
+    assert page_of(DETAILS_OF) == PAGE_TEXT
+    for part in PARTS:
+        details = DETAILS_OF[part.name]
+        assert details.startswith(f"# {part.title}\n")
+        assert re.search(r"(?m)^\*Measured on 20\d\d-\d\d-\d\d in \d+ s on .+\*$", details)
+
+
+def test_the_page_begins_with_the_public_situations_and_names_those_that_are_missed() -> None:
+    details = DETAILS_OF["cases"]
+    rows = re.findall(r"(?m)^\| .+\(\[report\]\(.+\)\) \| -?\d+ \| (-?\d+) \|$", details)
+    _, _, *texts = situations(details)
+    missed = re.findall(r"(?m)^- .+: (-?\d+)$", texts[-1]) if texts else []
+    assert sorted(missed) == sorted(each for each in rows if each != "2")
+    assert PAGE_TEXT.index("healthy robots") < PAGE_TEXT.index("## All figures")
 
 
 def test_the_page_knows_every_kind_of_event_every_check_and_every_fault() -> None:
-    assert set(re.findall(r"`(\w+)`", SECTIONS["Events"])) >= set(kind_names())
-    cells = {cell for row in re.findall(r"(?m)^\|.+\|$", SECTIONS["Checks"])
+    assert set(re.findall(r"`(\w+)`", DETAILS_OF["events"])) >= set(kind_names())
+    cells = {cell for row in re.findall(r"(?m)^\|.+\|$", DETAILS_OF["checks"])
              for cell in row.strip("| ").split(" | ")}  # fmt: skip
     assert cells >= {*FAULTS, *WRITTEN, *(check.name for check in CHECKS)}
 
 
 def test_the_readme_shows_four_figures_of_the_page() -> None:
     (shown,) = FIGURES.findall(README.read_text("utf-8"))
-    assert shown == figures(PAGE_TEXT)
+    assert shown == figures(DETAILS_OF)
     assert len(shown.splitlines()) == len(SHOWN) == 4
     assert "(docs/accuracy.md)" in README.read_text("utf-8")
 
@@ -58,7 +69,7 @@ def test_a_part_comes_out_in_the_form_that_the_page_has(part: Part, tmp_path: Pa
         pytest.importorskip("mcap", reason="the extra 'mcap' is not installed")
         pytest.importorskip("rerun.chunk", reason="the extra 'rerun' is not installed")
     made = part.measured(Bench(tmp_path, TINY, lambda text: None))
-    assert form(made) == form(SECTIONS[part.title]), f"python -m tests.accuracy {part.name}"
+    assert form(made) == form(DETAILS_OF[part.name]), f"python -m tests.accuracy {part.name}"
 
 
 def test_a_share_has_the_interval_of_the_textbook() -> None:

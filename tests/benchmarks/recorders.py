@@ -239,21 +239,21 @@ def loop(bench: Bench) -> Iterator[str]:
     yield (
         f"A recorded `publish()` of 39 values takes {ratio(ours, raw):.2f} times a raw `sqlite3` "
         f"insert ({duration(ours.p50)} of an 8 ms step), {ratio(both, raw):.2f} times with "
-        "the look for commands."
+        "`get_command()`."
     )
     yield _LOOP.format(blocks=rounds, steps=steps)
     heads = ("call, median", "x raw sqlite3", "1 in 100 longer than", "processor, a step")
-    yield table(("way", *heads, "bytes a state", "readable while it records"), rows)
+    yield table(("recorder", *heads, "bytes a state", "readable while it records"), rows)
 
 
 _LOOP: Final = """\
-One process, one loop: in each step of 8 ms it sleeps and then records a state of 39 values (740
-bytes of JSON). The ways take turns in {blocks} blocks of {steps} steps; the ratio is the median
-of those of neighbouring blocks. "Processor" is that of the whole process, its threads among it,
-above a loop that records nothing. They do not do the same: the bridge also keeps runs, changes,
-signals and commands, Rerun writes in threads of its own and leaves texts out here, MCAP packs
-chunks of 1 MB in the call in which one is full. None of them calls `fsync` in the loop, so that
-a power cut may cost each the newest states; that was not tried."""
+In each step of 8 ms, one process sleeps and then records a state of 39 values (740 bytes of
+JSON). The recorders take turns in {blocks} blocks of {steps} steps; the ratio is the median of
+the ratios of neighbouring blocks. "Processor" is the time of the whole process with its threads,
+minus that of a loop that records nothing. The recorders do different work: the bridge also
+stores runs, changes, signals and commands. Rerun writes in its own threads and leaves out texts
+here. MCAP compresses 1 MB in the call that fills a chunk. None calls `fsync` in the loop, so a
+power cut may cost the newest states; this was not tried."""
 
 
 def survival(bench: Bench) -> Iterator[str]:
@@ -277,16 +277,17 @@ def survival(bench: Bench) -> Iterator[str]:
     yield f"{ours[2]} of {ours[1]} states that the bridge had recorded were lost in {kills} kills."
     yield _KILLED.format(kills=kills)
     yield table(
-        ("way", "states written", "lost", "by a kill, median", "most", "nothing readable"), rows
+        ("recorder", "states written", "lost", "by a kill, median", "most", "nothing readable"),
+        rows,
     )
 
 
 _KILLED: Final = """\
-The same ways, each in a process of its own that records without a rest and is killed (SIGKILL)
-{kills} times after 1 to 3 s. Lost is what it had written by its own account and its library's
-reader does not find then; of MCAP the reader of streams is used, for the other one wants the end
-of a file that was closed. What holds a chunk or a batch in memory loses it, and is faster for
-it."""
+The same recorders, each in a process of its own, record without a pause and are killed (SIGKILL)
+{kills} times after 1 to 3 s. A state is lost if the process reported it as written, but the
+library's reader does not find it. For MCAP, the stream reader is used, because the other one
+needs a closed file. A recorder that keeps a chunk or batch in memory loses it, and is faster for
+that."""
 
 
 def _killed(name: str, folder: Path, life_s: float) -> int:

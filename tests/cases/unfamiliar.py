@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -27,6 +27,8 @@ RIGHT, HELPFUL, NOT_JUDGED, DENIED, FALSE = (
     "false alarm",
 )
 GOOD: Final = "quiet"
+# Of the first answers, before a rule was changed for what was missed.
+FIRST_ANSWERS: Final = {GOOD: 39, FALSE: 6, RIGHT: 10, HELPFUL: 3, NOT_JUDGED: 2, DENIED: 0}
 Draw = Callable[[Array, Random, bool], Columns]
 
 
@@ -65,7 +67,7 @@ def _robot(name: str, lasts_s: float, **label: Any) -> Callable[[Draw], Draw]:
     return register
 
 
-def _ramped(t: Array, marks: list[float], values: list[float]) -> Array:
+def _ramped(t: Array, marks: Sequence[float], values: Sequence[float]) -> Array:
     return np.interp(t, marks, values)
 
 
@@ -320,7 +322,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
     aim = _ramped(t, [0, 5, 5.01, 110, 110.01, 200], [10, 10, 30, 30, 18, 18])
-    tracked, value, step = [], 10.0, t[1] - t[0]
+    tracked, value, step = list[float](), 10.0, float(t[1] - t[0])
     for wanted in aim.tolist():
         value += max(-0.5 * step, min(0.5 * step, (wanted - value) * 0.2 * step))
         tracked.append(value)
@@ -432,7 +434,8 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-def _situation(name: str, interval_s: float, *, faulty: bool) -> Situation:
+def situation_of(name: str, interval_s: float, *, faulty: bool) -> Situation:
+    """Return the recording of a robot at a rate, healthy or with its fault."""
     robot = ROBOTS[name]
 
     def draw(t: Array, random: Random) -> Columns:
@@ -443,7 +446,7 @@ def _situation(name: str, interval_s: float, *, faulty: bool) -> Situation:
 
 def ask_healthy(name: str, interval_s: float) -> tuple[str, str]:
     """Return whether a healthy robot is quiet, and what was said."""
-    with recorded(_situation(name, interval_s, faulty=False)) as asked:
+    with recorded(situation_of(name, interval_s, faulty=False)) as asked:
         alarms = [f"{each.name}: {each.evidence}" for each in asked.checked.of("warn", "fail")]
         return (FALSE if alarms else GOOD), "; ".join(alarms)
 
@@ -451,7 +454,7 @@ def ask_healthy(name: str, interval_s: float) -> tuple[str, str]:
 def ask_faulty(name: str) -> tuple[str, str]:
     """Return how a faulty robot is answered, and what was said."""
     robot = ROBOTS[name]
-    with recorded(_situation(name, FAULTY_INTERVAL_S, faulty=True)) as asked:
+    with recorded(situation_of(name, FAULTY_INTERVAL_S, faulty=True)) as asked:
         return _judged(asked, robot)
 
 

@@ -28,7 +28,7 @@ def test_what_is_wrong_ends_with_1_and_what_mends_it_with_its_page(
     assert main(["doctor", "--no-server", "--data-dir", str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert "move it aside" in out
-    assert "(docs/troubleshooting.md#schema)" in out
+    assert "(webots-mcp help troubleshooting schema)" in out.replace("\n", " ")
     assert "Server" not in out
 
 
@@ -74,5 +74,5 @@ def test_as_json_it_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["doctor", "--no-server", "--json", "--data-dir", str(tmp_path)]) == 1
     checks = {each["check"]: each for each in json.loads(capsys.readouterr().out)["checks"]}
     assert checks["Schema"]["verdict"] == "wrong"
-    assert checks["Schema"]["page"] == "docs/troubleshooting.md#schema"
+    assert checks["Schema"]["page"] == "webots-mcp help troubleshooting schema"
     assert checks["Python"].keys() == {"check", "verdict", "seen"}

@@ -35,7 +35,8 @@ DOCS = CHECKOUT / "docs"
 INSTALLED = Path(webots_mcp.__file__).parents[1]
 PAGES = sorted([CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", CHECKOUT / "CONTRIBUTING.md",
                 CHECKOUT / "SECURITY.md",
-                *DOCS.glob("*.md"), *CHECKOUT.glob("examples/*/README.md")])  # fmt: skip
+                *DOCS.glob("*.md"), *CHECKOUT.glob("examples/*/README.md"),
+                CHECKOUT / "tests" / "evaluations" / "README.md"])  # fmt: skip
 WORDS = {2.0: "two", 8: "eight"}
 
 

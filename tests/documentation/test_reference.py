@@ -55,7 +55,7 @@ def test_each_tool_has_its_parameters_with_their_meaning() -> None:
     shown = parts(reference.tools())
     assert shown.keys() == {tool.name for tool in tools}
     for tool in tools:
-        rows = re.findall(r"(?m)^\| `(\w+)` \| .+ \| .* \| (.*) \|$", shown[tool.name])
+        rows = re.findall(r"(?m)^- `(\w+)` \(.+?\): (.*)$", shown[tool.name])
         assert dict(rows).keys() == tool.input_schema["properties"].keys()
         assert all(meaning for _, meaning in rows), tool.name
 
@@ -65,7 +65,7 @@ def test_each_command_has_its_options() -> None:
     assert sorted(shown) == names()
     for name, command in described().items():
         for typed in command.arguments:
-            assert f"`{typed}`".replace("|", "\\|") in shown[name], name
+            assert f"- `{typed}`: " in shown[name], name
 
 
 def test_each_table_and_view_has_its_columns_and_every_comment_of_the_schema() -> None:
@@ -161,3 +161,27 @@ def test_the_navigation_has_the_pages_of_each_list() -> None:
     index = "# A\n\n## One\n\n- [b](b.md): c\n- [d](../d.md)\n\n## Two\n\n- [e](e.md), f\n"
     trees = re.findall(r":caption: ([^\n]+)\n\n(.*?)\n```", reference.navigation(index), re.DOTALL)
     assert trees == [("One", "b.md\n../d.md"), ("Two", "e.md")]
+
+
+def test_each_tool_and_each_command_is_on_one_page() -> None:
+    for folder, everything in (
+        ("tools", reference.tools()),
+        ("command-line", reference.commands()),
+    ):
+        pages = [parts(added("")) for page, added in reference.ADDED.items()
+                 if page.startswith(f"docs/{folder}/")]  # fmt: skip
+        named = [name for page in pages for name in page]
+        assert all(pages)
+        assert sorted(named) == sorted(parts(everything))
+
+
+def test_each_page_that_is_generated_is_there_and_its_parent_links_to_it() -> None:
+    for folder in ("tools", "command-line"):
+        files = {file.stem for file in (reference.DOCS / folder).glob("*.md")}
+        assert {f"docs/{folder}/{name}" for name in files} == {
+            page for page in reference.ADDED if page.startswith(f"docs/{folder}/")
+        }
+        links = re.findall(
+            rf"\]\({folder}/(\w+)\.md\)", (reference.DOCS / f"{folder}.md").read_text()
+        )
+        assert set(links) == files

@@ -11,9 +11,10 @@ CHECKOUT = Path(__file__).parents[2]
 PROMISES, _, LIST = (CHECKOUT / "SECURITY.md").read_text("utf-8").partition("\n## Tests\n")
 # What a sentence is about that promises nothing, or that another sentence already promises.
 NO_PROMISE = (
-    "**An assistant.**", "See [who may do what]", "**Texts of a recording**",
+    "**An assistant.**", "See [permissions]", "**Texts of a recording**",
     "A model may still be fooled", "**A recording from somebody else.**",
     "**Other users of the computer.**", "**Web sites and other computers.**", "What a controller",
+    "What an assistant does",
 )  # fmt: skip
 _QUOTED = re.compile(r'^- "(.+)"$', re.MULTILINE)
 _NAMED = re.compile(r"^  - `(tests/\S+\.py)::(test_\w+)`$", re.MULTILINE)

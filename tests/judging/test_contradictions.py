@@ -10,6 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.cases import healthy_robots, problems
+from tests.cases.public import PUBLIC
+from tests.cases.situations import HEALTHY, PROBLEMS, recorded
+from tests.cases.unfamiliar import ROBOTS, situation_of
 from tests.judging.checks.labelled import FAULTS, healthy
 from tests.judging.checks.labelled import record as record_run
 from tests.judging.detection.drawing import KINDS, draw_case
@@ -24,6 +28,7 @@ from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.store.reading.ranges import Scope, find_range
 
+_MODULES = (healthy_robots, problems)  # which fill the registries
 _REPEATABLE = settings.default is not None and settings.default.derandomize
 _EXAMPLES = 8 if _REPEATABLE else 200
 _UNHURRIED_S: Final = 300.0
@@ -33,6 +38,7 @@ _REPORTED_BY: Final = {
     "stuck": "moves when commanded",
     "off_target": "follows its targets",
     "fall": "stays upright",
+    "slip": "wheels grip",
     "degradation": "sensors keep their noise",
     "gap": "misses no steps",
     "log": "logs no errors",
@@ -40,10 +46,18 @@ _REPORTED_BY: Final = {
 _NOT_MADE: Final[set[Outcome]] = {"not applicable", "not judged", "not looked at"}
 
 
-def contradictions(connection: sqlite3.Connection, run_id: int) -> list[str]:
-    """What of the events and checks of a run does not fit together."""
+def contradictions(
+    connection: sqlite3.Connection, run_id: int, *, by_default: bool = False
+) -> list[str]:
+    """What of the events and checks of a run does not fit together.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        by_default: Events are asked for without naming kinds, as most people do.
+    """
     kinds = tuple(dict.fromkeys(kind for check in CHECKS for kind in check.kinds))
-    options = EventOptions(kinds)
+    options = EventOptions() if by_default else EventOptions(kinds)
     found = find_events(
         connection, find_range(connection, Scope(run_id=run_id)), options, limit=500, group=False,
         deadline_s=_UNHURRIED_S,
@@ -60,6 +74,14 @@ def contradictions(connection: sqlite3.Connection, run_id: int) -> list[str]:
         wrong.append("the position jumped, and it stays in place")
     for check in CHECKS:
         unsearched = [kind for kind in check.kinds if found.verdicts.unlooked(kind)]
+        undecided = [
+            kind
+            for kind in _REPORTED_BY.keys() & {*check.kinds}
+            if outcomes[check.name] == "not judged" and kind in found.verdicts.not_found
+            if kind not in found.verdicts.reasons
+        ]
+        if undecided:
+            wrong.append(f"{check.name!r} is not judged, and {undecided} denied")
         if unsearched and outcomes[check.name] not in _NOT_MADE:
             wrong.append(f"{unsearched} not searched, and {check.name!r} was judged")
         if outcomes[check.name] == "pass":
@@ -74,6 +96,21 @@ def contradictions(connection: sqlite3.Connection, run_id: int) -> list[str]:
 
 def _has_leap(events: tuple[Event, ...]) -> bool:
     return any(each.kind == "jump" and each.name == "position" for each in events)
+
+
+_CASES: Final = {**HEALTHY, **PROBLEMS, **PUBLIC}
+
+
+@pytest.mark.parametrize("name", _CASES)
+def test_situations_of_public_reports(name: str) -> None:
+    with recorded(_CASES[name]) as asked:
+        assert contradictions(asked.connection, asked.run_id, by_default=True) == []
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_robots_of_unfamiliar_kinds(name: str) -> None:
+    with recorded(situation_of(name, 0.2, faulty=True)) as asked:
+        assert contradictions(asked.connection, asked.run_id, by_default=True) == []
 
 
 @pytest.mark.slow

@@ -146,7 +146,7 @@ LIVE: Final = [
          {"path": "ROVER.translation", "value": [0, 0.5, 0.1]}),
     Case("set_field", {"path": "ROVER.translaton", "value": [0, 0, 0]}, ("translation",),
          {"path": "ROVER.translation", "value": [0, 0, 0]}),
-    Case("remove_breakpoint", {"breakpoint_id": 99}, ("has none",), {}, "list_breakpoints"),
+    Case("remove_breakpoint", {"breakpoint_id": 99}, ("no breakpoints",), {}, "list_breakpoints"),
 ]  # fmt: skip
 
 

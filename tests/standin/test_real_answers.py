@@ -14,7 +14,7 @@ from webots_mcp.standin import Simulation
 
 HERE = Path(__file__).parent
 LACKING = "EXC NotInStandInError: the stand-in has no "
-PAGE = "; see docs/standin.md for what it has"
+PAGE = "; see 'webots-mcp help standin' for what it has"
 
 
 class Asked(NamedTuple):

@@ -58,7 +58,7 @@ def test_what_a_class_lacks_says_so_when_it_is_read_or_set(class_name: str) -> N
     for name in MEMBERS[class_name]:
         if isinstance(raw(class_name, name), Lacking):
             with pytest.raises(
-                NotInStandInError, match=rf"has no \w+\.{name}; see docs/standin.md"
+                NotInStandInError, match=rf"has no \w+\.{name}; see 'webots-mcp help standin'"
             ):
                 getattr(owner, name)
             with pytest.raises(NotInStandInError):
@@ -68,7 +68,9 @@ def test_what_a_class_lacks_says_so_when_it_is_read_or_set(class_name: str) -> N
 @pytest.mark.parametrize("class_name", LACKED)
 def test_a_class_that_is_lacking_can_be_imported_but_not_used(class_name: str) -> None:
     lacked = getattr(controller, class_name)
-    with pytest.raises(NotInStandInError, match=rf"has no {class_name}; see docs/standin.md"):
+    with pytest.raises(
+        NotInStandInError, match=rf"has no {class_name}; see 'webots-mcp help standin'"
+    ):
         lacked("x")
     with pytest.raises(NotInStandInError, match=rf"has no {class_name}\.RGB; see"):
         _ = lacked.RGB

@@ -80,7 +80,7 @@ def test_four_wheels_with_textures_and_meshes_drive() -> None:
     assert robot.simulation.robot("robot").position[0] == pytest.approx(0.04 * 5.0 * 0.032 * 20)
     with pytest.raises(
         NotInStandInError,
-        match=r"no Display nodes, so robot 'robot' has no 'display'; see docs/standin\.md",
+        match=r"no Display nodes, so robot 'robot' has no 'display'; see 'webots-mcp help standin'",
     ):
         robot.getDevice("display")
     assert robot.getDevice("nothing") is None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -24,11 +24,28 @@ _AT_ONCE: Final = 256  # windows, which stay in the cache of a processor
 _LOCAL: Final = 14  # rows over which an amplitude is local
 _LEAST_WINDOWS: Final = 3  # that follow each other: filtered noise seldom makes two
 LEAST_FAST_ROWS: Final = _WINDOW + (_LEAST_WINDOWS - 1) * _HOP  # of a fast one that is found
-_DEGREE: Final = 3  # of the polynomial that takes slow motion out of a window
-_CERTAIN: Final = 4.0  # standard errors: an amplitude beyond is none of noise
-_SAME_PHASE_RAD: Final = 1.0  # from one period to the next
-_GOES_ON: Final = 0.6  # of the amplitude of the next period: else it only reaches into this one
 _MOST_PERIODS: Final = 10_000
+
+
+@dataclass(frozen=True)
+class _Certainty:
+    """When an oscillation with a short period is more than noise.
+
+    Attributes:
+        degree: Degree of the polynomial that removes slow motion from a window.
+        certain: Standard errors that the amplitude must exceed.
+        same_phase_rad: Largest change of the phase from one period to the next.
+        goes_on: Smallest amplitude of a period, as a share of the next one's; with less, the
+            oscillation only reaches into that period.
+    """
+
+    degree: int = 3
+    certain: float = 4.0
+    same_phase_rad: float = 1.0
+    goes_on: float = 0.6
+
+
+_SURE: Final = _Certainty()
 
 
 def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> Iterator[Swing]:
@@ -47,10 +64,7 @@ def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> I
 
 def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
     starts = np.arange(0, len(values) - _WINDOW + 1, _HOP)
-    parts = [
-        _peaks_of(values, part) for part in np.split(starts, range(_AT_ONCE, len(starts), _AT_ONCE))
-    ]
-    swings, peak, share, amplitude = map(np.concatenate, zip(*parts, strict=True))
+    swings, peak, share, amplitude = _peaks_in(values, starts)
     for run in runs_of(swings, times[starts]).spans():
         if run.stop - run.start < _LEAST_WINDOWS or np.ptp(peak[run.start : run.stop]) > 2:
             continue
@@ -66,6 +80,30 @@ def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
             yield Swing(
                 float(times[begin]), float(times[end]), half_swings, period_s, size, explained
             )
+
+
+def _peaks_in(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Array]:
+    """Return what `_peaks_of` does of the windows that may be among enough that oscillate.
+
+    So many windows that follow each other include one of which the place is a multiple of their
+    number, and all of them lie near such a one. The others are not examined, and count as quiet.
+    """
+    swings = np.zeros(len(starts), np.bool_)
+    peak = np.zeros(len(starts), np.intp)
+    share, amplitude = np.zeros(len(starts)), np.zeros(len(starts))
+    first = np.arange(0, len(starts), _LEAST_WINDOWS)
+    for wanted in (first, None):
+        if wanted is None:
+            near = np.zeros(len(starts), np.bool_)
+            for shift in range(1, _LEAST_WINDOWS):
+                near[shift:] |= swings[:-shift]
+                near[:-shift] |= swings[shift:]
+            near[first] = False
+            wanted = np.flatnonzero(near)
+        for begin in range(0, len(wanted), _AT_ONCE):
+            some = wanted[begin : begin + _AT_ONCE]
+            swings[some], peak[some], share[some], amplitude[some] = _peaks_of(values, starts[some])
+    return swings, peak, share, amplitude
 
 
 def _peaks_of(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Array]:
@@ -96,7 +134,7 @@ def _peaks_of(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Ar
 @lru_cache(1)
 def _slow_motion() -> Array:
     """Polynomials over a window as orthogonal columns."""
-    return np.linalg.qr(np.vander(np.linspace(-1, 1, _WINDOW), _DEGREE + 1))[0]
+    return np.linalg.qr(np.vander(np.linspace(-1, 1, _WINDOW), _SURE.degree + 1))[0]
 
 
 def _ends_of(values: Array, ordinate: int, first: int) -> tuple[int, int]:
@@ -147,8 +185,8 @@ def course_of(swing: Swing, times: Array, values: Array, noise: float) -> SwingC
             amplitude, here, rows = found
             error = noise * math.sqrt(2 / rows)
             drift = abs(math.remainder(here - phase, 2 * math.pi))
-            is_lost = amplitude < max(_CERTAIN * error, _GOES_ON * size) or amplitude <= 0
-            if is_lost or drift > _SAME_PHASE_RAD:
+            is_lost = amplitude < max(_SURE.certain * error, _SURE.goes_on * size) or amplitude <= 0
+            if is_lost or drift > _SURE.same_phase_rad:
                 break
             edge_s, phase, size = edge_s + step_s, here, amplitude
         amplitudes.append(size)

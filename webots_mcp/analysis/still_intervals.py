@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -17,13 +18,6 @@ NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
 UNSEEN_SLOPE: Final = 3.0  # deviations: a speed that is less may be noise alone
 _SAMPLES: Final = 12  # of the shortest standstill: so finely places are compared at first
 _NEAR_SHARE: Final = 0.9  # of the shortest standstill that it has to stay within the radius
-_LEAST_RAMP_ROWS: Final = 4
-_MOST_RAMP_ROWS: Final = 2**12
-_AGREEING: Final = 3.0  # standard deviations: ends of one ramp in more and more rows
-_RAMP_SHARE: Final = 0.75  # of the smoothed rows: so far a ramp is looked for at first
-_REST_SHARE: Final = 4  # times as many rows as the ramp's tell the place of the rest after it
-_CERTAIN_RAMP: Final = 50.0  # variances of the noise: a ramp that explains more is none of it
-_EXACT_ROWS: Final = 0.25  # an end whose deviation is less is exact enough
 _ROUNDING_M: Final = 1e-6
 _MOST_AT_ONCE: Final = 2**20  # positions
 LONGEST_CREEP: Final = 100.0  # shortest standstills: who takes longer to leave a place drifts
@@ -39,6 +33,33 @@ _MEANS: Final = 30  # of neighbouring rows, that a line is laid through
 _FINE_MEANS: Final = 120  # in which a rest is looked for
 _BORDERS: Final = 25  # at which a rest between two ramps may begin and end
 _MOST_TWITCHES: Final = 12
+
+
+@dataclass(frozen=True)
+class _RampLimits:
+    """How the ends of a motion next to a standstill are found.
+
+    Attributes:
+        fewest_rows: Rows of the shortest motion that a ramp is fitted to.
+        most_rows: Rows of the longest one.
+        agreeing: Standard deviations within which the ends of one ramp, fitted to more
+            and more rows, count as equal.
+        first_share: Share of the smoothed rows in which a ramp is searched for at first.
+        rest_share: Rows of the rest after a ramp that locate it, in rows of the ramp.
+        certain: Variances of the noise that a ramp must explain, since noise explains less.
+        exact_rows: Deviation of an end, in rows, below which no other fit is tried.
+    """
+
+    fewest_rows: int = 4
+    most_rows: int = 2**12
+    agreeing: float = 3.0
+    first_share: float = 0.75
+    rest_share: int = 4
+    certain: float = 50.0
+    exact_rows: float = 0.25
+
+
+_RAMP: Final = _RampLimits()
 
 
 class Standstill(NamedTuple):
@@ -252,7 +273,7 @@ def _begins_of_rest(
         lasts: Indexes of rows in rest.
         coarse_rows: How exactly these are known.
     """
-    least = max(_LEAST_RAMP_ROWS, int(_RAMP_SHARE * track.smoothed_rows), coarse_rows)
+    least = max(_RAMP.fewest_rows, int(_RAMP.first_share * track.smoothed_rows), coarse_rows)
     interval_s = median(np.diff(track.times))
     begins: Indexes = np.array(firsts)
     centre, reach = np.array(begins), np.full(len(firsts), least)
@@ -266,10 +287,12 @@ def _begins_of_rest(
             return begins
         some = left[: max(1, _MOST_AT_ONCE // int(2 * reach[left].max()))]
         start, stop = start[some], stop[some]
-        rest_until = np.maximum(stop, np.minimum(rested[some], stop + _REST_SHARE * reach[some]))
+        rest_until = np.maximum(
+            stop, np.minimum(rested[some], stop + _RAMP.rest_share * reach[some])
+        )
         ramp = _ends_of_ramps(track, start, stop, rest_until)
-        widest = (start == 0) | (reach[some] >= _MOST_RAMP_ROWS)
-        certain = ramp.explained_m2 > _CERTAIN_RAMP * max(track.noise_m, _ROUNDING_M) ** 2
+        widest = (start == 0) | (reach[some] >= _RAMP.most_rows)
+        certain = ramp.explained_m2 > _RAMP.certain * max(track.noise_m, _ROUNDING_M) ** 2
         new = ~known[some]
         unseen = new & ~certain & ~widest
         moves_on = new & ~unseen & (ramp.end == stop - 1) & (stop < latest[some])
@@ -280,7 +303,7 @@ def _begins_of_rest(
         centre[some[moves_on]] = begins[some[moves_on]] = ramp.end[moves_on]
         with np.errstate(divide="ignore", invalid="ignore"):
             error_s = 2 * track.noise_m / (ramp.speed_m_s * np.sqrt(ramp.rows))
-        exact = error_s <= _EXACT_ROWS * interval_s
+        exact = error_s <= _RAMP.exact_rows * interval_s
         goes_on = taken & ~widest & ~exact
         reach[some[unseen | goes_on]] *= 2
         done = some[~(unseen | moves_on | goes_on)]
@@ -347,7 +370,7 @@ def _is_same_ramp(track: SmoothedTrack, end: Indexes, rows: Indexes, wider: _Ram
     more = 1 / np.maximum(rows, 1) - 1 / np.maximum(wider.rows, 1)
     apart_m = (track.times[wider.end] - track.times[end]) * wider.speed_m_s
     moves = (wider.rows > 0) & (wider.speed_m_s > 0)
-    return moves & (apart_m**2 <= more * (_AGREEING * 2 * track.noise_m) ** 2)
+    return moves & (apart_m**2 <= more * (_RAMP.agreeing * 2 * track.noise_m) ** 2)
 
 
 # -- whether it goes on slowly while it stays about a place, and where it rests then ---------------

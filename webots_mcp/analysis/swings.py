@@ -336,9 +336,12 @@ def _groups(good: Indexes, share: Array, which: Indexes, loud: Array) -> Iterato
     apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which)) > 1)
     apart |= np.abs(np.diff(np.log(loud))) > math.log(AS_LOUD) / 2
     waiting: list[tuple[float, float, Indexes]] = []
-    for group in np.split(np.arange(len(good)), np.flatnonzero(apart) + 1):
-        if not len(group) or share[group].max() < LIKELY:
-            continue
+    edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(good)]
+    likely: list[int] = []
+    if len(good):
+        likely = np.flatnonzero(np.maximum.reduceat(share, edges[:-1]) >= LIKELY).tolist()
+    for at in likely:
+        group: Indexes = np.arange(edges[at], edges[at + 1])
         period, size = _period(which[group]), median(loud[group])
         beside, waiting = waiting, []
         for other in beside:

@@ -50,9 +50,9 @@ class Answer(AnswerPart):
     robot: str | None = said("Name of the robot that the answer is about.")
     run_id: int | None = said("Number of the run that the answer is about.")
     sim_time_s: float | None = said("Simulation time of the newest data, in seconds.")
-    age_s: float | None = said("Wall-clock seconds since the newest data.")
+    age_s: float | int | None = said("Wall-clock seconds since the newest data.")
     newest_wall_time: str | None = said(
-        "Time of day of the newest data, if that is more than an hour old."
+        "Time of day of the newest data in UTC, if that is more than an hour old."
     )
     status: str | None = said(
         "Whether the robot is running, paused or starting, stopped some time ago or never seen."

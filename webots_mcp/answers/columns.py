@@ -1,4 +1,4 @@
-"""What each column of each table of the answers means; docs/fields.md is made from it.
+"""What each column of each table of the answers means; the page `fields` is made from it.
 
 Questions name the columns that they fill themselves; a test holds both together. Columns that are
 named by signals, parameters or a SELECT are described in words.

@@ -69,11 +69,6 @@ _C_NUMBERS: Final = re.compile(
 )
 # What Webots' PROTO Car keeps there for its vehicle library: seven numbers, the engine's letter.
 _OF_CAR: Final = re.compile(r"(?:[-+.\de]+ ){7}[CEPS] ")
-_END_REASON: Final = "SELECT end_reason FROM session WHERE id = ?"
-_OPEN_SESSIONS: Final = (
-    "SELECT r.name, s.id, s.instance, s.host, s.pid, s.process, s.last_seen_wall_time_s "
-    "FROM session s JOIN robot r ON r.id = s.robot_id WHERE s.ended_wall_time_s IS NULL"
-)
 
 
 class SeenRobot(Protocol):
@@ -184,7 +179,11 @@ class CustomDataReader:
         """Return the names of the robots of this simulation that other processes record."""
         own = {robot.session_id for robot in self._robots.values()}
         instance, now_s = self._observer.identity.instance, time.time()
-        rows = self._observer.recorder.fetch(_OPEN_SESSIONS, ())
+        statement = (
+            "SELECT r.name, s.id, s.instance, s.host, s.pid, s.process, s.last_seen_wall_time_s "
+            "FROM session s JOIN robot r ON r.id = s.robot_id WHERE s.ended_wall_time_s IS NULL"
+        )
+        rows = self._observer.recorder.fetch(statement, ())
         if rows is None:
             return self._taken
         checked_s = time.monotonic()
@@ -346,7 +345,8 @@ class _Recording:
     def end(self, reason: str) -> None:
         """End run and session; a session that a bridge has ended keeps its reason."""
         ids = self.recorder.registration
-        for (ended,) in (ids and self.recorder.fetch(_END_REASON, (ids.session_id,))) or ():
+        statement = "SELECT end_reason FROM session WHERE id = ?"
+        for (ended,) in (ids and self.recorder.fetch(statement, (ids.session_id,))) or ():
             reason = ended or reason
         self.recorder.close(reason, self._clock.sim_time_s)
 
@@ -391,7 +391,8 @@ class _Recording:
         self._errors.warn(  # also shown by status, as its newest error
             "missed",
             f"robot {self._body.name!r} overwrote {counted.missed} of {counted.total} messages in "
-            "its customData before the observer read them (seq): see docs/any-language.md#rates",
+            "its customData before the observer read them (seq): "
+            "see 'webots-mcp help any-language rates'",
         )
         self._heartbeat.beat()
 

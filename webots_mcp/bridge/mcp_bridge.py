@@ -442,8 +442,8 @@ class MCPBridge:
 
         Events, checks and comparisons then use it, also for runs that were recorded before. A
         signal whose meaning is unknown is not judged. The declaration is stored with the robot; a
-        later one replaces it. docs/meanings.md lists the quantities and the names that need no
-        description.
+        later one replaces it. 'webots-mcp help meanings' lists the quantities
+        and the names that need no description.
 
         Args:
             name: The dotted name of the signal, such as `motors.left`. A `*` stands for any text.
@@ -478,7 +478,7 @@ class MCPBridge:
         signals, and its state is recorded too.
 
         Args:
-            condition: In the language of docs/conditions.md.
+            condition: In the language of 'webots-mcp help conditions'.
             action: `pause` pauses the simulation at that step, which needs a Supervisor; `keep`
                 keeps the seconds around the hit at full rate (see `keep`), as `pause` does too;
                 `log` only records the hit.
@@ -506,8 +506,8 @@ class MCPBridge:
         which it held.
 
         Args:
-            condition: In the language of docs/conditions.md. With `within 20` at its end it must
-                hold once, within 20 seconds from the start of the run.
+            condition: In the language of 'webots-mcp help conditions'. With `within 20` at
+                its end it must hold once, within 20 seconds from the start of the run.
             during: Only while this condition holds.
             name: The name in reports; by default the condition.
 

@@ -84,7 +84,6 @@ _BETWEEN_TRIES_S: Final = 0.0 if sys.platform == "win32" else 0.0001
 _CATCH_UP_S: Final = 0.002  # per call: writing waiting rows must not stall the loop
 _RETRY_INTERVAL_S: Final = 1.0
 _INSERT_STATE: Final = STATEMENTS["state"]
-_RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
 _GO_ON: Final = "UPDATE run SET end_reason = NULL, ended_wall_time_s = NULL WHERE id = ?"
 
 # Errors that no later attempt can resolve.
@@ -431,7 +430,8 @@ class Recorder:
         """Write the run's row, or continue the existing one."""
         values = bind(None, self._ids.session_id, self.describe_run(run))
         entered = self._execute(STATEMENTS["run"], values)
-        ((run_id,),) = self._opened.execute(_RUN_ID, (run.uuid,)).fetchall()
+        statement = "SELECT id FROM run WHERE uuid = ?"
+        ((run_id,),) = self._opened.execute(statement, (run.uuid,)).fetchall()
         if not entered and run is self.run:
             self._execute(_GO_ON, (run_id,))
         run.id = run_id

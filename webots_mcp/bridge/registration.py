@@ -25,7 +25,6 @@ from webots_mcp.database.pauses import PAUSED, STEPPING_WORLD
 from webots_mcp.database.processes import process_identity
 from webots_mcp.database.waiting_file import enter_robot, enter_session
 
-_KIND: Final = "SELECT kind FROM robot WHERE name = ?"
 # A successor in the same Webots within seconds means a reload; so does one after an issued reload
 # command. A predecessor that was killed counts only where Webots starts the controllers: Webots
 # kills one that does not end within a second, while an extern one was killed by a person.
@@ -45,11 +44,6 @@ _RELOADED_SESSION: Final = (
 _RELOADED_RUN: Final = (
     "UPDATE run SET end_reason = 'reload' WHERE end_reason = 'finished' "
     "AND id = (SELECT max(id) FROM run WHERE robot_id = ?)"
-)
-_PAUSED_MODE: Final = (
-    "SELECT coalesce(mode_before_pause, 'real_time') FROM session "
-    "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? "
-    "AND pause_state = ?"
 )
 _LEFT_WAITING: Final = (
     "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) "
@@ -217,7 +211,8 @@ def register(
         session_cleanup.reap(connection, now_s)
         makes_way = partial(_makes_way, identity=identity)
         name = session_cleanup.free_name(connection, identity.robot_name, makes_way)
-        before = connection.execute(_KIND, (name,)).fetchone()
+        statement = "SELECT kind FROM robot WHERE name = ?"
+        before = connection.execute(statement, (name,)).fetchone()
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         # A bridge is not the reloaded successor of an observer's reading of customData.
         is_same = before is None or (before[0] == CUSTOM_DATA) == (identity.kind == CUSTOM_DATA)
@@ -259,7 +254,12 @@ def _is_started_by_webots(identity: Identity) -> bool:
 def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: int) -> str | None:
     """Return the mode before the pause that the robot's last session left in this Webots."""
     values = (robot_id, identity.instance, PAUSED)
-    row = connection.execute(_PAUSED_MODE, values).fetchone()
+    statement = (
+        "SELECT coalesce(mode_before_pause, 'real_time') FROM session "
+        "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? "
+        "AND pause_state = ?"
+    )
+    row = connection.execute(statement, values).fetchone()
     return row[0] if row else None
 
 

@@ -114,17 +114,9 @@ class RunningActions:
             watch.stepping = None
             raise CommandRefusedError(f"{interruption} after {made} of {steps} steps") from None
         ended_by = "it was cancelled" if watch.stepping != command.id else "a breakpoint paused it"
-        why = {"why": f"{ended_by} before the last step"} if made < steps else {}
         watch.stepping = None
         self._pause.begin(Cause(command.id))
-        advanced_s = round(clock.sim_time_s - from_s, 6)
-        counted = {"steps": made, "advanced_s": advanced_s}
-        return {
-            **_miscounted(made, steps),
-            **counted,
-            **mode_now(self._simulation, self._clock),
-            **why,
-        }
+        return self._stepped(made, steps, round(clock.sim_time_s - from_s, 6), ended_by)
 
     def _step_world(self, command: ClaimedCommand, steps: int) -> Progress:
         """Make `steps` steps of a world that does not wait for this robot, then pause.
@@ -136,59 +128,45 @@ class RunningActions:
         """
         pause, simulation, watch = self._pause, self._simulation, self._watch
         simulation.pump()  # the newest answer may be older than the world
-        counted_steps, counted_to_s, ended_by = 0, simulation.time_s, ""
+        world = _WorldSteps(simulation, pause, watch, command.id)
         pause.change_mode_temporarily(command.id, "real_time", stepping=True)
         watch.stepping = command.id
-
-        def made() -> int:
-            nonlocal counted_steps, counted_to_s
-            time_s = simulation.time_s
-            began_s = counted_to_s if time_s >= counted_to_s else 0.0  # the simulation was reset
-            counted_steps += round((time_s - began_s) / simulation.basic_time_step_s)
-            counted_to_s = time_s
-            return counted_steps
-
-        def steps_until(count: int, go_on: Callable[[], bool], round_s: float) -> Generator[None]:
-            """Step until `count` steps are made; yield in between to serve the loop."""
-            nonlocal ended_by
-            until_s = time.monotonic() + round_s
-            while made() < count and watch.stepping == command.id and not ended_by:
-                may_go_on = go_on()
-                if time.monotonic() >= until_s or simulation.over:
-                    yield
-                    until_s = time.monotonic() + round_s
-                    may_go_on = may_go_on and not simulation.paused
-                if pause.active:
-                    ended_by = "a breakpoint paused it"
-                elif not may_go_on:
-                    ended_by = "it was paused in Webots"
-
         try:
-            yield from steps_until(1, simulation.pump, _ROUND_S)
-            if made() < steps and watch.stepping == command.id and not ended_by:
+            yield from world.make(1, simulation.pump, _ROUND_S)
+            if world.go_on_to(steps):
                 with pause.world_waits():
                     # Conditions are evaluated on what is published in a round.
                     round_s = 0.0 if self._breakpoints.armed else _ROUND_S
-                    yield from steps_until(steps, simulation.advance_unless_paused, round_s)
+                    yield from world.make(steps, simulation.advance_unless_paused, round_s)
                     simulation.set_mode("pause")  # before the world stops waiting
         except InterruptedCommandError as interruption:
             watch.stepping = None
-            raise CommandRefusedError(f"{interruption} after {made()} of {steps} steps") from None
+            made = world.count()
+            raise CommandRefusedError(f"{interruption} after {made} of {steps} steps") from None
         simulation.set_mode("pause")
         if not simulation.pump():  # the world may have made a step until it was paused
             yield  # Webots has ended the controller
-        ended_by = ended_by or "it was cancelled"
-        why = {"why": f"{ended_by} before the last step"} if made() < steps else {}
+        made = world.count()
         watch.stepping = None
         self._check_clock()
         pause.begin(Cause(command.id))
-        counted = {"steps": made(), "advanced_s": round(made() * simulation.basic_time_step_s, 6)}
-        return {
-            **_miscounted(made(), steps),
-            **counted,
-            **mode_now(self._simulation, self._clock),
-            **why,
-        }
+        advanced_s = round(made * simulation.basic_time_step_s, 6)
+        ended_by = world.ended_by or "it was cancelled"
+        return self._stepped(made, steps, advanced_s, ended_by)
+
+    def _stepped(
+        self, made: int, steps: int, advanced_s: float, ended_by: str
+    ) -> dict[str, object]:
+        """Return the answer of `step`; a warning comes first where another number was made."""
+        answer: dict[str, object] = {}
+        if made > steps:
+            why = "the loop could not stop in time"
+            answer["warning"] = f"{made} steps were made, not {steps}: {why}"
+        answer |= {"steps": made, "advanced_s": advanced_s}
+        answer |= mode_now(self._simulation, self._clock)
+        if made < steps:
+            answer["why"] = f"{ended_by} before the last step"
+        return answer
 
     def run(self, command: ClaimedCommand) -> Progress:
         """Let the loop run until a condition holds or a time has passed; then act on `then`."""
@@ -251,14 +229,57 @@ class RunningActions:
 
         return finish
 
-    def _mode(
-        self,
-    ) -> dict[str, object]:
+    def _mode(self) -> dict[str, object]:
         return {"mode": self._simulation.mode_name, "sim_time_s": self._clock.sim_time_s}
 
 
-def _miscounted(made: int, steps: int) -> dict[str, object]:
-    """Return a warning where another number of steps was made than was asked for."""
-    if made <= steps:
-        return {}
-    return {"warning": f"{made} steps were made, not {steps}: the loop could not stop in time"}
+class _WorldSteps:
+    """Counts the steps of a world that does not wait for this robot, and lets it make them.
+
+    Args:
+        command_id: The `step` command; it is cancelled once `watch` holds another one.
+
+    Attributes:
+        ended_by: What ended the steps early; empty if nothing did, or the command was cancelled.
+    """
+
+    def __init__(self, simulation: Simulation, pause: Pause, watch: Watch, command_id: int) -> None:
+        self._simulation = simulation
+        self._pause = pause
+        self._watch = watch
+        self._command_id = command_id
+        self._count, self._counted_to_s = 0, simulation.time_s
+        self.ended_by = ""
+
+    def count(self) -> int:
+        """Return the number of steps that the world has made."""
+        time_s = self._simulation.time_s
+        began_s = self._counted_to_s if time_s >= self._counted_to_s else 0.0  # it was reset
+        self._count += round((time_s - began_s) / self._simulation.basic_time_step_s)
+        self._counted_to_s = time_s
+        return self._count
+
+    def go_on_to(self, steps: int) -> bool:
+        """Return whether the world is to make more steps to reach that count."""
+        going_on = self._watch.stepping == self._command_id and not self.ended_by
+        return self.count() < steps and going_on
+
+    def make(self, steps: int, go_on: Callable[[], bool], round_s: float) -> Generator[None]:
+        """Step until the count is reached; yield after each round to serve the loop.
+
+        Args:
+            steps: The count at which to stop.
+            go_on: Waits for or makes the next step, and returns False if the world is paused.
+            round_s: Wall time of a round.
+        """
+        simulation, until_s = self._simulation, time.monotonic() + round_s
+        while self.go_on_to(steps):
+            may_go_on = go_on()
+            if time.monotonic() >= until_s or simulation.over:
+                yield
+                until_s = time.monotonic() + round_s
+                may_go_on = may_go_on and not simulation.paused
+            if self._pause.active:
+                self.ended_by = "a breakpoint paused it"
+            elif not may_go_on:
+                self.ended_by = "it was paused in Webots"

@@ -86,25 +86,29 @@ class BridgeSession:
             simulation, clock, recorder, journal, self.pause, self.full_rate
         )
         self.watch = Watch(clock, simulation.basic_time_step_s / 100)
-        self.publisher = Publisher(
-            clock,
-            recorder,
-            journal,
-            self.heartbeat,
-            throttle,
-            self.breakpoints,
-            self.watch,
-            self.full_rate,
-            DeviceReader(simulation, journal, errors, self._describe_devices),
-            self.reloads,
-            self.begin_run,
-        )
+        self.publisher = self._build_publisher()
         self.unseen = UnseenSteps(simulation, journal, errors)
         self._scene = SceneActions(simulation, clock, journal, errors)
         self.control = self._build_control()
         self._watchdog = Watchdog(simulation, clock, recorder, journal, database, hang_after_s)
         self._began_s: float | None = time.monotonic()  # None once `_on_tick` has checked the loop
         self._maintainer = _start_maintainer(database, self._on_tick)
+
+    def _build_publisher(self) -> Publisher:
+        devices = DeviceReader(self.simulation, self.journal, self.errors, self._describe_devices)
+        return Publisher(
+            self.clock,
+            self.recorder,
+            self.journal,
+            self.heartbeat,
+            self.throttle,
+            self.breakpoints,
+            self.watch,
+            self.full_rate,
+            devices,
+            self.reloads,
+            self.begin_run,
+        )
 
     def _build_control(self) -> Control:
         simulation, clock, pause, queue = (

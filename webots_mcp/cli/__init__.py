@@ -35,7 +35,8 @@ EXIT_BAD_INPUT: Final = 2
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
 
 Controllers record into one SQLite database. An AI assistant reads it and steers the simulation over
-MCP. Try `webots-mcp demo` first. `webots-mcp COMMAND --help` explains a command.
+MCP. Try `webots-mcp demo` first. `webots-mcp COMMAND --help` explains a command, and
+`webots-mcp help TOPIC` prints what the documentation says about a topic.
 """
 _HELP_OF_A_FEW: Final = (
     "\nThese are the everyday commands; `webots-mcp --help --all` lists all {number}.\n"
@@ -113,7 +114,8 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
             for each in app[argv[0]].assemble_argument_collection()
             if each.names
         )
-    is_help = not {"--help", "-h"}.isdisjoint(argv)  # nothing of a recording, and may have colours
+    # Nothing of a recording, and may have colours.
+    is_help = argv[:1] == ["help"] or not {"--help", "-h"}.isdisjoint(argv)
     if is_help:
         argv = [each for each in argv if each != "--all" or argv[0] in COMMANDS]
     ending = ending_by_signals(is_process=is_process)

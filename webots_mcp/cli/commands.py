@@ -33,6 +33,7 @@ _OF_THE_CORE: Final = {
     "init": CommandEntry(START, f"{_CLI}.setting_up", "init"),
     "launch": CommandEntry(START, f"{_CLI}.serving", "launch"),
     "doctor": CommandEntry(START, f"{_CLI}.setting_up", "doctor"),
+    "help": CommandEntry(START, f"{_CLI}.help_pages", "help_"),
     "status": CommandEntry(NOW, f"{_CLI}.status", "status"),
     "tail": CommandEntry(NOW, f"{_CLI}.data", "tail"),
     "logs": CommandEntry(NOW, f"{_Q}.get_logs", "webots_get_logs"),

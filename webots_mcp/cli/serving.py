@@ -97,7 +97,7 @@ def serve(
             negative=(),
             help="Tell clients that have channels (Claude Code) without being asked when a "
             "breakpoint is hit, an expectation is violated, a controller crashed or trials are "
-            "done; see docs/updates.md.",
+            "done; see 'webots-mcp help updates'.",
         ),
     ] = False,
     limits: RetentionOptions = _AS_BEFORE,
@@ -110,7 +110,7 @@ def serve(
 
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
 
-    With --http 8000 it runs until Ctrl-C, and clients come and go: see docs/clients.md.
+    With --http 8000 it runs until Ctrl-C, and clients come and go: see 'webots-mcp help clients'.
 
     While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
     Limits belong to the database: what 'webots-mcp prune' or 'retention' has set,

@@ -574,7 +574,7 @@ def header(
 
         webots-mcp header controllers/my_robot
 
-    An older one is replaced. docs/c.md has what a controller calls.
+    An older one is replaced. 'webots-mcp help c' has what a controller calls.
     """
     from webots_mcp.contract import C_HEADER
 

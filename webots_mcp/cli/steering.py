@@ -179,8 +179,8 @@ def signals(
         webots-mcp signals 'front*'
 
     Describe those whose meaning is unknown or wrong. The fields are quantity, role, unit,
-    target_of, same_as, side, low and high; docs/meanings.md lists their values. A description
-    applies to past runs too.
+    target_of, same_as, side, low and high; 'webots-mcp help meanings' lists their values. A
+    description applies to past runs too.
 
         webots-mcp signals --describe motors.left quantity='wheel speed' role=commanded
     """
@@ -320,7 +320,8 @@ def audit(
 ) -> None:
     """Who asked for what that changes something, and what became of it; newest first.
 
-    MCP clients, this command line and the page; see docs/policy.md. No row is ever deleted.
+    MCP clients, this command line and the page; see 'webots-mcp help policy'. No row is ever
+    deleted.
     """
     from webots_mcp.store.requests import newest_requests
 
@@ -394,7 +395,7 @@ _DEFAULTS: Final = TrialOptions()
 
 
 def trials(
-    plan: Annotated[Path, Parameter("PLAN", help="A .toml file: see docs/trials.md.")],
+    plan: Annotated[Path, Parameter("PLAN", help="A .toml file: see 'webots-mcp help trials'.")],
     /,
     *,
     options: TrialOptions = _DEFAULTS,

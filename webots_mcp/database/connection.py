@@ -61,10 +61,6 @@ _OF_COLUMNS: Final = (
     r'(, ?"?\w+"?( (ASC|DESC))?)*\)'
 )
 _INDEX: Final = r"CREATE (UNIQUE )?INDEX"
-_OBJECTS: Final = (
-    "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
-    "FROM {}.sqlite_master WHERE sql IS NOT NULL"
-)
 # Names of SQLite's own functions: a table or view of such a name would be read in their place.
 _OF_SQLITE: Final = r"pragma_|json_(each|tree)$|sqlite_"
 _OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
@@ -379,7 +375,11 @@ def require_shipped(
     """
     shipped = _objects_of(statements or shipped_statements())
     texts = set(shipped.values())
-    found = connection.execute(_OBJECTS.format(schema)).fetchall()
+    statement = (
+        "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
+        "FROM {}.sqlite_master WHERE sql IS NOT NULL"
+    )
+    found = connection.execute(statement.format(schema)).fetchall()
     names = {name.lower() for _, name, _, _ in found}
     for name, sql in shipped.items():
         if name not in names and not re.match(_INDEX, sql):  # without one, all is slower, and true

@@ -24,19 +24,7 @@ LEASE_S: Final = 30.0
 # One that ends later was taken before the clock was set back. It is not one lease from now: the
 # holder may renew after the asker looked at the clock and before its statement reads the row.
 _TIMES: Final = 2
-_TAKE: Final = (
-    "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (:name, :holder, :until) "
-    "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
-    "WHERE holder = :holder OR until_wall_time_s NOT BETWEEN :now AND :latest "
-    "OR :forced OR holder LIKE :outranked"
-)
 _RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?"
-_GIVE_BACK: Final = "DELETE FROM lease WHERE name = ? AND holder = ?"
-_HOLDER: Final = "SELECT holder FROM lease WHERE name = ? AND until_wall_time_s BETWEEN ? AND ?"
-_HELD: Final = (
-    "SELECT name FROM lease WHERE substr(name, 1, length(:prefix)) = :prefix "
-    "AND until_wall_time_s BETWEEN :now AND :latest ORDER BY name"
-)
 
 
 class JobLease(NamedTuple):
@@ -65,7 +53,8 @@ def lease_of(name: str) -> JobLease:
 def holder_of(connection: sqlite3.Connection, name: str) -> str | None:
     """Return the process that holds the lease of a job; None if no process renewed it lately."""
     now_s = time.time()
-    row = connection.execute(_HOLDER, (name, now_s, now_s + _TIMES * LEASE_S)).fetchone()
+    statement = "SELECT holder FROM lease WHERE name = ? AND until_wall_time_s BETWEEN ? AND ?"
+    row = connection.execute(statement, (name, now_s, now_s + _TIMES * LEASE_S)).fetchone()
     return row and str(row[0])
 
 
@@ -73,7 +62,11 @@ def held_jobs(connection: sqlite3.Connection, prefix: str) -> list[str]:
     """Return the names of the jobs with this prefix whose lease some process holds."""
     now_s = time.time()
     asked = {"prefix": prefix, "now": now_s, "latest": now_s + _TIMES * LEASE_S}
-    return [str(name) for (name,) in connection.execute(_HELD, asked)]
+    statement = (
+        "SELECT name FROM lease WHERE substr(name, 1, length(:prefix)) = :prefix "
+        "AND until_wall_time_s BETWEEN :now AND :latest ORDER BY name"
+    )
+    return [str(name) for (name,) in connection.execute(statement, asked)]
 
 
 def take(
@@ -94,12 +87,19 @@ def take(
     now_s = time.time()
     times = {"now": now_s, "until": now_s + lease.lasts_s, "latest": lease.latest_s(now_s)}
     names = {"name": lease.name, "holder": lease.holder, "outranked": outranked}
-    return connection.execute(_TAKE, {**names, **times, "forced": forced}).rowcount > 0
+    statement = (
+        "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (:name, :holder, :until) "
+        "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
+        "WHERE holder = :holder OR until_wall_time_s NOT BETWEEN :now AND :latest "
+        "OR :forced OR holder LIKE :outranked"
+    )
+    return connection.execute(statement, {**names, **times, "forced": forced}).rowcount > 0
 
 
 def give_back(connection: sqlite3.Connection, lease: JobLease) -> None:
     """Release a lease, so that others can take it at once."""
-    connection.execute(_GIVE_BACK, (lease.name, lease.holder))
+    statement = "DELETE FROM lease WHERE name = ? AND holder = ?"
+    connection.execute(statement, (lease.name, lease.holder))
 
 
 @contextmanager

@@ -35,11 +35,6 @@ _ENQUEUE: Final = (
     "(:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires, :request) "
     "ON CONFLICT (idempotency_key) DO NOTHING"
 )
-_CANCEL: Final = (
-    "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
-    "WHERE id = :id AND status = 'pending'"
-)
-_NOTE: Final = "UPDATE command SET error = :note WHERE id = :id AND status = 'claimed'"
 
 # -- the statements by which a controller claims and answers commands, and others settle them ------
 
@@ -213,12 +208,17 @@ class CommandQueue:
         if self.cancel(command_id, why):
             return False
         values = {"id": command_id, "note": f"{why}; the command continues"}
-        return _while_busy(lambda: self._connection.execute(_NOTE, values)).rowcount == 1
+        statement = "UPDATE command SET error = :note WHERE id = :id AND status = 'claimed'"
+        return _while_busy(lambda: self._connection.execute(statement, values)).rowcount == 1
 
     def cancel(self, command_id: int, why: str) -> bool:
         """Cancel a command that is not claimed yet; True if it will now never run."""
         values = {"id": command_id, "now": self._clock(), "why": why}
-        return _while_busy(lambda: self._connection.execute(_CANCEL, values)).rowcount == 1
+        statement = (
+            "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
+            "WHERE id = :id AND status = 'pending'"
+        )
+        return _while_busy(lambda: self._connection.execute(statement, values)).rowcount == 1
 
 
 def find_command(connection: sqlite3.Connection, idempotency_key: str) -> QueuedCommand | None:

@@ -266,7 +266,7 @@ CREATE TABLE breakpoint (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	robot_id INTEGER /* null: of robot_name */, 
 	session_id INTEGER, 
-	condition TEXT NOT NULL /* see docs/conditions.md */, 
+	condition TEXT NOT NULL /* see webots-mcp help conditions */, 
 	action TEXT NOT NULL /* pause, log or keep */, 
 	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
 	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 

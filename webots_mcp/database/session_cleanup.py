@@ -48,11 +48,6 @@ _OPEN_SESSIONS: Final = (
     "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
     "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
 )
-_SESSIONS_OF: Final = (
-    "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s, s.instance, r.kind "
-    "FROM session s JOIN robot r ON r.id = s.robot_id "
-    "WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
-)
 
 
 class OpenSession(NamedTuple):
@@ -82,7 +77,12 @@ def free_name(
     """
     wanted, number = name, 1
     while True:
-        sessions = [OpenSession(*row) for row in connection.execute(_SESSIONS_OF, (wanted,))]
+        statement = (
+            "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s, s.instance, r.kind "
+            "FROM session s JOIN robot r ON r.id = s.robot_id "
+            "WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
+        )
+        sessions = [OpenSession(*row) for row in connection.execute(statement, (wanted,))]
         living = (each for each in sessions if is_living(*each[1:5], time.time()))
         if all(map(makes_way, living)):
             for session in sessions:

@@ -59,11 +59,6 @@ _REMOVE: Final = (
     "DELETE FROM breakpoint WHERE id = :id AND robot_id = :robot AND id IN "
     f"(SELECT b.id {_OF_ROBOT.replace('?', ':robot')}) RETURNING id"
 )
-_NEWEST_HIT: Final = (
-    "SELECT e.run_id, e.sim_time_s FROM event e JOIN run u ON u.id = e.run_id "
-    "WHERE u.robot_id = ? AND e.kind IN ('breakpoint', 'violation') "
-    "AND json_extract(e.data, '$.breakpoint_id') = ? ORDER BY e.id DESC LIMIT 1"
-)
 
 
 class StoredBreakpoint(NamedTuple):
@@ -140,5 +135,10 @@ def newest_hit(
     connection: sqlite3.Connection, robot_id: int, breakpoint_id: int
 ) -> tuple[int, float] | None:
     """Run and simulation time of the newest hit whose action was taken; None without any."""
-    row = connection.execute(_NEWEST_HIT, (robot_id, breakpoint_id)).fetchone()
+    statement = (
+        "SELECT e.run_id, e.sim_time_s FROM event e JOIN run u ON u.id = e.run_id "
+        "WHERE u.robot_id = ? AND e.kind IN ('breakpoint', 'violation') "
+        "AND json_extract(e.data, '$.breakpoint_id') = ? ORDER BY e.id DESC LIMIT 1"
+    )
+    row = connection.execute(statement, (robot_id, breakpoint_id)).fetchone()
     return None if row is None else (row[0], row[1])

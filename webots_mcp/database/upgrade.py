@@ -28,8 +28,6 @@ PREVIOUS_SCHEMA_FILE: Final = Path(__file__).with_name(f"schema_{PREVIOUS_SCHEMA
 # They belong to SQLite. All other files whose names begin with that of the database hold rows.
 _FILES_OF_SQLITE: Final = ("-wal", "-shm", "-journal")
 _NOT_COPIED: Final = ("alembic_version",)
-_TABLES: Final = "SELECT name FROM old.sqlite_master WHERE type = 'table' AND name = ?"
-_COLUMNS: Final = "SELECT name FROM pragma_table_info(?, ?)"
 
 
 @contextmanager
@@ -87,12 +85,14 @@ def _tables(connection: sqlite3.Connection) -> list[str]:
     """Return the tables of the current schema that the other database has too."""
     query = "SELECT name FROM main.sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
     names = [name for (name,) in connection.execute(query) if name not in _NOT_COPIED]
-    return [name for name in names if connection.execute(_TABLES, (name,)).fetchone()]
+    statement = "SELECT name FROM old.sqlite_master WHERE type = 'table' AND name = ?"
+    return [name for name in names if connection.execute(statement, (name,)).fetchone()]
 
 
 def _shared_columns(connection: sqlite3.Connection, table: str) -> list[str]:
+    statement = "SELECT name FROM pragma_table_info(?, ?)"
     main, old = (
-        [name for (name,) in connection.execute(_COLUMNS, (table, schema))]
+        [name for (name,) in connection.execute(statement, (table, schema))]
         for schema in ("main", "old")
     )
     return [name for name in main if name in old]

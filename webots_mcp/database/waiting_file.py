@@ -195,23 +195,13 @@ _NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
 _LOCKED_BYTE: Final = 1 << 40  # far beyond the end: Windows refuses to read what is locked
 _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 _SESSION_OF: Final = "SELECT id, last_adopted_entry FROM session WHERE uuid = ?"
-_ADOPTED: Final = "SELECT last_adopted_entry FROM session WHERE id = ?"
 _SET_ADOPTED: Final = "UPDATE session SET last_adopted_entry = ? WHERE id = ?"
 _RUN_OF: Final = "SELECT id FROM run WHERE uuid = ? AND session_id = ?"
-_RECOUNT: Final = (
-    "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
-    "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
-)
 _RUN_SEEN: Final = (
     "SELECT r.id, r.last_wall_time_s FROM run r JOIN session s ON s.id = r.session_id "
     "WHERE r.uuid = ? AND coalesce(s.last_poll_wall_time_s, s.moved_wall_time_s) IS NOT NULL"
 )
 _SET_ROWS: Final = "UPDATE run SET row_count = ? WHERE id = ?"
-_KNOWN_ROBOT: Final = (
-    "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
-    "VALUES (:name, :kind, :devices, :now, :now) ON CONFLICT (name) DO UPDATE SET "
-    "kind = excluded.kind, devices = excluded.devices, last_seen_wall_time_s = :now"
-)
 SESSION_COLUMNS: Final = (
     "uuid",
     "pid",
@@ -293,7 +283,9 @@ def left_waiting(database: Path) -> list[Path]:
 
 
 def journal_parts(database: Path) -> dict[str, list[Path]]:
-    """Return the journals of controllers that open no database (docs/journal.md), by session.
+    """Return the journals of controllers that open no database, by session.
+
+    Their format is described by 'webots-mcp help journal'.
 
     Returns:
         Of each UUID the parts in order; those that were written last come last. Where a part is
@@ -548,7 +540,8 @@ def ingest(
 
     def act() -> Ingested:
         until_s = time.monotonic() + _PIECE_S
-        session = connection.execute(_ADOPTED, (session_id,)).fetchone()
+        statement = "SELECT last_adopted_entry FROM session WHERE id = ?"
+        session = connection.execute(statement, (session_id,)).fetchone()
         if session is None:
             raise SessionGoneError(f"the session {session_id} was deleted from the database")
         taken = Ingested(session[0], session[0], [], [])
@@ -678,7 +671,11 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO, until_s: float) 
         if time.monotonic() > until_s:
             return count, False
     # Also where all entries were in: who wrote them may have ended before it came to this.
-    for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
+    statement = (
+        "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
+        "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
+    )
+    for counted in connection.execute(statement, (session_id,)).fetchall():
         connection.execute(_SET_ROWS, counted)
     if unfit:
         warn(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
@@ -702,7 +699,12 @@ def _session(connection: sqlite3.Connection, header: dict[str, Any]) -> int:
 
 def enter_robot(connection: sqlite3.Connection, robot: dict[str, Any], now_s: float) -> int:
     """Insert or update a robot's row; return its id."""
-    connection.execute(_KNOWN_ROBOT, {**robot, "now": now_s})
+    statement = (
+        "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
+        "VALUES (:name, :kind, :devices, :now, :now) ON CONFLICT (name) DO UPDATE SET "
+        "kind = excluded.kind, devices = excluded.devices, last_seen_wall_time_s = :now"
+    )
+    connection.execute(statement, {**robot, "now": now_s})
     found = connection.execute("SELECT id FROM robot WHERE name = ?", (robot["name"],)).fetchone()
     return int(found[0])
 

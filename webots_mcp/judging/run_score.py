@@ -63,7 +63,7 @@ def score_run(
     Args:
         connection: Any.
         run_id: The run.
-        text: The score; see docs/trials.md.
+        text: The score; see 'webots-mcp help trials'.
         end_s: Only what came up to and with this simulation time counts; None for all of it.
         deadline_s: A run that takes longer to read has no score.
 

@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import PurePath
 from typing import Annotated, Any, Final
 
@@ -60,6 +59,7 @@ from webots_mcp.questions.arguments import (
 from webots_mcp.questions.declaring import READS, SETS, question
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.signals.naming import listed
+from webots_mcp.store.ages import utc
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
@@ -336,9 +336,7 @@ def _run_row(run: RunInfo) -> list[Any]:
 
 def started(run: RunInfo) -> str:
     """Return when the run began, UTC, as `since` takes it."""
-    return datetime.fromtimestamp(run.started_wall_time_s, timezone.utc).strftime(
-        "%Y-%m-%dT%H:%M:%SZ"
-    )
+    return utc(run.started_wall_time_s)
 
 
 def _file(path: str | None) -> str | None:

@@ -201,7 +201,6 @@ def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
         return {}
     bodies = [*world.content.get("robots", ()), *world.content.get("solids", ())]
     shown = [body | world.places.get(body["key"], {}) for body in bodies[: _SIZES.bodies]]
-    # as they differ
     used = [
         column
         for column in (*BODY_COLUMNS, *PLACE_COLUMNS)

@@ -152,12 +152,13 @@ def _report(view: RobotView, wall_start_s: float, window_s: float) -> MonitorAns
 def _found(connection: sqlite3.Connection, view: RobotView, wall_start_s: float) -> dict[str, Any]:
     window = window_from(view, wall_start_s)
     recorded, shown = bool(window.rows.segments), _SIZES.signals
+    # The events are searched in a row more, so that trends find the values that these read.
+    found = search_events(connection, window.around, None if recorded else _ROWLESS)
     described = (
         trends(connection, window.rows, limit=MOST_SIGNALS, shown=shown) if recorded else None
     )
     told = described.runs if described else ()
     newest = told[-_SIZES.runs :]
-    found = search_events(connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
     known = in_window.verdicts if recorded else _unlooked(in_window.verdicts)

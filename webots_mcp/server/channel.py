@@ -1,7 +1,7 @@
 """The channel by which a server tells Claude Code what happened, without being asked.
 
 Claude Code shows the notification `notifications/claude/channel` of a server that announces the
-experimental capability `claude/channel`; other clients ignore both. See docs/updates.md.
+experimental capability `claude/channel`; other clients ignore both. See 'webots-mcp help updates'.
 """
 
 from __future__ import annotations

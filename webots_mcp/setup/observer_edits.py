@@ -22,7 +22,7 @@ from webots_mcp.simulator.observer import main
 main()
 '''
 # Without synchronization the world does not wait for it, and a pause by hand does not stop it:
-# see docs/webots.md.
+# see 'webots-mcp help webots'.
 _ROBOT: Final = """Robot {{
   name "{name}"
   controller "{controller}"

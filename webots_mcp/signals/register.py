@@ -71,14 +71,9 @@ _KEPT: Final = 4096  # names whose motion is remembered
 MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
 MOST_CHOICES: Final = 20  # that a number which names a mode has
 ADDED_AT_ONCE: Final = 50  # in one statement, which holds the write lock for half a millisecond
-_OF_ROBOT: Final = (
-    "SELECT name, kind, unit, role, max - min FROM signal "
-    "WHERE robot_id = ? AND typeof(name) = 'text' ORDER BY id"
-)
 _COLUMNS: Final = "robot_id, name, path, reduction, first_seen_wall_time_s, kind, unit, role"
 _ADD: Final = f"INSERT OR IGNORE INTO signal ({_COLUMNS}) VALUES "
 _MARKS: Final = "(?, ?, ?, ?, ?, ?, ?, ?)"
-_CHANGE: Final = "UPDATE signal SET kind = ?, unit = ?, role = ? WHERE robot_id = ? AND name = ?"
 MOST_KEYS: Final = 1000  # of a state that are compared
 _MOST_SHAPES: Final = 64  # keys made of ids or times would make every state a new one
 MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode
@@ -399,7 +394,11 @@ def find_changes(
     Names beyond `MAX_SIGNALS` of a robot stay out. Of each name the kind is widened; which roles
     the names have is decided anew.
     """
-    rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
+    statement = (
+        "SELECT name, kind, unit, role, max - min FROM signal "
+        "WHERE robot_id = ? AND typeof(name) = 'text' ORDER BY id"
+    )
+    rows = connection.execute(statement, (robot_id,)).fetchall()
     known = {name: Described(*described) for name, *described, _ in rows}
     spans = {name: span or 0.0 for name, *_, span in rows}
     fresh = [name for name in seen if name not in known][: max(0, MAX_SIGNALS - len(known))]
@@ -444,7 +443,8 @@ def write_changes(connection: sqlite3.Connection, robot_id: int, changes: Change
         marks = ", ".join([_MARKS] * len(some))
         connection.execute(_ADD + marks, [value for row in some for value in row])
     changed = [(*each, robot_id, name) for name, each in changes.changed.items()]
-    connection.executemany(_CHANGE, changed)
+    statement = "UPDATE signal SET kind = ?, unit = ?, role = ? WHERE robot_id = ? AND name = ?"
+    connection.executemany(statement, changed)
 
 
 # What a recorder looks at in each state: names that are new, and changes of what the robot does.

@@ -1,7 +1,7 @@
 """The Webots that are installed on this machine: its folder, programs and version.
 
 What Webots' sources say about each version, and what happens here if it is otherwise, is listed in
-docs/webots.md.
+'webots-mcp help webots'.
 """
 
 from __future__ import annotations

@@ -22,14 +22,6 @@ from webots_mcp.store.recording import RecordingAccess
 
 _EXTERN: Final = "<extern>"
 _NOBODYS: Final = (_EXTERN, "<none>", "<generic>", "void")
-_SINCE: Final = (
-    "SELECT robot.name, s.pid, s.instance, "
-    "(SELECT min(id) FROM run WHERE session_id = s.id "
-    "AND EXISTS (SELECT 1 FROM state WHERE run_id = run.id)) AS run_id, "
-    "(SELECT world FROM run WHERE session_id = s.id ORDER BY id LIMIT 1) "
-    "FROM session s JOIN robot ON robot.id = s.robot_id WHERE s.id > ? "
-    "ORDER BY run_id IS NULL, s.id"
-)
 
 
 def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, Path]:
@@ -210,7 +202,15 @@ def newest_in(recording: RecordingAccess) -> int:
 
 def starts_since(recording: RecordingAccess, session: int) -> list[SessionStart]:
     """Return the sessions of a recording after that one; those that have recorded first."""
-    return [SessionStart(*row) for row in _read(recording, _SINCE, session)]
+    statement = (
+        "SELECT robot.name, s.pid, s.instance, "
+        "(SELECT min(id) FROM run WHERE session_id = s.id "
+        "AND EXISTS (SELECT 1 FROM state WHERE run_id = run.id)) AS run_id, "
+        "(SELECT world FROM run WHERE session_id = s.id ORDER BY id LIMIT 1) "
+        "FROM session s JOIN robot ON robot.id = s.robot_id WHERE s.id > ? "
+        "ORDER BY run_id IS NULL, s.id"
+    )
+    return [SessionStart(*row) for row in _read(recording, statement, session)]
 
 
 def _read(recording: RecordingAccess, query: str, *values: object) -> list[tuple[Any, ...]]:

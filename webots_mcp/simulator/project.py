@@ -35,7 +35,7 @@ _CALLS: Final = {
 }
 _ONE_LINE: Final = (
     "write its values as JSON with {} in each step: an observer ('webots-mcp init --observer "
-    "WORLD') records them; see docs/any-language.md"
+    "WORLD') records them; see 'webots-mcp help any-language'"
 )
 NO_SUPERVISOR: Final = (
     "is a plain Robot: pause, step, reset, screenshots and the scene need a Supervisor"

@@ -7,7 +7,7 @@ controllers: processes, blocking, pause, reset, reload, and what each call retur
 It simplifies the physics: robots collide as discs; a Solid with Physics is pushed along without
 turning or rolling on; rays are level; there is no noise and no torque, and nothing falls. Nodes of
 unknown types are left out of a world with a warning. Functions that the stand-in's `controller`
-package lacks raise an error. docs/standin.md lists what there is.
+package lacks raise an error. 'webots-mcp help standin' lists what there is.
 
 Controllers run unchanged: `from controller import Robot` finds the stand-in's `controller` package
 in their processes. Importing this package makes that package importable in this process as well.

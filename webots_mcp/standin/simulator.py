@@ -187,7 +187,7 @@ class Simulator:
                 f"{' or '.join(types)} nodes{self.world.why_not(types[0])}. If the robot is one: "
                 "in Webots, right-click it, choose 'Convert Root to Base Node(s)' and save the "
                 "world, or let WEBOTS_HOME name an installed Webots, whose PROTO files are read "
-                "then; docs/standin.md lists what the stand-in has"
+                "then; 'webots-mcp help standin' lists what the stand-in has"
             )
         known = ", ".join(repr(robot.name) for robot in self.robots)
         asked = "no robot" if name is None else f"no robot {name!r}"

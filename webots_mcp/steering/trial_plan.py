@@ -94,7 +94,7 @@ class TrialPlan:
     """A plan of trials, independent of where they run.
 
     Attributes:
-        score: The expression that scores a run, see docs/trials.md.
+        score: The expression that scores a run, see 'webots-mcp help trials'.
         parameters: The parameter sets to try; empty if they are searched for.
         best: Whether the highest or the lowest score is the best.
         for_s: Simulated seconds after which a trial ends.

@@ -104,7 +104,7 @@ class TrialWatch:
                 known = ", ".join(sorted(declared)) or "none"
                 raise InvalidInputError(
                     f"The controller declares no parameter {name!r}. It declares {known}; see "
-                    "bridge.parameter() in docs/trials.md."
+                    "bridge.parameter() in 'webots-mcp help trials'."
                 )
             if json.loads(taken[name]) != value:
                 low, high, choices = declared.get(name, (None, None, None))

@@ -5,7 +5,7 @@ Sentences use it for wall time; the data of an answer have the seconds, and the 
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import datetime, timezone
 from typing import Final
 
 LONG_AGO_S: Final = 3_600.0  # from here on an answer says the time of day as well
@@ -35,6 +35,15 @@ def age_in_words(seconds: float) -> str:
 def ago(seconds: float) -> str:
     """Return an age with `ago` behind it."""
     return f"{age_in_words(seconds)} ago"
+
+
+def utc(wall_time_s: float) -> str:
+    """Return a moment of wall time to the second, in UTC, as `since` of the tools takes it."""
+    try:
+        moment = datetime.fromtimestamp(wall_time_s, timezone.utc)
+    except (OverflowError, OSError, ValueError):  # no bridge has written this
+        return f"{wall_time_s}"
+    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def wall_clock(wall_time_s: float) -> str:

@@ -15,6 +15,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -61,15 +62,42 @@ from webots_mcp.store.registered_signals import (
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.run_rows import reading_texts
 
+
+@dataclass(frozen=True)
+class ChunkMakingSizes:
+    """Sizes and steps of making chunks, in bytes where nothing else is said.
+
+    Attributes:
+        ids_per_step: State ids that one step of the search for new rows covers.
+        first_piece: Size of the first write, from which the next ones are adapted.
+        per_chunk: What writing one chunk costs in addition to its content, as a size.
+        state_row: A row of `state` without its text: run, two times and lengths.
+        statistics: A row of `chunk` without its compressed values.
+        chunk_indexes: The entries of a chunk in both indexes, as measured.
+        batch_rows: Rows that are put into chunks between two checks of the deadline.
+        page_head: The head of a page of SQLite.
+        cell_head: Pointer, length and id of a row in a page.
+        overflow_link: The link to the next page of a row that is longer than a page.
+    """
+
+    ids_per_step: int = 20_000
+    first_piece: int = 100_000
+    per_chunk: int = 5_000
+    state_row: int = 25
+    statistics: int = 115
+    chunk_indexes: int = 110
+    batch_rows: int = 2000
+    page_head: int = 8
+    cell_head: int = 7
+    overflow_link: int = 4
+
+
+_SIZES: Final = ChunkMakingSizes()
+
+
 GROUP_ROWS: Final = 1024
 MIN_ROWS_AT_END: Final = 32  # fewer rows at the end of a run are not put into chunks
-_IDS_AT_ONCE: Final = 20_000
-_FIRST_AT_ONCE: Final = 100_000  # bytes
-_STEP_BYTES: Final = 5_000  # a chunk takes as long as so many bytes, and its own besides
 _NO_LIMIT: Final = 2**62
-_STATE_BYTES: Final = 25  # of a record beside its text: run, two times, lengths
-_STATISTICS_BYTES: Final = 115  # of a chunk beside what is compressed
-_CHUNK_INDEX_BYTES: Final = 110  # in both indexes, measured
 
 _COLUMNS: Final = (
     "run_id",
@@ -117,11 +145,7 @@ _REPLACE: Final = AtomicStatements(
 )
 _LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
 MIN_ROWS_ON_DEMAND: Final = 2000  # a question reads fewer as they are
-_BATCH_ROWS: Final = 2000
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
-_PAGE_HEAD_BYTES: Final = 8
-_CELL_HEAD_BYTES: Final = 7  # pointer, length and id
-_LINK_BYTES: Final = 4  # to the next page of a long row
 INDEX_BYTES: Final = 21  # an entry (run_id, sim_time_s, id) of a time index, measured
 
 
@@ -163,7 +187,7 @@ def make_chunks(
         mark = watermark(connection)
         last = connection.execute(
             "SELECT max(id) FROM (SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?)",
-            (mark, _IDS_AT_ONCE),
+            (mark, _SIZES.ids_per_step),
         ).fetchone()[0]
         # The bounds 1 and 0 hold no row.
         runs = dict.fromkeys(ended, (1, 0))
@@ -353,10 +377,10 @@ def _sizes_of(
 ) -> tuple[float, int]:
     """Bytes on the disk, with indexes: of a state row on average, and of all chunks."""
     page_bytes = connection.execute("PRAGMA page_size").fetchone()[0]
-    texts = (len(text.encode()) + _STATE_BYTES for text in columns.texts)
-    packed = (_packed_bytes(chunk) + _STATISTICS_BYTES for chunk in chunks)
+    texts = (len(text.encode()) + _SIZES.state_row for text in columns.texts)
+    packed = (_packed_bytes(chunk) + _SIZES.statistics for chunk in chunks)
     row_bytes = disk_bytes(texts, page_bytes) / len(columns) + INDEX_BYTES
-    return row_bytes, round(disk_bytes(packed, page_bytes) + _CHUNK_INDEX_BYTES * len(chunks))
+    return row_bytes, round(disk_bytes(packed, page_bytes) + _SIZES.chunk_indexes * len(chunks))
 
 
 def _prepare(connection: sqlite3.Connection, chunks: Sequence[tuple[Any, ...]]) -> None:
@@ -483,7 +507,7 @@ def _signals_of(
 
 
 def count_lost(columns: StateColumns, signals: dict[str, RegisteredSignal]) -> int:
-    """How many values of some rows chunks do not hold as they were (docs/database.md)."""
+    """How many values of some rows chunks do not hold as they were ('webots-mcp help database')."""
     lost = 0
     for name, values in columns.values.items():
         signal = signals.get(name)
@@ -520,12 +544,12 @@ def _in_short_steps(
     sizes: Sequence[int], store: Callable[[int, int], object], pause_s: float
 ) -> None:
     """Store the items from one to another, as many at a time as half a millisecond takes."""
-    most, done = _FIRST_AT_ONCE, 0
+    most, done = _SIZES.first_piece, 0
     while done < len(sizes):
-        last, size = done, sizes[done] + _STEP_BYTES
-        while last + 1 < len(sizes) and size + sizes[last + 1] + _STEP_BYTES <= most:
+        last, size = done, sizes[done] + _SIZES.per_chunk
+        while last + 1 < len(sizes) and size + sizes[last + 1] + _SIZES.per_chunk <= most:
             last += 1
-            size += sizes[last] + _STEP_BYTES
+            size += sizes[last] + _SIZES.per_chunk
         started_s = time.perf_counter()
         store(done, last)
         took_s = time.perf_counter() - started_s
@@ -597,7 +621,7 @@ def make_missing_chunks(
                 robot.live for robot in list_robots(connection, time.time())
             )
             while not why:
-                done = make_chunks(connection, _BATCH_ROWS, _PAUSE_S if live else 0.0).done
+                done = make_chunks(connection, _SIZES.batch_rows, _PAUSE_S if live else 0.0).done
                 left = 0 if done else min(left, _rows_left(connection))
                 if progress is not None:
                     progress(total - left, total)
@@ -659,7 +683,7 @@ def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
         payloads: Bytes of the record of each row.
         page_bytes: Of the database.
     """
-    space = page_bytes - _PAGE_HEAD_BYTES
+    space = page_bytes - _SIZES.page_head
     full_pages = own_bytes = filled = used = rows = 0
     for payload in payloads:
         local, own = _cell(payload, page_bytes)
@@ -680,9 +704,9 @@ def _cell(payload: int, page_bytes: int) -> tuple[int, int]:
     """Bytes of a row on its table page, and bytes of the pages that it has for itself."""
     most, least = page_bytes - 35, (page_bytes - 12) * 32 // 255 - 23
     if payload <= most:
-        return payload + _CELL_HEAD_BYTES, 0
-    overflow_space = page_bytes - _LINK_BYTES
+        return payload + _SIZES.cell_head, 0
+    overflow_space = page_bytes - _SIZES.overflow_link
     local = least + (payload - least) % overflow_space
     local = local if local <= most else least
     pages = -(-(payload - local) // overflow_space)
-    return local + _CELL_HEAD_BYTES + _LINK_BYTES, pages * page_bytes
+    return local + _SIZES.cell_head + _SIZES.overflow_link, pages * page_bytes

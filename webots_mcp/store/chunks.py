@@ -156,7 +156,7 @@ def decode(encoded: EncodedChunk, rows: int) -> Decoded:
     """
     try:
         if encoded.codes is None:
-            numbers = np.empty(rows)
+            numbers: Array = np.empty(rows)
             _decompress(encoded, numbers)
             return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
@@ -287,8 +287,8 @@ def _decompress(encoded: EncodedChunk, into: Array) -> None:
         )
     if encoded.numbers is None:
         raise DamagedChunkError("damaged: its numbers are missing")
-    checksum, packed = encoded.numbers[:_CHECKSUM_BYTES], encoded.numbers[_CHECKSUM_BYTES:]
-    if zlib.crc32(packed) != int.from_bytes(checksum, "little"):
+    packed = encoded.numbers[_CHECKSUM_BYTES:]
+    if zlib.crc32(packed) != int.from_bytes(encoded.numbers[:_CHECKSUM_BYTES], "little"):
         raise DamagedChunkError("damaged: its bytes do not match their checksum")
     whole: Any = into if encoded.codec == _FLOATS else np.empty(len(into), np.int64)
     progress = _pcodec().simple_decompress_into(packed, whole)
@@ -582,12 +582,12 @@ def values_in(
             f"{values_query} AND group_id IN (SELECT value FROM json_each(?))",
             [*asked, json.dumps([*wanted])],
         )
-    for group_id, *encoded in connection.execute(query, asked):
+    for group_id, codec, numbers, codes, labels in connection.execute(query, asked):
         rows = wanted.get(group_id)
         if rows is None:
             continue
         try:
-            yield group_id, decode(EncodedChunk(*encoded), rows)
+            yield group_id, decode(EncodedChunk(codec, numbers, codes, labels), rows)
         except DamagedChunkError as error:
             yield group_id, error
 

@@ -49,7 +49,8 @@ from webots_mcp.store.trial_sets import TrialRecord, best_of, fetch_trial_set, r
 # Rows to be exported: those of a range, flattened, and trials; one value per dotted name.
 #
 # State rows that retention has deleted are given back from their chunks, as JSON, as they were
-# recorded. What chunks do not hold (docs/database.md) is missing in them; `notes` says how much.
+# recorded. What chunks do not hold ('webots-mcp help database') is missing in them; `notes` says
+# how much.
 
 
 _STEP: Final = re.compile(r'\."((?:[^"\\]|\\.)*)"|\.([^.\[]+)|\[(\d+)\]')
@@ -128,7 +129,8 @@ class PurgedRows:
         self.unread: dict[Unread, None] = {deleted: None} if deleted else {}
         self.notes = [
             f"{lost} values of run {segment.run_id} are incomplete: their rows were deleted, and "
-            "chunks hold no long arrays and texts, and no integers beyond 2^53 (docs/database.md)"
+            "chunks hold no long arrays and texts, and no integers beyond 2^53 "
+            "('webots-mcp help database')"
         ] * (lost > 0)  # fmt: skip
 
     def __len__(self) -> int:

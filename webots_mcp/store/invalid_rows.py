@@ -15,15 +15,33 @@ import sqlite3
 from collections.abc import Generator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any, Final, cast
 
 from webots_mcp.database.connection import shipped_statements
 
+
+@dataclass(frozen=True)
+class ValidRange:
+    """The range of values that a bridge writes.
+
+    Attributes:
+        max_sim_time_s: Maximum simulation time.
+        max_wall_time_s: Maximum Unix time: the end of the year 9999.
+        max_integer: No id or count is larger, and a float holds it exactly.
+        max_float: Maximum absolute value of a number.
+    """
+
+    max_sim_time_s: float = 1e10
+    max_wall_time_s: float = 253_402_300_799.0
+    max_integer: int = 2**53
+    max_float: float = 1.7e308
+
+
+_VALID: Final = ValidRange()
+
+
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
-MAX_SIM_TIME_S: Final = 1e10
-MAX_WALL_TIME_S: Final = 253_402_300_799.0  # the end of the year 9999
-_MAX_INTEGER: Final = 2**53  # no id or count is larger, and a float holds it
-_MAX_FLOAT: Final = 1.7e308
 _SHOWN: Final = 5
 
 _OBJECTS: Final = frozenset(
@@ -173,10 +191,13 @@ def _check(table: str, name: str, kind: str) -> tuple[str, str]:
     if kind == "BLOB":
         return f"typeof({name}) = 'blob'", "bytes"
     if "INT" in kind:
-        return f"typeof({name}) = 'integer' AND abs({name} / 2) <= {_MAX_INTEGER // 2}", "integer"
-    limit = _MAX_FLOAT
+        return (
+            f"typeof({name}) = 'integer' AND abs({name} / 2) <= {_VALID.max_integer // 2}",
+            "integer",
+        )
+    limit = _VALID.max_float
     if name.endswith("time_s"):
-        limit = MAX_WALL_TIME_S if name.endswith("wall_time_s") else MAX_SIM_TIME_S
+        limit = _VALID.max_wall_time_s if name.endswith("wall_time_s") else _VALID.max_sim_time_s
     return f"typeof({name}) IN ('real', 'integer') AND abs({name}) <= {limit!r}", "number"
 
 

@@ -1,4 +1,6 @@
-"""Takes into the database what controllers write without it: the journals of docs/journal.md.
+"""Takes into the database what controllers write without it: journals.
+
+Their format is described by 'webots-mcp help journal'.
 
 A controller in C, or any program, appends lines to a file of its session in the data folder, and
 never opens the database. Servers and commands take the lines in while it does: exactly once, as
@@ -56,14 +58,33 @@ from webots_mcp.errors import warn
 from webots_mcp.signals import register as signal_register
 from webots_mcp.signals.naming import flatten
 
+
+@dataclass(frozen=True)
+class JournalLimits:
+    """Limits within which journals and waiting files are ingested.
+
+    Attributes:
+        batch_bytes: Size of the lines that are in memory at once; a single line may be longer.
+        depth: Levels of a state. SQLite reads 1,000; Python's recursion ends before.
+        program_bytes: Maximum size of a program whose digest is recorded.
+        headerless_s: Wall time for which a file without a header is left alone: its writer may be
+            about to write it.
+        lag_s: A row that is at most that new does not count as a delay.
+    """
+
+    batch_bytes: int = 1_000_000
+    depth: int = 100
+    program_bytes: int = 100_000_000
+    headerless_s: float = 60.0
+    lag_s: float = 2.0
+
+
+_LIMITS: Final = JournalLimits()
+
+
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
 MAINTAINER_BUDGET_S: Final = 1.0  # in each of its rounds, so that its lease does not run out
 LONGEST_LINE_BYTES: Final = 4_000_000
-_BATCH_BYTES: Final = 1_000_000  # of lines that are in memory at once; one line may be longer
-_DEEPEST: Final = 100  # levels of a state: SQLite reads 1,000, Python's calls end before
-_LARGEST_PROGRAM_BYTES: Final = 100_000_000
-_HEADERLESS_S: Final = 60.0  # its writer has not come to the header yet, or never will
-_LAG_S: Final = 2.0  # a row that came since the question began is no delay
 
 # The values of each kind: (n)umbers, (c)ounts, (s)trings, (o)bjects. Those with a capital letter
 # may be null. For these and for those with a question mark null stands for what does not fit.
@@ -204,7 +225,7 @@ def journals_behind(connection: sqlite3.Connection, database: Path) -> list[str]
             "SELECT last_seen_wall_time_s FROM session WHERE uuid = ?", (uuid,)
         ).fetchone() or (0.0,)
         with suppress(OSError):
-            if parts[-1].name not in kept and parts[-1].stat().st_mtime > seen_s + _LAG_S:
+            if parts[-1].name not in kept and parts[-1].stat().st_mtime > seen_s + _LIMITS.lag_s:
                 behind.append(parts[-1].name)
     return behind
 
@@ -263,7 +284,7 @@ def _ingest_part(
         with path.open("r+b") as file:
             status = os.fstat(file.fileno())
             header = waiting_file.read_header(file)
-            if header is None and time.time() - status.st_mtime < _HEADERLESS_S:
+            if header is None and time.time() - status.st_mtime < _LIMITS.headerless_s:
                 return False
             # First of all: what is written after the last look would be deleted unread.
             is_complete = waiting_file.lock(file.fileno())
@@ -559,7 +580,7 @@ def _sha256(file: str, started_s: float) -> str | None:
     """Of the program, if it is still the one that was started."""
     with suppress(OSError, ValueError):
         status = Path(file).stat()
-        is_program = stat.S_ISREG(status.st_mode) and status.st_size <= _LARGEST_PROGRAM_BYTES
+        is_program = stat.S_ISREG(status.st_mode) and status.st_size <= _LIMITS.program_bytes
         if is_program and status.st_mtime <= started_s:
             return sha256(Path(file).read_bytes()).hexdigest()
     return None
@@ -592,7 +613,7 @@ def _read_lines(file: BinaryIO, offset: int) -> list[_Line]:
     """The next complete lines from that byte on, as many as are good to have in memory at once."""
     lines: list[_Line] = []
     file.seek(offset)
-    until = offset + _BATCH_BYTES
+    until = offset + _LIMITS.batch_bytes
     while len(lines) < waiting_file.ENTRIES_AT_ONCE and offset < until:
         line = file.readline(LONGEST_LINE_BYTES)
         start, size, is_whole = line, len(line), len(line) < LONGEST_LINE_BYTES
@@ -748,7 +769,7 @@ def _require_shallow(value: object) -> None:
         ValueError: There are more than 100 levels.
     """
     level: list[Any] = [value]
-    for _ in range(_DEEPEST):
+    for _ in range(_LIMITS.depth):
         inner: list[Any] = []
         for each in level:
             is_object = isinstance(each, dict)
@@ -756,7 +777,7 @@ def _require_shallow(value: object) -> None:
             inner += [item for item in items if isinstance(item, (dict, list))]
         if not (level := inner):
             return
-    raise ValueError(f"more than {_DEEPEST} objects or arrays in each other")
+    raise ValueError(f"more than {_LIMITS.depth} objects or arrays in each other")
 
 
 def _state(given: dict[str, Any], text: str, line: bytes) -> dict[str, Any]:

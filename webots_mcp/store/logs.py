@@ -19,6 +19,39 @@ from webots_mcp.contract import LOG_LEVELS, LogLevel, LogSource
 from webots_mcp.store.reading.ranges import Scope, moment_of
 from webots_mcp.store.run_rows import columns_of
 
+
+@dataclass(frozen=True)
+class ConsoleLimits:
+    """How many lines of Webots' console are compared and kept, and for how long.
+
+    Attributes:
+        followed_characters: Length at which a followed text is cut; the database has all of it.
+        followed_lines: Lines of one kind that one poll returns.
+        waiting_s: Wall time for which a line may wait for the robot that it belongs to.
+        early_s: A run may begin that long before the console reports its controller.
+        runs: Newest runs to which a line may belong.
+        sessions: Newest sessions whose runs are considered.
+        recorded_rows: Newest rows of bridges with which a line is compared.
+        logged_texts: Texts logged by a bridge with which a line is compared.
+        compared_s: A line that is that much later is not the one that a bridge recorded.
+        message_characters: Maximum length of a message, as in a row of the bridge.
+    """
+
+    followed_characters: int = 400
+    followed_lines: int = 500
+    waiting_s: float = 7 * 86_400.0
+    early_s: float = 1.0
+    runs: int = 50
+    sessions: int = 500
+    recorded_rows: int = 2_000
+    logged_texts: int = 500
+    compared_s: float = 60.0
+    message_characters: int = 10_000
+
+
+_CONSOLE: Final = ConsoleLimits()
+
+
 COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it is worth
 OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
 _RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
@@ -43,19 +76,9 @@ _BESIDE_ROBOT: Final = (
     + _CONSOLE_OF.format(f"SELECT id FROM run WHERE session_id IN ({_COMPANIONS})")
     + f") {_MATCHING}"
 )
-_LONGEST_FOLLOWED_TEXT: Final = 400  # of a state, log line or result; the database has it whole
-_MOST_FOLLOWED_LINES: Final = 500  # of one kind in one look
 _ASKED: Final = "'#' || t.id, t.action"
 _SETTLED_S: Final = "t.finished_wall_time_s"
 MOST_WAITING: Final = 500  # of one Webots; the newest are kept
-_KEPT_WAITING_S: Final = 7 * 86_400.0
-_EARLY_S: Final = 1.0  # a run may begin before the line that its controller starts
-_MOST_RUNS: Final = 50
-_MOST_SESSIONS: Final = 500
-_MOST_RECORDED: Final = 2_000  # newest rows of bridges that a line is compared with
-_MOST_LOGGED: Final = 500
-_COMPARED_S: Final = 60.0  # a line that is as late is not taken for what a bridge recorded
-_MESSAGE: Final = 10_000  # characters, as of a bridge's row
 _NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
 
 
@@ -99,7 +122,7 @@ def _news_of_commands(cursor: str, wall: str, sim: str, text: str) -> str:
 
 
 def _cut(text: str) -> str:
-    return f"substr({text}, 1, {_LONGEST_FOLLOWED_TEXT})"
+    return f"substr({text}, 1, {_CONSOLE.followed_characters})"
 
 
 _OUTCOME: Final = _cut("coalesce(t.error, t.result)")
@@ -258,7 +281,7 @@ class Follower:
         self._robot_id = robot_id
         self._cursors = dict.fromkeys(_NEWS, 0.0)
 
-    def read_new(self, limit: int = _MOST_FOLLOWED_LINES) -> list[FollowedLine]:
+    def read_new(self, limit: int = _CONSOLE.followed_lines) -> list[FollowedLine]:
         """Return the newest lines recorded since the last call, at most `limit`, oldest first."""
         lines = [line for news in _NEWS for line in self._read(news, limit)]
         return sorted(lines, key=lambda line: line.wall_time_s)[-limit:] if limit else []
@@ -324,13 +347,18 @@ class ConsoleRows:
         self.waits = True  # lines may wait for a run
         self._instance = instance
         self._started_s = started_wall_time_s
-        self._runs_since_s = started_wall_time_s - _EARLY_S  # of which what comes now may be
+        # Runs since then may be those that the next lines belong to.
+        self._runs_since_s = started_wall_time_s - _CONSOLE.early_s
         self._recorded = _Recorded(instance, started_wall_time_s)
         self._left_out = 0
 
     def begin(self, connection: sqlite3.Connection) -> None:
         """Forget what waits for runs that will not come."""
-        past = (self._instance, self._started_s - _EARLY_S, time.time() - _KEPT_WAITING_S)
+        past = (
+            self._instance,
+            self._started_s - _CONSOLE.early_s,
+            time.time() - _CONSOLE.waiting_s,
+        )
         connection.execute(
             "DELETE FROM console_line WHERE (instance = ? AND wall_time_s < ?) OR wall_time_s < ?",
             past,
@@ -363,16 +391,16 @@ class ConsoleRows:
 
     def _runs(self, connection: sqlite3.Connection) -> list[_Run]:
         """The newest runs of this Webots, the newest of them first."""
-        since_s = self._started_s - _EARLY_S
+        since_s = self._started_s - _CONSOLE.early_s
         query = (
             "SELECT id, robot_id, controller FROM session WHERE instance = ? "
-            f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_MOST_SESSIONS}"
+            f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_CONSOLE.sessions}"
         )
         found = connection.execute(
             "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s, "
             f"r.last_wall_time_s FROM ({query}) s JOIN run r ON r.session_id = s.id JOIN "
             "robot b ON b.id = s.robot_id WHERE r.started_wall_time_s >= ? ORDER BY r.id DESC "
-            f"LIMIT {_MOST_RUNS}",
+            f"LIMIT {_CONSOLE.runs}",
             (self._instance, since_s),
         ).fetchall()
         return [_Run(*row) for row in found]
@@ -383,7 +411,8 @@ class ConsoleRows:
         return [
             run
             for run in runs
-            if run.started_wall_time_s >= since_s or run.last_wall_time_s > since_s + _EARLY_S
+            if run.started_wall_time_s >= since_s
+            or run.last_wall_time_s > since_s + _CONSOLE.early_s
         ]
 
     def _notice_start(self, line: Said, runs: list[_Run]) -> None:
@@ -392,12 +421,18 @@ class ConsoleRows:
             None if line.is_old else re.match(r"INFO: (.+?): Starting controller: ", line.message)
         )
         if found and any(_is_called(run, found[1]) for run in runs):
-            self._runs_since_s = line.wall_time_s - _EARLY_S
+            self._runs_since_s = line.wall_time_s - _CONSOLE.early_s
 
     def _write(self, connection: sqlite3.Connection, line: Said, runs: list[_Run]) -> None:
         fitting = runs if line.is_old else self._fitting(runs)
         line, fitting = _of_named(line, fitting)
-        values = (line.wall_time_s, line.level, line.source, line.message[:_MESSAGE], line.stream)
+        values = (
+            line.wall_time_s,
+            line.level,
+            line.source,
+            line.message[: _CONSOLE.message_characters],
+            line.stream,
+        )
         if not fitting:
             self._keep_waiting(connection, values)
             return
@@ -462,7 +497,7 @@ class _Recorded:
             "JOIN run r ON r.id = l.run_id JOIN session s ON s.id = r.session_id "
             "JOIN robot b ON b.id = r.robot_id WHERE l.id > ? AND l.wall_time_s >= ? "
             f"AND s.instance = ? AND l.source IN ('controller', 'bridge') "
-            f"ORDER BY l.id DESC LIMIT {_MOST_RECORDED}",
+            f"ORDER BY l.id DESC LIMIT {_CONSOLE.recorded_rows}",
             asked,
         ).fetchall()
         for log_id, message, logger, robot, controller in reversed(rows):
@@ -486,9 +521,13 @@ class _Recorded:
             return False
         named = _NAMED.fullmatch(line.message) if line.source == "console" else None
         robot = named and self._robots.get(named[1])
-        if named and robot and self._texts[robot].take(named[2][:_MESSAGE].strip()):
+        if (
+            named
+            and robot
+            and self._texts[robot].take(named[2][: _CONSOLE.message_characters].strip())
+        ):
             return True
-        text = line.message[:_MESSAGE].strip()
+        text = line.message[: _CONSOLE.message_characters].strip()
         return any(texts.take(text) for texts in self._texts.values())
 
 
@@ -496,8 +535,8 @@ class _OfRobot:
     """What the bridge of one robot recorded of what its controller printed and logged."""
 
     def __init__(self) -> None:
-        self.lines = _Texts(_MOST_RECORDED)
-        self.logged = _Texts(_MOST_LOGGED)
+        self.lines = _Texts(_CONSOLE.recorded_rows)
+        self.logged = _Texts(_CONSOLE.logged_texts)
 
     def take(self, text: str) -> bool:
         """Whether it recorded this text."""
@@ -516,7 +555,7 @@ class _Texts:
         self._added: deque[tuple[float, str]] = deque(maxlen=most)
 
     def __iter__(self) -> Iterator[str]:
-        since_s = time.monotonic() - _COMPARED_S
+        since_s = time.monotonic() - _CONSOLE.compared_s
         while self._added and self._added[0][0] < since_s:
             self._added.popleft()
         return iter(list(dict.fromkeys(text for _, text in self._added)))

@@ -418,7 +418,7 @@ class Breakpoint(SQLModel, table=True):
     id: int | None = _id()
     robot_id: int | None = _to("robot", "null: of robot_name", nullable=True, on_delete="CASCADE")
     session_id: int | None = _to("session", nullable=True)
-    condition: str = _text("see docs/conditions.md", nullable=False)
+    condition: str = _text("see webots-mcp help conditions", nullable=False)
     action: str = _text("pause, log or keep", nullable=False)
     after_hits: int = _column(
         Integer,

@@ -1,4 +1,6 @@
-"""Who may do what: the table `[allow]` of a project's `webots-mcp.toml`; see docs/policy.md.
+"""Who may do what: the table `[allow]` of a project's `webots-mcp.toml`.
+
+See 'webots-mcp help policy'.
 
     [allow]
     tools = ["*", "!webots_report"]  # the last pattern that fits decides; without one: refused

@@ -26,11 +26,34 @@ from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force
 from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, ids_of, plan
 from webots_mcp.store.run_rows import inside
 
+
+@dataclass(frozen=True)
+class PurgeLimits:
+    """How a purge is divided, so that robots can write meanwhile.
+
+    Attributes:
+        chunked_rows: Rows that are put into chunks before their states are deleted.
+        rest_s: Minimum time between two writes.
+        hurried_rest_s: The same where no robot records; a checkpoint still gets its turn.
+        rests: Time between two writes in units of the last write: the lock is held for a tenth of
+            the time.
+        failures: Attempts to take the write lock before a purge is given up.
+        spare_pages: Maximum number of pages, 10 MB, that stay free in the file for the next rows; a
+            fortieth of the file where that is less.
+    """
+
+    chunked_rows: int = 4096
+    rest_s: float = 0.005
+    hurried_rest_s: float = 0.001
+    rests: int = 9
+    failures: int = 200
+    spare_pages: int = 2500
+
+
+_LIMITS: Final = PurgeLimits()
+
+
 BATCH_ROWS: Final = 500
-CHUNKED_ROWS: Final = 4096
-REST_S: Final = 0.005  # at least, between two writes
-HURRIED_REST_S: Final = 0.001  # where no robot records: a checkpoint still gets its turn
-RESTS: Final = 9  # the lock is held for a tenth of the time at most
 
 _NOT_GOING: Final = (
     "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
@@ -83,11 +106,8 @@ _PATHS: Final = {  # of the pictures that go with rows
     "image": "SELECT path FROM image WHERE id IN (SELECT id FROM temp.going)",
     "run": "SELECT path FROM image WHERE run_id IN (SELECT id FROM temp.going)",
 }
-_MOST_FAILURES: Final = 200
 INTERVAL_S: Final = 60.0  # between two checks; one of ten million rows takes about a second
 BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
-# A fortieth of the file stays free for the rows to come, but no more than 10 MB.
-MOST_SPARE_PAGES: Final = 2500
 
 
 @dataclass
@@ -113,7 +133,7 @@ class Purged:
     @property
     def rest_s(self) -> float:
         """How long to leave the lock to others now."""
-        return max(REST_S, RESTS * self.held_s)
+        return max(_LIMITS.rest_s, _LIMITS.rests * self.held_s)
 
 
 def prune(
@@ -139,14 +159,14 @@ def prune(
         DatabaseError: Another process held the write lock all the time.
         sqlite3.Error: The file cannot be written or is damaged; what was deleted stays deleted.
     """
-    while not make_chunks(connection, CHUNKED_ROWS, 0.002 if rest else 0.0).done:
+    while not make_chunks(connection, _LIMITS.chunked_rows, 0.002 if rest else 0.0).done:
         pass
     wanted = plan(connection, retention, now_s)
     purged = Purged()
     for purged in purge(connection, wanted, data_dir):
         if progress is not None:
             progress(purged.rows.total(), wanted.rows)
-        time.sleep(purged.rest_s if rest else HURRIED_REST_S)
+        time.sleep(purged.rest_s if rest else _LIMITS.hurried_rest_s)
     return purged
 
 
@@ -248,7 +268,7 @@ class _Purge:
 
     def _chunked(self, run_id: int) -> bool:
         """Put rows into chunks for a moment; whether all rows of a run are in one."""
-        if not make_chunks(self._connection, CHUNKED_ROWS).done:
+        if not make_chunks(self._connection, _LIMITS.chunked_rows).done:
             return False
         return chunk_whole_run(self._connection, run_id)
 
@@ -391,9 +411,9 @@ class _Purge:
             if not is_busy(error):
                 raise
             self._failures += 1
-            if self._failures > _MOST_FAILURES:
+            if self._failures > _LIMITS.failures:
                 raise DatabaseError(
-                    f"Another process held the write lock in {_MOST_FAILURES} attempts. End it "
+                    f"Another process held the write lock in {_LIMITS.failures} attempts. End it "
                     "and try again."
                 ) from error
             return 0
@@ -455,7 +475,7 @@ class Upkeep:
                 return
             self._planned, self._next_plan_s = limits, started_s + self._interval_s
             pages = int(connection.execute("PRAGMA page_count").fetchone()[0])
-            spare_pages = min(pages // 40, MOST_SPARE_PAGES)
+            spare_pages = min(pages // 40, _LIMITS.spare_pages)
             wanted = plan(connection, limits)
             self._under_way = purge(connection, wanted, self._data_dir, spare_pages)
         for purged in self._under_way:

@@ -47,7 +47,7 @@ from webots_mcp.errors import (
     NothingRecordedError,
 )
 from webots_mcp.signals.naming import counted
-from webots_mcp.store.ages import LONG_AGO_S, wall_clock
+from webots_mcp.store.ages import LONG_AGO_S, utc
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.journal_intake import (
@@ -128,7 +128,7 @@ class RobotView:
         """Return when the newest data were recorded, if that is long ago."""
         if wall_time_s is None or self.now_s - wall_time_s <= LONG_AGO_S:
             return {}
-        return {"newest_wall_time": wall_clock(wall_time_s)}
+        return {"newest_wall_time": utc(wall_time_s)}
 
     def _why(self) -> str | None:
         """Why time stands still; of a robot that is gone also what a later start has said."""
@@ -162,8 +162,9 @@ class RobotView:
         return None, None
 
     def age_s(self, wall_time_s: float) -> float:
-        """How long ago that was."""
-        return round(max(self.now_s - wall_time_s, 0.0), 2)
+        """How long ago that was, to 10 ms; of what is over an hour old, to the second."""
+        age_s = max(self.now_s - wall_time_s, 0.0)
+        return round(age_s, 2) if age_s <= LONG_AGO_S else round(age_s)
 
     def require_run(self) -> RunRecord:
         """The run; see `subject.require_run`."""

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple, cast
@@ -25,9 +26,25 @@ from webots_mcp.errors import ConsentRequiredError, DatabaseError, NoDatabaseErr
 from webots_mcp.store.policy import LAUNCH, Policy, policies_of
 from webots_mcp.store.recording import RecordingAccess
 
-LONGEST_ARGUMENTS: Final = 1_000  # characters
-_LONGEST_OUTCOME: Final = 300
-_SHORTEST_SECRET: Final = 4  # a shorter one would blacken words of the outcome
+
+@dataclass(frozen=True)
+class RequestLimits:
+    """Lengths of what is stored of a request, in characters.
+
+    Attributes:
+        arguments: Length at which the arguments are cut.
+        outcome: Length at which the outcome is cut.
+        secret: Shortest secret that is removed; removing shorter ones would remove words.
+    """
+
+    arguments: int = 1_000
+    outcome: int = 300
+    secret: int = 4
+
+
+_LIMITS: Final = RequestLimits()
+
+
 _SECRET: Final = re.compile(
     r"token|passw|passphrase|secret|credential|authori[sz]ation|bearer|"
     r"(^|[_\W])(pwd|pass|auth)($|[_\W\d])|(^|[_\W])key|key$|apikey",
@@ -364,7 +381,7 @@ def newest_requests(
 def recorded_arguments(arguments: Mapping[str, Any]) -> str:
     """Return arguments as JSON without secrets, cut where they are long."""
     text = _PASSWORD.sub(_LEFT_OUT, _as_json(_without_secrets(arguments)))
-    return text if len(text) <= LONGEST_ARGUMENTS else _as_json({"cut": text[:LONGEST_ARGUMENTS]})
+    return text if len(text) <= _LIMITS.arguments else _as_json({"cut": text[: _LIMITS.arguments]})
 
 
 def _as_json(value: Any) -> str:
@@ -393,9 +410,9 @@ def _secrets_in(value: Any, *, is_secret: bool = False) -> Generator[str]:
     elif isinstance(value, (list, tuple)):
         for each in cast("Sequence[Any]", value):
             yield from _secrets_in(each, is_secret=is_secret)
-    elif is_secret and len(str(value)) >= _SHORTEST_SECRET:
+    elif is_secret and len(str(value)) >= _LIMITS.secret:
         yield str(value)
 
 
 def _bounded(text: str) -> str:
-    return text[:_LONGEST_OUTCOME].encode("utf-8", "replace").decode()
+    return text[: _LIMITS.outcome].encode("utf-8", "replace").decode()

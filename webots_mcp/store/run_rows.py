@@ -24,27 +24,49 @@ from webots_mcp.signals.naming import nearest_first
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+
+@dataclass(frozen=True)
+class RowLimits:
+    """Limits of what is read and shown of a run.
+
+    Attributes:
+        pace_rows: Newest rows whose times give the interval between rows.
+        pace_window_s: Wall time before the newest row that the real-time factor covers.
+        pace_window_rows: Maximum number of rows in that time.
+        pace_share: Share of a round from which its code, or the rest, counts as the bottleneck.
+        shown_keys: Keys of a state that an error lists.
+        searched_keys: Keys that are searched for names similar to a missing one.
+        shown_key_characters: Length at which a listed key is cut.
+        max_pixels: Pixels of a picture that is opened: 200 MB in memory.
+        shown_path_characters: Length at which a path in an error is cut.
+    """
+
+    pace_rows: int = 6
+    pace_window_s: float = 5.0
+    pace_window_rows: int = 500
+    pace_share: float = 0.8
+    shown_keys: int = 20
+    searched_keys: int = 1000
+    shown_key_characters: int = 40
+    max_pixels: int = 50_000_000
+    shown_path_characters: int = 100
+
+
+_LIMITS: Final = RowLimits()
+
+
 _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
 # A blob is greater than any number or text: a time that is not a number is found too, and reported.
 _LATER_THAN_ANY: Final = b"\xff"
-PACE_ROWS: Final = 6
-PACE_WINDOW_S: Final = 5.0
-_PACE_WINDOW_ROWS: Final = 500
 # Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
 _ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
 OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
 STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
-_SETS_PACE: Final = 0.8  # of a round's time
-_SHOWN_KEYS: Final = 20
-_SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
-_SHOWN_KEY_CHARACTERS: Final = 40
 PICTURES: Final = (".png", ".jpg", ".jpeg")
 MAX_FILE_BYTES: Final = 64_000_000
-MAX_PIXELS: Final = 50_000_000  # 200 MB in memory
-_SHOWN_PATH: Final = 100
 _OF_CAMERA: Final = f"kind IN ('camera', '{KEPT_FRAME}')"
 
 
@@ -254,15 +276,15 @@ def _state_up_to(
 
 def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:
     """Median wall time between the latest rows of a run, in seconds; None with fewer than two."""
-    times = connection.execute(_RECENT_TIMES, (run_id, PACE_ROWS)).fetchall()
+    times = connection.execute(_RECENT_TIMES, (run_id, _LIMITS.pace_rows)).fetchall()
     gaps = sorted(newer[1] - older[1] for newer, older in itertools.pairwise(times))
     return gaps[len(gaps) // 2] if gaps else None
 
 
 def real_time_factor(connection: sqlite3.Connection, run_id: int) -> float | None:
     """Simulation time per wall time over the last few seconds that were recorded."""
-    times = connection.execute(_RECENT_TIMES, (run_id, _PACE_WINDOW_ROWS)).fetchall()
-    recent = [time for time in times if times[0][1] - time[1] <= PACE_WINDOW_S]
+    times = connection.execute(_RECENT_TIMES, (run_id, _LIMITS.pace_window_rows)).fetchall()
+    recent = [time for time in times if times[0][1] - time[1] <= _LIMITS.pace_window_s]
     if len(recent) < 2 or recent[0][1] <= recent[-1][1]:
         return None
     return (recent[0][0] - recent[-1][0]) / (recent[0][1] - recent[-1][1])
@@ -276,9 +298,9 @@ def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | No
     if own_ms is None:
         return None
     share = own_ms / max(own_ms + wait_ms, 1e-9)
-    if share >= _SETS_PACE:
+    if share >= _LIMITS.pace_share:
         why = "the controller sets the pace, not the physics"
-    elif share > 1 - _SETS_PACE:
+    elif share > 1 - _LIMITS.pace_share:
         why = "controller and Webots (or another controller) take turns"
     else:
         why = "not the bottleneck: Webots, real time or another controller sets the pace"
@@ -312,8 +334,10 @@ def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
         for taken in range(len(parts), 0, -1):
             if (key := ".".join(parts[:taken])) in members:
                 return key, taken
-        near = nearest_first(parts[0], itertools.islice(members, _SEARCHED_KEYS))[:_SHOWN_KEYS]
-        known = [key[:_SHOWN_KEY_CHARACTERS] for key in near]
+        near = nearest_first(parts[0], itertools.islice(members, _LIMITS.searched_keys))[
+            : _LIMITS.shown_keys
+        ]
+        known = [key[: _LIMITS.shown_key_characters] for key in near]
         raise InvalidInputError(
             f"path={path!r}: no member {parts[0]!r} in this part of the state. Use one of {known}."
         )
@@ -426,7 +450,9 @@ def inside(data_dir: Path, path: str) -> Path:
             "webots_get_camera() shows the newest picture."
         ) from error
     except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, a loop of links
-        raise InvalidInputError(f"{path[:_SHOWN_PATH]!r} is not a usable path: {error}.") from error
+        raise InvalidInputError(
+            f"{path[: _LIMITS.shown_path_characters]!r} is not a usable path: {error}."
+        ) from error
     if not stat.S_ISREG(mode):
         raise InvalidInputError(f"{file} is not a regular file and is not opened")
     return file
@@ -450,7 +476,7 @@ def opened(file: Path) -> Generator[Image]:
         _require_at_most(MAX_FILE_BYTES, "bytes", file.stat().st_size)
         picture: Any = Pictures.open(file, formats=("PNG", "JPEG"))
         with picture:
-            _require_at_most(MAX_PIXELS, "pixels", picture.width * picture.height)
+            _require_at_most(_LIMITS.max_pixels, "pixels", picture.width * picture.height)
             yield picture
     except Exception as error:  # Pillow raises nearly anything about a file that is damaged
         raise InvalidInputError(f"{file} is not a usable PNG or JPEG: {error}") from error

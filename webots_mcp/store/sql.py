@@ -33,10 +33,32 @@ from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.run_rows import reading_texts
 
+
+@dataclass(frozen=True)
+class QueryLimits:
+    """Limits of a query, which keep its process and its answer small.
+
+    Attributes:
+        value_bytes: Maximum size of one value; SQLite would build values of 1 GB.
+        error_characters: Length at which an error is cut.
+        offered_columns: Columns that are offered instead of an unknown one.
+        heap_bytes: Maximum memory of SQLite.
+        grace_s: Wall time after SQLite's own deadline, which keeps the rows found so far.
+    """
+
+    value_bytes: int = 10_000_000
+    error_characters: int = 300
+    offered_columns: int = 20
+    heap_bytes: int = 400_000_000
+    grace_s: float = 0.3
+
+
+_LIMITS: Final = QueryLimits()
+
+
 MOST_ROWS: Final = 1000
 MAX_BYTES: Final = 20_000  # about 5,000 tokens
 MAX_TEXT: Final = 200  # characters of one value
-MAX_VALUE_BYTES: Final = 10_000_000  # SQLite may build values of 1 GB otherwise
 MAX_COLUMNS: Final = 100  # a row of so many such values still fits into memory
 
 _READING: Final = frozenset(
@@ -46,17 +68,13 @@ _REFUSED_FUNCTIONS: Final = frozenset(
     {"load_extension", "fts3_tokenizer", "zeroblob", "randomblob"}
 )
 TOO_LARGE: Final = "it needs too much memory: read fewer or shorter values at a time"
-_LONGEST_ERROR: Final = 300
-_MOST_COLUMNS: Final = 20  # are offered instead of an unknown one
 _MOST_NAMED: Final = 2  # tables whose columns are offered, even if none is like it
 
 Cell = int | float | str | None
 LINE: Final = (sys.executable, "-m", __name__)
 # Modules are looked for here first, so that no file of the user's folder is taken for one.
 FOLDER: Final = Path(__file__).parents[2]  # which holds the package
-_MAX_HEAP_BYTES: Final = 400_000_000
 _TIMED_OUT: Final = 124  # the exit code of timeout(1): no other end of the process has it
-_GRACE_S: Final = 0.3  # SQLite's own deadline comes first: it keeps the rows that were found
 _OBJECTS: Final = (
     "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "
     "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
@@ -181,7 +199,7 @@ def _only_reading(connection: sqlite3.Connection) -> Generator[None]:
     """Refuse all but reading, and values beyond 10 MB, until the end of the block."""
     # The first use on a connection defines these functions, which an authorizer takes for writing.
     connection.execute("SELECT 1 FROM json_each('[]'), json_tree('[]')").fetchall()
-    before = _limit_values(connection, (MAX_VALUE_BYTES, MAX_COLUMNS))
+    before = _limit_values(connection, (_LIMITS.value_bytes, MAX_COLUMNS))
     connection.set_authorizer(_authorize)
     try:
         yield
@@ -269,7 +287,7 @@ def too_slow(deadline_s: float) -> str:
 
 
 def _explain(connection: sqlite3.Connection, statement: str, error: Exception) -> str:
-    text = str(error)[:_LONGEST_ERROR]
+    text = str(error)[: _LIMITS.error_characters]
     if "one statement" in text:
         return "Only one statement is allowed in a call. Send each in a call of its own."
     if "not authorized" in text or "prohibited" in text or "readonly" in text:
@@ -298,7 +316,7 @@ def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) 
     columns = dict.fromkeys(column for table in named for column in tables[table])
     said = f"No column {name!r}."
     if len(named) <= _MOST_NAMED or difflib.get_close_matches(wanted, columns, 1, 0.5):
-        offer = listed(_by_likeness(wanted, columns), _MOST_COLUMNS)
+        offer = listed(_by_likeness(wanted, columns), _LIMITS.offered_columns)
         whose = ", ".join(named[:_MOST_NAMED])
         said += f" Columns of {whose}, the nearest first: {offer}."
     return (
@@ -380,7 +398,7 @@ def as_file(database: Database) -> Generator[Path]:
 def main(ask: Callable[[Statement], SqlResult]) -> None:
     """Answer the request on stdin."""
     asked = Statement(**json.load(sys.stdin))
-    end = threading.Timer(asked.deadline_s + _GRACE_S, os._exit, [_TIMED_OUT])
+    end = threading.Timer(asked.deadline_s + _LIMITS.grace_s, os._exit, [_TIMED_OUT])
     end.daemon = True
     end.start()
     try:
@@ -394,7 +412,7 @@ def main(ask: Callable[[Statement], SqlResult]) -> None:
 
 def _ask(asked: Statement) -> SqlResult:
     with closing(connect(Path(asked.database), "reader")) as connection:
-        connection.execute(f"PRAGMA hard_heap_limit={_MAX_HEAP_BYTES}")
+        connection.execute(f"PRAGMA hard_heap_limit={_LIMITS.heap_bytes}")
         return query_sql(
             connection, asked.sql, max_rows=asked.max_rows, max_bytes=asked.max_bytes,
             deadline_s=asked.deadline_s,

@@ -1,4 +1,6 @@
-"""The pytest plugin: fixtures for testing a controller by what it records; see docs/testing.md.
+"""The pytest plugin: fixtures for testing a controller by what it records.
+
+See 'webots-mcp help testing'.
 
 pytest loads this module whenever the package is installed. Slow imports are therefore in the
 fixtures that use them.

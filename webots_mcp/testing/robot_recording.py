@@ -165,8 +165,8 @@ class RobotRecording:
         """Return the segments of the run in which a condition held: `front_m < 0.1 for 0.5`.
 
         Raises:
-            InvalidInputError: The condition is not in the language of docs/conditions.md, or cannot
-                be applied to the values.
+            InvalidInputError: The condition is not in the language of
+                'webots-mcp help conditions', or cannot be applied to the values.
             UnknownSignalError: It names a signal that was never published.
         """
         return self.find_events("condition", where=condition)

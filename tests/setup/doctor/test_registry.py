@@ -25,9 +25,11 @@ ELSEWHERE = {"Webots", "Clients", "Controllers", "Supervisor", "Recording now", 
 
 
 def test_each_check_has_its_part_of_the_page_and_each_part_its_check() -> None:
-    headings = re.findall(r"^## (.+)$", (CHECKOUT / PAGE).read_text("utf-8"), re.MULTILINE)
+    headings = re.findall(
+        r"^## (.+)$", (CHECKOUT / "docs" / f"{PAGE}.md").read_text("utf-8"), re.MULTILINE
+    )
     assert headings == [check.name for check in all_checks(with_server=True)]
-    assert all_checks()[3].page == "docs/troubleshooting.md#data-folder"
+    assert all_checks()[3].page == "webots-mcp help troubleshooting data-folder"
 
 
 def test_a_recording_of_a_robot_that_has_finished_is_well(bridge_recording: Path) -> None:

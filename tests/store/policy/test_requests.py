@@ -27,7 +27,7 @@ from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.policy import LAUNCH, Policy, read_policy
 from webots_mcp.store.recording import RecordingAccess
-from webots_mcp.store.requests import LONGEST_ARGUMENTS, newest_requests
+from webots_mcp.store.requests import _LIMITS, newest_requests
 
 pytestmark = pytest.mark.anyio
 PACKAGE = Path(webots_mcp.__file__).parent
@@ -91,7 +91,7 @@ async def test_a_request_is_a_row_with_who_asked_how_for_what_and_what_became_of
     assert hidden["arguments"]["params"] | left_out == hidden["arguments"]["params"]
     assert json.dumps(hidden).count("hunter") == 1, "where no name says that it is a secret"
     assert hidden["arguments"]["params"]["at"] == "s3://(left out)@host/x"
-    assert 0 < len(json.dumps(long["arguments"], ensure_ascii=False)) < LONGEST_ARGUMENTS + 100
+    assert 0 < len(json.dumps(long["arguments"], ensure_ascii=False)) < _LIMITS.arguments + 100
     at = f"{project / 'webots-mcp.toml'}, line 3: actions = ['run']"
     assert at in refusal and "the person whose project it is can change that line" in refusal
     assert (forbidden["rule"], forbidden["outcome"]) == (at, "refused") and not forbidden[

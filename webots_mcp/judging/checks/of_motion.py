@@ -10,9 +10,10 @@ from webots_mcp.analysis.arrays import Array, Indexes, RowSpan, median, np, runs
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times, total_s
 from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
+from webots_mcp.judging.detection.holding import grips_in
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
-from webots_mcp.judging.detection.oscillation import GROWS, OSCILLATION
+from webots_mcp.judging.detection.oscillation import GROWS, OSCILLATION, growth_begins_s
 from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
 from webots_mcp.judging.detection.slip import SLIP, SLIPS, flies
 from webots_mcp.judging.detection.standstill import (
@@ -164,12 +165,16 @@ def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
 def follows_targets(run: RunUnderCheck) -> Examined:
     """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
 
-    Places where a robot shall go are no targets, and grippers hold things. A target that is always
-    0 has no range to judge by.
+    Also where it made less than half of the usual share of the motion of a target that keeps
+    moving. Warns where a closed gripper lost the force with which it held something. Places where a
+    robot shall go are no targets, and grippers hold things. A target that is always 0 has no range
+    to judge by.
     """
     found = run.events(OFF_TARGET.name)
     if not found:
         pursuits = pursuits_in(run.search)
+        if not pursuits and (grips := grips_in(run.search)):
+            return run.covered(f"{counted(len(grips), 'grip')} kept", of=OFF_TARGET.name)
         if not pursuits:
             raise NotSearchableError("no target is published next to what it is the target of")
         said = f"{counted(len(pursuits), 'target')} followed, as by {pursuits[0].measured.name}"
@@ -180,35 +185,70 @@ def follows_targets(run: RunUnderCheck) -> Examined:
     details = longest.details
     evidence = (
         f"{names}: {details['off_percent']:g} % off {details['target']} for "
-        f"{longest.duration_s:.3g} s without coming nearer"
+        f"{longest.duration_s:.3g} s, {details.get('says', 'without coming nearer')}"
     )
     firm = run.firmest(each.name or "" for each in found)
     more = run.more(OFF_TARGET.name)
-    return Fault("fail", evidence, found[0].start_s, len(found), more, signals=firm)
+    grips = {each.force.name for each in grips_in(run.search)}
+    severity = "warn" if grips.issuperset(each.name or "" for each in found) else "fail"
+    return Fault(severity, evidence, found[0].start_s, len(found), more, signals=firm)
 
 
 def stays_stable(run: RunUnderCheck) -> Examined:
-    """Warns where an oscillation of heading, wheels, speed and the like became twice as large."""
-    growing = [
-        each
-        for each in run.events(OSCILLATION.name)
-        if each.details.get("amplitude_at_end", 0.0) > each.details.get("amplitude_at_start", 0.0)
-    ]
+    """Warns where an oscillation of heading, wheels, speed and the like became twice as large.
+
+    It has to grow steadily: of those that do not, a rank test takes one in 1,000 to grow. What
+    follows a target whose oscillation grew as well does what it shall, and how a joint shall move
+    is planned.
+    """
+    pursuits = pursuits_in(run.search)
+    targets = {each.measured.name: each.target.name for each in pursuits}
+    planned = {
+        each.target.name
+        for each in pursuits
+        if run.meanings[each.measured.name].quantity == "joint position"
+    }
+    growing: dict[float, Event] = {}
+    for each in run.events(OSCILLATION.name):
+        ends = (each.details.get(f"amplitude_at_{at}", 0.0) for at in ("start", "end"))
+        if next(ends) >= next(ends) or each.name in planned:
+            continue
+        if _target_grew(run, each, targets.get(each.name or "")):
+            continue
+        turn = run.search.known[each.name or ""].turn
+        if (since_s := growth_begins_s(run.frame, each, turn)) is not None:
+            growing.setdefault(since_s, each)
     if not growing:
         return run.covered(
             "no oscillation grew", of=OSCILLATION.name, limit=f"limit {GROWS:g} times"
         )
     worst = max(
-        growing,
+        growing.values(),
         key=lambda e: e.details["amplitude_at_end"] / (e.details["amplitude_at_start"] or 1),
     )
     start, end = (worst.details[f"amplitude_at_{at}"] for at in ("start", "end"))
-    names = listed(list(dict.fromkeys(each.name or "" for each in growing)), 3)
+    names = listed(list(dict.fromkeys(each.name or "" for each in growing.values())), 3)
     evidence = (
         f"{names}: the amplitude grew from {start:.3g} to {end:.3g} in {worst.duration_s:.3g} s, "
         f"with a period of {worst.details['period_s']:.3g} s"
     )
-    return Fault("warn", evidence, worst.start_s, len(growing), run.more(OSCILLATION.name))
+    return Fault("warn", evidence, min(growing), len(growing), run.more(OSCILLATION.name))
+
+
+def _target_grew(run: RunUnderCheck, growing: Event, target: str | None) -> bool:
+    """Whether the target of an oscillation went to and fro twice as far at its end as well."""
+    if target is None:
+        return False
+    two_s = 2 * float(growing.details["period_s"])
+    ends = (
+        (growing.start_s, growing.start_s + two_s),
+        (growing.end_s - two_s, just_after(growing.end_s)),
+    )
+    ranges: list[float] = []
+    for span in ends:
+        values = run.frame.between(*span).usable(target)[1]
+        ranges.append(float(np.ptp(values)) if len(values) else 0.0)
+    return ranges[1] >= GROWS * ranges[0] and ranges[1] > 0
 
 
 # -- attitude --------------------------------------------------------------------------------------

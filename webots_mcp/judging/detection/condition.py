@@ -283,9 +283,9 @@ CONDITION: Final = EventKind(
 # -- the parsed tree asked of all rows at once -----------------------------------------------------
 #
 # In each row the outcome is that of the closures that the controller asks of each state; see
-# docs/conditions.md. A value is NaN where a row has no number. Integers beyond 2^53 are those of
-# 64-bit floats. Where a text stands in the place of a number, the closures themselves are asked,
-# row by row: they know in which row that is an error.
+# 'webots-mcp help conditions'. A value is NaN where a row has no number. Integers beyond 2^53 are
+# those of 64-bit floats. Where a text stands in the place of a number, the closures themselves are
+# asked, row by row: they know in which row that is an error.
 
 
 class _MixedKindsError(Exception):

@@ -14,7 +14,7 @@ from typing import Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, noise_of, np
 from webots_mcp.judging.detection.kinds import Event, NotSearchableError
-from webots_mcp.judging.detection.search import EventKind, Search, places_in
+from webots_mcp.judging.detection.search import EventKind, Search, places_in, were_not_searched
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal
@@ -24,7 +24,11 @@ TIMES: Final = 3.0  # the noise after, of the noise before
 _BLOCKS: Final = 32
 _LEAST_ROWS: Final = 40  # of a block: its noise is known to about 15 % then
 _LEAST_SIDE: Final = 6  # blocks before, and after
-_MOST_CHANCE: Final = 1 / 12_870
+_LEAST_BLOCKS: Final = 16  # of fewer no order is as rare
+_MOST_CHANCE: Final = 1 / math.comb(_LEAST_BLOCKS, _LEAST_BLOCKS // 2)  # 1 in 12,870
+_DIFFERENCES: Final = 4  # leave out smooth motion; of independent noise they have ...
+_DIFFERENCE_VARIANCE: Final = 70.0  # ... so many times its variance
+_OUTLIER: Final = 4.0  # standard deviations of the larger noise; more does not count more
 _SAME_MOTION: Final = 2.0  # times as fast: then the motion may explain the noise
 _SHAKEN: Final[frozenset[Quantity | None]] = frozenset(("angular velocity", "acceleration"))
 # Quantities whose noise does not depend on how the robot moves.
@@ -55,6 +59,17 @@ def degradation_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError("; ".join(undecided), "undecided")
     if not signals:
         raise NotSearchableError("no sensor is known whose noise does not depend on motion")
+    least_rows = _LEAST_ROWS * _LEAST_BLOCKS
+    few = [each for each in signals if _rows_of(search, each) < least_rows]
+    signals = [each for each in signals if each not in few]
+    if few:
+        why = (
+            f"{were_not_searched([each.name for each in few])}: noise is judged only in "
+            f"{least_rows} rows or more"
+        )
+        if not signals:
+            raise NotSearchableError(why, "undecided")
+        search.not_searched("degradation", why)
     found_any = False
     for signal in search.in_time("degradation", signals):
         found = _change_of(search, signal)
@@ -87,10 +102,9 @@ def _shaken_more(search: Search, signals: Sequence[RegisteredSignal]) -> Iterato
 
 def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, float] | None:
     """When the noise grew, and how large it was before and after; None where it did not."""
-    zones = search.frame.zone_map(signal.name)
-    rows = int(zones.value_count.sum())
+    rows = _rows_of(search, signal)
     blocks = min(_BLOCKS, rows // _LEAST_ROWS)
-    if blocks < 2 * _LEAST_SIDE:
+    if blocks < _LEAST_BLOCKS:
         return None
     edges = np.linspace(0, rows, blocks + 1).astype(np.intp)
     if not _may_have_grown(search.frame, signal.name, edges):
@@ -99,19 +113,46 @@ def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, 
     noises = np.array([noise_of(values[a:b]) for a, b in pairwise(edges.tolist())])
     if noises.min() <= _ROUNDING * float(np.abs(values).max()):
         return None
-    best: tuple[float, int] | None = None
-    for at in range(_LEAST_SIDE, blocks - _LEAST_SIDE + 1):
-        if noises[:at].max() < noises[at:].min() and 1 / math.comb(blocks, at) <= _MOST_CHANCE:
-            ratio = float(np.median(noises[at:]) / np.median(noises[:at]))
-            best = max(best or (0.0, 0), (ratio, at))
-    if best is None or best[0] < TIMES or not _moves_alike(search, times, int(edges[best[1]])):
+    divided = [
+        at
+        for at in range(_LEAST_SIDE, blocks - _LEAST_SIDE + 1)
+        if noises[:at].max() < noises[at:].min() and 1 / math.comb(blocks, at) <= _MOST_CHANCE
+    ]
+    if not divided:
         return None
-    middle = best[1]
-    return (
-        float(times[edges[middle]]),
-        float(np.median(noises[:middle])),
-        float(np.median(noises[middle:])),
-    )
+    # Where one level before and one after it explain all blocks best, whatever their order is.
+    middle = min(divided, key=lambda at: _misfit(np.log(noises), at))
+    before, after = float(np.median(noises[:middle])), float(np.median(noises[middle:]))
+    first, stop = int(edges[middle - 1]), int(edges[middle + 1])
+    row = first + _onset(values[first:stop], before, after)
+    if after < TIMES * before or not _moves_alike(search, times, row):
+        return None
+    return float(times[row]), before, after
+
+
+def _rows_of(search: Search, signal: RegisteredSignal) -> int:
+    """How many rows have a value of a signal."""
+    return int(search.frame.zone_map(signal.name).value_count.sum())
+
+
+def _misfit(values: Array, at: int) -> float:
+    """The squares that are left of values with one mean before a place and one after it."""
+    return float(sum(np.square(part - part.mean()).sum() for part in (values[:at], values[at:])))
+
+
+def _onset(values: Array, before: float, after: float) -> int:
+    """The row from which the larger noise is likelier (maximum likelihood of normal noise).
+
+    Args:
+        values: Of the block before the change and the one after it, which begin around it.
+        before: Standard deviation of the noise before.
+        after: Of the noise after.
+    """
+    squares = np.square(np.diff(values, _DIFFERENCES)) / _DIFFERENCE_VARIANCE
+    squares = np.minimum(squares, np.square(_OUTLIER * after))
+    likelier = squares * (1 / before**2 - 1 / after**2) / 2 - math.log(after / before)
+    from_there = np.cumsum(likelier[::-1])[::-1]
+    return min(int(from_there.argmax()) + _DIFFERENCES - 1, len(values) - 1)
 
 
 def _may_have_grown(frame: Frame, name: str, edges: Indexes) -> bool:

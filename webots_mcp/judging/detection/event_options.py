@@ -31,7 +31,7 @@ class EventOptions:
         stuck_m: Who stays within this distance (more where the noise of the position is more) is at
             a standstill, and stuck who should move besides, ...
         stuck_s: ... for so long.
-        where: For the kind "condition"; see docs/conditions.md.
+        where: For the kind "condition"; see 'webots-mcp help conditions'.
         missing_s: Without a value for so long, though it mostly has one.
         flat_s: Exactly the same number for so long, though it mostly changes; for a signal that
             is noisy otherwise 0.15 of that are enough.

@@ -34,6 +34,7 @@ from webots_mcp.analysis.swings import (
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.kinds import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search
+from webots_mcp.signals.meaning import Quantity, is_asked_for, words_in
 from webots_mcp.signals.naming import counted, in_snake_case
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 from webots_mcp.store.reading.segment import just_after
@@ -44,6 +45,10 @@ GROWS: Final = 2.0  # times the amplitude at one end: then both are reported
 _ENDS_WITHIN: Final = 1.5  # periods
 _NAMED: Final = 3  # signals that were not searched
 _QUICK_S: Final = 1.0  # a period: how quickly the body of a robot goes to and fro
+_LEAST_HALVES: Final = 8  # half periods, of which growth is told
+_MOST_HALVES: Final = 400  # of a long one parts of several half periods are compared
+_GROWTH_DEVIATIONS: Final = 3.09  # of a rank trend: by chance once in 1,000 oscillations
+_SWINGING_ANGLES: Final = frozenset[Quantity | None](("angle", "heading", "roll", "pitch", None))
 # Sensors swing by nature while a robot drives.
 _SWINGING: Final = re.compile(
     r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
@@ -53,10 +58,10 @@ _SWINGING: Final = re.compile(
 
 
 def oscillation_events(search: Search) -> Iterator[Event]:
-    """Of heading, wheels, speed, position and the like, and of what is asked for."""
+    """Of heading, wheels, speed, position, angles and the like, and of what is asked for."""
     signals = search.required_numbers()
     if search.options.signals == EventOptions.signals:
-        signals = [each for each in signals if _SWINGING.search(in_snake_case(each.name))]
+        signals = [each for each in signals if _may_swing(search, each)]
     if left := [each.name for each in search.numbers if each not in signals]:
         their = "its name does" if len(left) == 1 else "their names do"
         why = (
@@ -83,6 +88,88 @@ def oscillation_events(search: Search) -> Iterator[Event]:
         event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
         goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
         yield replace(event, ongoing=goes_on)
+
+
+def _may_swing(search: Search, signal: RegisteredSignal) -> bool:
+    """Whether a signal tells of motion by its name, or is a measured angle: what hangs swings."""
+    if _SWINGING.search(in_snake_case(signal.name)):
+        return True
+    meaning = search.meanings[signal.name]
+    is_angle = signal.turn is not None or angle_unit_of(signal) is not None
+    is_angle &= meaning.quantity in _SWINGING_ANGLES
+    return (is_angle or meaning.quantity == "angle") and not is_asked_for(signal.name)
+
+
+def angle_unit_of(signal: RegisteredSignal) -> str | None:
+    """Return `rad` or `deg` of what is stated or named to be measured in it; None of others."""
+    if signal.stated_unit:
+        return signal.stated_unit if signal.stated_unit in ("rad", "deg") else None
+    words = words_in(signal.name)
+    return words[-1] if words and words[-1] in ("rad", "deg") else None
+
+
+def growth_begins_s(frame: Frame, event: Event, turn: float | None = None) -> float | None:
+    """Return from when on an oscillation became larger and larger; None where it did not.
+
+    Its half periods are compared by a rank test. One that was pushed once, and is as large ever
+    since, has two amplitudes and does not grow. Of oscillations that keep their amplitude one in
+    1,000 is said to grow (H. B. Mann, Nonparametric tests against trend, Econometrica 13, 1945).
+
+    Args:
+        frame: Rows that hold it.
+        event: The oscillation.
+        turn: A whole turn of an angle.
+    """
+    half_s = float(event.details["period_s"]) / 2
+    part = frame.between(event.start_s, just_after(event.end_s))
+    times, values = part.usable(event.name or "")
+    if turn and len(values):
+        values = unwrap(values, turn)
+    lasts_s = float(times[-1] - times[0]) if len(times) else 0.0
+    halves = min(int(lasts_s / half_s), _MOST_HALVES)
+    if halves < _LEAST_HALVES:
+        return None
+    totals = np.concatenate(([0.0], np.cumsum(values)))
+    firsts, stops = (np.searchsorted(times, times + each) for each in (-half_s, half_s))
+    off = values - (totals[stops] - totals[firsts]) / np.maximum(stops - firsts, 1)
+    moments: Array = times[0] + lasts_s / halves * np.arange(halves, dtype=np.float64)
+    starts: Indexes = np.searchsorted(times, moments)
+    rows = np.diff(starts, append=len(times))
+    if (rows < 1).any():
+        return None
+    sizes: Array = np.add.reduceat(off**2, starts) / rows
+    sizes, starts = sizes[1:-1], starts[1:-1]  # the mean of a whole period is not known at the ends
+    halves = len(sizes)
+    later: Array = np.sign(sizes[None, :] - sizes[:, None])
+    score = float(np.triu(later, 1).sum())
+    variance = halves * (halves - 1) * (2 * halves + 5) / 18
+    if score - 1 <= _GROWTH_DEVIATIONS * math.sqrt(variance):
+        return None
+    bend = _bend_of(np.log(np.maximum(sizes, np.finfo(np.float64).tiny)))
+    if bend is None:
+        return None
+    # A bend in the first period cannot be told from growth since the start.
+    return float(times[starts[bend]]) if bend > 2 else event.start_s
+
+
+def _bend_of(values: Array) -> int | None:
+    """The place up to which values are constant, and from which they rise evenly (least squares).
+
+    None where two constants explain them better: they rose at once.
+    """
+    places = np.arange(len(values), dtype=np.float64)
+    left: list[float] = []
+    for bend in range(len(values) - 2):
+        rise = np.maximum(places - bend, 0.0)
+        off = rise - rise.mean()
+        slope = float((off * values).sum() / (off * off).sum())
+        left.append(float(np.square(values - values.mean() - slope * off).sum()))
+    steps = (_left_of(values[:at]) + _left_of(values[at:]) for at in range(1, len(values)))
+    return int(np.argmin(left)) if min(left) < min(steps) else None
+
+
+def _left_of(values: Array) -> float:
+    return float(np.square(values - values.mean()).sum())
 
 
 def _passed(names: Sequence[str]) -> str:

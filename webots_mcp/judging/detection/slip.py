@@ -33,6 +33,9 @@ _SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say no
 _BY_WHEELS: Final = ("odom", "odometry")
 _OFF_THE_FLOOR_M: Final = 0.3
 _NOISE: Final = 6.0  # standard deviations
+_OWN_HEIGHT: Final = frozenset(("altitude", "height", "m", "cm", "pressure", "gps", "position"))
+_ON_THE_GROUND: Final = frozenset(("wheel", "track", "caterpillar"))
+_RUDDERS: Final = frozenset(("steering", "rudder", "aileron", "elevon", "fin"))
 
 
 class _Slip(NamedTuple):
@@ -79,11 +82,22 @@ def flies(search: Search) -> bool:
 
     The motors of what flies turn all the time.
     """
-    motors, height = search.motion.wheels or search.motion.wheel_commands, search.motion.height
+    motors, height = search.motion.wheels or search.motion.wheel_commands, _own_height(search)
     if height is None or any("wheel" in each.name.lower() for each in motors):
         return False
     heights = in_metres(height, search.whole.usable(height.name)[1])
     return len(heights) > 0 and median(heights) > _OFF_THE_FLOOR_M
+
+
+def _own_height(search: Search) -> RegisteredSignal | None:
+    """The height of the robot itself, not that of something that it lifts."""
+    others = (
+        search.known[name]
+        for name, meaning in search.meanings.items()
+        if meaning.quantity == "height" and meaning.is_sensed and name in search.whole
+        if _OWN_HEIGHT.issuperset(words_in(name))
+    )
+    return search.motion.height or next(others, None)
 
 
 def _slips_of(
@@ -125,14 +139,20 @@ def _turns_though_straight(search: Search, wheels: list[RegisteredSignal]) -> It
     """A robot that turned for long while the wheels of both sides turned alike: one side slips.
 
     A robot that steers turns so by nature, and where none of its wheels has a side nothing is said.
+    Motors that are not known to drive wheels may be those of propellers.
     """
     heading = search.motion.heading
     sides = {
         side: [w for w in wheels if (search.meanings[w.name].side or "").endswith(side)]
         for side in ("left", "right")
     }
-    steers = any("steering" in words_in(name) for name in search.known)
-    if heading is None or steers or not all(sides.values()):
+    steers = any(not _RUDDERS.isdisjoint(words_in(name)) for name in search.known)
+    on_ground = all(
+        not _ON_THE_GROUND.isdisjoint(words_in(each.name))
+        or search.meanings[each.name].source in ("declared", "device")
+        for each in wheels
+    )
+    if heading is None or steers or not on_ground or not all(sides.values()):
         return
     frame, turn = search.whole, heading.turn or math.tau
     course = unwrap(frame.numbers(heading.name), turn) * math.tau / turn

@@ -1,26 +1,40 @@
 """`off_target`: what should follow a target stayed away from it and came no nearer.
 
 Judged is by medians of cells of a second, whose error is known from the noise of both signals, so
-that neither noise nor the rate of rows decides. A height takes as long as it takes: it is off only
-where it never came to a target that stayed, nor any nearer in the second half of its stay.
+that neither noise nor the rate of rows decides. A target that keeps moving is judged by how it is
+followed. A height takes as long as it takes: it is off only where it never came to a target that
+stayed, nor any nearer in the second half of its stay.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, constant_runs, np, runs_of
+from webots_mcp.analysis.arrays import (
+    MOSTLY,
+    Array,
+    Flags,
+    Indexes,
+    constant_runs,
+    np,
+    runs_of,
+)
 from webots_mcp.analysis.summary import unwrap
+from webots_mcp.judging.detection.following import following_of
+from webots_mcp.judging.detection.holding import Grip, grips_in, lost_grips
 from webots_mcp.judging.detection.kinds import (
     Alike,
     Event,
     NotSearchableError,
 )
 from webots_mcp.judging.detection.search import EventKind, Search
-from webots_mcp.signals.meaning import HOLDING, Meaning, targets_in, words_in
+from webots_mcp.signals.meaning import HOLDING, Meaning, Quantity, targets_in, words_in
 from webots_mcp.signals.naming import METRES
+from webots_mcp.store.chunks import shown
+from webots_mcp.store.reading.segment import just_after
 from webots_mcp.store.registered_signals import RegisteredSignal
 
 OFF_S: Final = 3.0  # away for so long, without coming nearer
@@ -32,7 +46,13 @@ _NEARER_SHARE: Final = 0.05  # of the distance, from one cell to the next: it is
 _ON_ITS_WAY: Final = 0.01  # ... and so is what comes nearer by this share of the target's size
 _LEAST_ROWS: Final = 3  # of a cell
 _PLACES: Final = ("x", "y", "heading")  # where a robot goes takes as long as it takes
-_STAYS_S: Final = 2 * OFF_S  # a target of a height for so long, to judge by the half of it
+# What goes round so fast, be it of a wheel, a motor or a joint: names tell one or the other.
+_TURNING: Final = frozenset[Quantity | None](
+    ("angular velocity", "turn rate", "wheel speed", "motor speed", "joint speed")
+)
+# A target of a height for so long, to judge by the half of it: of 300 stays that healthy heights
+# came to, with delays up to 2 s and time constants up to 20 s, none was taken to be off.
+_STAYS_S: Final = 2 * OFF_S
 _TURNS: Final = {"rad": 1.0, "deg": math.pi / 180}
 _SPEEDS: Final = {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6}
 _TURN_SPEEDS: Final = {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": math.pi / 30}
@@ -68,7 +88,13 @@ def pursuits_in(search: Search) -> list[Pursuit]:
         if known[name].kind in ("num", "angle") and frame.zone_map(name).value_count.any()
     }
     found: list[Pursuit] = []
-    for measured, target in targets_in(there):
+    by_dimension = {
+        name: meaning._replace(quantity="angular velocity")
+        if meaning.quantity in _TURNING
+        else meaning
+        for name, meaning in there.items()
+    }
+    for measured, target in targets_in(by_dimension):
         zones = frame.zone_map(target)
         is_set = (zones.min < 0).any() or (zones.max > 0).any()
         follows = there[measured].quantity not in _PLACES
@@ -94,8 +120,9 @@ def _scale_between(target: Meaning, measured: Meaning) -> float | None:
 
 def off_target_events(search: Search) -> Iterator[Event]:
     """Where the median of each second is off the target, and not on its way to it, for 3 s."""
-    pursuits = pursuits_in(search)
-    if not pursuits:
+    pursuits, grips = pursuits_in(search), grips_in(search)
+    yield from _lost_grips(search, grips)
+    if not pursuits and not grips:
         raise NotSearchableError(
             "no signal is known to be the target of another, or it is always 0: declare one with "
             "target_of"
@@ -104,7 +131,134 @@ def off_target_events(search: Search) -> Iterator[Event]:
     search.judged("off_target", [each.target for each in pursuits])
     for signal in search.in_time("off_target", [each.measured for each in pursuits]):
         pursuit = targets[signal.name]
-        yield from (_never_reached if pursuit.is_height else _apart)(search, pursuit)
+        yield from (_never_reached if pursuit.is_height else _off_or_lost)(search, pursuit)
+
+
+def _lost_grips(search: Search, grips: Sequence[Grip]) -> Iterator[Event]:
+    """Where closed grippers lost what they held; what they hold decides what is a loss."""
+    segment = search.segment
+    search.judged("off_target", [each for grip in grips for each in grip])
+    for grip in grips:
+        for lost in lost_grips(search, grip):
+            if lost.start_s >= segment.end_s or lost.end_s < segment.start_s:
+                continue
+            size = abs(lost.held - lost.empty)
+            error = np.array([lost.empty - lost.held])
+            event = _off_target(
+                search, Pursuit(grip.force, grip.command), lost.start_s, lost.end_s, error, size
+            )
+            says = (
+                f"the grip was lost: from {lost.held:.3g} to {lost.empty:.3g}, as while it is "
+                f"open, though {grip.command.name} stayed"
+            )
+            yield replace(event, details=event.details | {"says": says})
+
+
+def _off_or_lost(search: Search, pursuit: Pursuit) -> Iterator[Event]:
+    """Where it was off a target that stays, and where it did not follow one that moves."""
+    apart, limp = list[Event](), dict[str, None]()
+    for each in _apart(search, pursuit):
+        if mode := limp_in(search, pursuit, each):
+            limp[mode] = None
+        else:
+            apart.append(each)
+    for mode in limp:
+        search.not_searched(
+            "off_target",
+            f"not judged in {mode}: no target moves in it, and what should follow them left them, "
+            "as with limp drives",
+            cause="undecided",
+        )
+    lost = list(_lost(search, pursuit))
+    for each in apart:  # it stopped following before it was far away
+        before = [e.start_s for e in lost if e.start_s <= each.start_s <= e.end_s + OFF_S]
+        start_s = min((each.start_s, *before))
+        yield replace(each, start_s=start_s, wall_time_s=search.wall_time_at(start_s))
+    known = [(each.start_s - OFF_S, each.end_s) for each in apart]
+    yield from (e for e in lost if all(e.end_s < a or e.start_s > b for a, b in known))
+
+
+def _lost(search: Search, pursuit: Pursuit) -> Iterator[Event]:
+    """Where it did not follow a moving target.
+
+    Off a target that moves so far in 3 s nothing can be. Where that is so for twice as long, and
+    it cannot be told how it follows, it is not searched.
+    """
+    frame, measured, target = search.frame, pursuit.measured, pursuit.target
+    values, aims = frame.numbers(measured.name), pursuit.scale * frame.numbers(target.name)
+    there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
+    if len(there) < 2:
+        return
+    times, values, aims = frame.times[there], values[there], aims[there]
+    if turn := measured.turn:
+        values, aims = unwrap(values, turn), unwrap(aims, turn)
+    size = _size_of(search, pursuit)
+    low, high = _recent_range(times, aims)
+    moving = runs_of(high - low > OFF_SHARE * size, times)
+    moving_s = float(moving.durations_s[moving.durations_s >= 2 * OFF_S].sum())
+    if not moving_s:
+        return
+    noise = max(search.noise.of(measured.name), pursuit.scale * search.noise.of(target.name))
+    found = following_of(times, values, aims, OFF_SHARE * size, noise, _ERRORS)
+    if found.judged_s < moving_s / 2:
+        why = found.why_not or f"how it follows is known in only {found.judged_s:.3g} s"
+        search.not_searched(
+            "off_target",
+            f"{measured.name} while {target.name} moved ({moving_s:.3g} s): {why}",
+            cause="undecided",
+        )
+    for span in found.lost:
+        rows = slice(*np.searchsorted(times, (span.start_s, just_after(span.end_s))).tolist())
+        says = (
+            f"it made {100 * max(span.gain, 0.0):.0f} % of the motion of its target, "
+            f"{100 * span.usual:.0f} % at other times"
+        )
+        error = np.abs(values[rows] - aims[rows])
+        event = _off_target(search, pursuit, span.start_s, span.end_s, error, size)
+        yield replace(event, details=event.details | {"says": says})
+
+
+def limp_in(search: Search, pursuit: Pursuit, off: Event) -> str | None:
+    """Return the mode in which drives are limp as far as can be told; None where they are not.
+
+    In limp mode no target moves, and most of what should follow one leaves it by itself. One joint
+    that leaves its target is off it; and so is what was off before the mode began.
+
+    Args:
+        search: Where it is looked.
+        pursuit: What left its target.
+        off: From when to when.
+    """
+    mode, frame = search.motion.mode, search.frame
+    if mode is None or mode.name not in frame:
+        return None
+    codes, labels = frame.coded(mode.name)
+    first, stop = frame.places([off.start_s, off.end_s]).tolist()
+    code = int(codes[first])
+    visit = next(
+        e for e in runs_of(codes == code, frame.times).spans() if e.start <= first < e.stop
+    )
+    if visit.start == 0 or visit.stop < stop:
+        return None
+    moved: list[bool] = []
+    for each in pursuits_in(search):
+        if each.is_height or each.measured.name not in frame or each.target.name not in frame:
+            continue
+        aims = frame.numbers(each.target.name)
+        size = _size_of(search, each)
+        if each.scale * _range_of(aims[codes == code]) > OFF_SHARE * size:
+            return None  # targets are followed in this mode
+        part = frame.numbers(each.measured.name)[visit.start : visit.stop]
+        moved.append(_range_of(part) > OFF_SHARE * size)
+    if len(moved) < 2 or sum(moved) <= MOSTLY * len(moved):
+        return None
+    return f"{mode.name} {shown(labels[code])}"
+
+
+def _range_of(values: Array) -> float:
+    """From the first to the last percentile, so that single readings do not count."""
+    known = values[np.isfinite(values)]
+    return float(np.ptp(np.quantile(known, (0.01, 0.99)))) if len(known) else 0.0
 
 
 def _apart(search: Search, pursuit: Pursuit) -> Iterator[Event]:

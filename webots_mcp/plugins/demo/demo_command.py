@@ -317,7 +317,7 @@ def _show_database(data_dir: Path) -> None:
 
 
 def _show_connections(data_dir: Path) -> None:
-    """Print the entries of docs/clients.md with the full paths of this environment."""
+    """Print the entries of the page clients with the full paths of this environment."""
     command = server_command(data_dir)
     entry = {"mcpServers": {"webots": {"command": command[0], "args": command[1:]}}}
     _say("\nConnect an assistant to this recording. Claude Code by one line:")

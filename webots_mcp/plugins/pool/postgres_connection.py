@@ -78,7 +78,9 @@ def _explained(error: psycopg.Error, address: str) -> PoolError:
     said = one_line(error.diag.message_primary or str(error))
     is_lost = not state and isinstance(error, psycopg.OperationalError)  # The connection was lost.
     if state == "42501":  # insufficient_privilege
-        return PoolError(f"{address} forbids it: {said}; see docs/pool.md for what to grant")
+        return PoolError(
+            f"{address} forbids it: {said}; see 'webots-mcp help pool' for what to grant"
+        )
     # The table or the function exists already.
     if state in ("42P07", "42723"):
         return PoolError(

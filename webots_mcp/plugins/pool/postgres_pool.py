@@ -184,7 +184,7 @@ def _clear_question() -> Generator[None]:
         hint = f"; {one_line(error.diag.message_hint)}" if error.diag.message_hint else ""
         raise InvalidInputError(
             f"PostgreSQL does not answer this: {said}{hint}. Ask one SELECT, which ends within "
-            f"{SELECT_S} s, of the tables and views of docs/pool.md"
+            f"{SELECT_S} s, of the tables and views of 'webots-mcp help pool'"
         ) from None
 
 

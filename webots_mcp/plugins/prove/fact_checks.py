@@ -1,10 +1,10 @@
 """Checks of a running Webots, one for each fact that is known from its sources only.
 
-docs/webots.md names the check of each of its statements. The docstring of a check is printed: what
-the sources say, and after "otherwise" what still works if that is wrong. A check returns what it
-measured, or fails with what it observed. `running_NAME` is called with Webots in real time, after
-the rover has recorded `bench.before`; `streaming_NAME` the same with --stream. `check_NAME` starts
-Webots itself.
+'webots-mcp help webots' names the check of each of its statements. The docstring of a check is
+printed: what the sources say, and after "otherwise" what still works if that is wrong. A check
+returns what it measured, or fails with what it observed. `running_NAME` is called with Webots in
+real time, after the rover has recorded `bench.before`; `streaming_NAME` the same with --stream.
+`check_NAME` starts Webots itself.
 """
 
 from __future__ import annotations

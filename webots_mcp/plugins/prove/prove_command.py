@@ -43,9 +43,9 @@ def prove(
     """Try on the Webots of this machine what we know of it from its sources alone.
 
     Starts it a few times without its window, on a world of its own in a temporary folder, and says
-    of each statement of docs/webots.md whether it is so. This takes some minutes. What --json
-    prints names no file, user or machine: please send it with an issue. The exit code is 1 if
-    anything is otherwise.
+    of each statement of 'webots-mcp help webots' whether it is so. This takes some minutes. What
+    --json prints names no file, user or machine: please send it with an issue. The exit code
+    is 1 if anything is otherwise.
     """
     from webots_mcp.contract import VERSION
     from webots_mcp.plugins.prove.fact_checks import CHECKS

@@ -2,7 +2,7 @@
 
 A check is one function of what is `Examined` that yields each `Diagnosis`, declared by
 `@check(NAME)` in one of the modules of this package. What it finds is explained in
-docs/troubleshooting.md, under a heading of its name. A diagnosis changes nothing.
+the page troubleshooting, under a heading of its name. A diagnosis changes nothing.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Verdict = Literal["ok", "warning", "wrong", "not checked"]
 _WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not checked", "ok")
-PAGE: Final = "docs/troubleshooting.md"
+PAGE: Final = "troubleshooting"  # of the documentation
 # From the controller's machine to the client; within a module the order is that of its functions.
 _IN_ORDER: Final = (
     "machine_checks", "recording_checks", "controller_checks", "simulation_check", "webots_checks",
@@ -140,8 +140,8 @@ class DoctorCheck:
 
     @property
     def page(self) -> str:
-        """Where it is explained further."""
-        return f"{PAGE}#{self.name.lower().replace(' ', '-')}"
+        """The command that prints the section of the documentation about it."""
+        return f"webots-mcp help {PAGE} {self.name.lower().replace(' ', '-')}"
 
 
 class Checked(NamedTuple):

@@ -143,7 +143,8 @@ def rows(subject: Examined) -> Iterator[Diagnosis]:
     for name, why in (kept_journals(subject.file) if subject.file else {}).items():
         yield warning(
             f"{name} could not be read and was left as it is: {why}",
-            "correct the program that writes it (docs/journal.md); then move or delete the file",
+            "correct the program that writes it ('webots-mcp help journal'); then move or delete "
+            "the file",
         )
 
 

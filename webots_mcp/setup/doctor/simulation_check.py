@@ -99,7 +99,7 @@ def _is_unclear(view: RobotView) -> bool:
 def _judged(view: RobotView) -> Diagnosis:
     name, status = view.robot.name, view.status
     seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
-    see_page = "see docs/troubleshooting.md#simulation"
+    see_page = "see 'webots-mcp help troubleshooting simulation'"
     if view.session is None or not view.robot.live:
         if status.why == UNSEEN:
             return warning(seen, see_page)

@@ -1,4 +1,4 @@
-"""Conditions on the signals of a robot: `front_m < 0.1 for 0.5`; see docs/conditions.md.
+"""Conditions on the signals of a robot: `front_m < 0.1 for 0.5`; see 'webots-mcp help conditions'.
 
 The controller's side asks them of each published state, the server's side of recorded rows, and
 both get the same answer.

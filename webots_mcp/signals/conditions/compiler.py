@@ -89,7 +89,7 @@ def _as_it_is(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition of the language in docs/conditions.md.
+    """A condition of the language in 'webots-mcp help conditions'.
 
     Attributes:
         text: Without the spaces around it.

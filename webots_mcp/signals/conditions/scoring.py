@@ -1,4 +1,4 @@
-"""A score of a finished run: `max(pose.x) - 2 * count(stuck)`; see docs/trials.md.
+"""A score of a finished run: `max(pose.x) - 2 * count(stuck)`; see 'webots-mcp help trials'.
 
 It is arithmetic over facts about the run, such as what the values of a signal come to: mean(x),
 max(x), time(condition).

@@ -1,9 +1,9 @@
-"""What a condition remembers of a robot's states: the newest values, and earlier ones.
+"""The signal values that a condition reads from a robot's states, and those that it remembers.
 
-A signal's value is what `flatten` of the recorded row gives under its name. A whole state is not
-flattened for that: a condition has two microseconds. What is kept of the states before (the last
-value, a rate, places, since when something holds) is brought up to date with every state, whatever
-`and` and `or` leave unasked.
+A signal's value equals what `flatten` gives for the recorded row. A condition has two microseconds,
+which is too short to flatten a whole state. The values of earlier states (the last value, a rate,
+positions, since when something holds) are updated with every state, even if `and` or `or` skips
+the comparison that uses them.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ Answer = TypeVar("Answer")
 
 
 def reader(name: str, plain: Plain) -> Read:
-    """What reads the signal of that name from a state; None where it has no value.
+    """Return a function that reads a signal from a state, and returns None if it has no value.
 
-    NaN and the infinities are no values: a row holds null in their place.
+    NaN and the infinities count as missing: a row holds null in their place.
 
     Args:
-        name: Dotted.
-        plain: The counterpart that a row holds, in JSON's terms, of what is not plain JSON.
+        name: The name of the signal, with dots.
+        plain: Returns the plain JSON value that a row holds in place of any other object.
     """
     return _shortcut(name, _careful_reader(name, plain))
 
@@ -105,10 +105,11 @@ def _careful_reader(name: str, plain: Plain) -> Read:
         kind = container.__class__
         if kind is dict:
             if part not in container:
-                return whole(container) if is_unclear(container) else None
+                unclear = _may_hold_otherwise(container, others)
+                return _flattened(container, name, plain) if unclear else None
             for other in others:
                 if other in container:
-                    return whole(container)
+                    return _flattened(container, name, plain)
             value = container[part]
         elif (kind is list or kind is tuple) and len(container) <= LONGEST_SPREAD_ARRAY:
             if not 0 <= index < len(container):
@@ -122,23 +123,8 @@ def _careful_reader(name: str, plain: Plain) -> Read:
             return value if -_INFINITY < value < _INFINITY else None
         return _leaf(value, plain)
 
-    def is_unclear(container: dict[Any, Any]) -> bool:
-        """Whether a key that holds a dot, or is no text, may give a value that name."""
-        try:
-            "".join(container)
-        except TypeError:
-            return True
-        for other in others:  # noqa: SIM110  (twice as fast as any())
-            if other in container:
-                return True
-        return False
-
-    def whole(container: dict[Any, Any]) -> Value:
-        """The slow way that is always right."""
-        return _leaf(flatten(plain(container)).get(name), plain)
-
     def read_other(container: State) -> Value:
-        """Of a long array, of nothing that could have parts, or of what is not plain JSON."""
+        """Read from a long array, a value without parts, or an object that is not plain JSON."""
         kind = container.__class__
         if kind is list or kind is tuple:
             return _reduced(container, name, plain) if name in REDUCTIONS else None
@@ -150,15 +136,32 @@ def _careful_reader(name: str, plain: Plain) -> Read:
     return read
 
 
+def _may_hold_otherwise(container: dict[Any, Any], others: tuple[object, ...]) -> bool:
+    """Return whether a key with a dot, or one that is not a string, may give a value its name."""
+    try:
+        "".join(container)
+    except TypeError:
+        return True
+    for other in others:  # noqa: SIM110  (twice as fast as any())
+        if other in container:
+            return True
+    return False
+
+
+def _flattened(container: dict[Any, Any], name: str, plain: Plain) -> Value:
+    """Read a signal from the flattened container: slow, and right for every kind of key."""
+    return _leaf(flatten(plain(container)).get(name), plain)
+
+
 def _other_keys(name: str) -> tuple[object, ...]:
-    """Keys of a dict that give its values the same name: one with a dot in it, or the number 1."""
+    """Return the other keys that give a value this name: "a.b", or the number 1 for "1"."""
     parts = name.split(".")
     texts = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
     return (*texts[1:], *(key for text in texts for key in _keys_written(text)))
 
 
 def _keys_written(text: str) -> Iterable[object]:
-    """The key that is no text and that JSON writes like that."""
+    """Yield the keys that are not strings and that JSON writes as this text."""
     if text in _CONSTANT_KEYS:
         yield _CONSTANT_KEYS[text]
     if text[:1] in _NUMERIC and len(text) < _LONGEST_NUMBER:
@@ -167,7 +170,7 @@ def _keys_written(text: str) -> Iterable[object]:
 
 
 def _leaf(value: Any, plain: Plain) -> Value:
-    """A value as a row holds it."""
+    """Return a value as a row holds it."""
     kind = value.__class__
     if kind is float:
         return value if -_INFINITY < value < _INFINITY else None
@@ -193,7 +196,7 @@ def _nearest_float(number: int) -> float | None:
 
 
 def _reduced(array: list[Any] | tuple[Any, ...], reduction: str, plain: Plain) -> Value:
-    """One reduction of a long array; of nothing but ordinary numbers at the speed of C."""
+    """Return one reduction of a long array; an array of ordinary numbers takes a fast path."""
     if len(array) <= _LONGEST_ARRAY and _is_usual(array):
         return _REDUCE[reduction](array)
     as_in_row = plain(array)
@@ -204,7 +207,7 @@ def _reduced(array: list[Any] | tuple[Any, ...], reduction: str, plain: Plain) -
 
 
 def _is_usual(array: list[Any] | tuple[Any, ...]) -> bool:
-    """Whether it holds nothing but numbers that a row holds as they are."""
+    """Return whether an array holds only numbers that a row stores unchanged."""
     kinds = set(map(type, array))
     if not kinds <= _NUMBERS:
         return False

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
@@ -362,14 +362,21 @@ class Frame:
         return Decoded(numbers, codes, labels)
 
     def _part_of_whole(self, column: Column) -> Decoded | None:
-        """The numbers out of those of all rows, where they are known already."""
-        first, stop = self._source.bounds
-        if (self._start, self._stop) == (first, stop):
-            return None
-        whole: Decoded | None = self._source.known(("values", column, *self._source.bounds))
-        if whole is None or whole.codes is not None:
-            return None
-        return Decoded(whole.numbers[self._start - first : self._stop - first], None, ())
+        """The numbers out of those of all rows of a frame, where they are known already.
+
+        Of another frame than its own they have to be whole: what could not be read may lie in rows
+        that only the other one has.
+        """
+        source, own = self._source, (self._start, self._stop)
+        for first, stop in source.frames:
+            if (first, stop) == own or not first <= own[0] <= own[1] <= stop:
+                continue
+            key = ("values", column, first, stop)
+            find = source.known if (first, stop) == source.bounds else source.known_whole
+            whole: Decoded | None = find(key)
+            if whole is not None and whole.codes is None:
+                return Decoded(whole.numbers[own[0] - first : own[1] - first], None, ())
+        return None
 
     def _coded(self, name: str, *, numbers: bool) -> Coded:
         """Codes from 1 on; numbers get labels as well, where they are wanted."""
@@ -431,7 +438,7 @@ def read_frame(
     """
     asked = (segment.run_id, segment.start_s, segment.end_s, segment.full_rate and full_rate)
     memo = read_so_far(connection)
-    if (source := memo.get((*asked, every_call))) is not None:
+    if (source := memo.get((*asked, every_call)) or _wider(memo, asked, every_call)) is not None:
         return _framed(source.twin(), segment, None)
     source, cut_at_s = _source_of(
         connection, segment, deadline, full_rate=full_rate, every_call=every_call
@@ -440,6 +447,22 @@ def read_frame(
     if cut_at_s is None:
         memo[(*asked, every_call)] = source.twin()
     return frame
+
+
+def _wider(
+    memo: Mapping[tuple[int, float, float, bool, bool], FrameSource],
+    asked: tuple[int, float, float, bool],
+    every_call: bool,
+) -> FrameSource | None:
+    """Return what a longer segment of the run was read from, where that is the same."""
+    run_id, start_s, end_s, at_full_rate = asked
+    if at_full_rate or every_call:
+        return None
+    for (other_id, first_s, last_s, *kinds), source in memo.items():
+        is_longer = other_id == run_id and first_s <= start_s and last_s >= end_s
+        if is_longer and not any(kinds) and source.may_serve(start_s, end_s):
+            return source
+    return None
 
 
 def _source_of(
@@ -553,6 +576,7 @@ def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Fr
         stop = start + int(inside[-1]) + 1 if len(inside) else start
         start += int(inside[0]) if len(inside) else 0
     source.bounds = start, stop
+    source.frames[source.bounds] = None
     return Frame(source, start, stop, cut_at_s)
 
 

@@ -63,6 +63,7 @@ class FrameSource:
         unread: What could not be read so far, each with its column: None for all of them.
         derived: Signals that no row holds, by name: their values at some times.
         bounds: The rows [start, stop) that were asked for.
+        frames: The bounds of all frames that share the arrays of this source.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class FrameSource:
         self.derived: Derived = {}
         self.order: Indexes | None = None
         self.bounds: tuple[int, int] = (0, 0)
+        self.frames: dict[tuple[int, int], None] = {}
         self._cache = _ArrayCache()
         self._noting: list[dict[Unread, Column | None]] = []
         groups = self._sound(groups)
@@ -133,8 +135,9 @@ class FrameSource:
         """
         parts = self.parts(start, stop)
         places = range(parts.start, parts.stop)
+        edges = self.first_rows.tolist()
         for place, values in self._of_parts(column, places if wanted is None else wanted.tolist()):
-            first, behind = self.first_rows[place : place + 2].tolist()
+            first, behind = edges[place], edges[place + 1]
             if start <= first and behind <= stop:
                 yield first - start, values
                 continue
@@ -206,9 +209,10 @@ class FrameSource:
         signal_id = self._signal_id(column)
         if signal_id is None or not places:
             return
-        of_group = {int(self._group_ids[place]): place for place in places}
-        sizes = np.diff(self.first_rows)
-        wanted = {group_id: int(sizes[place]) for group_id, place in of_group.items()}
+        at = np.array(places, np.intp)
+        ids = self._group_ids[at].tolist()
+        of_group = dict(zip(ids, places, strict=True))
+        wanted = dict(zip(ids, np.diff(self.first_rows)[at].tolist(), strict=True))
         missing = dict(of_group) if signal_id <= SIM_TIMES else {}  # each group has times and ids
         for group_id, values in values_in(self.connection, self.run_id, signal_id, wanted):
             missing.pop(group_id, None)
@@ -331,11 +335,31 @@ class FrameSource:
             self.note(part, column)
         return found[0]
 
+    def known_whole(self, key: object) -> Any:
+        """Return what was made under this key before and could be read whole, or None."""
+        found = self._cache.find(key)
+        return None if found is None or found[1] else found[0]
+
     def note(self, part: Unread, column: Column | None) -> None:
         """Note what could not be read, of which column; None for all of them."""
         self.unread[part] = column
         for notes in self._noting[-1:]:
             notes[part] = column
+
+    def may_serve(self, start_s: float, end_s: float) -> bool:
+        """Return whether a source of [start_s, end_s) alone would read the same, as sparingly.
+
+        The source has the rows of a longer time. Rows in no chunk count in parts from the first
+        one on, so that all of them have to be asked for. The statistics of a signal are read for
+        all groups: at least half of them have to be asked for.
+        """
+        if self.unread or self.derived or self.order is not None or not self.is_in_order:
+            return False
+        times = self.columns.times
+        if len(times) and not (start_s <= times[0] and times[-1] < end_s):
+            return False
+        touched = np.count_nonzero((self.ends_s >= start_s) & (self.starts_s < end_s))
+        return 2 * int(touched) >= len(self.starts_s)
 
     def twin(self) -> FrameSource:
         """Return one that shares all arrays, and knows only of what itself could not read."""

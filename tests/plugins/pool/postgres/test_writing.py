@@ -205,7 +205,9 @@ def test_a_role_without_a_right_is_told_which_and_nothing_is_made(
     postgres.execute(database, "CREATE ROLE visitor LOGIN")
     postgres.execute(database, "REVOKE CREATE ON SCHEMA public FROM PUBLIC")  # as from 15 on
     said = refusal(postgres.url(database, user="visitor"))
-    assert "permission denied for schema public; see docs/pool.md for what to grant" in said
+    assert (
+        "permission denied for schema public; see 'webots-mcp help pool' for what to grant" in said
+    )
     postgres.execute(database, f"ALTER DATABASE {database} SET default_transaction_read_only = on")
     assert "read-only" in refusal(postgres.url(database))
     assert relations(postgres, database) == []

@@ -48,7 +48,9 @@ class NotInStandInError(AttributeError, NotImplementedError):
 
 def lacking(what: str) -> NotInStandInError:
     """Return the error for something that Webots has and the stand-in lacks."""
-    return NotInStandInError(f"the stand-in has no {what}; see docs/standin.md for what it has")
+    return NotInStandInError(
+        f"the stand-in has no {what}; see 'webots-mcp help standin' for what it has"
+    )
 
 
 class Lacking:

@@ -53,12 +53,12 @@ NO_WAY: Final = "fewer than two rows have a position"
 OUT_OF_TIME: Final = "time limit reached before all rows were read: compare fewer runs at once"
 _NOT_EXPECTED: Final = "nothing was expected of it when it ran"
 _SPEED: Final = "mean_speed_m_s"
-_GOAL_REACHED: Final = "goal reached"
+GOAL_REACHED: Final = "goal reached"
 _GOAL_TIME: Final = "time_to_goal_s"
 _DURATION: Final = "duration_s"
 _OWN_MS: Final = "own_ms_per_step"
 WHOLE_RUNS: Final = "whole runs"
-_OF_WHOLE_RUNS: Final = (_GOAL_REACHED, _GOAL_TIME, _DURATION, _OWN_MS)
+_OF_WHOLE_RUNS: Final = (GOAL_REACHED, _GOAL_TIME, _DURATION, _OWN_MS)
 _GOALS: Final = (  # the last run command with a goal that finished in each run
     "SELECT json_extract(result, '$.run_id'), json_extract(params, '$.until'), "
     "json_extract(result, '$.ended'), json_extract(result, '$.advanced_s') FROM command "
@@ -234,7 +234,7 @@ def outcomes_of(
     """Compare what the runs of each group achieved; the goal comes first."""
     runs = [run for group in groups for run in group]
     named = dict.fromkeys(name for run in runs for name in run.figures)
-    first = [name for name in (_GOAL_REACHED, _GOAL_TIME) if name in named]
+    first = [name for name in (GOAL_REACHED, _GOAL_TIME) if name in named]
     names = [*first, *(name for name in named if name not in first)]
     if _DURATION in names and not _varies_in_length([run.figures[_DURATION] for run in runs]):
         names.remove(_DURATION)
@@ -302,7 +302,7 @@ def _measure(
     holds_for: str,
 ) -> Measure:
     figures = [[run.figure(name) for run in group] for group in groups]
-    by_run = name == _GOAL_REACHED
+    by_run = name == GOAL_REACHED
     if by_run:
         verdicts = verdicts_on_shares(figures, *tests, min_effect_sd)
     else:
@@ -472,7 +472,7 @@ def outcome_of(
     run_id, duration_s = part.segment.run_id, part.segment.end_s - part.segment.start_s
     figures: dict[str, float | None] = {}
     if part.goal is not None:
-        figures[_GOAL_REACHED] = float(part.goal.took_s is not None)
+        figures[GOAL_REACHED] = float(part.goal.took_s is not None)
         figures[_GOAL_TIME] = part.goal.took_s
     figures[_DURATION] = part.whole.end_s - part.whole.start_s
     if part.run.own_ms is not None:

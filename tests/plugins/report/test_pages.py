@@ -17,8 +17,14 @@ from PIL import Image
 from tests.plugins.report.conftest import Shown
 from tests.recordings.rows import Recorded
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
+from webots_mcp.judging.checks import CheckedRun
+from webots_mcp.judging.checks.finding import Finding
 from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.plugins.report.making import Report, make_report
+from webots_mcp.plugins.report.opening import most_important
+from webots_mcp.plugins.report.run_comparison import verdict_of
 from webots_mcp.plugins.report.words import cut, length, number
 
 EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
@@ -42,11 +48,70 @@ def test_durations_and_cut_texts_are_told_in_words() -> None:
 
 
 def test_it_tells_events_with_the_seconds_around_them(page: Shown) -> None:
-    gap = page.text.index("gap at 11.968 s, for 3.04 s")
-    around = page.text[gap : page.text.index("Events", gap)]
-    assert "mode: cruise → back_up" in around
+    moments = page.text[page.text.index("Most important moments") :]
+    moments = moments[: moments.index("What ran")]
+    assert re.search(r"\w+ at [\d.]+ s", moments)
+    assert "of the timeline around it" in moments
     assert "grasp(): failed" in page.text
     assert "the gripper is not mounted" in page.text
+
+
+def test_it_begins_with_what_happened_then_moments_then_checks_then_details(page: Shown) -> None:
+    chapter = page.text[page.text.rindex("Run 1 of rover") :]
+    places = [
+        chapter.index(each)
+        for each in ("rover ran for", "Most important moments", "Checks", "What ran", "Events")
+    ]
+    assert places == sorted(places)
+    assert re.search(r"(Failed|Passed|Not judged)[\w ]* rover ran for [\w. ]+ and ", chapter)
+
+
+def event(kind: str, start_s: float, duration_s: float = 0.0) -> Event:
+    return Event(kind, 1, start_s, start_s + duration_s, 0.0)
+
+
+def test_each_kind_has_a_moment_before_any_has_a_second_and_falls_come_first() -> None:
+    jumps = [event("jump", at_s) for at_s in (1.0, 2.0, 3.0)]
+    stuck = [event("stuck", 4.0, 3.0), event("stuck", 20.0, 9.0)]
+    fall = event("fall", 30.0)
+    assert most_important([*jumps, *stuck, fall]) == [jumps[0], stuck[1], fall]
+    assert most_important([*stuck, fall], 2) == [stuck[1], fall]
+    assert most_important(stuck) == stuck
+
+
+def checked(run_id: int, outcome: Outcome) -> CheckedRun:
+    return CheckedRun(run_id, "rover", (Finding(outcome, "its evidence", name="keeps pace"),))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "said"),
+    [
+        ("fail", "pass", "Run 2 did better: its checks passed, those of run 1 failed (keeps pace"),
+        ("pass", "warn", "Run 1 did better"),
+        ("pass", "pass", "Neither run did better by its checks: both passed."),
+        ("pass", "not judged", "Cannot tell which run did better"),
+    ],
+)
+def test_two_runs_are_compared_by_their_checks_first(
+    first: Outcome, second: Outcome, said: str
+) -> None:
+    assert said in verdict_of([checked(1, first), checked(2, second)], ())
+
+
+def test_a_report_names_a_newer_start_that_recorded_no_run(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1.0})
+    recorded.connection.execute(
+        "INSERT INTO session (robot_id, uuid, pid, host, instance, started_wall_time_s, "
+        "last_error, supervisor, last_seen_wall_time_s) "
+        "SELECT robot_id, 'newer', pid, host, instance, 2e9, 'ImportError: numpy', "
+        "supervisor, 2e9 FROM session"
+    )
+    text = make_report(recorded.connection, [robot.run_id], tmp_path).html.decode()
+    assert "A newer start of this controller" in text
+    assert "recorded no run (ImportError: numpy)" in text
 
 
 def test_it_tells_for_how_long_each_mode_was_there(page: Shown) -> None:
@@ -69,7 +134,7 @@ def test_it_compares_two_runs_as_compare_runs_does(
 def test_its_pictures_are_inside(page: Shown, recording: sqlite3.Connection) -> None:
     (count,) = recording.execute("SELECT count(*) FROM image").fetchone()
     sources = [value for tag, name, value in page.attributes if (tag, name) == ("img", "src")]
-    assert len(sources) == count > 0
+    assert len(sources) >= count > 0
     assert all(source.startswith("data:image/") for source in sources)
 
 

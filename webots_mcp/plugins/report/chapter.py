@@ -10,14 +10,15 @@ from typing import Final, NamedTuple
 
 from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks import CheckedRun, check_run
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import KINDS, Found, choose, search_events, stored_kinds
+from webots_mcp.judging.detection.events import KINDS, Found, search_events, stored_kinds
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.judging.verdicts import Verdicts
 from webots_mcp.plugins.report.grid import Grid, GridRow
+from webots_mcp.plugins.report.opening import MOMENTS, Opening, most_important, opening_of
 from webots_mcp.plugins.report.words import (
     clock,
     counted,
@@ -56,8 +57,6 @@ class _ChapterLimits:
     events: int = 200
     timeline_entries: int = 500
     log_lines: int = 2_000
-    event_contexts: int = 6
-    """Events that are shown with the seconds around them."""
     around_s: float = 5.0
     """Time that is shown before and after such an event."""
     event_s: float = 30.0
@@ -119,6 +118,8 @@ class Chapter:
     """One run. A table that would be empty is None.
 
     Attributes:
+        opening: What happened, the outcome and the timeline.
+        checked: What became of each check.
         range: The whole run; None if it has no state row.
         numbers: Number of numeric signals with values.
         changed_most: Names of signals that changed, the largest change first.
@@ -132,6 +133,8 @@ class Chapter:
     range: TimeRange | None
     title: str
     summary: str
+    opening: Opening
+    checked: CheckedRun
     facts: Mapping[str, str]
     findings: Sequence[str] = ()
     unsearched: Sequence[str] = ()
@@ -197,20 +200,28 @@ def chapter_of(
     budget = _TextBudget(budget_bytes)
     facts = _facts(info, session, run.basic_time_step_ms)
     title = f"Run {run_id} of {info.robot}" + (f": {info.label}" if info.label else "")
+    newer = _failed_start_after(connection, session)
     try:
         whole = find_range(connection, Scope(run_id=run_id))
     except NothingRecordedError as error:  # The run has no state row.
-        checks = budget.fit("checks", _checks(connection, run_id, deadline_s))
+        checked = check_run(connection, run_id, deadline_s=deadline_s / 2)
+        checks = budget.fit("checks", _checks(checked))
         parameters = budget.fit("parameters", _parameters(connection, run_id))
         log = budget.fit("log", _log(connection, run_id), newest=True)
-        return Chapter(info, None, title, f"{_first_words(info)} {error}.", facts,
-                       checks=checks, parameters=parameters, log=log)  # fmt: skip
+        opening = opening_of(info, checked, run.started_sim_time_s)
+        return Chapter(info, None, title, f"{_first_words(info)} {error}.", opening, checked, facts,
+                       checks=checks, parameters=parameters, log=log, notes=newer)  # fmt: skip
     each_alone = _found(connection, whole, deadline_s)
-    checks = budget.fit("checks", _checks(connection, run_id, deadline_s, each_alone))
+    checked = check_run(connection, run_id, found=each_alone, deadline_s=deadline_s / 2)
+    checks = budget.fit("checks", _checks(checked))
     parameters = budget.fit("parameters", _parameters(connection, run_id))
     found = each_alone.in_groups(known_signals(connection, whole))
     stored = _stored(connection, whole, deadline_s / 3)
-    moments = [_moment(each, stored) for each in _outstanding(connection, found)]
+    outstanding = _outstanding(connection, found)
+    moments = [_moment(each, stored) for each in outstanding]
+    opening = opening_of(
+        info, checked, run.started_sim_time_s, _that_matter(each_alone), outstanding
+    )
     course = trends(connection, whole, limit=500, deadline_s=deadline_s / 3)
     (run_trends,) = course.runs
     mode = _mode(run_trends)
@@ -218,12 +229,14 @@ def chapter_of(
     return Chapter(
         info, whole, title,
         summary=_first_words(info),
+        opening=opening,
+        checked=checked,
         facts=facts,
         findings=[*travelled, *_findings(found.verdicts)],
         unsearched=[f"{kinds}: {why}" for kinds, why in found.verdicts.gaps.items()],
         mode=mode.name if mode else "",
         held=_mode_shares(mode) if mode else (),
-        moments=[e for e in moments if budget.fit("moments", e.lines) or not e.lines.rows],
+        moments=moments,
         checks=checks,
         parameters=parameters,
         events=budget.fit("events", _events(connection, found)),
@@ -236,7 +249,7 @@ def chapter_of(
         found=each_alone,
         images=[each for each in stored.events if each.kind == "image"],
         notes=tuple(
-            dict.fromkeys((*found.notes, *course.notes, *_unread(run_trends), *why_not))
+            dict.fromkeys((*newer, *found.notes, *course.notes, *_unread(run_trends), *why_not))
         ),
     )  # fmt: skip
 
@@ -293,11 +306,26 @@ def _facts(info: RunInfo, session: SessionRecord | None, step_ms: float | None) 
     return {name: cut(str(fact), 4_000) for name, fact in facts.items() if fact is not None}
 
 
-def _checks(
-    connection: sqlite3.Connection, run_id: int, deadline_s: float, found: Found | None = None
-) -> Grid:
+def _failed_start_after(
+    connection: sqlite3.Connection, session: SessionRecord | None
+) -> tuple[str, ...]:
+    """Return a note if a controller was started later and recorded nothing."""
+    if session is None:
+        return ()
+    found = connection.execute(
+        "SELECT started_wall_time_s, coalesce(end_reason, last_error) FROM session s "
+        "WHERE robot_id = ? AND id > ? "
+        "AND NOT EXISTS (SELECT 1 FROM run r WHERE r.session_id = s.id) ORDER BY id DESC LIMIT 1",
+        (session.robot_id, session.id),
+    ).fetchone()
+    if found is None:
+        return ()
+    why = f" ({cut(str(found[1]), 200)})" if found[1] else ""
+    return (f"A newer start of this controller, at {clock(found[0])}, recorded no run{why}.",)
+
+
+def _checks(checked: CheckedRun) -> Grid:
     """Return each check, the worst first."""
-    checked = check_run(connection, run_id, found=found, deadline_s=deadline_s / 2)
     rows: list[GridRow] = []
     for each in checked.worst_first:
         since = "" if each.since_s is None else time_at(each.since_s)
@@ -356,13 +384,17 @@ def _events(connection: sqlite3.Connection, found: Found) -> Grid:
     return Grid(columns, rows, left_out=left_out)
 
 
-def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
-    """Return the few events that are shown with their context: in values, else in the log."""
+def _that_matter(found: Found) -> list[Event]:
+    """Return the events that are no routine: those in values, warnings, and what failed."""
     matter = [each for each in found.events if each.kind not in ("kept_stretch", "command", "log")]
     matter = [each for each in matter if each.details.get("what") not in _ORDINARY]
-    failed = [each for each in found.events if _mark(each)]
-    chosen = choose(matter, _LIMITS.event_contexts) or choose(failed, _LIMITS.event_contexts)
-    return list(found.only(chosen).page(connection, _LIMITS.event_contexts).events)
+    return [*matter, *(each for each in found.events if _mark(each))]
+
+
+def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
+    """Return the few events that are shown with picture, curves and context."""
+    chosen = most_important(_that_matter(found))
+    return list(found.only(chosen).page(connection, MOMENTS).events)
 
 
 def _moment(event: Event, stored: Found) -> EventContext:

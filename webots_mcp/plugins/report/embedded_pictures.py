@@ -49,6 +49,17 @@ def pictures_of(found: Sequence[Event], data_dir: Path, room_bytes: float) -> Em
     return EmbeddedPictures(_within(made, room_bytes), len(found), len(tried) - len(made))
 
 
+def picture_near(
+    found: Sequence[Event], data_dir: Path, at_s: float, within_s: float
+) -> EmbeddedPicture | None:
+    """Return the picture nearest to a moment; None if none was taken within some seconds of it."""
+    near = [each for each in found if abs(each.start_s - at_s) <= within_s]
+    for event in sorted(near, key=lambda each: abs(each.start_s - at_s)):
+        if (picture := _picture(event, data_dir)) is not None:
+            return picture
+    return None
+
+
 def spread(items: Sequence[Event], most: int) -> list[Event]:
     """Return at most `most` items, evenly spread, with the first and the last among them."""
     if len(items) <= most:

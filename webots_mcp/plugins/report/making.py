@@ -19,7 +19,12 @@ from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
-from webots_mcp.plugins.report.embedded_pictures import EmbeddedPictures, pictures_of
+from webots_mcp.plugins.report.embedded_pictures import (
+    EmbeddedPicture,
+    EmbeddedPictures,
+    picture_near,
+    pictures_of,
+)
 from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
 from webots_mcp.plugins.report.run_comparison import RunComparison, compare_two_runs
 from webots_mcp.plugins.report.words import clock, counted, size
@@ -46,6 +51,8 @@ class _ReportLimits:
     runs: int = 2
     deadline_s: float = 12.0
     """Time limit of all searches in values."""
+    picture_within_s: float = 3.0
+    """Time between a moment and the picture that is shown with it."""
     frame_bytes: int = 60_000
     """Style, script, headings and facts, which always fit."""
     share_of_texts: float = 0.35
@@ -120,13 +127,17 @@ def make_report(
             chapter_of(connection, run_id, texts_bytes / count, _LIMITS.deadline_s / count)
         )
         done.step()
-    compared = compare_two_runs(connection, run_ids, texts_bytes) if len(run_ids) > 1 else None
+    compared = None
+    if count > 1:
+        checked = [chapter.checked for chapter in chapters]
+        compared = compare_two_runs(connection, run_ids, texts_bytes, checked)
     done.step()
     figures_bytes = _LIMITS.share_of_figures * (budget_bytes - texts_bytes)
     differing = compared.differing if compared is not None else ()
     figures = figures_of(connection, chapters, names, differing, figures_bytes)
     done.step()
     page = ReportContent(_title(chapters), time.time(), max_mb, chapters, compared, figures)
+    page.moment_pictures.update(_pictures_of_moments(chapters, data_dir))
     rest_bytes = max_mb * 1e6 - len(render(page))
     share_bytes = rest_bytes / len(chapters)
     for chapter in chapters:
@@ -137,6 +148,18 @@ def make_report(
     html = render(replace(page, size_bytes=len(render(page))))
     done.step()
     return Report(html, page.title, _holds(page), tuple(page.left_out))
+
+
+def _pictures_of_moments(chapters: Sequence[Chapter], data_dir: Path) -> dict[str, EmbeddedPicture]:
+    """Return the picture nearest to each moment, by the key of its figure."""
+    found: dict[str, EmbeddedPicture] = {}
+    for chapter in chapters:
+        for moment in chapter.moments:
+            at_s, within_s = moment.event.start_s, _LIMITS.picture_within_s
+            picture = picture_near(chapter.images, data_dir, at_s, within_s)
+            if picture is not None:
+                found[moment_key(chapter, moment)] = picture
+    return found
 
 
 class _Steps:
@@ -203,6 +226,7 @@ class ReportContent:
         max_mb: Maximum size.
         comparison: The comparison of two runs; None for one run.
         pictures: Pictures by run.
+        moment_pictures: The picture nearest to a moment, by the key of its figure.
         left_out: Notes on what it lacks.
         size_bytes: Approximate size; None while unknown.
     """
@@ -214,6 +238,7 @@ class ReportContent:
     comparison: RunComparison | None
     figures: Figures
     pictures: dict[int, EmbeddedPictures] = field(default_factory=dict[int, EmbeddedPictures])
+    moment_pictures: dict[str, EmbeddedPicture] = field(default_factory=dict[str, EmbeddedPicture])
     left_out: Sequence[str] = ()
     size_bytes: int | None = None
 

@@ -68,7 +68,7 @@ REFUSED = [
     ("first-difference 1 1", "two different runs"),
     ("first-difference 1 77", "No run 77"),
     ("first-difference 1 2 --signal moed", "mode"),
-    ("compare 1 --first-difference", "compares exactly two runs, not [1]"),
+    ("compare 1 --first-difference", "needs exactly two runs, not [1]"),
     ("runs -n 501", "-n must be less than or equal to 500, not 501"),
     ("plot -o a.gif", ".png or .svg"),
     ("plot -o /no/such/folder/a.png", "cannot be written"),

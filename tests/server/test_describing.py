@@ -115,7 +115,7 @@ async def test_undo_brings_back_what_the_code_declares_and_then_what_the_name_sa
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"quantity": "speed"}, "signals is missing. Name the signals to describe"),
+        ({"quantity": "speed"}, "signals is missing. Give names of recorded signals"),
         ({"signals": ["u"], "quantity": "speed", "undo": True}, "undo=true removes a description"),
         ({"signals": ["nope"], "quantity": "speed"}, "No signal 'nope' is recorded"),
         ({"signals": ["u"], "target_of": "nope"}, "No signal 'nope' is recorded"),

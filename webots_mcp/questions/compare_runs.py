@@ -225,8 +225,8 @@ def webots_compare_runs(
         )
     if first_difference and (not run_ids or len(run_ids) != 2 or position or mode):
         raise InvalidInputError(
-            f"first_difference=true compares exactly two runs, not {run_ids or 'none'}, and takes "
-            "only signals besides them. Give two, as in run_ids=[3, 4], without position and mode."
+            f"first_difference=true needs exactly two runs, not {run_ids or 'none'}: "
+            "give run_ids with two ids from webots_list_runs. position and mode do not apply to it."
         )
     options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None

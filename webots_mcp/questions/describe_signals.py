@@ -108,7 +108,7 @@ def webots_describe_signals(
     declares = any(value is not None for value in said.values())
     if (declares or undo) and not signals:
         raise InvalidInputError(
-            "signals is missing. Name the signals to describe, for example signals=['motors.left']."
+            "signals is missing. Give names of recorded signals; webots_list_signals lists them."
         )
     if declares and undo:
         raise InvalidInputError(

@@ -180,8 +180,8 @@ async def webots_run_trials(
             )
         if parameters is None or score is None:
             raise InvalidInputError(
-                "A new set needs parameters to try and a score to rank them by. Give both, for "
-                """example parameters=[{"kp": 1.0}, {"kp": 2.0}], score='mean(abs(error))'."""
+                "A new set needs parameters to try, a score to rank them by and an end. Example: "
+                """parameters=[{"kp": 1.0}, {"kp": 2.0}], score='mean(abs(error))', for_s=10."""
             )
         asked = {"score": score, "best": best, "for_s": for_s, "until": until, "repeats": repeats}
         asked |= {"timeout_s": trial_timeout_wall_s, "prune": prune}

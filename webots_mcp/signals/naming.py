@@ -65,7 +65,7 @@ _SAME_MEANING: Final = (
     {"pause", "stop", "halt", "freeze"}, {"resume", "start", "play", "continue", "unpause"},
     {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport", "move", "place", "change"},
     {"add", "node", "spawn"}, {"drive", "move", "go", "goto"},
-    {"duration", "for", "length", "period", "s", "seconds", "time"},
+    {"duration", "for", "period", "s", "seconds", "time"},
     {"action", "command"}, {"condition", "until"},
 )  # fmt: skip
 # Words of actions, commands and options that lose something: none is ever offered as a correction.

@@ -194,10 +194,13 @@ def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetReco
     ).fetchone()
     if row is None:
         newest = find_trial_set(connection)
-        there = "none was started yet" if newest is None else f"the newest is {newest}"
+        if newest is None:
+            raise InvalidInputError(
+                f"No trial set {set_id} is recorded: none was started yet. Only "
+                "webots_run_trials starts one."
+            )
         raise InvalidInputError(
-            f"No trial set {set_id} is recorded: {there}. webots_run_trials starts one, and "
-            "webots_get_trials() shows the newest."
+            f"No trial set {set_id} is recorded. The newest is {newest}: use trial_set={newest}."
         )
     return TrialSetRecord(*row)
 

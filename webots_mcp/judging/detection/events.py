@@ -17,6 +17,7 @@ from webots_mcp.judging.detection import (
     condition,
     degradation,
     fall,
+    gap,
     jump,
     oscillation,
     sensors,
@@ -63,7 +64,7 @@ _NO_CURSOR: Final = (
 )
 KINDS: Final[list[EventKind]] = [
     stored.RUN,
-    stored.GAP,
+    gap.GAP,
     stored.CHANGE,
     standstill.STANDSTILL,
     standstill.STUCK,

@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
-from webots_mcp.analysis.arrays import longest_usual_s, np, usual_interval_s
+from webots_mcp.analysis.arrays import np
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.database.stored_breakpoints import VIOLATION
 from webots_mcp.judging.detection.kinds import (
@@ -23,11 +23,8 @@ from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,
     Point,
     change_points,
-    frame_around,
-    rhythm_in,
 )
 from webots_mcp.store.reading.segment import Segment, full_rate_segments
-from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.run_rows import count_kept_frames
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
@@ -63,9 +60,6 @@ _REFUSED: Final = (
     "SELECT sim_time_s, wall_time_s, tool, client || ' (' || transport || ')', rule FROM request "
     f"{_IN_SEGMENT} AND rule IS NOT NULL "
 )
-END_OF_RUN: Final = "the end of the run"
-_LAST_ROWS: Final = 21  # of a run: they tell what is usual at its end
-_ENDED: Final = "SELECT last_sim_time_s FROM run WHERE id = ? AND end_reason IS NOT NULL"
 _RUN_WALLS: Final = (
     "SELECT started_wall_time_s, coalesce((SELECT min(n.started_wall_time_s) FROM run n "
     "WHERE n.robot_id = r.robot_id AND n.id > r.id), 9e99) FROM run r WHERE id = ?"
@@ -86,48 +80,11 @@ def run_events(search: Search) -> Iterator[Event]:
         yield Event("run", run_id, end_s, end_s, end_wall_s, None, details)
 
 
-def _recorded(search: Search) -> Segment:
-    """The part of the segment that has rows."""
+def recorded_segment(search: Search) -> Segment:
+    """Return the part of the segment that has rows."""
     if search.recorded is None:
         raise NotSearchableError(f"no row in run {search.segment.run_id} there")
     return search.recorded
-
-
-def gap_events(search: Search) -> Iterator[Event]:
-    """Where rows are missing: gaps that the segment touches, also all around it."""
-    segment = _recorded(search)
-    around = frame_around(search.connection, segment, search.deadline)
-    _note_unread(search, "gap", around.cut_at_s)
-    asked = search.segment
-    for e in around.unread:
-        if e.end_s > asked.start_s and e.start_s < asked.end_s:
-            here = (max(e.start_s, asked.start_s), min(e.end_s, asked.end_s))
-            search.not_searched("gap", str(Unread(*here, e.why)))
-    rhythm = rhythm_in(around)
-    for gap in rhythm.gaps:
-        if gap.end_s > segment.start_s and gap.start_s < segment.end_s:
-            place = (segment.run_id, gap.start_s, gap.end_s, search.wall_time_at(gap.start_s))
-            yield Event("gap", *place, None, {"usual_interval_s": rhythm.interval_s})
-    yield from _gap_at_end(search, rhythm.interval_s)
-
-
-def _gap_at_end(search: Search, interval_s: float | None) -> Iterator[Event]:
-    """Yield the gap between the last row of a run that ended and its end, if there is one.
-
-    The next row would have come after the end, at the earliest a usual interval later.
-    """
-    run_id = search.segment.run_id
-    ended = search.connection.execute(_ENDED, (run_id,)).fetchone()
-    rows = search.whole.rows(len(search.whole) - _LAST_ROWS, len(search.whole))
-    if ended is None or interval_s is None or len(rows) < 2 or search.whole.cut_at_s is not None:
-        return
-    last_s, end_s = float(rows.times[-1]), float(ended[0])
-    most_s, usual_s = longest_usual_s(rows.times), usual_interval_s(rows.times)
-    is_asked = search.segment.start_s < end_s and search.segment.end_s > last_s
-    if most_s and usual_s and is_asked and end_s - last_s + usual_s > most_s:
-        place = (run_id, last_s, end_s, search.wall_time_at(last_s))
-        details = {"usual_interval_s": interval_s, "until": END_OF_RUN}
-        yield Event("gap", *place, None, details)
 
 
 def change_events(search: Search) -> Iterator[Event]:
@@ -142,7 +99,7 @@ def change_events(search: Search) -> Iterator[Event]:
     found = change_points(
         search.connection, here, states, search.deadline, frame=frame, since=False
     )
-    _note_unread(search, "change", found.unread_from_s)
+    note_unread(search, "change", found.unread_from_s)
     search.not_searched("change", *map(str, found.unread))
     goes_on = found.unread_from_s is None and here.end_s > search.ended_s
     last_s = frame.bounds_s[1] if len(frame) else here.start_s
@@ -167,7 +124,8 @@ def change_events(search: Search) -> Iterator[Event]:
             yield replace(each, wall_time_s=search.wall_time_at(each.start_s))
 
 
-def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
+def note_unread(search: Search, kind: str, from_s: float | None) -> None:
+    """Note that a kind was not searched after the moment at which the time was over."""
     if from_s is not None and from_s < search.segment.end_s:
         from_s = max(from_s, search.segment.start_s)
         why = f"not after {from_s:.3f} s: time limit reached, ask start_s={from_s:.3f}"
@@ -289,7 +247,7 @@ def command_events(search: Search) -> Iterator[Event]:
 
 def _sim_time_at(search: Search, wall_s: float) -> float | None:
     """Of the last row of the segment at or before a wall time; None without any."""
-    _note_unread(search, "command", search.whole.cut_at_s)
+    note_unread(search, "command", search.whole.cut_at_s)
     rows = search.whole.between(search.segment.holds_from_s, search.segment.holds_to_s)
     place = int(np.searchsorted(rows.wall_times, wall_s, "right"))
     return float(rows.times[place - 1]) if place else None
@@ -315,14 +273,6 @@ def _to(changes: Sequence[Event]) -> dict[str, Any]:
 
 CHANGES: Final = Alike(lambda events, unit: "changes", adds=_to, most_single=10)
 RUN: Final = EventKind("run", "a run began or ended", run_events, stored=True, counted=False)
-GAP: Final = EventKind(
-    "gap",
-    "no rows recorded",
-    gap_events,
-    stored=True,
-    alike=Alike(lambda events, unit: "gaps"),
-    severity=10,
-)
 CHANGE: Final = EventKind(
     "change",
     "a mode or flag changed",

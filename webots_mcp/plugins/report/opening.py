@@ -9,17 +9,14 @@ from typing import Final, NamedTuple
 
 from webots_mcp.judging.checks import CheckedRun
 from webots_mcp.judging.checks.finding import Finding, Outcome
+from webots_mcp.judging.detection.events import kind_named
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.plugins.report.grid import Grid, GridRow
 from webots_mcp.plugins.report.words import counted, cut, describe_event, length, time_at
 from webots_mcp.store.runs import RunInfo
 
 MOMENTS: Final = 3
-# Kinds of events by how much they matter, the most important first. Others follow.
-_BY_IMPORTANCE: Final = (
-    "fall", "error", "violation", "stuck", "off_target", "slip", "degradation", "missing", "flat",
-    "jump", "oscillation", "warning", "bridge_event", "standstill", "gap", "change",
-)  # fmt: skip
+_LOGGED_SEVERITY: Final = 95  # of a logged error: above that of every kind
 _MOST_LANES: Final = 8
 _LEAST_PERCENT: Final = 0.4  # width of a mark, so that it can be seen
 _LONGEST_EVIDENCE: Final = 200
@@ -125,10 +122,10 @@ def opening_of(
 def most_important(events: Sequence[Event], most: int = MOMENTS) -> list[Event]:
     """Return the few events that matter most, in the order of time.
 
-    Kinds come in the order of `_BY_IMPORTANCE`; of one kind the longest first. Each kind has one
+    Kinds come in the order of their severity; of one kind the longest first. Each kind has one
     event before any has a second.
     """
-    ranked = sorted(events, key=lambda each: (_importance(each), -each.duration_s, each.start_s))
+    ranked = sorted(events, key=lambda each: (-_importance(each), -each.duration_s, each.start_s))
     seen: dict[str, int] = {}
     rounds: list[tuple[int, int]] = []
     for place, event in enumerate(ranked):
@@ -139,9 +136,10 @@ def most_important(events: Sequence[Event], most: int = MOMENTS) -> list[Event]:
 
 
 def _importance(event: Event) -> int:
-    kind = event.name if event.kind == "log" else event.kind
-    kind = "error" if kind == "critical" else kind
-    return _BY_IMPORTANCE.index(kind) if kind in _BY_IMPORTANCE else len(_BY_IMPORTANCE)
+    """Return how bad an event is: the severity of its kind; errors that were logged come first."""
+    if event.kind == "log":
+        return _LOGGED_SEVERITY if event.name in ("error", "critical") else 0
+    return kind_named(event.kind).severity
 
 
 def _happened(info: RunInfo, bad: Sequence[Finding]) -> str:
@@ -201,7 +199,7 @@ def _lanes(
     if duration_s <= 0:
         return []
     by_kind: dict[str, list[Event]] = {}
-    for event in sorted(events, key=_importance):
+    for event in sorted(events, key=_importance, reverse=True):
         by_kind.setdefault(event.kind, []).append(event)
     anchors = {id(event): f"moment-{run_id}-{number}" for number, event in enumerate(moments)}
     places = {(each.kind, each.name, each.start_s): anchors[id(each)] for each in moments}

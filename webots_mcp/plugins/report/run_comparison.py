@@ -93,9 +93,7 @@ def verdict_of(checked: Sequence[CheckedRun], measures: Sequence[Measure]) -> st
     reached = [each.median for each in goals if each is not None]
     if len(reached) == 2 and reached[0] != reached[1]:
         better, worse = (first, second) if reached[0] > reached[1] else (second, first)
-        return (
-            f"Run {better.run_id} did better: it reached its goal, run {worse.run_id} did not."
-        )
+        return f"Run {better.run_id} did better: it reached its goal, run {worse.run_id} did not."
     ranks = [WORST_FIRST.index(each.outcome) for each in checked]
     judged = [each.outcome in ("fail", "warn", "pass") for each in checked]
     if not all(judged):

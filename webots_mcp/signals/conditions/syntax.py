@@ -154,7 +154,9 @@ def _why_unknown(sign: str) -> str:
     if sign in "\n\r\t":
         return "a condition is one line; use spaces between its words"
     hint = _INSTEAD.get(
-        sign, "it has no meaning in a condition; remove it, or quote a text, as in mode == 'turn'"
+        sign,
+        "it has no meaning in a condition; join conditions with and, or; quote texts, as in "
+        "mode == 'turn'",
     )
     return f"{sign!r}: {hint}"
 
@@ -188,6 +190,11 @@ def _why_unread(scanned: Scanned, place: int, error: SyntaxError) -> str:
         return "it ends too early; add a value or a condition, as in x < 1 and y > 2"
     if re.search(r"\b(if|else)\b", scanned.original):
         return "if and else have no meaning here; join conditions with and, or, not"
+    if rest.startswith("during"):
+        return (
+            "cannot read 'during'; only expectations have it, followed by a condition, as in "
+            "x > 0 during mode == 'drive'; for a minimum duration write for 0.5"
+        )
     if re.search(r"\bfor\b", scanned.original[: scanned.columns[place]]):
         return f"cannot read {rest[:20]!r}; after `for` give seconds without a unit, as in for 0.5"
     return f"cannot read {rest[:20]!r}; join conditions with and, or; quote texts, as in 'turn'"

@@ -34,15 +34,15 @@ EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
 
-Controllers record into one SQLite database. An AI assistant reads it and steers the simulation over
-MCP. Try `webots-mcp demo` first. `webots-mcp COMMAND --help` explains a command, and
-`webots-mcp help TOPIC` prints what the documentation says about a topic.
+Controllers record into one SQLite database. An AI assistant reads it, and steers the simulation,
+over MCP. Try `webots-mcp demo` first. For the options of a command use `webots-mcp COMMAND --help`;
+for the documentation of a topic use `webots-mcp help TOPIC`.
 """
 _HELP_OF_A_FEW: Final = (
     "\nThese are the everyday commands; `webots-mcp --help --all` lists all {number}.\n"
 )
 _HELP_OF_DISPLAY: Final = (
-    "\nEvery command takes `--verbose` (show every column and detail) and `--no-color`.\n"
+    "\nEvery command accepts `--verbose` (show all columns and details) and `--no-color`.\n"
 )
 
 

@@ -18,7 +18,6 @@ from webots_mcp.cli.options import (
     Json,
     Parameter,
     RetentionOptions,
-    Robot,
     TimeRangeOptions,
     Where,
     make_chunks_first,
@@ -73,18 +72,19 @@ def export(
             metavar="FILE",
             allow_leading_hyphen=True,  # for stdout
             validator=refuse_options,
-            help="A .csv, .jsonl, .parquet, .mcap, .rrd or .zip file; by default CSV to stdout.",
+            help="File to write: .csv, .jsonl, .parquet, .mcap, .rrd or .zip. Default: CSV to "
+            "stdout.",
         ),
     ] = None,
     form: Annotated[
-        _Format | None, Parameter("--format", help="Where the file's name does not tell it.")
+        _Format | None, Parameter("--format", help="File format. Default: by the ending of FILE.")
     ] = None,
     safe_cells: Annotated[
         bool,
         Parameter(
             "--safe-cells",
-            help="In CSV, an apostrophe before texts that a spreadsheet would run as a formula "
-            "(they begin with =, +, - or @).",
+            help="In CSV, put an apostrophe before texts that a spreadsheet would run as a formula "
+            "(they start with =, +, - or @).",
         ),
     ] = False,
     trial_set: Annotated[
@@ -92,22 +92,30 @@ def export(
         Parameter(
             "--trials",
             metavar="SET",
-            help="The trials of that set instead, one row each, with score, rank and spread.",
+            help="Export the trials of this set instead, one row each, with score, rank and "
+            "spread.",
         ),
     ] = None,
     part: TimeRangeOptions = _ALL,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Write recorded states as a table, or all of a run for a viewer or for another recording.
+    """Export states as a table, or a whole run for a viewer or for another recording.
 
-    The newest run is written, or a range; --since 0 writes all runs of a robot. A table has one row
-    per state; columns are run, row, times, and the dotted names of what the controller published;
-    NaN and infinity are kept. A .mcap (Foxglove, Lichtblick, PlotJuggler) or .rrd file (Rerun) has
-    states, poses, pictures, log lines, events and commands. A .zip file is a bundle: a run that is
-    over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet
-    needs pyarrow, MCAP mcap, and Rerun rerun-sdk; the line that installs them is printed. --json
-    tells what a file got.
+        webots-mcp export --run 4 -o run4.csv
+
+    Exports the newest run unless a run or a range is given; --since 0 exports all runs of a robot.
+
+    Tables (.csv, .jsonl, .parquet) have one row per state. The columns are run, row, times, and the
+    dotted names of published signals. NaN and infinity are kept.
+
+    Files for viewers, .mcap (Foxglove, Lichtblick, PlotJuggler) and .rrd (Rerun), hold states,
+    poses, pictures, log lines, events and commands.
+
+    A .zip bundle holds one finished run with its pictures, for 'webots-mcp import'.
+
+    Parquet needs pyarrow, MCAP needs mcap and Rerun needs rerun-sdk. If one is missing, the error
+    shows the command that installs it.
     """
     from webots_mcp.store.export import BUNDLE, FOR_VIEWERS, FORMATS, format_of
     from webots_mcp.store.reading.ranges import Scope
@@ -230,7 +238,7 @@ def import_(
         Path,
         Parameter(
             "SOURCE",
-            help="A recording, a webots.db; or a bundle, a .zip of 'webots-mcp export'.",
+            help="Database of another recording (webots.db), or a .zip bundle.",
         ),
     ],
     /,
@@ -238,10 +246,12 @@ def import_(
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Import another recording.
+    """Import the runs of another recording, or of a bundle made by 'webots-mcp export'.
 
-    A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
-    is there already is left as it is, so that it may be imported again.
+        webots-mcp import run4.zip
+
+    The source must not be recording. Runs that were imported before are left unchanged, so the same
+    source can be imported again.
     """
     from webots_mcp.store.merging import is_bundle, unpacked
 
@@ -299,21 +309,24 @@ def _taken_in(found: dict[str, Any]) -> str:
 
 def prune(
     *,
-    dry_run: Annotated[bool, Parameter("--dry-run", help="Only tell what would go.")] = False,
+    dry_run: Annotated[
+        bool, Parameter("--dry-run", help="Show what would be deleted, and delete nothing.")
+    ] = False,
     limits: RetentionOptions = _UNLIMITED,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Delete what is beyond the limits, and give the space back to the disk.
+    """Delete the oldest rows beyond the limits, and return the space to the disk.
 
-    Rows go in the order in which they were recorded, whatever their run. Runs with a label (but
-    that of a trial) or a note, and those marked by 'webots-mcp retention', lose nothing and do not
-    count. A LIMIT is a size
-    (500MB), an age (30d), a number of rows (100000rows), several of them with commas between; all,
-    which keeps everything; or default. What is given belongs to the database from then on, and
-    servers keep to it; with --dry-run it is only tried. A size or a number of rows always holds; an
-    age spares the newest rows, as many as the options tell. Robots may record meanwhile. The MCP
-    server does the same every few seconds.
+        webots-mcp prune --keep-states 500MB --dry-run
+
+    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of these joined
+    by commas, 'all' (no limit) or 'default'. Limits given here are stored in the database and
+    apply to servers too; with --dry-run they are only tried.
+
+    The oldest rows are deleted first, across all runs. Runs with a label or a note, and runs marked
+    by 'webots-mcp retention', are never pruned and do not count; labels of trials do not protect a
+    run. Robots may record meanwhile. The MCP server prunes in the same way every few seconds.
     """
     from webots_mcp.store.retention import in_force, set_limits
     from webots_mcp.store.retention_plan import file_sizes, plan
@@ -345,16 +358,21 @@ def prune(
 
 
 def retention(
-    *run_ids: Annotated[Id, Parameter("RUN", help="As 'webots-mcp runs' lists them.")],
-    release: Annotated[bool, Parameter("--release", help="Let retention have them again.")] = False,
+    *run_ids: Annotated[Id, Parameter("RUN", help="Run numbers, from 'webots-mcp runs'.")],
+    release: Annotated[
+        bool, Parameter("--release", help="Remove the mark from these runs.")
+    ] = False,
     limits: RetentionOptions = _UNLIMITED,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Mark runs that are never pruned, or set how much is kept of the others.
+    """Mark runs that are never pruned, or set the limits for the others.
 
-    The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
-    to what holds where nothing is set. 'webots-mcp status' shows them.
+        webots-mcp retention 4 7 --keep-states 20GB
+
+    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of these joined
+    by commas, 'all' (no limit) or 'default'. Limits are stored in the database and apply at once.
+    'webots-mcp status --storage' shows them.
     """
     from webots_mcp.store.retention import described, mark_kept, set_limits
 
@@ -470,27 +488,37 @@ def tail(
         int,
         Parameter(
             "-n",
-            help="Begin with so many of the last lines (10).",
+            metavar="N",
+            help="Number of earlier lines to start with. Default: 10.",
             converter=whole_number,
             validator=Number(gte=0),
         ),
     ] = 10,
-    robot: Robot = None,
+    robot: Annotated[
+        str | None,
+        Parameter("--robot", metavar="NAME", help="Follow only this robot. Default: all robots."),
+    ] = None,
     interval_s: Annotated[
         float,
-        Parameter("--interval", help="Seconds between looks (0.5).", validator=Number(gt=0)),
+        Parameter(
+            "--interval",
+            metavar="S",
+            help="Seconds between two reads of the recording. Default: 0.5.",
+            validator=Number(gt=0),
+        ),
     ] = 0.5,
     no_follow: Annotated[
-        bool, Parameter("--no-follow", negative=(), help="Print the last lines and end.")
+        bool, Parameter("--no-follow", negative=(), help="Print the last lines and stop.")
     ] = False,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Follow what is being recorded: states, log lines, events, commands. Ctrl-C ends it.
+    """Follow a recording live: states, log lines, events and commands, until Ctrl-C.
 
-    Of the states that came since the last look the newest of each robot is shown. Where nothing
-    can be written, nothing can come, and it ends after the last lines. As JSON each line is an
-    object.
+        webots-mcp tail -n 20 --robot rover
+
+    Shows the newest state of each robot at every read, and all other lines. Stops after the last
+    lines if the recording cannot grow. With --json each line is an object.
     """
     from webots_mcp.store.logs import Follower
     from webots_mcp.store.robots import resolve_robot
@@ -523,32 +551,48 @@ def _newest_states_only(lines: Sequence[FollowedLine]) -> list[FollowedLine]:
 
 
 def plot(
-    *signals: Annotated[str, Parameter("SIGNAL", help="Names, with '*' (all).")],
-    output: Annotated[Path, Parameter(("-o", "--output"), help="A .png or .svg file.")],
+    *signals: Annotated[str, Parameter("SIGNAL", help="Signals to draw; '*' means any text.")],
+    output: Annotated[
+        Path, Parameter(("-o", "--output"), metavar="FILE", help="File to write: .png or .svg.")
+    ],
     trajectory: Annotated[
         bool,
-        Parameter("--trajectory", negative=(), help="The path of the robot, seen from above."),
+        Parameter("--trajectory", negative=(), help="Draw the robot's path, seen from above."),
     ] = False,
     run_ids: Annotated[
         list[str] | None,
         Parameter(
-            "--runs", negative=(), consume_multiple=True, help="Several runs, laid over each other."
+            "--runs",
+            metavar="ID",
+            negative=(),
+            consume_multiple=True,
+            help="Draw several runs over each other, such as --runs 3 4.",
         ),
     ] = None,
     trial_set: Annotated[
         Id | None,
         Parameter(
             "--trials",
-            help="The scores of a trial set, over one or two parameters (named as signals).",
+            metavar="SET",
+            help="Draw the scores of this trial set over one or two parameters, given as SIGNAL.",
         ),
     ] = None,
-    width_px: Annotated[Count, Parameter("--width", help="Pixels (900).")] = 900,
-    height_px: Annotated[Count, Parameter("--height", help="Pixels (500).")] = 500,
+    width_px: Annotated[
+        Count, Parameter("--width", metavar="N", help="Width in pixels. Default: 900.")
+    ] = 900,
+    height_px: Annotated[
+        Count, Parameter("--height", metavar="N", help="Height in pixels. Default: 500.")
+    ] = 500,
     span: TimeRangeOptions | None = None,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Draw signals over time, the robot's path, or trials; without signals what changed most."""
+    """Draw signals over time, the robot's path, or the scores of trials.
+
+        webots-mcp plot 'pose*' --last 10 -o pose.png
+
+    Without SIGNAL it draws the signals that changed most.
+    """
     ids = [int(each) for each in run_ids or () if _is_id(each)]
     behind_runs = [each for each in run_ids or () if not _is_id(each)]
 

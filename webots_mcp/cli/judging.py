@@ -51,7 +51,9 @@ _WAITING: Final = Waiting()
 
 
 def check(
-    run_id: Annotated[Id | None, Parameter("RUN", help="Else the newest run.")] = None,
+    run_id: Annotated[
+        Id | None, Parameter("RUN", help="Run number. Default: the newest run.")
+    ] = None,
     /,
     *,
     expect: Annotated[
@@ -59,23 +61,27 @@ def check(
         Parameter(
             "--expect",
             metavar="CONDITION",
-            help="What shall hold, as \"front_m > 0.1 during mode == 'drive'\"; may be repeated.",
+            help="Condition that must hold, such as \"front_m > 0.1 during mode == 'drive'\". Can "
+            "be "
+            "repeated.",
         ),
     ] = None,
     junit: Annotated[
         Path | None,
-        Parameter("--junit", metavar="FILE", help="Write the checks there as JUnit XML too."),
+        Parameter(
+            "--junit", metavar="FILE", help="Also write the checks to this file as JUnit XML."
+        ),
     ] = None,
     robot: Robot = None,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> int:
-    """Is this run well? Motion against commands, sensors, pace, log, end, lost rows, goal.
+    """Check a run: motion against commands, sensors, pace, log, end, lost rows and goal.
 
         webots-mcp check 4 --junit check.xml
 
-    Exit code 0: each check passed, warned or did not apply. 1: one failed. 2: it could not be
-    asked, or not all of the run was looked at.
+    Exit code 0: no check failed. 1: a check failed. 2: the run could not be read, or not all of it
+    was checked.
     """
     from webots_mcp.cli.asking import ask, show
     from webots_mcp.questions.compare_runs import webots_check_run
@@ -203,22 +209,28 @@ _World = Path | None
 
 
 def first_difference(
-    first: Annotated[Id, Parameter("RUN", help="The id of a run.")],
-    other: Annotated[Id, Parameter("RUN", help="The id of another.")],
+    first: Annotated[Id, Parameter("RUN", help="Numbers of the two runs to compare.")],
+    other: Annotated[Id, Parameter("RUN", help="Numbers of the two runs to compare.")],
     /,
     *,
     signals: Annotated[
-        _Names, Parameter("--signal", negative=(), help="Only these, with '*'.")
+        _Names,
+        Parameter(
+            "--signal",
+            metavar="SIGNAL",
+            negative=(),
+            help="Compare only these signals; '*' means any text.",
+        ),
     ] = None,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Where two runs part: which signal is first not the same to the last digit, and how it grows.
+    """Find where two runs diverge: the first signal that differs, and how the difference grows.
 
         webots-mcp first-difference 3 4 --signal 'pose*'
 
-    Parameters, code, world and versions that differ are named first. Rows are compared with those
-    of the other run at the same simulation time; the others are counted.
+    Differing parameters, code, worlds and versions are listed first. Rows are compared at equal
+    simulated times, to the last digit; rows without a counterpart are counted.
     """
     from webots_mcp.cli.asking import ask_and_show
     from webots_mcp.questions.compare_runs import webots_compare_runs
@@ -228,23 +240,37 @@ def first_difference(
 
 
 def repeatability(
-    world: Annotated[_World, Parameter("WORLD", help="Of processes (the newest run's).")] = None,
+    world: Annotated[
+        _World, Parameter("WORLD", help="World for --by process. Default: that of the newest run.")
+    ] = None,
     /,
     *,
-    for_s: Annotated[float, Parameter("--for", metavar="S", help="Simulated seconds of each.")],
-    by: Annotated[By, Parameter("--by", negative=(), help="How each begins (reset).")] = None,
-    number: Annotated[Count, Parameter("-n", help="How many of each (5).")] = 5,
-    stand_in: Annotated[bool, Parameter("--stand-in", negative=(), help="Not Webots.")] = False,
+    for_s: Annotated[float, Parameter("--for", metavar="S", help="Simulated seconds per run.")],
+    by: Annotated[
+        By,
+        Parameter(
+            "--by",
+            negative=(),
+            help="How each run begins; can be repeated. Default: reset.",
+        ),
+    ] = None,
+    number: Annotated[
+        Count, Parameter("-n", metavar="N", help="Number of runs of each kind. Default: 5.")
+    ] = 5,
+    stand_in: Annotated[
+        bool,
+        Parameter("--stand-in", negative=(), help="Use the stand-in simulator, not Webots."),
+    ] = False,
     asked: Waiting = _WAITING,
     json: Json = False,
 ) -> None:
-    """Run the same again, and say where the runs part from the first, and how it grows.
+    """Repeat a run several times, and find where the repeats diverge and how that grows.
 
         webots-mcp repeatability --by reset --by process -n 3 --for 20
 
-    Each begins with a reset or reload of the live simulation, whose controller has to be a
-    Supervisor, or in a simulator process of its own, as a trial does. Where runs part after a
-    reset, and processes of their own do not, the reset is to blame.
+    A run begins with a reset or reload of the live simulation, whose controller must be a
+    Supervisor, or in a simulator process of its own, as a trial does. If runs diverge after a reset
+    but not between processes, the reset is the cause.
     """
     from webots_mcp.judging.divergence import compare_repeats
     from webots_mcp.store.run_rows import fetch_run
@@ -353,17 +379,24 @@ def _answer(found: Sequence[Parting]) -> dict[str, Any]:
 
 
 def profile(
-    robot: Annotated[str | None, Parameter("ROBOT", help="Which (the only live one).")] = None,
+    robot: Annotated[
+        str | None, Parameter("ROBOT", help="Name of the robot. Needed only if several are live.")
+    ] = None,
     /,
     *,
-    seconds: Annotated[Count, Parameter("--for", help="Seconds of wall time (10).")] = 10,
+    seconds: Annotated[
+        Count, Parameter("--for", metavar="S", help="Wall-clock seconds to sample. Default: 10.")
+    ] = 10,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Sample which lines of a controller take its time, 100 times a second, by py-spy.
+    """Find the lines of a Python controller that take the most time, by sampling it with py-spy.
 
-    Of the lines of its own files those that the main thread was in, or in what they called; time in
-    which it sleeps or waits counts. Each sample stops the controller for about a millisecond.
+        webots-mcp profile rover --for 20
+
+    Samples the main thread 100 times a second and counts lines of the controller's own files, with
+    everything they call. Time spent sleeping or waiting counts too. A sample stops the controller
+    for about a millisecond.
     """
     with recorded.recording().view(robot) as view:
         name, session = view.robot.name, view.session

@@ -27,11 +27,12 @@ _ROBOT: Final = ToRobot()
 
 
 def camera(
-    name: Annotated[str, Parameter("CAMERA", help="Name of the camera. Default: any.")] = "",
+    name: Annotated[str, Parameter("CAMERA", help="Camera name. Default: any camera.")] = "",
     /,
     *,
     output: Annotated[
-        Path | None, Parameter(("-o", "--output"), metavar="FILE", help="File to write.")
+        Path | None,
+        Parameter(("-o", "--output"), metavar="FILE", help="File to write. Default: camera.jpg."),
     ] = None,
     fresh: Annotated[
         bool,
@@ -42,13 +43,18 @@ def camera(
         Parameter("--at", metavar="S", help="Picture nearest to this simulated time, in seconds."),
     ] = None,
     frames: Annotated[
-        Count, Parameter("--frames", metavar="N", help="N pictures around that time, on one sheet.")
+        Count,
+        Parameter(
+            "--frames",
+            metavar="N",
+            help="Number of pictures around that time, on one sheet. Default: 1.",
+        ),
     ] = 1,
     run_id: RunId = None,
     asked: ToRobot = _ROBOT,
     json: Json = False,
 ) -> None:
-    """Save a picture of the robot's own camera: the newest, a new one, or one of the past.
+    """Save a picture of the robot's own camera: the newest, a new one, or an earlier one.
 
     webots-mcp camera --at 12.4 -o moment.jpg
     """
@@ -62,10 +68,13 @@ def camera(
 def screenshot(
     *,
     output: Annotated[
-        Path | None, Parameter(("-o", "--output"), metavar="FILE", help="File to write.")
+        Path | None,
+        Parameter(
+            ("-o", "--output"), metavar="FILE", help="File to write. Default: screenshot.jpg."
+        ),
     ] = None,
     quality: Annotated[
-        Count, Parameter("--quality", metavar="N", help="JPEG quality from 1 to 100 (90).")
+        Count, Parameter("--quality", metavar="N", help="JPEG quality from 1 to 100. Default: 90.")
     ] = 90,
     asked: Waiting = _WAITING,
     json: Json = False,

@@ -47,22 +47,22 @@ MAX_PORT: Final = 65_535
 def serve(
     *,
     read_only: Annotated[
-        bool, Parameter("--read-only", help="Leave out the tools that change the simulation.")
+        bool, Parameter("--read-only", help="Offer only tools that change nothing.")
     ] = False,
     tools: Annotated[
         Literal["core", "default", "all"],
         Parameter(
             "--tools",
-            help="Which tools to list: core (20 tools), default (34) or all. A tool that is not "
-            "listed still answers when it is called by name.",
+            help="Tools to list: core (20 tools), default (34) or all. Tools that are not listed "
+            "can "
+            "still be called by name.",
         ),
     ] = "default",
     output_schemas: Annotated[
         bool,
         Parameter(
             "--output-schemas",
-            help="List the schemas of the answers too, which need four times as much room as all "
-            "else.",
+            help="Also list the schemas of the answers. This makes the list five times as long.",
         ),
     ] = False,
     http: Annotated[
@@ -70,8 +70,8 @@ def serve(
         Parameter(
             "--http",
             metavar="[HOST:]PORT",
-            help="Serve many clients over HTTP, at this port of 127.0.0.1, say 8000; each gives "
-            "the token that 'webots-mcp token' shows.",
+            help="Serve many clients over HTTP at this port, such as 8000. HOST is 127.0.0.1 by "
+            "default. Clients need the token of 'webots-mcp token'.",
         ),
     ] = None,
     allow_host: Annotated[
@@ -79,45 +79,52 @@ def serve(
         Parameter(
             "--allow-host",
             metavar="NAME",
-            help="With --http: a name that clients call this computer by; needed with a HOST that "
-            "the network reaches, as are the files of TLS.",
+            help="With --http: host name that clients may use for this computer. Required, with "
+            "the "
+            "TLS files, if HOST can be reached from the network.",
         ),
     ] = (),
     tls_cert: Annotated[
         Path | None,
-        Parameter("--tls-cert", help="With --http: its certificate, with the chain, in PEM."),
+        Parameter(
+            "--tls-cert",
+            metavar="FILE",
+            help="With --http: certificate with its chain, as a PEM file.",
+        ),
     ] = None,
     tls_key: Annotated[
-        Path | None, Parameter("--tls-key", help="With --http: the certificate's key, in PEM.")
+        Path | None,
+        Parameter(
+            "--tls-key", metavar="FILE", help="With --http: key of the certificate, as a PEM file."
+        ),
     ] = None,
     notify: Annotated[
         bool,
         Parameter(
             "--notify",
             negative=(),
-            help="Tell clients that have channels (Claude Code) without being asked when a "
-            "breakpoint is hit, an expectation is violated, a controller crashed or trials are "
-            "done; see 'webots-mcp help updates'.",
+            help="Notify clients that support channels (Claude Code) when a breakpoint is hit, an "
+            "expectation is violated, a controller crashes or trials finish. See 'webots-mcp help "
+            "updates'.",
         ),
     ] = False,
     limits: RetentionOptions = _AS_BEFORE,
     recorded: Where = HERE,
 ) -> None:
-    """Serve a recording to an MCP client over stdin and stdout, or to many over HTTP.
+    """Serve a recording to an MCP client over stdin and stdout, or to many clients over HTTP.
 
-    Starts whether or not anything was recorded yet. 'webots-mcp init' tells clients of it; by
-    hand, Claude Code is told with:
+    'webots-mcp init' registers this server with clients. To register it by hand in Claude Code:
 
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
 
-    With --http 8000 it runs until Ctrl-C, and clients come and go: see 'webots-mcp help clients'.
+    It starts even if nothing was recorded yet. With --http it runs until Ctrl-C; see 'webots-mcp
+    help clients'.
 
-    While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
-    Limits belong to the database: what 'webots-mcp prune' or 'retention' has set,
-    or another server that runs, holds on, and is said.
-    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
-    commas between, or all, which keeps everything. 'webots-mcp prune --dry-run' with the same
-    limits tells what would go.
+    Unless --read-only is given, the server deletes the oldest rows beyond the limits. A LIMIT is a
+    size (500MB), an age (30d), a number of rows (100000rows), several of these joined by commas, or
+    'all' (no limit). Limits are stored in the database. Those set before by 'webots-mcp prune',
+    'webots-mcp retention' or another running server stay in force, and a message says so.
+    'webots-mcp prune --dry-run' with the same limits shows what would be deleted.
     """
     import logging
 
@@ -173,14 +180,14 @@ def token(
     *,
     new: Annotated[
         bool,
-        Parameter("--new", help="Make another first; the one before is refused from then on."),
+        Parameter("--new", help="Replace the token first. Clients with the old token are refused."),
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Show the token that clients of 'webots-mcp serve --http' give; one for all your projects.
+    """Show the token that clients of 'webots-mcp serve --http' need.
 
-    It is in a file that only you can read. The address of the page of 'webots-mcp view' is made
-    from it.
+    All your projects use the same token. It is stored in a file that only you can read. The address
+    of the page of 'webots-mcp view' is derived from it.
     """
     from webots_mcp.server.access_token import access_token, new_token, token_file
 
@@ -242,7 +249,7 @@ def observe(
         Parameter(
             "--robot",
             metavar="NAME",
-            help=f"The Robot node to be, with supervisor TRUE ({OBSERVER_NAME}).",
+            help=f"Robot node to run as, which has supervisor TRUE. Default: {OBSERVER_NAME}.",
         ),
     ] = OBSERVER_NAME,
     url: Annotated[
@@ -250,7 +257,7 @@ def observe(
         Parameter(
             "--url",
             metavar="URL",
-            help="Where Webots is: ipc://1234, tcp://192.168.1.5:1234; else here, at port 1234.",
+            help="Address of Webots, such as tcp://192.168.1.5:1234. Default: ipc://1234.",
         ),
     ] = None,
     period_ms: Annotated[
@@ -259,17 +266,19 @@ def observe(
             "--period-ms",
             metavar="N",
             converter=whole_number,
-            help="Milliseconds of simulation time between two rows (100).",
+            help="Simulated milliseconds between two rows. Default: 100.",
         ),
     ] = None,
     data_dir: DataDir = None,
     as_json: Json = False,
 ) -> None:
-    """Record where all robots of a running world are, as an extern controller of it.
+    """Record the positions of all robots in a running world, as an extern controller.
 
-    The world needs a robot for it, which 'webots-mcp init --observer WORLD --extern' adds; without
-    --extern Webots starts the observer itself, and this command is not needed. It ends when Webots
-    reloads the world or ends; with --json it says then where it has recorded.
+        webots-mcp observe --url ipc://1234
+
+    The world needs an observer robot, which 'webots-mcp init --observer WORLD --extern' adds.
+    Without --extern, Webots starts the observer itself and this command is not needed. It stops
+    when Webots reloads the world or quits; with --json it then reports where it recorded.
     """
     from webots_mcp.database.location import resolve_data_dir
     from webots_mcp.simulator import observer
@@ -312,62 +321,75 @@ def _connect_to(url: str | None, robot: str) -> str:
 
 
 def launch(
-    world: Annotated[Path, Parameter("WORLD", help="A .wbt file in a Webots project.")],
+    world: Annotated[
+        Path, Parameter("WORLD", help="World to open: a .wbt file in a Webots project.")
+    ],
     /,
     *,
     headless: Annotated[
-        bool, Parameter("--headless", help="Without its window and its 3D view.")
+        bool, Parameter("--headless", help="Start without window and 3D view.")
     ] = False,
     mode: Annotated[
         Literal["fast", "realtime", "pause"] | None,
-        Parameter("--mode", help="The mode that it begins with; else that of its preferences."),
+        Parameter("--mode", help="Mode to start in. Default: as in the preferences of Webots."),
     ] = None,
     stream: Annotated[
         bool,
         Parameter(
             "--stream",
-            help="Let it be steered from outside without a controller of ours; at its port the "
-            "project's files can then be read, from the network too.",
+            help="Allow steering without a controller that records. Everyone who can reach the "
+            "port "
+            "can then read files of the project.",
         ),
     ] = False,
     port: Annotated[
         int | None,
         Parameter(
             "--port",
+            metavar="PORT",
             validator=Number(gte=1, lte=MAX_PORT),
-            help="Else the first free one from 1234 on.",
+            help="Port of Webots. Default: the first free port from 1234.",
         ),
     ] = None,
     stand_in: Annotated[
         bool,
         Parameter(
             "--stand-in",
-            help="Run the world on the stand-in simulator that comes with webots-mcp, where no "
-            "Webots is installed; it ends with its last controller, or with Ctrl-C.",
+            help="Use the stand-in simulator of webots-mcp, which needs no Webots. It stops with "
+            "its "
+            "last controller, or with Ctrl-C.",
         ),
     ] = False,
     robot: Annotated[
         tuple[str, ...],
         Parameter(
             "--robot",
-            help="With --stand-in: NAME=FILE runs this file as the controller of a robot, also of "
-            "one that is `<extern>`.",
+            metavar="NAME=FILE",
+            help="With --stand-in: run FILE as the controller of the robot NAME, also if it is "
+            "`<extern>`.",
         ),
     ] = (),
     data_dir: Annotated[
         Path | None,
-        Parameter("--data-dir", help="Where controllers record; else mcp_data/ of the project."),
+        Parameter(
+            "--data-dir",
+            metavar="DIR",
+            help="Folder to record in. Default: mcp_data/ in the project.",
+        ),
     ] = None,
     patience_s: Annotated[
         float,
-        Parameter("--patience", help="Say after so many seconds why nobody has recorded yet (30)."),
+        Parameter(
+            "--patience",
+            metavar="S",
+            help="Seconds to wait for the first row before reporting why none came. Default: 30.",
+        ),
     ] = 30.0,
 ) -> int:
-    """Start Webots on a world, show and record its console, say when the first controller records.
+    """Start Webots on a world, record its console, and report the first controller that records.
 
-    Webots opens no dialogs and ends with this command, however that ends: by Ctrl-C, by SIGTERM,
-    killed. If it ends by itself, the exit code is its own. Where there is no display, xvfb-run
-    gives it one.
+    Webots opens no dialogs. It is stopped whenever this command ends, even if it is killed. If
+    Webots quits by itself, its exit code is returned. Without a display, xvfb-run provides one.
 
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """

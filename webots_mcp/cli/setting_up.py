@@ -31,11 +31,11 @@ class Writing:
     """Whether files are written, and how it is answered what was."""
 
     yes: Annotated[
-        bool, Parameter("--yes", negative=(), help="Change what is there without asking.")
+        bool, Parameter("--yes", negative=(), help="Change existing files without asking.")
     ] = False
     dry_run: Annotated[
         bool,
-        Parameter("--dry-run", negative=(), help="Write nothing, and say what would be written."),
+        Parameter("--dry-run", negative=(), help="Show what would be written, and write nothing."),
     ] = False
     as_json: Json = False
 
@@ -91,32 +91,36 @@ _ASKING: Final = Writing()
 
 def init(
     project: Annotated[
-        str | None, Parameter("PROJECT", help="A folder in the project; else the current one.")
+        str | None, Parameter("PROJECT", help="Folder in the project. Default: the current folder.")
     ] = None,
     /,
     *,
     claude_desktop: Annotated[
         bool,
         Parameter(
-            "--claude-desktop", help="Tell Claude Desktop too, whose file is not in the project."
+            "--claude-desktop",
+            help="Also register with Claude Desktop, whose file is outside the project.",
         ),
     ] = False,
     name: Annotated[
-        str, Parameter("--name", metavar="NAME", help="What clients call the server (webots).")
+        str,
+        Parameter("--name", metavar="NAME", help="Name of the server in clients. Default: webots."),
     ] = "webots",
     http: Annotated[
         str | None,
         Parameter(
             "--http",
             metavar="URL",
-            help="Tell them of a server that runs, as http://127.0.0.1:8000/mcp; they take its "
-            "token from the environment variable WEBOTS_MCP_TOKEN.",
+            help="Register a running server instead, such as http://127.0.0.1:8000/mcp. Clients "
+            "read "
+            "its token from the environment variable WEBOTS_MCP_TOKEN.",
         ),
     ] = None,
     skills: Annotated[
         bool,
         Parameter(
-            "--skills", help="Add skills to .claude/skills and AGENTS.md; what you change, stays."
+            "--skills",
+            help="Also install skills in .claude/skills and AGENTS.md. Your own changes stay.",
         ),
     ] = False,
     patch: Annotated[
@@ -124,7 +128,7 @@ def init(
         Parameter(
             "--patch",
             metavar="FILE",
-            help="Put the bridge's lines into this controller, and do nothing else.",
+            help="Only add the lines that record to this controller, after asking.",
         ),
     ] = None,
     observer: Annotated[
@@ -132,16 +136,17 @@ def init(
         Parameter(
             "--observer",
             metavar="WORLD",
-            help="Add a robot that records where all robots are, to a copy of this world.",
+            help="Only add a robot that records all positions, to a copy of this world.",
         ),
     ] = None,
     in_place: Annotated[
-        bool, Parameter("--in-place", help="With --observer: to the world itself.")
+        bool, Parameter("--in-place", help="With --observer: change the world itself, not a copy.")
     ] = False,
     extern: Annotated[
         bool,
         Parameter(
-            "--extern", help="With --observer: to be run by 'webots-mcp observe', not by Webots."
+            "--extern",
+            help="With --observer: 'webots-mcp observe' runs it, instead of Webots.",
         ),
     ] = False,
     undo: Annotated[
@@ -149,29 +154,29 @@ def init(
         Parameter(
             "--undo",
             metavar="FILE",
-            help="Take the bridge's lines out of a controller, or the observer out of a world.",
+            help="Remove these lines from a controller, or the observer from a world.",
         ),
     ] = None,
     writing: Writing = _ASKING,
 ) -> None:
-    """Make a Webots project ready: tell MCP clients of the server, look at the controllers.
+    """Set up a Webots project: register the MCP server and list what each controller needs.
 
-    The project is the nearest folder that holds worlds/ with a world; it need not have
-    controllers/. Claude Code (.mcp.json), Cursor (.cursor/mcp.json) and VS Code (.vscode/mcp.json)
-    are told of the server, by a full path; other entries stay. In WSL, where the project is on a
-    drive of Windows, it is the server of Windows. Of each controller in Python the lines that it
-    needs are shown, the Python that Webots starts it with, and what mends that where the bridge is
-    not installed there. Nothing is changed a second time.
+        webots-mcp init ~/my_project --skills
 
-    --patch writes those lines, after a question:
+    Registers the server with Claude Code (.mcp.json), Cursor (.cursor/mcp.json) and VS Code
+    (.vscode/mcp.json); other entries stay. The project is the nearest folder with worlds/. In WSL,
+    a project on a Windows drive gets the server of Windows. Running it again changes nothing.
+
+    For each Python controller it shows the two lines that record, the Python that Webots runs it
+    with, and how to install webots-mcp there. --patch adds these lines for you:
 
         webots-mcp init --patch controllers/my_robot/my_robot.py
 
-    --skills adds pages for assistants, again after an update: why it does not move, did my edit
-    help, tune, test, a new world.
+    --skills installs guides for assistants, such as "why does it not move" and "did my edit help".
+    Repeat it after an update.
 
-    --observer adds a robot to a copy of a world (arena_observed.wbt, say), and its controller to
-    the project; then nothing has to be changed in any controller:
+    --observer records positions without changing any controller. It adds a robot to a copy of the
+    world, here arena_observed.wbt:
 
         webots-mcp init --observer worlds/arena.wbt
     """
@@ -500,15 +505,15 @@ def _print_python(python: dict[str, Any]) -> None:
 def doctor(
     *,
     no_server: Annotated[
-        bool, Parameter("--no-server", help="Start no server to talk to.")
+        bool, Parameter("--no-server", help="Skip the check that starts an MCP server.")
     ] = False,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> int:
-    """Look at each link of the chain from controller to client, and say what mends it.
+    """Check every step from controller to client, and show how to fix what is wrong.
 
-    Nothing is changed. Exit code 0: nothing is wrong (there may be warnings). 1: something is
-    wrong. 2: it could not look.
+    Changes nothing. Exit code 0: nothing is wrong; there may be warnings. 1: something is wrong.
+    2: the checks could not run.
     """
     from webots_mcp.setup.doctor import all_checks, diagnose
 
@@ -564,17 +569,20 @@ def _print_folded(head: str, text: str) -> None:
 
 def header(
     target: Annotated[
-        Path, Parameter("TARGET", help="The controller's folder, or the file (webots_mcp.h here).")
+        Path,
+        Parameter(
+            "TARGET", help="Folder of the controller, or the file to write. Default: webots_mcp.h."
+        ),
     ] = Path(),
     /,
     *,
     as_json: Json = False,
 ) -> None:
-    """Write webots_mcp.h into the folder of a controller in C or C++, which records with it.
+    """Write webots_mcp.h, with which a controller in C or C++ records.
 
         webots-mcp header controllers/my_robot
 
-    An older one is replaced. 'webots-mcp help c' has what a controller calls.
+    Replaces an older version of this file. 'webots-mcp help c' lists its functions.
     """
     from webots_mcp.contract import C_HEADER
 
@@ -605,24 +613,24 @@ def completion(
         Parameter(
             "--install",
             negative=(),
-            help="Write the script where the shell looks for it, and load it in its start-up file.",
+            help="Install the script for all later sessions, in the folder of the shell.",
         ),
     ] = False,
     values: Annotated[
         Literal["robots", "runs", "signals", "kinds"] | None,
-        Parameter("--values", help="List these names of the recording, one per line."),
+        Parameter("--values", help="List names from the recording instead, one per line."),
     ] = None,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Print the script that completes commands, options, files and recorded names at the Tab key.
+    """Print the script for Tab completion of commands, options, files and recorded names.
 
-    For one session:
+    For this session only:
 
         source <(webots-mcp completion bash)
 
-    `--install` does it for all later sessions. Install it again after an update of webots-mcp.
-    Names of robots, runs, signals and kinds of events are completed in bash and fish.
+    --install sets it up for all later sessions. Repeat that after an update of webots-mcp. Robots,
+    runs, signals and kinds of events are completed in bash and fish.
     """
     from cyclopts.completion import detect_shell
     from cyclopts.completion.detect import ShellDetectionError

@@ -40,19 +40,20 @@ def fetch(
         Parameter(
             "--from",
             metavar="URL",
-            help="The pool: postgresql://HOST/DATABASE, a folder, s3://BUCKET/PREFIX, ...",
+            help="Pool: a folder, postgresql://HOST/DATABASE or s3://BUCKET/PREFIX.",
         ),
     ],
     choice: RunFilter = _ALL,
     recorded: Where = HERE,
     json: Json = False,
 ) -> int:
-    """Bring runs of a pool back into a recording here, for every command, tool and plot.
+    """Fetch runs from a pool into a local recording.
 
-    They come with their sessions, commands, trials and what was shipped of their pictures, each
-    once however often it is fetched; what is here is left as it is. Of a run of which chunks were
-    shipped and no states, the chunks come: the values of all of its signals. A run that goes on or
-    is still being shipped is not taken: fetch it again when it is whole.
+        webots-mcp fetch --from ./pool --label baseline
+
+    Runs come with their sessions, commands, trials and shipped pictures. Fetching again changes
+    nothing. If only chunks of a run were shipped, the values of all its signals come, but no
+    states. Runs that are still recording or being shipped are skipped; fetch them later.
     """
     from webots_mcp.plugins.pool.fetching import fetch as fetch_runs
     from webots_mcp.plugins.pool.pool_contents import open_pool
@@ -118,30 +119,37 @@ def _named(uuids: Sequence[str]) -> str:
 
 
 def pool(
-    url: Annotated[str, Parameter("URL", help="postgresql://HOST/DATABASE, a folder, s3://...")],
+    url: Annotated[
+        str,
+        Parameter("URL", help="Pool: a folder, postgresql://HOST/DATABASE or s3://BUCKET/PREFIX."),
+    ],
     part: Annotated[
         Literal["robots", "runs", "trials"],
-        Parameter("PART", help="What to list (robots)."),
+        Parameter("PART", help="What to list. Default: robots."),
     ] = "robots",
     /,
     *,
     sql: Annotated[
         str | None,
         Parameter(
-            "--sql", metavar="SELECT", help="One SELECT in the language of the pool, in quotes."
+            "--sql",
+            metavar="SELECT",
+            help="Run this SELECT, in the SQL of the pool (PostgreSQL or DuckDB).",
         ),
     ] = None,
     max_rows: Annotated[
         Count,
-        Parameter("-n", metavar="N", help="The newest N, or N rows (20); of a SELECT up to 1000."),
+        Parameter(
+            "-n", metavar="N", help="Maximum number of rows, up to 1000 with --sql. Default: 20."
+        ),
     ] = 20,
     choice: RunFilter = _ALL,
     json: Json = False,
 ) -> None:
-    """List what is in a pool, or ask it one SELECT; nothing is changed.
+    """List robots, runs or trials in a pool, or run one SELECT on it. Changes nothing.
 
-    A SELECT ends after a minute (over Parquet files after 20 seconds, or 1 GB of memory), and its
-    values are cut to 200 characters.
+    A SELECT is stopped after 60 s; over Parquet files after 20 s or 1 GB of memory. Values are cut
+    to 200 characters.
 
         webots-mcp pool ./pool runs --robot rover
 
@@ -222,45 +230,44 @@ def ship(
         Parameter(
             "--to",
             metavar="URL",
-            help="The pool: postgresql://[USER@]HOST/DATABASE, a folder, or s3://BUCKET/PREFIX "
-            "and the like.",
+            help="Pool: a folder, postgresql://[USER@]HOST/DATABASE or s3://BUCKET/PREFIX.",
         ),
     ],
     follow: Annotated[
-        bool, Parameter("--follow", help="Go on with what comes, until Ctrl-C.")
+        bool, Parameter("--follow", help="Keep shipping new rows until Ctrl-C.")
     ] = False,
     full: Annotated[
         bool,
         Parameter(
             "--full",
-            help="Ship all states; else only those of full-rate segments, and the chunks of all.",
+            help="Ship every state. Default: chunks of all states, and full-rate segments.",
         ),
     ] = False,
-    pictures: Annotated[
-        bool, Parameter("--pictures", help="Ship the files of pictures as well.")
-    ] = False,
+    pictures: Annotated[bool, Parameter("--pictures", help="Also ship the picture files.")] = False,
     pause_s: Annotated[
         float | None,
         Parameter(
             "--every",
-            metavar="SECONDS",
+            metavar="S",
             validator=Number(gte=0.1, lte=86_400),
-            help="With --follow, how long to wait between two looks (2; for files 60).",
+            help="With --follow: seconds between two shipments. Default: 2 for PostgreSQL, 60 for "
+            "files.",
         ),
     ] = None,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Ship a recording to a pool, where the recordings of many machines are.
+    """Ship a recording to a pool, which collects recordings of many machines.
 
-    The pool is a PostgreSQL database, or a dataset of Parquet files in a folder or an object store.
-    The recording is only read, but that runs whose process was killed are ended. What the pool has
-    is not sent again, so that this may be killed and started again at any time; a run that another
-    recording has shipped stays that one's.
+        webots-mcp ship --to postgresql://HOST/lab --follow
 
-    Runs, commands, events, log lines, parameters, trials, chunks and full-rate segments are
-    shipped, with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file,
-    never from the URL.
+    A pool is a PostgreSQL database, or a set of Parquet files in a folder or an object store. Rows
+    that the pool already has are not sent again, so this can be stopped and restarted at any time.
+    A run that was shipped from another recording is left to that recording.
+
+    Ships runs, commands, events, log lines, parameters, trials, chunks and full-rate segments. The
+    only change to the recording is that runs of killed processes are marked as ended. Passwords
+    come from PGPASSWORD, ~/.pgpass or a service file, never from the URL.
     """
     from webots_mcp.plugins.pool.pool_contents import is_postgres, open_pool
     from webots_mcp.plugins.pool.pool_interface import redacted

@@ -27,8 +27,15 @@ from webots_mcp.cli.options import (
     refuse_options,
     whole_number,
 )
-from webots_mcp.cli.streams import binary_stdout, shown_progress, wait
-from webots_mcp.cli.terminal import id_ranges, print_json, print_notes, print_table, printable
+from webots_mcp.cli.streams import binary_stdout, shown_activity, shown_progress, wait
+from webots_mcp.cli.terminal import (
+    id_ranges,
+    print_json,
+    print_notes,
+    print_table,
+    printable,
+    runs_named,
+)
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.plugin_registry import export_formats
@@ -123,14 +130,23 @@ def export(
     file = output if output != _STDOUT else None
     form = form or (format_of(file) if file else "csv")
     if trial_set is not None and part.scope() != Scope():
-        raise InvalidInputError("give --trials or a range of states, not both")
+        raise InvalidInputError(
+            "--trials cannot be combined with a robot, run or range of states, because trials are "
+            "a "
+            "table of their own. Leave one of them out."
+        )
     recording = recorded.recording()
     if file is None:
         _require_for_stdout(form, as_json=json)
     elif isinstance(recording.database, Path) and file.resolve() == recording.database:
-        raise InvalidInputError(f"{file} is the recording itself: choose another file")
+        raise InvalidInputError(
+            f"{file} is the recording itself, which would be lost. Choose another file with -o."
+        )
     if trial_set is not None and form not in FORMATS:
-        raise InvalidInputError(f"trials are a table: choose {' or '.join(FORMATS)}, not {form}")
+        raise InvalidInputError(
+            f"Trials cannot be exported as {form}, because they are a table. Use "
+            f"--format {' or '.join(FORMATS)}."
+        )
     if form == BUNDLE and file is not None:
         return _show(_export_bundle(recorded, part, file), as_json=json)
 
@@ -149,12 +165,14 @@ def _require_for_stdout(form: str, *, as_json: bool) -> None:
     from webots_mcp.store.export import FORMATS
 
     if form not in FORMATS:
-        raise InvalidInputError(f"{form} is not for stdout: give a file with -o")
+        raise InvalidInputError(f"{form} cannot be written to stdout. Name a file with -o.")
     if not FORMATS[form].is_text and sys.stdout.isatty():
-        raise InvalidInputError(f"{form} is not for a terminal: give a file with -o")
+        raise InvalidInputError(f"{form} is binary and not for a terminal. Name a file with -o.")
     if as_json:
         raise InvalidInputError(
-            "--json tells what a file got: give one with -o; --format jsonl writes states as JSON"
+            "--json describes an exported file, and none was named. Name one with -o, or write "
+            "states "
+            "as JSON with --format jsonl."
         )
 
 
@@ -182,7 +200,7 @@ def _export_table(
             write(connection, wanted, form, binary_stdout(), progress, **how)
             return _Written(None, "", {}, tuple(notes))
         rows = export_file(connection, wanted, form, file, progress, **how)
-    return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(notes))
+    return _Written(file, f"{rows:,} rows", {"row_count": rows}, tuple(notes))
 
 
 def _export_for_viewers(recorded: Where, part: TimeRangeOptions, file: Path, form: str) -> _Written:
@@ -197,7 +215,7 @@ def _export_for_viewers(recorded: Where, part: TimeRangeOptions, file: Path, for
     by_kind = {kind.replace(" ", "_"): count for kind, count in counts.items()}
     data: dict[str, Any] = {"counts": by_kind}
     if written.beside:
-        text, data["beside"] = f"{text}; {written.beside}", written.beside
+        data["beside"] = written.beside
     return _Written(file, text, data, (*_notes_of(wanted), *written.notes))
 
 
@@ -213,7 +231,10 @@ def _export_bundle(recorded: Where, part: TimeRangeOptions, file: Path) -> _Writ
 
     scope, recording = part.scope(), recorded.recording()
     if scope != Scope(robot=scope.robot, run_id=scope.run_id):
-        raise InvalidInputError("a bundle is a whole run: give --run or --robot, and no times")
+        raise InvalidInputError(
+            "A .zip bundle holds a whole run, so a time range cannot be applied. Use only --run or "
+            "--robot."
+        )
     assert isinstance(recording.database, Path)
     with recorded.reader() as connection, shown_progress("packing") as progress:
         run_id = find_subject(connection, scope.robot, scope.run_id).run_id
@@ -222,14 +243,16 @@ def _export_bundle(recorded: Where, part: TimeRangeOptions, file: Path) -> _Writ
             write_bundle(connection, *place, aside, progress)
     size = file.stat().st_size
     data = {"run_id": run_id, "size_bytes": size}
-    return _Written(file, f"run {run_id}, {size:,} bytes", data)
+    return _Written(file, f"run {run_id} ({size:,} bytes)", data)
 
 
 def _show(written: _Written, *, as_json: bool) -> None:
     if as_json:
         return print_json({"file": str(written.file), **written.data, "notes": list(written.notes)})
     if written.file is not None:
-        print(f"{written.file}: {written.text}")
+        beside = str(written.data.get("beside", ""))
+        beside = f" {beside[0].upper()}{beside[1:]}" if beside else ""
+        print(f"Exported {written.text} to {written.file}.{beside}")
     print_notes(written.notes, sys.stderr)  # stdout may be the table
 
 
@@ -256,16 +279,21 @@ def import_(
     from webots_mcp.store.merging import is_bundle, unpacked
 
     if not source.is_file():
-        why = "it is a folder: name the file in it" if source.is_dir() else "there is no such file"
+        why = (
+            "it is a folder. Name the webots.db in it."
+            if source.is_dir()
+            else "there is no such file. Check the path."
+        )
         raise InvalidInputError(f"{source} cannot be imported: {why}")
-    if is_bundle(source):
-        with unpacked(source) as database:
-            found = _take_in(recorded, database)
-    else:
-        found = _take_in(recorded, source)
+    with shown_activity("importing"):
+        if is_bundle(source):
+            with unpacked(source) as database:
+                found = _take_in(recorded, database)
+        else:
+            found = _take_in(recorded, source)
     if json:
         return print_json({"source": str(source), **found})
-    print(f"{source}: {_taken_in(found)}")
+    print(_imported(found, source))
 
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
@@ -284,7 +312,9 @@ def _merge_into(recorded: Where, source: Path, current: Path) -> dict[str, Any]:
 
     with recorded.writer("import", {"source": source}, create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
-            raise InvalidInputError(f"{source} is the recording itself: choose another file")
+            raise InvalidInputError(
+                f"{source} is the recording that would be imported into. Choose another file."
+            )
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
         runs = merge(connection, recording.data_dir, current, pictures=source.parent).values()
@@ -296,15 +326,17 @@ def _merge_into(recorded: Where, source: Path, current: Path) -> dict[str, Any]:
         }
 
 
-def _taken_in(found: dict[str, Any]) -> str:
-    new, before = id_ranges(found["new_run_ids"]), id_ranges(found["known_run_ids"])
-    known = f"run {before} was here already" if before else ""
-    beside = f"; {known}" if known else ""
+def _imported(found: dict[str, Any], source: Path) -> str:
+    """Return what an import has brought, in a sentence."""
+    new, known = found["new_run_ids"], found["known_run_ids"]
+    was = "was" if len(known) == 1 else "were"
+    before = f"{runs_named(known)} {was} imported before" if known else ""
     if new:
-        return f"new here: run {new}{beside}"
+        return f"Imported {runs_named(new)} from {source}{'; ' if known else ''}{before}."
     if found["changed"]:
-        return f"no run is new, but sessions without runs, or trials, are{beside}"
-    return f"nothing is new{': ' if known else ', it has no runs'}{known}"
+        what = "sessions without runs, or trials"
+        return f"Imported no new run from {source}, but {what}{'; ' if known else ''}{before}."
+    return f"Nothing new in {source}: {before or 'it has no runs'}."
 
 
 def prune(
@@ -339,7 +371,7 @@ def prune(
         disk = _on_disk(wanted, sizes)
         if json:
             return print_json({"dry_run": True, **_as_data(wanted), "disk_bytes": disk})
-        _print_plan(wanted, "would go")
+        _print_plan(wanted, "Would delete")
         _print_disk(disk)
 
     if dry_run:
@@ -348,13 +380,12 @@ def prune(
         set_limits(connection, asked, "prune")
         retention = in_force(connection)
         wanted = plan(connection, retention)
-        if not json:
-            _print_plan(wanted, "goes")
         purged = _prune(recording, connection, retention)
     if json:
         done = {"freed_bytes": purged.freed_bytes, "notes": purged.problems}
         return print_json({"dry_run": False, **_as_data(wanted), **done})
-    _print_purged(purged)
+    _print_plan(wanted, "Deleted", freed_bytes=purged.freed_bytes)
+    print_notes(purged.problems)
 
 
 def retention(
@@ -378,14 +409,25 @@ def retention(
 
     asked = limits.asked()
     if not run_ids and not asked:
-        raise InvalidInputError("name runs to retain, or a limit to set: --keep-states 20GB")
+        raise InvalidInputError(
+            "Nothing to change: no run and no limit was given. Name runs to keep, such as "
+            "'webots-mcp "
+            "retention 4', or a limit, such as --keep-states 20GB."
+        )
     given = {"run_ids": run_ids, "release": release, **asked}
     with recorded.writer("retain", given) as (_, connection):
         mark_kept(connection, run_ids, keep=not release)
         set_limits(connection, asked, "retain")
         if json:
             done = {"run_ids": run_ids, "retained": not release} if run_ids else {}
-            print_json({**done, "limits": described(connection)})
+            return print_json({**done, "limits": described(connection)})
+    ids = [*run_ids]
+    if ids and release:
+        print(f"Removed the mark from {runs_named(ids)}: retention applies again.")
+    elif ids:
+        print(f"Marked {runs_named(ids)}: never pruned.")
+    if asked:
+        print("Limits are set; 'webots-mcp status --storage' shows them.")
 
 
 def _prune(
@@ -424,29 +466,34 @@ def _as_data(wanted: Plan) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _print_plan(wanted: Plan, going: str) -> None:
+def _print_plan(wanted: Plan, done: str, *, freed_bytes: int = 0) -> None:
+    """Print what was or would be deleted: first in a sentence, then by kind of row."""
     from webots_mcp.store.retention import size_text
 
     rows = wanted.rows_by_table()
+    total, size = sum(rows.values()), size_text(sum(map(wanted.size_of, rows)))
+    freed = f"; the file is {size_text(freed_bytes)} smaller" if freed_bytes else ""
+    if rows:
+        print(f"{done} {total:,} row{'s' * (total != 1)} beyond the limits, about {size}{freed}.")
+    else:
+        print(f"Nothing is beyond the limits{freed}.")
     table = [
         [kind, rows[kind], size_text(wanted.size_of(kind)), id_ranges(wanted.runs_of(kind))]
         for kind in rows
     ]
     if table:
-        print_table((going, "rows", "about", "runs"), table)
-    else:
-        print("nothing is beyond the limits")
+        print_table(("kind", "rows", "size", "runs"), table)
     print_notes(
         [
-            f"beyond the limit, but spared: {each.rows} rows of {each.table}, about "
+            f"beyond the limit, but kept: {each.rows} rows of {each.table}, about "
             f"{size_text(each.size_bytes)}, {each.why}"
             for each in wanted.spared
         ]
     )
     if wanted.kept_run_ids:
-        ids, size = id_ranges(wanted.kept_run_ids), size_text(wanted.kept_bytes)
+        kept, size = runs_named(wanted.kept_run_ids), size_text(wanted.kept_bytes)
         why = "kept because of a label, a note or a mark, and not counted"
-        print_notes([f"{why}: run {ids}, about {size}"])
+        print_notes([f"{why}: {kept}, about {size}"])
 
 
 def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
@@ -467,15 +514,7 @@ def _print_disk(disk: dict[str, Any]) -> None:
         return ", ".join(f"{name} {size_text(size)}" for name, size in sizes.items())
 
     parts, others = sized(disk["in_file"]), sized(disk["beside"])
-    print_notes([f"the file has {size_text(disk['file'])}, about: {parts}; beside it {others}"])
-
-
-def _print_purged(purged: Purged) -> None:
-    from webots_mcp.store.retention import size_text
-
-    if purged.freed_bytes:
-        print(f"{size_text(purged.freed_bytes)} of the database file freed")
-    print_notes(purged.problems)
+    print_notes([f"the file takes {size_text(disk['file'])}: {parts}; next to it {others}"])
 
 
 # -- a recording as lines that follow it, and as a picture --
@@ -526,8 +565,12 @@ def tail(
     with recorded.reader() as connection:
         found = robot and resolve_robot(connection, robot, time.time())
         follower = Follower(connection, found.id if found else None)
-        _print_lines(follower.read_new(limit), as_json=json)
         following = not no_follow and recorded.may_change()
+        subject = found.name if found else "all robots"
+        where = f"{subject} in {recorded.recording().database}"
+        if following:
+            print(f"webots-mcp: following {where}; Ctrl-C stops it", file=sys.stderr, flush=True)
+        _print_lines(follower.read_new(limit), as_json=json)
         while following:
             wait(interval_s)
             recorded.recording().ingest()

@@ -28,6 +28,7 @@ from webots_mcp.cli.options import (
     Where,
     make_chunks_first,
 )
+from webots_mcp.cli.streams import shown_activity
 from webots_mcp.cli.terminal import is_verbose, print_answer, print_json, print_table
 from webots_mcp.contract import host_name
 from webots_mcp.database.files import placed
@@ -278,27 +279,38 @@ def repeatability(
 
     ways = sorted(dict.fromkeys(by or ["reset"]))  # processes first: others are judged by them
     if number < 2:
-        raise InvalidInputError(f"-n {number}: it takes two runs to see whether they are the same")
+        raise InvalidInputError(
+            f"-n {number} is too few: at least two runs are needed to compare. Use -n 2 or more."
+        )
     if (world or stand_in) and "process" not in ways:
-        raise InvalidInputError("WORLD and --stand-in are for --by process")
+        raise InvalidInputError(
+            "WORLD and --stand-in apply only to processes. Add --by process, or leave them out."
+        )
     runs = dict[str, list[int]]()
     for way in ways:
         if way == "process":
             runs[way] = _in_processes(world, asked, for_s, number, stand_in=stand_in)
         else:
-            runs[way] = [_live(way, asked, for_s) for _ in range(number)]
+            runs[way] = []
+            for at in range(1, number + 1):
+                with shown_activity(f"run {at} of {number}, by {way}"):
+                    runs[way].append(_live(way, asked, for_s))
             with asked.recording(read_only=False).writer() as connection:
                 for at, run_id in enumerate(runs[way], 1):
                     annotate_run(connection, run_id, label=f"repeat {at} of {number}, by {way}")
     if len(ways) > 1:
         runs["the first of each"] = [run_ids[0] for run_ids in runs.values()]
     found: dict[str, list[Parting]] = {}
-    with asked.recording().reader() as connection:
+    with asked.recording().reader() as connection, shown_activity("comparing the runs"):
         for way, run_ids in runs.items():
             until_s = fetch_run(connection, run_ids[0]).started_sim_time_s + for_s
             found[way] = compare_repeats(connection, run_ids, until_s=until_s, deadline_s=math.inf)
     answer: dict[str, Any] = {way: _answer(each) for way, each in found.items()}
-    (print_json if json else print_answer)(answer | _blame(found))
+    blame = _blame(found)
+    if json:
+        return print_json(answer | blame)
+    verdicts = (f"{way}: {each['verdict']}" for way, each in answer.items())
+    print_answer({"summary": blame.get("verdict") or "; ".join(verdicts)} | answer)
 
 
 def _in_processes(
@@ -321,7 +333,9 @@ def _in_processes(
     with recording.reader() as connection:
         found = [each.run_id for each in trials_of(connection, set_id) if each.run_id is not None]
     if len(found) < 2:
-        raise CommandRefusedError("fewer than two runs were recorded")
+        raise CommandRefusedError(
+            "Fewer than two runs were recorded, so nothing can be compared. See 'webots-mcp logs'."
+        )
     return found
 
 
@@ -339,7 +353,7 @@ def _live(way: str, asked: Waiting, for_s: float) -> int:
         answer = ask(webots_run, to, asked).data or {}
     if answer.get("stopped") != "simulation time reached":
         why = (answer.get(each) for each in ("error", "stopped", "stop_reason", "hint"))
-        raise CommandRefusedError("; ".join(["a run did not reach its end", *filter(None, why)]))
+        raise CommandRefusedError("; ".join(["A run did not reach its end", *filter(None, why)]))
     return answer["run_id"]
 
 
@@ -349,14 +363,18 @@ def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
     if first != "process" or not ways:
         return {}
     if not all(each.is_equal for each in found[first]):
-        return {"verdict": "processes of their own part as well, or tell nothing"}
+        return {
+            "verdict": "runs in processes of their own diverge as well, or could not be compared"
+        }
     across = dict(zip(ways, found[ways.pop()], strict=False))
     unlike = {name: None for each in across.values() for name in each.unlike}
     blamed = [way for way in ways if any(each.parted for each in (across[way], *found[way]))]
     if named := [name for name in unlike if name not in ("robot", "began_by")]:
-        return {"verdict": f"nothing is blamed: not alike to begin with ({listed(named)})"}
-    said = f"the {' and the '.join(blamed)} is to blame: processes of their own repeat"
-    return {"verdict": said if blamed else "what was compared is the same, however a run begins"}
+        return {"verdict": f"no cause is named: the runs began with differences ({listed(named)})"}
+    said = (
+        f"the {' and the '.join(blamed)} is the cause: runs in processes of their own are identical"
+    )
+    return {"verdict": said if blamed else "the runs are identical, however they begin"}
 
 
 def _answer(found: Sequence[Parting]) -> dict[str, Any]:
@@ -401,22 +419,30 @@ def profile(
     with recorded.recording().view(robot) as view:
         name, session = view.robot.name, view.session
     if session is None or not view.robot.live or session.host != host_name():
-        raise CommandRefusedError(f"no controller of {name} runs on this machine")
+        raise CommandRefusedError(
+            f"No controller of {name} is running on this machine. Start the simulation first."
+        )
     if not session.has_bridge:
-        raise CommandRefusedError(f"{name} has no bridge in Python: its lines cannot be sampled")
+        raise CommandRefusedError(
+            f"{name} is not recorded by a Python controller, so its lines cannot be sampled."
+        )
     controller = Path(session.controller or "/nowhere")
     own = str(find_project(controller.parent) or controller.parent)
     samples = Counter[tuple[str, str | None]]()
-    for stack, count in _sampled(session.pid, seconds):
-        samples[_place_of(stack, own)] += count
+    with shown_activity(f"sampling {name} for {seconds} s"):
+        for stack, count in _sampled(session.pid, seconds):
+            samples[_place_of(stack, own)] += count
     total = samples.total()
     columns = ("share", "line", "function", "samples")
     rows = [[f"{n / total:.1%}", *place, n] for place, n in samples.most_common(12)]
     if json:
         found = {"robot": name, "seconds": seconds, "samples": total}
         return print_json(found | {"columns": columns, "rows": rows})
+    (first, function), most = samples.most_common(1)[0]
+    where = f"{first} in {function}" if function else first
+    print(f"{name} spends {most / total:.0%} of its time {'at ' if function else ''}{where}.")
     print_table(columns, rows)
-    print(f"{name}: {total} samples of its main thread in {seconds} s")
+    print(f"{total} samples of its main thread in {seconds} s")
 
 
 def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
@@ -439,9 +465,9 @@ def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
         return [(stack, int(count)) for stack, _, count in found]
     if re.search("permi", ended.stderr, re.IGNORECASE):
         raise CommandRefusedError(
-            f"py-spy may not look into process {pid}: allow it with 'sudo sysctl "
-            "kernel.yama.ptrace_scope=0' on Linux, with --cap-add SYS_PTRACE for a container, or "
-            "ask as root (macOS)"
+            f"py-spy is not allowed to sample process {pid}. On Linux run 'sudo sysctl "
+            "kernel.yama.ptrace_scope=0', for a container add --cap-add SYS_PTRACE, on macOS run "
+            "this command as root."
         )
     *_, said = ended.stderr.strip().splitlines() or ["it has written nothing"]
     raise CommandRefusedError(f"py-spy could not sample process {pid}: {said}")

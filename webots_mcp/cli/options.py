@@ -57,7 +57,7 @@ def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
     """
     text = tokens[0].value
     if not re.fullmatch(r"[+-]?[0-9]+", text):
-        raise ValueError(f"{text!r} is no whole number")
+        raise ValueError(f"{text!r} is not a whole number")
     if abs(int(text)) >= _TOO_LARGE:
         raise ValueError(f"{text} is too large")
     return int(text)
@@ -79,7 +79,7 @@ def _row_id(_kind: Any, tokens: Sequence[Token]) -> int:
         text.isascii() and text.isdecimal() and int(text) < _TOO_LARGE
     ):  # what SQLite could have given
         return int(text)
-    raise ValueError(f"{text!r} is no id: it is a number from an answer")
+    raise ValueError(f"{text!r} is not an id. An id is a number from an answer")
 
 
 Id: TypeAlias = Annotated[int, Parameter(converter=_row_id)]
@@ -101,7 +101,7 @@ def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> d
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise InvalidInputError(f"{text!r} names no value: write {name}=VALUE")
+            raise InvalidInputError(f"{text!r} has no value. Write {name}=VALUE.")
         values[name] = value if kinds.get(name) == "str" else value_of(value)
     return values
 
@@ -163,10 +163,12 @@ class Where:
 
     def recording(self, *, read_only: bool = True) -> RecordingAccess:
         """Return the recording."""
+        from webots_mcp.cli.terminal import note_recording
         from webots_mcp.database.location import resolve_database
         from webots_mcp.store.recording import RecordingAccess
 
         where = resolve_database(self.database, self.data_dir)
+        note_recording(where[0])
         return RecordingAccess(*where, read_only=read_only, asker="cli")
 
     def typed(self) -> list[str]:
@@ -421,5 +423,7 @@ def _times_of(text: str) -> float:
     except ValueError:
         times = math.nan
     if not 1 <= times < math.inf:
-        raise InvalidInputError(f"{text!r} must be a number, 1 or more, or {NO_LIMIT}")
+        raise InvalidInputError(
+            f"{text!r} is not a number of times. Give a number from 1, or {NO_LIMIT}."
+        )
     return times

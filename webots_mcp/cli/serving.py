@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import os
+import shlex
 import sys
 import threading
 import time
@@ -139,11 +140,15 @@ def serve(
 
         place = endpoint_of(http, allow_host, tls_cert, tls_key)
     elif allow_host or tls_cert or tls_key:
-        raise InvalidInputError("--allow-host, --tls-cert and --tls-key are for --http")
+        raise InvalidInputError(
+            "--allow-host, --tls-cert and --tls-key apply only to --http. Add --http PORT, or "
+            "leave "
+            "them out."
+        )
     elif sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
-            "Clients start this command themselves, see 'webots-mcp serve --help'.",
+            "MCP clients start this command themselves; 'webots-mcp init' registers it.",
             file=sys.stderr,
         )
     if asked and not read_only:
@@ -407,18 +412,26 @@ def launch(
         permit(recording, LAUNCH, asked, create=True)
     if stand_in:
         if stream or port is not None:
-            raise InvalidInputError("--stream and --port are Webots' own: leave them out")
+            raise InvalidInputError(
+                "--stream and --port apply only to Webots, not to --stand-in. Leave them out."
+            )
         os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
         watched = recording, newest_in(recording), file, patience_s
         threading.Thread(target=_watch, args=watched, daemon=True).start()
         named = _controllers(robot)
         with StandInConsole(recording) as recorder:
             status = stand_in_simulator()(file, mode or "realtime", None, named, recorder)
-        if not _has_recorded(*watched[:2]):
-            _say("no controller has recorded; 'webots-mcp logs' shows what they printed")
+        option = _data_dir_option(recording)
+        if _has_recorded(*watched[:2]):
+            _say(f"next: 'webots-mcp check{option}' judges what was recorded")
+        else:
+            _say(f"no controller has recorded; 'webots-mcp logs{option}' shows what they printed")
         return status
     if robot:
-        raise InvalidInputError("--robot is for --stand-in: Webots runs what the world names")
+        raise InvalidInputError(
+            "--robot applies only to --stand-in: Webots runs the controllers that the world names. "
+            "Leave it out."
+        )
     start = Start(file, mode, headless, stream, port or free_port())
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
     console = _Console()
@@ -438,7 +451,9 @@ def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
     for text in robots:
         name, equals, file = text.partition("=")
         if not (name and equals and file):
-            raise InvalidInputError(f"--robot {text!r} is not NAME=FILE")
+            raise InvalidInputError(
+                f"--robot {text!r} is not of the form NAME=FILE, such as rover=rover.py"
+            )
         named[name] = file
     return named
 
@@ -465,7 +480,8 @@ def _watch(recording: RecordingAccess, before: int, world: Path, patience_s: flo
         except WebotsMCPError as error:
             return _say(str(error))
         if begun and begun[0].run_id is not None:  # those that have recorded come first
-            return _say(f"{begun[0].robot} records: run {begun[0].run_id}")
+            _say(f"{begun[0].robot} records: run {begun[0].run_id}")
+            return _say(_next_step(recording))
         if time.monotonic() > until_s:
             until_s = math.inf
             reasons = why_silent(begun, world, extern="--robot NAME=FILE runs one")
@@ -493,7 +509,7 @@ def _follow(
     webots, first = launched.webots, None
     until_s = time.monotonic() + patience_s
     while (code := webots.exit_code) is None:
-        first = first or _announce_first(launched)
+        first = first or _announce_first(launched, recorder.recording)
         if first is None and time.monotonic() > until_s:
             until_s = math.inf
             _say(f"no controller has recorded within {patience_s:g} s: {launched.silence()}")
@@ -501,19 +517,20 @@ def _follow(
         recorder.begin()
         time.sleep(_LOOK_EVERY_S)
     webots.wait_for_output()
-    if first is None and _announce_first(launched) is None:
+    if first is None and _announce_first(launched, recorder.recording) is None:
         launched.record_unfollowed_output()
         _say(launched.silence())
     return code
 
 
-def _announce_first(launched: WebotsLaunch) -> SessionStart | None:
+def _announce_first(launched: WebotsLaunch, recording: RecordingAccess) -> SessionStart | None:
     """Say which controller records first, once there is one."""
     first = launched.first_record()
     if first is not None:
         address = launched.webots.address_now()
         where = f", Webots listens at port {address.port}" if address else ""
         _say(f"{first.robot} records: run {first.run_id}{where}")
+        _say(_next_step(recording))
     return first
 
 
@@ -542,7 +559,7 @@ class _Recorder(ExitStack):
     def __init__(self, launched: WebotsLaunch, recording: RecordingAccess) -> None:
         super().__init__()
         self._launched = launched
-        self._recording = recording
+        self.recording = recording
         self._begun = False
 
     def begin(self) -> None:
@@ -552,7 +569,26 @@ class _Recorder(ExitStack):
         instance = None if self._begun else self._launched.webots.instance
         if instance is not None:
             self._begun = True
-            self.enter_context(follow_console(instance, self._recording))
+            self.enter_context(follow_console(instance, self.recording))
+
+
+def _next_step(recording: RecordingAccess) -> str:
+    """Return what to do once a robot is recorded."""
+    return (
+        'next: ask your assistant "What is the robot doing?", or run '
+        f"'webots-mcp status{_data_dir_option(recording)}' in another terminal"
+    )
+
+
+def _data_dir_option(recording: RecordingAccess) -> str:
+    """Return the option that names the recording; none where the current folder says it."""
+    from webots_mcp.contract import PROJECT_DATA_FOLDER
+    from webots_mcp.database.location import find_project
+
+    project = find_project(Path.cwd())
+    if project and project / PROJECT_DATA_FOLDER == recording.data_dir:
+        return ""
+    return f" --data-dir {shlex.quote(str(recording.data_dir))}"
 
 
 def _say(text: str) -> None:

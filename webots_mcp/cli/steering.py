@@ -31,6 +31,7 @@ from webots_mcp.cli.options import (
     whole_number,
 )
 from webots_mcp.cli.terminal import clock_text, print_json, print_notes, print_table, text_of
+from webots_mcp.cli.wording import as_typed
 from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
@@ -145,7 +146,11 @@ def parameters(
     if not settings:
         return _show(webots_get_parameters, asked, as_json=json, run_id=run_id)
     if run_id is not None:
-        raise InvalidInputError("--run shows an earlier run; parameters are set in the current one")
+        raise InvalidInputError(
+            "--run shows the parameters of an earlier run, which cannot be changed. Leave --run "
+            "out to "
+            "set them in the current run."
+        )
     when = "reset" if from_reset else "now"
     _show(webots_set_parameters, asked, as_json=json, values=settings, when=when)
 
@@ -203,19 +208,22 @@ def signals(
     from webots_mcp.questions.history import webots_list_signals
 
     if describe is not None and undo is not None:
-        raise InvalidInputError("give --describe NAME or --undo NAME, not both")
+        raise InvalidInputError("--describe and --undo exclude each other. Give one of them.")
     if describe is not None:
         said = _fields_of(words)
         return _show(webots_describe_signals, asked, as_json=json, signals=[describe], **said)
     if undo is not None and words:
-        raise InvalidInputError(f"--undo takes one name: leave out {words[0]!r}")
+        raise InvalidInputError(f"--undo takes one signal. Leave out {words[0]!r}.")
     if undo is not None:
         return _show(webots_describe_signals, asked, as_json=json, signals=[undo], undo=True)
     if meanings:
         names = [*words] or None
         return _show(webots_list_meanings, asked, as_json=json, signals=names)
     if len(words) > 1:
-        raise InvalidInputError(f"give one pattern, in quotes: {words[1]!r} is too much")
+        raise InvalidInputError(
+            f"Only one pattern is allowed, and {words[1]!r} is a second one. Put the pattern in "
+            "quotes, so that the shell does not expand it."
+        )
     given = {"pattern": words[0]} if words else {}
     given |= {"limit": limit, "cursor": cursor, "run_id": run_id}
     _show(webots_list_signals, asked, as_json=json, **given)
@@ -230,7 +238,7 @@ def _fields_of(words: tuple[str, ...]) -> dict[str, Any]:
     kinds = dict.fromkeys((each for each in MEANING_FIELDS if each not in limits), "str")
     said = settings_of(words, kinds)
     if not said:
-        raise InvalidInputError("--describe NAME needs FIELD=VALUE, such as quantity=speed")
+        raise InvalidInputError("--describe needs FIELD=VALUE, such as quantity=speed")
     if unknown := [name for name in said if name not in MEANING_FIELDS]:
         fields = ", ".join(MEANING_FIELDS)
         raise InvalidInputError(f"unknown field {unknown[0]!r:.80}. Fields: {fields}")
@@ -266,7 +274,7 @@ def breakpoint_(
     from webots_mcp.questions import set_breakpoints
 
     if condition is not None and breakpoint_id is not None:
-        raise InvalidInputError("give a condition to set, or --remove ID, not both")
+        raise InvalidInputError("A condition and --remove exclude each other. Give one of them.")
     if breakpoint_id is not None:
         remove = set_breakpoints.webots_remove_breakpoint
         return _show(remove, asked, as_json=json, breakpoint_id=breakpoint_id)
@@ -314,7 +322,7 @@ def field(
     from webots_mcp.questions.edit_scene import webots_get_field, webots_set_field
 
     if stop and value is None:
-        raise InvalidInputError("--stop goes with a VALUE that is set")
+        raise InvalidInputError("--stop goes with a VALUE to set. Add it, or leave --stop out.")
     if value is None:
         return _show(webots_get_field, asked, as_json=json, path=path, start=start)
     _show(webots_set_field, asked, as_json=json, path=path, value=value, stop=stop)
@@ -355,7 +363,9 @@ def audit(
     if json:
         return print_json({"requests": found})
     if not found:
-        return print("no request was refused" if refused else "nothing was asked for yet")
+        return print("No request was refused." if refused else "No request was made yet.")
+    what = "refused requests" if refused else "requests"
+    print(f"The newest {len(found)} {what}, newest first:")
     print_table(
         ("id", "when", "at_s", "by", "tool", "arguments", "outcome", "commands"),
         [_request_row(each) for each in found],
@@ -507,7 +517,10 @@ def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManage
     if options.scheduler is not None:
         return _cluster(options, plan)
     if options.ship_to is not None:
-        raise InvalidInputError("--ship-to is for --scheduler: what runs here is merged as it is")
+        raise InvalidInputError(
+            "--ship-to applies only to --scheduler: trials on this machine need no pool. Leave it "
+            "out."
+        )
     command_of = stand_in if options.stand_in else webots
     command_of(plan.world)
     return nullcontext(LocalSimulators(command_of, options.jobs or 1))
@@ -570,7 +583,10 @@ def _begun_set(
     with recording.reader() as connection:
         known = find_trial_set(connection, _text_of(plan, options))
     if known is None:
-        raise NothingRecordedError(f"no trials of {file} were begun with these options")
+        raise NothingRecordedError(
+            f"No trials of {file} were started with these options. Start them with 'webots-mcp "
+            f"trials {file}'."
+        )
     return known
 
 
@@ -641,13 +657,14 @@ def _show_trials(
             json.dumps({"trial_set_id": set_id, **_as_json(ranking), "runs": runs, "notes": notes})
         )
         return
+    print(as_typed(ranking.verdict))
     print_table(
-        ("rank", "parameters", "mean", "least", "greatest", "scores", "pruned", "failed", "why"),
+        ("rank", "parameters", "mean", "min", "max", "scores", "pruned", "failed", "why"),
         [_row(number, each) for number, each in enumerate(ranking.sets, 1)],
     )
     ids = [each.run_id for each in found if each.run_id is not None]
     where = f"runs {min(ids)} to {max(ids)}" if ids else "no run was recorded"
-    print_notes([ranking.verdict, f"trial set {set_id}, {where}; score: {plan.score}", *notes])
+    print_notes([f"trial set {set_id}, {where}; score: {plan.score}", *notes])
 
 
 def _row(number: int, ranked: Any) -> list[Any]:

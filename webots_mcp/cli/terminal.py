@@ -101,11 +101,22 @@ class Display(NamedTuple):
 
 _USUAL: Final = Display()
 _display: ContextVar[Display] = ContextVar("display", default=_USUAL)
+_recording_read: ContextVar[str] = ContextVar("recording_read", default="")
 
 
 def set_display(display: Display) -> None:
     """Show the answers of this command in this way."""
     _display.set(display)
+
+
+def note_recording(database: object) -> None:
+    """Remember which recording the command reads, for an error with `--verbose`."""
+    _recording_read.set(str(database))
+
+
+def recording_read() -> str:
+    """Return the database of the recording that the command reads; empty where it reads none."""
+    return _recording_read.get()
 
 
 def is_verbose() -> bool:
@@ -184,12 +195,15 @@ def _styled(line: str, style: str) -> str:
 
 def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:
     """Return what there is to know about an answer, whole."""
-    lines = textwrap.wrap(
-        f"note: {printable(as_typed(text))}",
+    note = f"note: {printable(as_typed(text))}"
+    if width >= _LAYOUT.endless:
+        return [" ".join(note.split())]
+    return textwrap.wrap(
+        note,
         min(width, _LAYOUT.paragraph),
         subsequent_indent=_LAYOUT.indent,
+        break_on_hyphens=False,
     )
-    return lines if width < _LAYOUT.endless else [" ".join(map(str.strip, lines))]
 
 
 def print_notes(notes: Iterable[str], file: TextIO | None = None) -> None:
@@ -385,6 +399,11 @@ def id_ranges(numbers: Sequence[int]) -> str | None:
         else:
             parts.append([number])
     return ", ".join(" to ".join(map(str, part)) for part in parts) or None
+
+
+def runs_named(numbers: Sequence[int]) -> str:
+    """Return runs as the subject of a sentence: run 4; runs 1 to 3, 7."""
+    return f"{'run' if len(numbers) == 1 else 'runs'} {id_ranges(numbers) or 'none'}"
 
 
 def clock_text(wall_time_s: float) -> str:

@@ -11,8 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 from cyclopts.validators import Number
 
 from webots_mcp.cli.options import HERE, Count, Json, Parameter, Where
-from webots_mcp.cli.streams import shown_progress
-from webots_mcp.cli.terminal import clock_text, id_ranges, print_json, print_notes, print_table
+from webots_mcp.cli.streams import shown_activity, shown_progress
+from webots_mcp.cli.terminal import (
+    clock_text,
+    print_json,
+    print_notes,
+    print_table,
+    runs_named,
+)
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plugins.pool.pool_contents import (
     RunFilter,
@@ -87,29 +93,29 @@ def _as_data(found: FetchResult) -> dict[str, Any]:
 
 
 def _print_fetched(found: FetchResult, address: str) -> None:
-    def ids(uuids: Iterable[str]) -> str | None:
-        return id_ranges([found.runs[uuid] for uuid in uuids])
+    def runs(uuids: Iterable[str]) -> str:
+        return runs_named([found.runs[uuid] for uuid in uuids])
 
-    print(f"fetched from {address}: run {id_ranges(found.come) or 'none'}")
+    print(f"Fetched {runs_named(found.come) if found.come else 'no new run'} from {address}.")
     if found.known:
-        print(f"here already: run {ids(found.known)}")
+        print(f"Already in this recording: {runs(found.known)}.")
     if found.only_chunks:
         print(
-            f"of run {ids(found.only_chunks)} only chunks were shipped, no rows "
-            "('webots-mcp ship --full' does)"
+            f"Only chunks were shipped of {runs(found.only_chunks)}, and no states. To ship states "
+            "use 'webots-mcp ship --full'."
         )
     if found.unchunked:
         print(
-            f"of run {ids(found.unchunked)} not all rows are in chunks: retention had deleted "
-            "those, or the recording could not be written where it was shipped ('webots-mcp ship "
-            "--full' ships rows that are still there)"
+            f"Some rows are missing in {runs(found.unchunked)}: retention had deleted them, or the "
+            "recording was read-only when it was shipped. 'webots-mcp ship --full' ships the rows "
+            "that still exist."
         )
     if found.going_on:
-        print(f"not taken: {_named(found.going_on)} goes on, or nobody has shipped its end")
+        print(f"Skipped {_named(found.going_on)}: still recording, or its end was not shipped yet.")
     if found.arriving:
         print(
-            f"not taken: {_named(found.arriving)} is not wholly shipped yet; where it was recorded "
-            "'webots-mcp ship' goes on, as it was given before; then fetch it again"
+            f"Skipped {_named(found.arriving)}: only partly shipped. Repeat 'webots-mcp ship' on "
+            "the machine that recorded it, then fetch again."
         )
 
 
@@ -162,13 +168,16 @@ def pool(
             answer = opened.select(sql, max_rows)
             return print_json(asdict(answer)) if json else _print_answer(answer)
         listed = _listed(opened, part, choice)
+        address = opened.address
     total = len(listed.found)
     if json:
         shown = [vars(each) for each in listed.found[:max_rows]]
         return print_json({listed.key: shown, "total": total})
-    print_table(listed.columns, listed.rows[:max_rows])
-    if total > max_rows:
-        print_notes([f"{total} {listed.key.replace('_', ' ')} in all: -n shows more"])
+    kind = listed.key.replace("_", " ").removesuffix("s" if total == 1 else "")
+    more = f", the first {max_rows} of which are shown (-n shows more)" * (total > max_rows)
+    print(f"{total or 'No'} {kind} in {address}{more}.")
+    if total:
+        print_table(listed.columns, listed.rows[:max_rows])
 
 
 class _List(NamedTuple):
@@ -277,11 +286,15 @@ def ship(
 
     if len(urls) > 1:
         raise InvalidInputError(
-            f"--to is given {len(urls)} times: one call ships to one pool; start another "
-            "for the other"
+            f"--to was given {len(urls)} times, but one command ships to one pool. Start one "
+            f"command "
+            "per pool."
         )
     if pause_s is not None and not follow:
-        raise InvalidInputError("--every is for --follow: without it, everything is shipped once")
+        raise InvalidInputError(
+            "--every applies only to --follow: without it, everything is shipped once. Add "
+            "--follow."
+        )
     (url,) = urls
     connect = functools.partial(open_pool, url, ships=True)
     order = ShippingJob(recorded.recording(), connect, full, pictures)
@@ -294,7 +307,8 @@ def ship(
             )  # Shorter pauses would make many small files.
             follow_recording(order, report, _say, pause_s or default_s)
         else:
-            ship_once(order, report)
+            with shown_activity(f"shipping to {redacted(url)}"):
+                ship_once(order, report)
             is_done = True
     finally:
         is_reported = json and isinstance(sys.exc_info()[1], WebotsMCPError)  # As the only object.
@@ -313,9 +327,9 @@ def _show_report(address: str, report: ShippingReport, *, is_done: bool, as_json
     sent = [f"{table} {rows}" for table, rows in sorted(report.rows.items()) if rows]
     sent += [f"pictures {report.pictures}"] if report.pictures else []
     if sent:
-        print(f"sent to {address}: {', '.join(sent)}")
+        print(f"Shipped to {address}: {', '.join(sent)}.")
     elif is_done:
-        print(f"{address} has everything already")
+        print(f"Nothing to ship: {address} already has everything.")
     print_notes(notes)
 
 
@@ -326,14 +340,13 @@ def _notes(report: ShippingReport) -> list[str]:
     if report.replaced:
         altered = [f"{column} {values}" for column, values in sorted(report.replaced.items())]
         notes.append(
-            "values that the pool cannot hold, in whose place is what comes nearest: "
-            + ", ".join(altered)
+            "values that the pool cannot hold, replaced by the nearest ones: " + ", ".join(altered)
         )
     if report.lost_pictures:
-        notes.append(f"pictures that are not there any more: {report.lost_pictures}")
+        notes.append(f"missing picture files: {report.lost_pictures}")
     for recording in sorted(set(report.foreign.values())):
         runs = [uuid for uuid, owner in report.foreign.items() if owner == recording]
         notes.append(
-            f"{len(runs)} runs are left to the recording {recording}, which shipped them before"
+            f"{len(runs)} runs were skipped: the recording {recording} shipped them before"
         )
     return notes

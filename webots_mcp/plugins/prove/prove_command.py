@@ -25,7 +25,7 @@ def prove(
         Path | None,
         Parameter(
             "--webots",
-            metavar="PATH",
+            metavar="WEBOTS",
             help="Folder or program of Webots. Default: as for 'webots-mcp launch'.",
         ),
     ] = None,

@@ -268,3 +268,8 @@ def test_questions_load_neither_the_server_nor_what_draws(story: Path) -> None:
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ended.stderr.strip() == "set()"
+
+
+def test_hints_in_verdicts_are_typed_as_options(told: Cli) -> None:
+    said = " ".join(told("events --run 1 --kind oscillation --kind change").split())
+    assert "signals=[" not in said and "where='" not in said

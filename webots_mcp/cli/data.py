@@ -678,5 +678,5 @@ def write_picture(file: Path, picture: PlotImage, *, as_json: bool = False) -> N
         return print_json(
             {"file": str(file), "caption": picture.caption, "notes": list(picture.notes)}
         )
-    print(f"{file}: {printable(picture.caption)}")
+    print(f"Wrote {file}: {printable(picture.caption)}")
     print_notes(picture.notes)

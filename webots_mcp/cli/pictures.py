@@ -104,17 +104,18 @@ def _save(
     reply = ask(question, given, asked)
     texts = [each for each in reply.shown if isinstance(each, str)]
     picture = next((each for each in reply.shown if not isinstance(each, str)), None)
-    if picture is None:
-        raise NothingRecordedError("; ".join(texts) or "no picture was recorded")
-    if not file.suffix:
-        file = file.with_suffix("." + picture.format.replace("jpeg", "jpg"))
-    with placed(file) as aside:
-        aside.write_bytes(picture.data)
     facts: dict[str, Any] = {}
     for text in texts:  # the facts are JSON, as a model reads them
         with contextlib.suppress(ValueError):
             facts |= json.loads(text)
+    if picture is None:
+        why = facts.get("hint") or facts.get("error")
+        raise NothingRecordedError(why or "; ".join(texts) or "no picture was recorded")
+    if not file.suffix:
+        file = file.with_suffix("." + picture.format.replace("jpeg", "jpg"))
+    with placed(file) as aside:
+        aside.write_bytes(picture.data)
     facts["file"] = str(file)
     if as_json:
         return print_json(facts)
-    print_answer({"summary": f"{file} written"} | facts)
+    print_answer({"summary": f"Wrote {file}."} | facts)

@@ -390,6 +390,8 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
             if schema_version(connection) == 0:
                 create_schema(connection)
             compile_project(connection, project)
+    if not any(project):
+        return None
     expected, signals = map(len, project)
     counted = f"{expected} expectation{'s' * (expected != 1)}"
     if signals:
@@ -555,32 +557,35 @@ def _is_shared(file: Path, project: Path | None = None) -> bool:
 def _print_controller(described: dict[str, Any]) -> None:
     if "python" not in described:
         note = f" ({described['note']})" if "note" in described else ""
-        print(f"  is {described['language']}{note}: {described['advice']}")
+        _print_folded("  ", f"is {described['language']}{note}: {described['advice']}")
         return
     if "lines" in described:
         file = described["lines_in"]
         place = f" in {file}" if file != described["file"] else ""
-        print(
-            f"  needs these lines{place}, the second after line {described['after_line']}, where "
-            f"the robot is created (or: webots-mcp init --patch {file})\n"
+        _print_folded(
+            "  ",
+            f"needs these lines{place}, the second after line {described['after_line']}, where "
+            f"the robot is created (or: webots-mcp init --patch {file})",
         )
-        print("".join(f"      {line}\n" for line in described["lines"]))
+        print("\n" + "".join(f"      {line}\n" for line in described["lines"]))
     elif "unclear" in described:
-        print(f"  where to add the lines is not clear: {described['unclear']}")
+        _print_folded("  ", f"where to add the lines is not clear: {described['unclear']}")
     else:
         print(f"  {described['has_bridge']}")
     if "lacks" in described:
-        print(f"  {described['lacks']}")
+        _print_folded("  ", described["lacks"])
     _print_python(described["python"])
 
 
 def _print_python(python: dict[str, Any]) -> None:
     version = f", {python['executable']}, Python {python['python']}" if "python" in python else ""
-    print(f"  Webots runs it with {python['command']!r} ({python['chosen_by']}){version}")
+    _print_folded(
+        "  ", f"Webots runs it with {python['command']!r} ({python['chosen_by']}){version}"
+    )
     if "error" not in python:
         print(f"  which has webots-mcp {python['bridge']}")
         return
-    print(f"  where webots-mcp cannot be used: {python['error']}")
+    _print_folded("  ", f"where webots-mcp cannot be used: {python['error']}")
 
 
 def doctor(
@@ -632,7 +637,10 @@ def _print_checks(checked: list[Checked]) -> None:
     counts = Counter(each.finding.verdict for each in checked)
     wrong = counts["wrong"]
     problems = f"{wrong} problem{'s' * (wrong != 1)} found" if wrong else "No problem found"
-    print(f"{problems}: {', '.join(f'{n} {verdict}' for verdict, n in counts.items())}.\n")
+    named = (
+        f"{n} {verdict}{'s' * (verdict == 'warning' and n > 1)}" for verdict, n in counts.items()
+    )
+    print(f"{problems}: {', '.join(named)}.\n")
     for check, finding in checked:
         _print_folded(f"{finding.verdict:13}  {check.name:15}  ", finding.seen)
         if finding.fix:

@@ -69,11 +69,11 @@ _LESS_IMPORTANT: Final = (
     "sha256", "git_commit", "world", "controller", "route", "database", "began_by", "kind_of",
     "own_ms", "step_wait_ms", "real_time_factor", "took_wall_s", "deviation", "pace", "command_id",
     "actions", "runs", "row_count", "age_s", "more", "set_by", "source", "live", "first_id",
-    "arguments",
+    "arguments", "by", "at_s",
 )  # fmt: skip
 # Columns that stay as long as two columns fit.
 _MOST_IMPORTANT: Final = frozenset(
-    {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode"}
+    {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode", "tool"}
 )
 # Columns whose words have a colour, and the colours of those words.
 _COLOURED_COLUMNS: Final = frozenset({"outcome", "status", "level", "ended_by", "verdict"})
@@ -470,6 +470,8 @@ class _Layout:
                 yield line
                 continue
             yield f"{name}:"
+            if name == "verdicts":
+                part = _as_typed_texts(part)
             # In rows of a database null is a value.
             if name == "result" and "rows" in part and not self._is_of_command:
                 part = part | {
@@ -506,6 +508,17 @@ class _Layout:
 
     def _wrapped(self, texts: Iterable[str]) -> list[str]:
         return textwrap.wrap(", ".join(texts), self._paragraph, subsequent_indent=_LAYOUT.indent)
+
+
+def _as_typed_texts(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return texts of our own, such as what to do where nothing was searched, as typed."""
+    typed: dict[str, Any] = {}
+    for name, value in part.items():
+        if isinstance(value, dict):
+            typed[name] = _as_typed_texts(cast("dict[str, Any]", value))
+        else:
+            typed[name] = as_typed(value) if isinstance(value, str) else value
+    return typed
 
 
 def _without_lists(

@@ -93,6 +93,11 @@ def _text_as_typed(text: str) -> str:
     for each in _running.get():
         shown = f"{each.typed} {each.value_name}" if each.typed.startswith("-") else each.typed
         text = re.sub(rf"{_UNQUOTED}{each.name}=(\[['.]+\]|\.\.\.)", shown, text)
+        text = re.sub(
+            rf"{_UNQUOTED}{each.name}=\[('?[\w.*]+'?)(?:, ('?[\w.*]+'?))?\]",
+            lambda found, typed=each.typed: " ".join(filter(None, (typed, found[1], found[2]))),
+            text,
+        )
         text = re.sub(rf"{_UNQUOTED}{each.name}=true\b", each.typed, text)
         text = re.sub(rf"{_UNQUOTED}{each.name}=false\b", each.turned_off or each.typed, text)
         text = re.sub(rf"{_UNQUOTED}{each.name}=", f"{each.typed} ", text)

@@ -97,5 +97,5 @@ def report(
             }
         )
     held = "".join(f", {name} {count}" for name, count in made.holds.items()).replace(",", ";", 1)
-    print(f"{file}: {printable(made.title)}, {size(len(made.html))}{held}")
+    print(f"Wrote {file}: {printable(made.title)}, {size(len(made.html))}{held}")
     print_notes([f"left out: {each}" for each in made.left_out])

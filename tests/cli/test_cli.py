@@ -225,7 +225,12 @@ def test_the_tail_follows_until_ctrl_c_and_says_so(rover: RecordedRobot, tmp_pat
         assert "it goes on" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
-    assert (process.returncode, out, err) == (130, "", "webots-mcp: ended by Ctrl-C\n")
+    assert (process.returncode, out) == (130, "")
+    database = tmp_path / "webots.db"
+    assert err.splitlines() == [
+        f"webots-mcp: following all robots in {database}; Ctrl-C stops it",
+        "webots-mcp: ended by Ctrl-C",
+    ]
 
 
 def test_a_reader_that_has_seen_enough_ends_the_tail_quietly(
@@ -237,7 +242,21 @@ def test_a_reader_that_has_seen_enough_ends_the_tail_quietly(
         process.stdout.close()
         wait_for(lambda: rover.log(2.0, "into the void") and process.poll() is not None)
         assert process.stderr is not None
-        assert (process.wait(timeout=30), process.stderr.read()) == (0, "")
+        assert (process.wait(timeout=30), process.stderr.read().count("\n")) == (0, 1)
+
+
+@pytest.mark.usefixtures("rover")
+def test_an_error_shows_its_place_and_the_recording_with_verbose(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["history", "moed", "--data-dir", str(tmp_path)]
+    assert main(typed) == 2
+    short = capsys.readouterr().err
+    assert main([*typed, "--verbose"]) == 2
+    long = capsys.readouterr().err
+    assert "Traceback" not in short and long.startswith(short)
+    assert f"\nrecording: {tmp_path / 'webots.db'}\nTraceback " in long
+    assert "UnknownSignalError: " in long
 
 
 def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -70,7 +70,7 @@ def test_export_writes_csv_to_a_pipe(database: Path) -> None:
 
 def test_export_takes_the_format_from_the_name(say: Say, tmp_path: Path) -> None:
     file = tmp_path / "run.jsonl"
-    assert say("export", "-o", str(file), "--since", "0") == f"{file}: 857 rows\n"
+    assert say("export", "-o", str(file), "--since", "0") == f"Exported 857 rows to {file}.\n"
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert {line["run_id"] for line in lines} == {1, 2}
 
@@ -88,8 +88,8 @@ def test_export_for_viewers_tells_what_the_file_holds_and_where_the_layout_is(
     file = tmp_path / "run.mcap"
     said = say("export", "-o", str(file), "--run", "1", "--start", "0", "--end", "8")
     layout = tmp_path / "run.layout.json"
-    assert said.startswith(f"{file}: 249 states, ")
-    assert said.endswith(f"; layout for Foxglove and Lichtblick: {layout}\n")
+    assert said.startswith("Exported 249 states, ")
+    assert said.endswith(f" to {file}. Layout for Foxglove and Lichtblick: {layout}\n")
     assert sorted(tmp_path.glob("run.*")) == [layout, file]
 
 
@@ -101,14 +101,16 @@ def test_export_writes_the_trials_of_a_set(
         for trial in trials_of(connection, set_id):
             finish_trial(connection, trial, TrialResult(None, trial.values["kp"] * 2, None))
     file = tmp_path / "trials.csv"
-    assert say("export", "--trials", str(set_id), "-o", str(file)) == f"{file}: 2 rows\n"
+    assert (
+        say("export", "--trials", str(set_id), "-o", str(file)) == f"Exported 2 rows to {file}.\n"
+    )
     rows = list(csv.DictReader(io.StringIO(file.read_text())))
     assert [(row["kp"], row["score"], row["rank"]) for row in rows] == [
         ("1.0", "2.0", "2"),
         ("2.0", "4.0", "1"),
     ]
     line = ("export", "--database", str(database), "--trials", "1", "--last", "5")
-    assert "--trials or a range" in complaint(capsys, *line)
+    assert "--trials cannot be combined with" in complaint(capsys, *line)
 
 
 @pytest.mark.parametrize("output", ["a.csv", "-"])
@@ -156,7 +158,7 @@ def test_what_export_tells_is_not_mixed_with_a_table_on_stdout(
     database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", "--json", "--database", str(database)]) == 2
-    assert "--json tells what a file got" in json.loads(capsys.readouterr().out)["error"]
+    assert "--json describes an exported file" in json.loads(capsys.readouterr().out)["error"]
 
 
 # -- import ---------------------------------------------------------------------------------------
@@ -170,13 +172,16 @@ def test_import_takes_in_another_recording_with_its_trials_once(
         set_id = create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}])
         finish_trial(connection, trials_of(connection, set_id)[0], TrialResult(2, 4.5, None))
     new = tmp_path / "new" / "webots.db"
-    for told in ("new here: run 1 to 2", "nothing is new: run 1 to 2 was here already"):
+    for told in (
+        f"Imported runs 1 to 2 from {database}.",
+        f"Nothing new in {database}: runs 1 to 2 were imported before.",
+    ):
         assert main(["import", str(database), "--data-dir", str(new.parent)]) == 0
-        assert capsys.readouterr().out == f"{database}: {told}\n"
+        assert capsys.readouterr().out == f"{told}\n"
         assert query(new, "SELECT status, score, run_id FROM trial") == [("done", 4.5, 2)]
         assert query(new, "SELECT count(*) FROM run") == [(2,)]
     said = complaint(capsys, "import", str(new), "--database", str(new))
-    assert "is the recording itself" in said
+    assert "is the recording that would be imported into" in said
 
 
 def test_a_bundle_goes_from_one_recording_to_another(
@@ -187,23 +192,30 @@ def test_a_bundle_goes_from_one_recording_to_another(
         connection.execute("UPDATE run SET ended_wall_time_s = 1.0")
     file, new = tmp_path / "run.zip", tmp_path / "new"
     assert main(["export", "--run", "2", "-o", str(file), "--database", str(database)]) == 0
-    assert capsys.readouterr().out == f"{file}: run 2, {file.stat().st_size:,} bytes\n"
-    for told in ("new here: run 1", "nothing is new: run 1 was here already"):
+    assert capsys.readouterr().out == (
+        f"Exported run 2 ({file.stat().st_size:,} bytes) to {file}.\n"
+    )
+    for told in (
+        f"Imported run 1 from {file}.",
+        f"Nothing new in {file}: run 1 was imported before.",
+    ):
         assert main(["import", str(file), "--data-dir", str(new)]) == 0
-        assert capsys.readouterr().out == f"{file}: {told}\n"
+        assert capsys.readouterr().out == f"{told}\n"
     assert main(["import", str(file), "--data-dir", str(new), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {
         "source": str(file), "new_run_ids": [], "known_run_ids": [1], "changed": False,
     }  # fmt: skip
     assert query(new / "webots.db", "SELECT count(*) FROM state") == [(327,)]
     assert main(["import", str(database), "--data-dir", str(new)]) == 0
-    assert capsys.readouterr().out == f"{database}: new here: run 2; run 1 was here already\n"
+    assert capsys.readouterr().out == (
+        f"Imported run 2 from {database}; run 1 was imported before.\n"
+    )
     with closing(connect(database, "writer")) as connection:
         create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}])
     assert main(["import", str(database), "--data-dir", str(new)]) == 0
-    assert "no run is new, but sessions without runs, or trials, are" in capsys.readouterr().out
+    assert "no new run" in capsys.readouterr().out
     line = ("export", "--last", "5", "-o", str(file), "--database", str(database))
-    assert "a bundle is a whole run" in complaint(capsys, *line)
+    assert "bundle holds a whole run" in complaint(capsys, *line)
 
 
 def test_what_says_it_is_a_bundle_and_is_none_makes_no_database(
@@ -231,21 +243,24 @@ def test_what_is_no_recording_is_not_imported(
 def test_a_dry_run_tells_what_would_go_and_deletes_nothing(say: Say, database: Path) -> None:
     before = query(database, "SELECT count(*) FROM state")
     text = say("prune", "--dry-run", "--keep-states", "400rows")
-    *table, disk = text.splitlines()
-    assert [line.split()[:2] for line in table] == [["would", "go"], ["state", "530"]]
-    assert disk.startswith("note: the file has ") and ", about: states " in disk
+    answer, *table, disk = text.splitlines()
+    assert answer.startswith("Would delete 530 rows beyond the limits, about ")
+    assert [line.split()[:2] for line in table] == [["kind", "rows"], ["state", "530"]]
+    assert disk.startswith("note: the file takes ") and ": states " in disk
     assert query(database, "SELECT count(*) FROM state") == before
 
 
 def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
     text = say("prune", "--keep-states", "400rows", "--keep-images", "all")
-    assert text.splitlines()[1].split()[:2] == ["state", "530"]
+    answer, _, states, *_ = text.splitlines()
+    assert answer.startswith("Deleted 530 rows beyond the limits, about ")
+    assert states.split()[:2] == ["state", "530"]
     assert query(database, "SELECT run_id, row_count, purged_rows FROM robot_run") == [
         (1, 530, 530),
         (2, 327, 0),
     ]
     assert query(database, "PRAGMA integrity_check") == [("ok",)]
-    assert say("prune", "--keep-states", "400rows") == "nothing is beyond the limits\n"
+    assert say("prune", "--keep-states", "400rows") == "Nothing is beyond the limits.\n"
 
 
 def test_what_is_pruned_is_told_to_programs_in_bytes_and_ids(say: Say, database: Path) -> None:
@@ -264,18 +279,19 @@ def test_what_is_pruned_is_told_to_programs_in_bytes_and_ids(say: Say, database:
 
 
 def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None:
-    assert say("retention", "1") == ""
+    assert say("retention", "1") == "Marked run 1: never pruned.\n"
     nothing, note = say("prune", "--keep-states", "400rows").splitlines()
-    assert nothing == "nothing is beyond the limits"
+    assert nothing == "Nothing is beyond the limits."
     assert "kept because of a label, a note or a mark, and not counted: run 1, about " in note
-    say("retention", "1", "--release")
+    released = say("retention", "1", "--release")
+    assert released == "Removed the mark from run 1: retention applies again.\n"
     say("prune", "--keep-states", "400rows")
     assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(530,)]
 
 
 def test_what_is_too_old_but_among_the_newest_is_told(say: Say, database: Path) -> None:
     text = say("prune", "--dry-run", "--keep-states", "0s")
-    assert "beyond the limit, but spared: 857 rows of state, about " in text
+    assert "beyond the limit, but kept: 857 rows of state, about " in text
     assert "too old, but among the newest 50000" in text
 
 
@@ -339,7 +355,7 @@ def test_how_long_runs_are_kept_cannot_be_written_the_wrong_way_round(
     times: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = complaint(capsys, "prune", "--keep-runs", times)
-    assert f"--keep-runs: {times!r} must be a number, 1 or more, or all" in said
+    assert f"--keep-runs: {times!r} is not a number of times. Give a number from 1, or all." in said
 
 
 @pytest.mark.parametrize(
@@ -360,7 +376,7 @@ def test_a_recording_to_import_that_is_not_there_is_told(
 
 @pytest.mark.parametrize(
     ("more", "told"),
-    [(("--format", "mcap"), "give a file with -o"), (("-o", "a.mcap", "--trials", "1"), "a table")],
+    [(("--format", "mcap"), "Name a file with -o"), (("-o", "a.mcap", "--trials", "1"), "a table")],
 )
 def test_what_viewers_read_is_neither_for_a_pipe_nor_of_trials(
     database: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str

@@ -56,14 +56,14 @@ def test_the_list_names_the_command_that_describes_what_is_unknown(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--describe", "u", "--undo", "u"), "not both"),
-        (("--describe", "u"), "--describe NAME needs FIELD=VALUE, such as quantity=speed"),
-        (("--describe", "u", "speed"), "names no value: write speed=VALUE"),
+        (("--describe", "u", "--undo", "u"), "exclude each other"),
+        (("--describe", "u"), "--describe needs FIELD=VALUE, such as quantity=speed"),
+        (("--describe", "u", "speed"), "has no value. Write speed=VALUE"),
         (("--describe", "u", "kind=speed"), "unknown field 'kind'. Fields: quantity, role"),
         (("--describe", "u", "low=a"), "low"),
-        (("--undo", "u", "v"), "--undo takes one name"),
+        (("--undo", "u", "v"), "--undo takes one signal"),
         (("--undo", "u"), "No meaning is declared for signal 'u'"),
-        (("a", "b"), "give one pattern, in quotes"),
+        (("a", "b"), "Only one pattern is allowed"),
     ],
 )
 def test_what_is_typed_wrong_is_refused_with_what_to_type(

@@ -124,7 +124,7 @@ def test_a_damaged_file_is_refused_and_the_others_are_written(project: Path) -> 
     ended = run(cwd=project)
     assert ended.returncode == 2
     assert "line 2, column 7" in ended.stdout
-    assert "mcp.json; the reasons are above" in ended.stderr
+    assert "mcp.json could not be written. The reasons are above" in ended.stderr
     assert (project / ".vscode" / "mcp.json").read_text() == '{"servers": {\n  "a" 1}}'
     assert (project / ".mcp.json").exists()
 
@@ -158,7 +158,7 @@ def test_patch_shows_a_diff_and_undo_gives_the_same_bytes(project: Path) -> None
     assert (again.returncode, "already patched" in again.stdout) == (0, True)
     file.with_suffix(".cpp").write_text("int main() {}\n")
     other = run("--patch", str(file.with_suffix(".cpp")), "--yes", cwd=project)
-    assert (other.returncode, "no file of Python" in other.stderr) == (2, True)
+    assert (other.returncode, "is not a Python file" in other.stderr) == (2, True)
     undone = json.loads(run("--undo", str(file), "--yes", "--json", cwd=project).stdout)
     assert [(each["file"], each["outcome"]) for each in undone["files"]] == [(str(file), "written")]
     assert "\n-MCPBridge.attach(robot)\n" in undone["files"][0]["diff"]
@@ -214,3 +214,27 @@ def test_what_a_plain_robot_cannot_do_is_said_with_the_line_that_adds_an_observe
     assert "webots-mcp init --observer worlds/arena.wbt adds a robot" in said
     (project / "controllers" / "mcp_observer").mkdir()
     assert "plain Robot" not in run("--dry-run", cwd=project).stdout
+
+
+def test_it_ends_with_the_commands_that_follow_and_the_first_question(project: Path) -> None:
+    (project / "worlds" / "arena.wbt").write_text("#VRML_SIM R2025a utf8\n", "utf-8")
+    told = run(cwd=project).stdout
+    steps = json.loads(run("--json", cwd=project).stdout)["next"]
+    assert steps[0] == "webots-mcp init --patch 'controllers/läufer/läufer.py'"
+    assert steps[1].startswith("webots-mcp launch worlds/arena.wbt")
+    assert steps[2].endswith("What is the robot doing?")
+    assert told.splitlines()[-3:] == [f"  {n}. {step}" for n, step in enumerate(steps, 1)]
+    patched = run("--patch", "controllers/läufer/läufer.py", "--yes", cwd=project).stdout
+    assert patched.splitlines()[-1] == f"Next: {steps[1]}"
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="Git is not installed")
+def test_files_with_paths_of_this_machine_are_named_until_the_repository_ignores_them(
+    project: Path,
+) -> None:
+    assert ".gitignore: they hold" not in run(cwd=project).stdout
+    subprocess.run(["git", "init", "--quiet", str(project)], check=True)
+    told = run(cwd=project).stdout
+    assert "add .mcp.json, .cursor/mcp.json and .vscode/mcp.json to .gitignore: they hold" in told
+    (project / ".gitignore").write_text(".mcp.json\n.cursor/\n", "utf-8")
+    assert "add .vscode/mcp.json to .gitignore" in run(cwd=project).stdout

@@ -268,8 +268,8 @@ def test_the_stand_in_runs_a_file_for_an_extern_robot(
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (["--robot", "rover=x.py"], "--robot is for --stand-in"),
-        (["--stand-in", "--robot", "rover"], "--robot 'rover' is not NAME=FILE"),
+        (["--robot", "rover=x.py"], "--robot applies only to --stand-in"),
+        (["--stand-in", "--robot", "rover"], "--robot 'rover' is not of the form NAME=FILE"),
     ],
 )
 def test_a_file_for_a_robot_is_refused_where_it_cannot_be_run(
@@ -285,4 +285,4 @@ def test_what_only_webots_has_is_refused_for_the_stand_in(
 ) -> None:
     process = launch(project(), "--stand-in", "--stream")
     _, told = process.communicate(timeout=60)
-    assert (process.returncode, "--stream and --port are Webots' own" in told) == (2, True)
+    assert (process.returncode, "--stream and --port apply only to Webots" in told) == (2, True)

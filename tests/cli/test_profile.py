@@ -55,4 +55,4 @@ def test_without_the_sampler_or_a_controller_it_is_said_what_to_do(
     simulation.close()
     gone = here.ended("profile")[2]
     assert "webots-mcp profile needs" in missing and "install" in missing
-    assert "no controller of rover runs on this machine" in gone
+    assert "No controller of rover is running on this machine" in gone

@@ -221,12 +221,37 @@ def test_examples_can_be_typed() -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("signals", "'*' is any text. (*)"),
-        ("events", "without a value that count as missing. (1)"),
+        ("signals", "'*' means any text. Default: all."),
+        ("events", "Metres it may move meanwhile. Default: 0.05."),
     ],
 )
 def test_help_loses_no_word_and_no_default(cli: Cli, name: str, words: str) -> None:
     assert words in cli.on()(f"{name} --help")
+
+
+# Fragments and private words that a help text once had.
+UNCLEAR = re.compile(
+    r"\b(so (much|many|long)|mends?|the way|looks? (at|for)|is told|tell clients|beside)\b",
+    re.IGNORECASE,
+)
+
+
+def test_each_help_text_is_a_sentence_in_plain_words() -> None:
+    for name, command in described().items():
+        texts = [command.text, *command.arguments.values()]
+        assert [text for text in texts if UNCLEAR.search(text)] == [], name
+        assert [text for text in texts[1:] if not re.match(r"[A-Z.*'].*[.)]$", text)] == [], name
+        summary = command.text.partition("\n\n")[0]
+        assert summary.endswith(".") and len(summary) <= 100, name
+        values = {option.partition(" ")[2] for typed in command.arguments
+                  for option in typed.split(", ") if option.startswith("-")}  # fmt: skip
+        assert values.isdisjoint({"INT", "STR", "FLOAT", "PATH"}), name
+
+
+def test_a_hint_to_the_tool_that_steers_names_the_command_with_its_robot() -> None:
+    hint = "Go on with webots_simulation_control(command='resume', robot='my rover')."
+    assert as_typed(hint) == "Go on with 'webots-mcp resume --robot 'my rover''."
+    assert as_typed("webots_simulation_control('step')") == "'webots-mcp step'"
 
 
 def test_each_command_that_stands_for_a_tool_exists() -> None:
@@ -243,3 +268,8 @@ def test_questions_load_neither_the_server_nor_what_draws(story: Path) -> None:
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ended.stderr.strip() == "set()"
+
+
+def test_hints_in_verdicts_are_typed_as_options(told: Cli) -> None:
+    said = " ".join(told("events --run 1 --kind oscillation --kind change").split())
+    assert "signals=[" not in said and "where='" not in said

@@ -172,5 +172,5 @@ def test_no_password_of_an_address_is_written_into_a_project(
     (tmp_path / "worlds").mkdir()
     for url in ("http://me:hidden@robots.lab/mcp", "http://", "http://robots lab"):
         assert main(["init", str(tmp_path), "--http", url]) == 2
-        assert "is no URL without user and password" in capsys.readouterr().err
+        assert "is not a URL of a server without user and password" in capsys.readouterr().err
     assert not (tmp_path / ".mcp.json").exists()

@@ -34,15 +34,16 @@ EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
 
-Controllers record into one SQLite database. An AI assistant reads it and steers the simulation over
-MCP. Try `webots-mcp demo` first. `webots-mcp COMMAND --help` explains a command, and
-`webots-mcp help TOPIC` prints what the documentation says about a topic.
+Controllers record into one SQLite database. An AI assistant reads it, and steers the simulation,
+over MCP. Try `webots-mcp demo` first. For the options of a command use `webots-mcp COMMAND --help`;
+for the documentation of a topic use `webots-mcp help TOPIC`.
 """
 _HELP_OF_A_FEW: Final = (
     "\nThese are the everyday commands; `webots-mcp --help --all` lists all {number}.\n"
 )
 _HELP_OF_DISPLAY: Final = (
-    "\nEvery command takes `--verbose` (show every column and detail) and `--no-color`.\n"
+    "\nEvery command accepts `--verbose` (show all columns and details, and where an error was "
+    "raised) and `--no-color`.\n"
 )
 
 
@@ -83,11 +84,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _take_global_options(given: list[str]) -> list[str]:
     """Set how answers are shown; returns the rest, with the command's name of today."""
     from webots_mcp.cli.commands import FORMER_NAMES
-    from webots_mcp.cli.terminal import Display, set_display
+    from webots_mcp.cli.terminal import Display, note_recording, set_display
 
     end = given.index("--") if "--" in given else len(given)
     options, rest = given[:end], given[end:]
     set_display(Display("--verbose" in options, "--no-color" not in options))
+    note_recording("")
     options = [each for each in options if each not in ("--verbose", "--no-color")]
     if options and (name := FORMER_NAMES.get(options[0])):
         with contextlib.suppress(OSError):
@@ -157,11 +159,24 @@ def _end(code: int, text: str) -> int:
     """Say why in one line; what could not be printed before is not tried again at the exit."""
     with contextlib.suppress(OSError):
         print(f"webots-mcp: {spelled_out(text)}", file=sys.stderr, flush=True)
+        _print_details()
     try:
         sys.stdout.flush()
     except OSError:
         _discard_output()
     return code
+
+
+def _print_details() -> None:
+    """With `--verbose`, print which recording was read and where the error was raised."""
+    from webots_mcp.cli.terminal import is_verbose, recording_read
+
+    error = sys.exc_info()[1]
+    if not is_verbose() or error is None or isinstance(error, KeyboardInterrupt):
+        return
+    print(f"recording: {spelled_out(recording_read() or 'none was read')}", file=sys.stderr)
+    lines = "".join(traceback.format_exception(error)).splitlines()
+    print("\n".join(map(spelled_out, lines)), file=sys.stderr, flush=True)
 
 
 def _explain_missing(error: ModuleNotFoundError) -> str:

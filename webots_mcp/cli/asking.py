@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import shlex
 import sys
 import types
@@ -59,14 +60,19 @@ OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
 _VALUE_NAMES: Final = {
     "_s": "S", "_m": "M", "_px": "PX", "limit": "N", "robot": "NAME", "run_id": "ID",
     "signals": "SIGNAL", "position": "X Y", "mode": "SIGNAL",
-    "where": "CONDITION", "until": "CONDITION",
+    "where": "CONDITION", "until": "CONDITION", "cursor": "CURSOR", "trial_set": "SET",
+    "text": "TEXT", "note": "TEXT", "kinds": "KIND", "types": "TYPE", "names": "NAME",
+    "fields": "FIELD",
 }  # fmt: skip
+_NAMES_OF_TYPES: Final[Mapping[Any, str]] = types.MappingProxyType(
+    {int: "N", float: "X", str: "TEXT"}
+)
 # What a person does not give, where a model's client would soon give up waiting.
 _DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_wall_s": 600.0})
 _FOLLOW: Final = Annotated[
     bool,
     Parameter(
-        "--follow", help="Go on with what comes, until Ctrl-C. As JSON each row is an object."
+        "--follow", help="Keep printing new rows until Ctrl-C. With --json each is an object."
     ),
 ]
 
@@ -353,12 +359,12 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         kind = tuple[(str,) * number]
     elif _is_json(kind):
         kind = str if declared.default is inspect.Parameter.empty else str | None
-    text = as_typed(question.described(name))
+    text = _help_of(question, name)
     default = declared.default if isinstance(declared.default, bool) else None
     if declared.default is inspect.Parameter.empty:
         default = inspect.Parameter.empty
     elif not isinstance(usual := _DEFAULTS.get(name, declared.default), bool) and usual:
-        text = f"{text} ({usual:g})" if isinstance(usual, float) else f"{text} ({usual})"
+        text += f" Default: {usual:g}." if isinstance(usual, float) else f" Default: {usual}."
     text = text.replace("*", r"\*")  # help is Markdown, where two of them would be emphasis
     if default is None and type(None) not in get_args(kind):
         kind = Union[kind, None]  # noqa: UP007
@@ -376,16 +382,26 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         )  # fmt: skip
         place = inspect.Parameter.POSITIONAL_ONLY
     elif default is True:  # its option is the one that turns it off
+        text += f" This is the default; {option} turns it off."
         shown = Parameter(f"--{name.replace('_', '-')}", help=text, negative=option)
     else:
         converter = whole_number if _without_none(kind) is int else None
         is_text = _without_none(kind) is str
         shown = Parameter(
             option, help=text, negative=(), converter=converter,
-            metavar="NAME=VALUE" if _is_mapping(_plain(declared.annotation)) else _value_name(name),
+            metavar="NAME=VALUE"
+            if _is_mapping(_plain(declared.annotation))
+            else _value_name(name) or _NAMES_OF_TYPES.get(_without_none(kind)),
             allow_leading_hyphen=is_text, validator=refuse_options if is_text else None,
         )  # fmt: skip
     return inspect.Parameter(name, place, default=default, annotation=Annotated[kind, shown])
+
+
+def _help_of(question: Question, argument: str) -> str:
+    """Return what an argument means, with examples as they are typed."""
+    text = as_typed(question.described(argument))
+    text = re.sub(r"\{['\"](\w+)['\"]: ([^{},]+)\}", r"\1=\2", text)
+    return re.sub(r"\['(\w+)'\]", r"\1", text)
 
 
 def _value_name(argument: str) -> str | None:

@@ -18,7 +18,6 @@ from webots_mcp.cli.options import (
     Json,
     Parameter,
     RetentionOptions,
-    Robot,
     TimeRangeOptions,
     Where,
     make_chunks_first,
@@ -28,8 +27,15 @@ from webots_mcp.cli.options import (
     refuse_options,
     whole_number,
 )
-from webots_mcp.cli.streams import binary_stdout, shown_progress, wait
-from webots_mcp.cli.terminal import id_ranges, print_json, print_notes, print_table, printable
+from webots_mcp.cli.streams import binary_stdout, shown_activity, shown_progress, wait
+from webots_mcp.cli.terminal import (
+    id_ranges,
+    print_json,
+    print_notes,
+    print_table,
+    printable,
+    runs_named,
+)
 from webots_mcp.database.files import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.plugin_registry import export_formats
@@ -73,18 +79,19 @@ def export(
             metavar="FILE",
             allow_leading_hyphen=True,  # for stdout
             validator=refuse_options,
-            help="A .csv, .jsonl, .parquet, .mcap, .rrd or .zip file; by default CSV to stdout.",
+            help="File to write: .csv, .jsonl, .parquet, .mcap, .rrd or .zip. Default: CSV to "
+            "stdout.",
         ),
     ] = None,
     form: Annotated[
-        _Format | None, Parameter("--format", help="Where the file's name does not tell it.")
+        _Format | None, Parameter("--format", help="File format. Default: by the ending of FILE.")
     ] = None,
     safe_cells: Annotated[
         bool,
         Parameter(
             "--safe-cells",
-            help="In CSV, an apostrophe before texts that a spreadsheet would run as a formula "
-            "(they begin with =, +, - or @).",
+            help="In CSV, put an apostrophe before texts that a spreadsheet would run as a formula "
+            "(they start with =, +, - or @).",
         ),
     ] = False,
     trial_set: Annotated[
@@ -92,22 +99,30 @@ def export(
         Parameter(
             "--trials",
             metavar="SET",
-            help="The trials of that set instead, one row each, with score, rank and spread.",
+            help="Export the trials of this set instead, one row each, with score, rank and "
+            "spread.",
         ),
     ] = None,
     part: TimeRangeOptions = _ALL,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Write recorded states as a table, or all of a run for a viewer or for another recording.
+    """Export states as a table, or a whole run for a viewer or for another recording.
 
-    The newest run is written, or a range; --since 0 writes all runs of a robot. A table has one row
-    per state; columns are run, row, times, and the dotted names of what the controller published;
-    NaN and infinity are kept. A .mcap (Foxglove, Lichtblick, PlotJuggler) or .rrd file (Rerun) has
-    states, poses, pictures, log lines, events and commands. A .zip file is a bundle: a run that is
-    over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet
-    needs pyarrow, MCAP mcap, and Rerun rerun-sdk; the line that installs them is printed. --json
-    tells what a file got.
+        webots-mcp export --run 4 -o run4.csv
+
+    Exports the newest run unless a run or a range is given; --since 0 exports all runs of a robot.
+
+    Tables (.csv, .jsonl, .parquet) have one row per state. The columns are run, row, times, and the
+    dotted names of published signals. NaN and infinity are kept.
+
+    Files for viewers, .mcap (Foxglove, Lichtblick, PlotJuggler) and .rrd (Rerun), hold states,
+    poses, pictures, log lines, events and commands.
+
+    A .zip bundle holds one finished run with its pictures, for 'webots-mcp import'.
+
+    Parquet needs pyarrow, MCAP needs mcap and Rerun needs rerun-sdk. If one is missing, the error
+    shows the command that installs it.
     """
     from webots_mcp.store.export import BUNDLE, FOR_VIEWERS, FORMATS, format_of
     from webots_mcp.store.reading.ranges import Scope
@@ -115,14 +130,23 @@ def export(
     file = output if output != _STDOUT else None
     form = form or (format_of(file) if file else "csv")
     if trial_set is not None and part.scope() != Scope():
-        raise InvalidInputError("give --trials or a range of states, not both")
+        raise InvalidInputError(
+            "--trials cannot be combined with a robot, run or range of states, because trials are "
+            "a "
+            "table of their own. Leave one of them out."
+        )
     recording = recorded.recording()
     if file is None:
         _require_for_stdout(form, as_json=json)
     elif isinstance(recording.database, Path) and file.resolve() == recording.database:
-        raise InvalidInputError(f"{file} is the recording itself: choose another file")
+        raise InvalidInputError(
+            f"{file} is the recording itself, which would be lost. Choose another file with -o."
+        )
     if trial_set is not None and form not in FORMATS:
-        raise InvalidInputError(f"trials are a table: choose {' or '.join(FORMATS)}, not {form}")
+        raise InvalidInputError(
+            f"Trials cannot be exported as {form}, because they are a table. Use "
+            f"--format {' or '.join(FORMATS)}."
+        )
     if form == BUNDLE and file is not None:
         return _show(_export_bundle(recorded, part, file), as_json=json)
 
@@ -141,12 +165,14 @@ def _require_for_stdout(form: str, *, as_json: bool) -> None:
     from webots_mcp.store.export import FORMATS
 
     if form not in FORMATS:
-        raise InvalidInputError(f"{form} is not for stdout: give a file with -o")
+        raise InvalidInputError(f"{form} cannot be written to stdout. Name a file with -o.")
     if not FORMATS[form].is_text and sys.stdout.isatty():
-        raise InvalidInputError(f"{form} is not for a terminal: give a file with -o")
+        raise InvalidInputError(f"{form} is binary and not for a terminal. Name a file with -o.")
     if as_json:
         raise InvalidInputError(
-            "--json tells what a file got: give one with -o; --format jsonl writes states as JSON"
+            "--json describes an exported file, and none was named. Name one with -o, or write "
+            "states "
+            "as JSON with --format jsonl."
         )
 
 
@@ -174,7 +200,7 @@ def _export_table(
             write(connection, wanted, form, binary_stdout(), progress, **how)
             return _Written(None, "", {}, tuple(notes))
         rows = export_file(connection, wanted, form, file, progress, **how)
-    return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(notes))
+    return _Written(file, f"{rows:,} rows", {"row_count": rows}, tuple(notes))
 
 
 def _export_for_viewers(recorded: Where, part: TimeRangeOptions, file: Path, form: str) -> _Written:
@@ -189,7 +215,7 @@ def _export_for_viewers(recorded: Where, part: TimeRangeOptions, file: Path, for
     by_kind = {kind.replace(" ", "_"): count for kind, count in counts.items()}
     data: dict[str, Any] = {"counts": by_kind}
     if written.beside:
-        text, data["beside"] = f"{text}; {written.beside}", written.beside
+        data["beside"] = written.beside
     return _Written(file, text, data, (*_notes_of(wanted), *written.notes))
 
 
@@ -205,7 +231,10 @@ def _export_bundle(recorded: Where, part: TimeRangeOptions, file: Path) -> _Writ
 
     scope, recording = part.scope(), recorded.recording()
     if scope != Scope(robot=scope.robot, run_id=scope.run_id):
-        raise InvalidInputError("a bundle is a whole run: give --run or --robot, and no times")
+        raise InvalidInputError(
+            "A .zip bundle holds a whole run, so a time range cannot be applied. Use only --run or "
+            "--robot."
+        )
     assert isinstance(recording.database, Path)
     with recorded.reader() as connection, shown_progress("packing") as progress:
         run_id = find_subject(connection, scope.robot, scope.run_id).run_id
@@ -214,14 +243,16 @@ def _export_bundle(recorded: Where, part: TimeRangeOptions, file: Path) -> _Writ
             write_bundle(connection, *place, aside, progress)
     size = file.stat().st_size
     data = {"run_id": run_id, "size_bytes": size}
-    return _Written(file, f"run {run_id}, {size:,} bytes", data)
+    return _Written(file, f"run {run_id} ({size:,} bytes)", data)
 
 
 def _show(written: _Written, *, as_json: bool) -> None:
     if as_json:
         return print_json({"file": str(written.file), **written.data, "notes": list(written.notes)})
     if written.file is not None:
-        print(f"{written.file}: {written.text}")
+        beside = str(written.data.get("beside", ""))
+        beside = f" {beside[0].upper()}{beside[1:]}" if beside else ""
+        print(f"Exported {written.text} to {written.file}.{beside}")
     print_notes(written.notes, sys.stderr)  # stdout may be the table
 
 
@@ -230,7 +261,7 @@ def import_(
         Path,
         Parameter(
             "SOURCE",
-            help="A recording, a webots.db; or a bundle, a .zip of 'webots-mcp export'.",
+            help="Database of another recording (webots.db), or a .zip bundle.",
         ),
     ],
     /,
@@ -238,24 +269,31 @@ def import_(
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Import another recording.
+    """Import the runs of another recording, or of a bundle made by 'webots-mcp export'.
 
-    A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
-    is there already is left as it is, so that it may be imported again.
+        webots-mcp import run4.zip
+
+    The source must not be recording. Runs that were imported before are left unchanged, so the same
+    source can be imported again.
     """
     from webots_mcp.store.merging import is_bundle, unpacked
 
     if not source.is_file():
-        why = "it is a folder: name the file in it" if source.is_dir() else "there is no such file"
+        why = (
+            "it is a folder. Name the webots.db in it."
+            if source.is_dir()
+            else "there is no such file. Check the path."
+        )
         raise InvalidInputError(f"{source} cannot be imported: {why}")
-    if is_bundle(source):
-        with unpacked(source) as database:
-            found = _take_in(recorded, database)
-    else:
-        found = _take_in(recorded, source)
+    with shown_activity("importing"):
+        if is_bundle(source):
+            with unpacked(source) as database:
+                found = _take_in(recorded, database)
+        else:
+            found = _take_in(recorded, source)
     if json:
         return print_json({"source": str(source), **found})
-    print(f"{source}: {_taken_in(found)}")
+    print(_imported(found, source))
 
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
@@ -274,7 +312,9 @@ def _merge_into(recorded: Where, source: Path, current: Path) -> dict[str, Any]:
 
     with recorded.writer("import", {"source": source}, create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
-            raise InvalidInputError(f"{source} is the recording itself: choose another file")
+            raise InvalidInputError(
+                f"{source} is the recording that would be imported into. Choose another file."
+            )
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
         runs = merge(connection, recording.data_dir, current, pictures=source.parent).values()
@@ -286,34 +326,39 @@ def _merge_into(recorded: Where, source: Path, current: Path) -> dict[str, Any]:
         }
 
 
-def _taken_in(found: dict[str, Any]) -> str:
-    new, before = id_ranges(found["new_run_ids"]), id_ranges(found["known_run_ids"])
-    known = f"run {before} was here already" if before else ""
-    beside = f"; {known}" if known else ""
+def _imported(found: dict[str, Any], source: Path) -> str:
+    """Return what an import has brought, in a sentence."""
+    new, known = found["new_run_ids"], found["known_run_ids"]
+    was = "was" if len(known) == 1 else "were"
+    before = f"{runs_named(known)} {was} imported before" if known else ""
     if new:
-        return f"new here: run {new}{beside}"
+        return f"Imported {runs_named(new)} from {source}{'; ' if known else ''}{before}."
     if found["changed"]:
-        return f"no run is new, but sessions without runs, or trials, are{beside}"
-    return f"nothing is new{': ' if known else ', it has no runs'}{known}"
+        what = "sessions without runs, or trials"
+        return f"Imported no new run from {source}, but {what}{'; ' if known else ''}{before}."
+    return f"Nothing new in {source}: {before or 'it has no runs'}."
 
 
 def prune(
     *,
-    dry_run: Annotated[bool, Parameter("--dry-run", help="Only tell what would go.")] = False,
+    dry_run: Annotated[
+        bool, Parameter("--dry-run", help="Show what would be deleted, and delete nothing.")
+    ] = False,
     limits: RetentionOptions = _UNLIMITED,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Delete what is beyond the limits, and give the space back to the disk.
+    """Delete the oldest rows beyond the limits, and return the space to the disk.
 
-    Rows go in the order in which they were recorded, whatever their run. Runs with a label (but
-    that of a trial) or a note, and those marked by 'webots-mcp retention', lose nothing and do not
-    count. A LIMIT is a size
-    (500MB), an age (30d), a number of rows (100000rows), several of them with commas between; all,
-    which keeps everything; or default. What is given belongs to the database from then on, and
-    servers keep to it; with --dry-run it is only tried. A size or a number of rows always holds; an
-    age spares the newest rows, as many as the options tell. Robots may record meanwhile. The MCP
-    server does the same every few seconds.
+        webots-mcp prune --keep-states 500MB --dry-run
+
+    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of these joined
+    by commas, 'all' (no limit) or 'default'. Limits given here are stored in the database and
+    apply to servers too; with --dry-run they are only tried.
+
+    The oldest rows are deleted first, across all runs. Runs with a label or a note, and runs marked
+    by 'webots-mcp retention', are never pruned and do not count; labels of trials do not protect a
+    run. Robots may record meanwhile. The MCP server prunes in the same way every few seconds.
     """
     from webots_mcp.store.retention import in_force, set_limits
     from webots_mcp.store.retention_plan import file_sizes, plan
@@ -326,7 +371,7 @@ def prune(
         disk = _on_disk(wanted, sizes)
         if json:
             return print_json({"dry_run": True, **_as_data(wanted), "disk_bytes": disk})
-        _print_plan(wanted, "would go")
+        _print_plan(wanted, "Would delete")
         _print_disk(disk)
 
     if dry_run:
@@ -335,39 +380,54 @@ def prune(
         set_limits(connection, asked, "prune")
         retention = in_force(connection)
         wanted = plan(connection, retention)
-        if not json:
-            _print_plan(wanted, "goes")
         purged = _prune(recording, connection, retention)
     if json:
         done = {"freed_bytes": purged.freed_bytes, "notes": purged.problems}
         return print_json({"dry_run": False, **_as_data(wanted), **done})
-    _print_purged(purged)
+    _print_plan(wanted, "Deleted", freed_bytes=purged.freed_bytes)
+    print_notes(purged.problems)
 
 
 def retention(
-    *run_ids: Annotated[Id, Parameter("RUN", help="As 'webots-mcp runs' lists them.")],
-    release: Annotated[bool, Parameter("--release", help="Let retention have them again.")] = False,
+    *run_ids: Annotated[Id, Parameter("RUN", help="Run numbers, from 'webots-mcp runs'.")],
+    release: Annotated[
+        bool, Parameter("--release", help="Remove the mark from these runs.")
+    ] = False,
     limits: RetentionOptions = _UNLIMITED,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Mark runs that are never pruned, or set how much is kept of the others.
+    """Mark runs that are never pruned, or set the limits for the others.
 
-    The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
-    to what holds where nothing is set. 'webots-mcp status' shows them.
+        webots-mcp retention 4 7 --keep-states 20GB
+
+    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of these joined
+    by commas, 'all' (no limit) or 'default'. Limits are stored in the database and apply at once.
+    'webots-mcp status --storage' shows them.
     """
     from webots_mcp.store.retention import described, mark_kept, set_limits
 
     asked = limits.asked()
     if not run_ids and not asked:
-        raise InvalidInputError("name runs to retain, or a limit to set: --keep-states 20GB")
+        raise InvalidInputError(
+            "Nothing to change: no run and no limit was given. Name runs to keep, such as "
+            "'webots-mcp "
+            "retention 4', or a limit, such as --keep-states 20GB."
+        )
     given = {"run_ids": run_ids, "release": release, **asked}
     with recorded.writer("retain", given) as (_, connection):
         mark_kept(connection, run_ids, keep=not release)
         set_limits(connection, asked, "retain")
         if json:
             done = {"run_ids": run_ids, "retained": not release} if run_ids else {}
-            print_json({**done, "limits": described(connection)})
+            return print_json({**done, "limits": described(connection)})
+    ids = [*run_ids]
+    if ids and release:
+        print(f"Removed the mark from {runs_named(ids)}: retention applies again.")
+    elif ids:
+        print(f"Marked {runs_named(ids)}: never pruned.")
+    if asked:
+        print("Limits are set; 'webots-mcp status --storage' shows them.")
 
 
 def _prune(
@@ -406,29 +466,34 @@ def _as_data(wanted: Plan) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _print_plan(wanted: Plan, going: str) -> None:
+def _print_plan(wanted: Plan, done: str, *, freed_bytes: int = 0) -> None:
+    """Print what was or would be deleted: first in a sentence, then by kind of row."""
     from webots_mcp.store.retention import size_text
 
     rows = wanted.rows_by_table()
+    total, size = sum(rows.values()), size_text(sum(map(wanted.size_of, rows)))
+    freed = f"; the file is {size_text(freed_bytes)} smaller" if freed_bytes else ""
+    if rows:
+        print(f"{done} {total:,} row{'s' * (total != 1)} beyond the limits, about {size}{freed}.")
+    else:
+        print(f"Nothing is beyond the limits{freed}.")
     table = [
         [kind, rows[kind], size_text(wanted.size_of(kind)), id_ranges(wanted.runs_of(kind))]
         for kind in rows
     ]
     if table:
-        print_table((going, "rows", "about", "runs"), table)
-    else:
-        print("nothing is beyond the limits")
+        print_table(("kind", "rows", "size", "runs"), table)
     print_notes(
         [
-            f"beyond the limit, but spared: {each.rows} rows of {each.table}, about "
+            f"beyond the limit, but kept: {each.rows} rows of {each.table}, about "
             f"{size_text(each.size_bytes)}, {each.why}"
             for each in wanted.spared
         ]
     )
     if wanted.kept_run_ids:
-        ids, size = id_ranges(wanted.kept_run_ids), size_text(wanted.kept_bytes)
+        kept, size = runs_named(wanted.kept_run_ids), size_text(wanted.kept_bytes)
         why = "kept because of a label, a note or a mark, and not counted"
-        print_notes([f"{why}: run {ids}, about {size}"])
+        print_notes([f"{why}: {kept}, about {size}"])
 
 
 def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
@@ -449,15 +514,7 @@ def _print_disk(disk: dict[str, Any]) -> None:
         return ", ".join(f"{name} {size_text(size)}" for name, size in sizes.items())
 
     parts, others = sized(disk["in_file"]), sized(disk["beside"])
-    print_notes([f"the file has {size_text(disk['file'])}, about: {parts}; beside it {others}"])
-
-
-def _print_purged(purged: Purged) -> None:
-    from webots_mcp.store.retention import size_text
-
-    if purged.freed_bytes:
-        print(f"{size_text(purged.freed_bytes)} of the database file freed")
-    print_notes(purged.problems)
+    print_notes([f"the file takes {size_text(disk['file'])}: {parts}; next to it {others}"])
 
 
 # -- a recording as lines that follow it, and as a picture --
@@ -470,27 +527,37 @@ def tail(
         int,
         Parameter(
             "-n",
-            help="Begin with so many of the last lines (10).",
+            metavar="N",
+            help="Number of earlier lines to start with. Default: 10.",
             converter=whole_number,
             validator=Number(gte=0),
         ),
     ] = 10,
-    robot: Robot = None,
+    robot: Annotated[
+        str | None,
+        Parameter("--robot", metavar="NAME", help="Follow only this robot. Default: all robots."),
+    ] = None,
     interval_s: Annotated[
         float,
-        Parameter("--interval", help="Seconds between looks (0.5).", validator=Number(gt=0)),
+        Parameter(
+            "--interval",
+            metavar="S",
+            help="Seconds between two reads of the recording. Default: 0.5.",
+            validator=Number(gt=0),
+        ),
     ] = 0.5,
     no_follow: Annotated[
-        bool, Parameter("--no-follow", negative=(), help="Print the last lines and end.")
+        bool, Parameter("--no-follow", negative=(), help="Print the last lines and stop.")
     ] = False,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Follow what is being recorded: states, log lines, events, commands. Ctrl-C ends it.
+    """Follow a recording live: states, log lines, events and commands, until Ctrl-C.
 
-    Of the states that came since the last look the newest of each robot is shown. Where nothing
-    can be written, nothing can come, and it ends after the last lines. As JSON each line is an
-    object.
+        webots-mcp tail -n 20 --robot rover
+
+    Shows the newest state of each robot at every read, and all other lines. Stops after the last
+    lines if the recording cannot grow. With --json each line is an object.
     """
     from webots_mcp.store.logs import Follower
     from webots_mcp.store.robots import resolve_robot
@@ -498,8 +565,12 @@ def tail(
     with recorded.reader() as connection:
         found = robot and resolve_robot(connection, robot, time.time())
         follower = Follower(connection, found.id if found else None)
-        _print_lines(follower.read_new(limit), as_json=json)
         following = not no_follow and recorded.may_change()
+        subject = found.name if found else "all robots"
+        where = f"{subject} in {recorded.recording().database}"
+        if following:
+            print(f"webots-mcp: following {where}; Ctrl-C stops it", file=sys.stderr, flush=True)
+        _print_lines(follower.read_new(limit), as_json=json)
         while following:
             wait(interval_s)
             recorded.recording().ingest()
@@ -523,32 +594,48 @@ def _newest_states_only(lines: Sequence[FollowedLine]) -> list[FollowedLine]:
 
 
 def plot(
-    *signals: Annotated[str, Parameter("SIGNAL", help="Names, with '*' (all).")],
-    output: Annotated[Path, Parameter(("-o", "--output"), help="A .png or .svg file.")],
+    *signals: Annotated[str, Parameter("SIGNAL", help="Signals to draw; '*' means any text.")],
+    output: Annotated[
+        Path, Parameter(("-o", "--output"), metavar="FILE", help="File to write: .png or .svg.")
+    ],
     trajectory: Annotated[
         bool,
-        Parameter("--trajectory", negative=(), help="The path of the robot, seen from above."),
+        Parameter("--trajectory", negative=(), help="Draw the robot's path, seen from above."),
     ] = False,
     run_ids: Annotated[
         list[str] | None,
         Parameter(
-            "--runs", negative=(), consume_multiple=True, help="Several runs, laid over each other."
+            "--runs",
+            metavar="ID",
+            negative=(),
+            consume_multiple=True,
+            help="Draw several runs over each other, such as --runs 3 4.",
         ),
     ] = None,
     trial_set: Annotated[
         Id | None,
         Parameter(
             "--trials",
-            help="The scores of a trial set, over one or two parameters (named as signals).",
+            metavar="SET",
+            help="Draw the scores of this trial set over one or two parameters, given as SIGNAL.",
         ),
     ] = None,
-    width_px: Annotated[Count, Parameter("--width", help="Pixels (900).")] = 900,
-    height_px: Annotated[Count, Parameter("--height", help="Pixels (500).")] = 500,
+    width_px: Annotated[
+        Count, Parameter("--width", metavar="N", help="Width in pixels. Default: 900.")
+    ] = 900,
+    height_px: Annotated[
+        Count, Parameter("--height", metavar="N", help="Height in pixels. Default: 500.")
+    ] = 500,
     span: TimeRangeOptions | None = None,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Draw signals over time, the robot's path, or trials; without signals what changed most."""
+    """Draw signals over time, the robot's path, or the scores of trials.
+
+        webots-mcp plot 'pose*' --last 10 -o pose.png
+
+    Without SIGNAL it draws the signals that changed most.
+    """
     ids = [int(each) for each in run_ids or () if _is_id(each)]
     behind_runs = [each for each in run_ids or () if not _is_id(each)]
 
@@ -591,5 +678,5 @@ def write_picture(file: Path, picture: PlotImage, *, as_json: bool = False) -> N
         return print_json(
             {"file": str(file), "caption": picture.caption, "notes": list(picture.notes)}
         )
-    print(f"{file}: {printable(picture.caption)}")
+    print(f"Wrote {file}: {printable(picture.caption)}")
     print_notes(picture.notes)

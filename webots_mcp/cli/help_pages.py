@@ -49,14 +49,14 @@ class Section(NamedTuple):
 
 
 def help_(
-    *topic: Annotated[str, Parameter("TOPIC", help="A page, a heading, or words of one.")],
+    *topic: Annotated[str, Parameter("TOPIC", help="Page, heading, or words of a heading.")],
     as_json: Json = False,
 ) -> None:
-    """Print a page of this documentation, or the section about a topic.
+    """Print a page of the documentation, or the section about a topic.
 
         webots-mcp help stuck
 
-    Without a topic, list the pages. `webots-mcp COMMAND --help` explains a command.
+    Without TOPIC it lists the pages. For the options of a command use 'webots-mcp COMMAND --help'.
     """
     if not topic:
         return print_json({"pages": titles()}) if as_json else print(_overview())

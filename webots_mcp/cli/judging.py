@@ -28,6 +28,7 @@ from webots_mcp.cli.options import (
     Where,
     make_chunks_first,
 )
+from webots_mcp.cli.streams import shown_activity
 from webots_mcp.cli.terminal import is_verbose, print_answer, print_json, print_table
 from webots_mcp.contract import host_name
 from webots_mcp.database.files import placed
@@ -51,7 +52,9 @@ _WAITING: Final = Waiting()
 
 
 def check(
-    run_id: Annotated[Id | None, Parameter("RUN", help="Else the newest run.")] = None,
+    run_id: Annotated[
+        Id | None, Parameter("RUN", help="Run number. Default: the newest run.")
+    ] = None,
     /,
     *,
     expect: Annotated[
@@ -59,23 +62,27 @@ def check(
         Parameter(
             "--expect",
             metavar="CONDITION",
-            help="What shall hold, as \"front_m > 0.1 during mode == 'drive'\"; may be repeated.",
+            help="Condition that must hold, such as \"front_m > 0.1 during mode == 'drive'\". Can "
+            "be "
+            "repeated.",
         ),
     ] = None,
     junit: Annotated[
         Path | None,
-        Parameter("--junit", metavar="FILE", help="Write the checks there as JUnit XML too."),
+        Parameter(
+            "--junit", metavar="FILE", help="Also write the checks to this file as JUnit XML."
+        ),
     ] = None,
     robot: Robot = None,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> int:
-    """Is this run well? Motion against commands, sensors, pace, log, end, lost rows, goal.
+    """Check a run: motion against commands, sensors, pace, log, end, lost rows and goal.
 
         webots-mcp check 4 --junit check.xml
 
-    Exit code 0: each check passed, warned or did not apply. 1: one failed. 2: it could not be
-    asked, or not all of the run was looked at.
+    Exit code 0: no check failed. 1: a check failed. 2: the run could not be read, or not all of it
+    was checked.
     """
     from webots_mcp.cli.asking import ask, show
     from webots_mcp.questions.compare_runs import webots_check_run
@@ -203,22 +210,28 @@ _World = Path | None
 
 
 def first_difference(
-    first: Annotated[Id, Parameter("RUN", help="The id of a run.")],
-    other: Annotated[Id, Parameter("RUN", help="The id of another.")],
+    first: Annotated[Id, Parameter("RUN", help="Numbers of the two runs to compare.")],
+    other: Annotated[Id, Parameter("RUN", help="Numbers of the two runs to compare.")],
     /,
     *,
     signals: Annotated[
-        _Names, Parameter("--signal", negative=(), help="Only these, with '*'.")
+        _Names,
+        Parameter(
+            "--signal",
+            metavar="SIGNAL",
+            negative=(),
+            help="Compare only these signals; '*' means any text.",
+        ),
     ] = None,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Where two runs part: which signal is first not the same to the last digit, and how it grows.
+    """Find where two runs diverge: the first signal that differs, and how the difference grows.
 
         webots-mcp first-difference 3 4 --signal 'pose*'
 
-    Parameters, code, world and versions that differ are named first. Rows are compared with those
-    of the other run at the same simulation time; the others are counted.
+    Differing parameters, code, worlds and versions are listed first. Rows are compared at equal
+    simulated times, to the last digit; rows without a counterpart are counted.
     """
     from webots_mcp.cli.asking import ask_and_show
     from webots_mcp.questions.compare_runs import webots_compare_runs
@@ -228,23 +241,37 @@ def first_difference(
 
 
 def repeatability(
-    world: Annotated[_World, Parameter("WORLD", help="Of processes (the newest run's).")] = None,
+    world: Annotated[
+        _World, Parameter("WORLD", help="World for --by process. Default: that of the newest run.")
+    ] = None,
     /,
     *,
-    for_s: Annotated[float, Parameter("--for", metavar="S", help="Simulated seconds of each.")],
-    by: Annotated[By, Parameter("--by", negative=(), help="How each begins (reset).")] = None,
-    number: Annotated[Count, Parameter("-n", help="How many of each (5).")] = 5,
-    stand_in: Annotated[bool, Parameter("--stand-in", negative=(), help="Not Webots.")] = False,
+    for_s: Annotated[float, Parameter("--for", metavar="S", help="Simulated seconds per run.")],
+    by: Annotated[
+        By,
+        Parameter(
+            "--by",
+            negative=(),
+            help="How each run begins; can be repeated. Default: reset.",
+        ),
+    ] = None,
+    number: Annotated[
+        Count, Parameter("-n", metavar="N", help="Number of runs of each kind. Default: 5.")
+    ] = 5,
+    stand_in: Annotated[
+        bool,
+        Parameter("--stand-in", negative=(), help="Use the stand-in simulator, not Webots."),
+    ] = False,
     asked: Waiting = _WAITING,
     json: Json = False,
 ) -> None:
-    """Run the same again, and say where the runs part from the first, and how it grows.
+    """Repeat a run several times, and find where the repeats diverge and how that grows.
 
         webots-mcp repeatability --by reset --by process -n 3 --for 20
 
-    Each begins with a reset or reload of the live simulation, whose controller has to be a
-    Supervisor, or in a simulator process of its own, as a trial does. Where runs part after a
-    reset, and processes of their own do not, the reset is to blame.
+    A run begins with a reset or reload of the live simulation, whose controller must be a
+    Supervisor, or in a simulator process of its own, as a trial does. If runs diverge after a reset
+    but not between processes, the reset is the cause.
     """
     from webots_mcp.judging.divergence import compare_repeats
     from webots_mcp.store.run_rows import fetch_run
@@ -252,27 +279,38 @@ def repeatability(
 
     ways = sorted(dict.fromkeys(by or ["reset"]))  # processes first: others are judged by them
     if number < 2:
-        raise InvalidInputError(f"-n {number}: it takes two runs to see whether they are the same")
+        raise InvalidInputError(
+            f"-n {number} is too few: at least two runs are needed to compare. Use -n 2 or more."
+        )
     if (world or stand_in) and "process" not in ways:
-        raise InvalidInputError("WORLD and --stand-in are for --by process")
+        raise InvalidInputError(
+            "WORLD and --stand-in apply only to processes. Add --by process, or leave them out."
+        )
     runs = dict[str, list[int]]()
     for way in ways:
         if way == "process":
             runs[way] = _in_processes(world, asked, for_s, number, stand_in=stand_in)
         else:
-            runs[way] = [_live(way, asked, for_s) for _ in range(number)]
+            runs[way] = []
+            for at in range(1, number + 1):
+                with shown_activity(f"run {at} of {number}, by {way}"):
+                    runs[way].append(_live(way, asked, for_s))
             with asked.recording(read_only=False).writer() as connection:
                 for at, run_id in enumerate(runs[way], 1):
                     annotate_run(connection, run_id, label=f"repeat {at} of {number}, by {way}")
     if len(ways) > 1:
         runs["the first of each"] = [run_ids[0] for run_ids in runs.values()]
     found: dict[str, list[Parting]] = {}
-    with asked.recording().reader() as connection:
+    with asked.recording().reader() as connection, shown_activity("comparing the runs"):
         for way, run_ids in runs.items():
             until_s = fetch_run(connection, run_ids[0]).started_sim_time_s + for_s
             found[way] = compare_repeats(connection, run_ids, until_s=until_s, deadline_s=math.inf)
     answer: dict[str, Any] = {way: _answer(each) for way, each in found.items()}
-    (print_json if json else print_answer)(answer | _blame(found))
+    blame = _blame(found)
+    if json:
+        return print_json(answer | blame)
+    verdicts = (f"{way}: {each['verdict']}" for way, each in answer.items())
+    print_answer({"summary": blame.get("verdict") or "; ".join(verdicts)} | answer)
 
 
 def _in_processes(
@@ -295,7 +333,9 @@ def _in_processes(
     with recording.reader() as connection:
         found = [each.run_id for each in trials_of(connection, set_id) if each.run_id is not None]
     if len(found) < 2:
-        raise CommandRefusedError("fewer than two runs were recorded")
+        raise CommandRefusedError(
+            "Fewer than two runs were recorded, so nothing can be compared. See 'webots-mcp logs'."
+        )
     return found
 
 
@@ -313,7 +353,7 @@ def _live(way: str, asked: Waiting, for_s: float) -> int:
         answer = ask(webots_run, to, asked).data or {}
     if answer.get("stopped") != "simulation time reached":
         why = (answer.get(each) for each in ("error", "stopped", "stop_reason", "hint"))
-        raise CommandRefusedError("; ".join(["a run did not reach its end", *filter(None, why)]))
+        raise CommandRefusedError("; ".join(["A run did not reach its end", *filter(None, why)]))
     return answer["run_id"]
 
 
@@ -323,14 +363,18 @@ def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
     if first != "process" or not ways:
         return {}
     if not all(each.is_equal for each in found[first]):
-        return {"verdict": "processes of their own part as well, or tell nothing"}
+        return {
+            "verdict": "runs in processes of their own diverge as well, or could not be compared"
+        }
     across = dict(zip(ways, found[ways.pop()], strict=False))
     unlike = {name: None for each in across.values() for name in each.unlike}
     blamed = [way for way in ways if any(each.parted for each in (across[way], *found[way]))]
     if named := [name for name in unlike if name not in ("robot", "began_by")]:
-        return {"verdict": f"nothing is blamed: not alike to begin with ({listed(named)})"}
-    said = f"the {' and the '.join(blamed)} is to blame: processes of their own repeat"
-    return {"verdict": said if blamed else "what was compared is the same, however a run begins"}
+        return {"verdict": f"no cause is named: the runs began with differences ({listed(named)})"}
+    said = (
+        f"the {' and the '.join(blamed)} is the cause: runs in processes of their own are identical"
+    )
+    return {"verdict": said if blamed else "the runs are identical, however they begin"}
 
 
 def _answer(found: Sequence[Parting]) -> dict[str, Any]:
@@ -353,37 +397,52 @@ def _answer(found: Sequence[Parting]) -> dict[str, Any]:
 
 
 def profile(
-    robot: Annotated[str | None, Parameter("ROBOT", help="Which (the only live one).")] = None,
+    robot: Annotated[
+        str | None, Parameter("ROBOT", help="Name of the robot. Needed only if several are live.")
+    ] = None,
     /,
     *,
-    seconds: Annotated[Count, Parameter("--for", help="Seconds of wall time (10).")] = 10,
+    seconds: Annotated[
+        Count, Parameter("--for", metavar="S", help="Wall-clock seconds to sample. Default: 10.")
+    ] = 10,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Sample which lines of a controller take its time, 100 times a second, by py-spy.
+    """Find the lines of a Python controller that take the most time, by sampling it with py-spy.
 
-    Of the lines of its own files those that the main thread was in, or in what they called; time in
-    which it sleeps or waits counts. Each sample stops the controller for about a millisecond.
+        webots-mcp profile rover --for 20
+
+    Samples the main thread 100 times a second and counts lines of the controller's own files, with
+    everything they call. Time spent sleeping or waiting counts too. A sample stops the controller
+    for about a millisecond.
     """
     with recorded.recording().view(robot) as view:
         name, session = view.robot.name, view.session
     if session is None or not view.robot.live or session.host != host_name():
-        raise CommandRefusedError(f"no controller of {name} runs on this machine")
+        raise CommandRefusedError(
+            f"No controller of {name} is running on this machine. Start the simulation first."
+        )
     if not session.has_bridge:
-        raise CommandRefusedError(f"{name} has no bridge in Python: its lines cannot be sampled")
+        raise CommandRefusedError(
+            f"{name} is not recorded by a Python controller, so its lines cannot be sampled."
+        )
     controller = Path(session.controller or "/nowhere")
     own = str(find_project(controller.parent) or controller.parent)
     samples = Counter[tuple[str, str | None]]()
-    for stack, count in _sampled(session.pid, seconds):
-        samples[_place_of(stack, own)] += count
+    with shown_activity(f"sampling {name} for {seconds} s"):
+        for stack, count in _sampled(session.pid, seconds):
+            samples[_place_of(stack, own)] += count
     total = samples.total()
     columns = ("share", "line", "function", "samples")
     rows = [[f"{n / total:.1%}", *place, n] for place, n in samples.most_common(12)]
     if json:
         found = {"robot": name, "seconds": seconds, "samples": total}
         return print_json(found | {"columns": columns, "rows": rows})
+    (first, function), most = samples.most_common(1)[0]
+    where = f"{first} in {function}" if function else first
+    print(f"{name} spends {most / total:.0%} of its time {'at ' if function else ''}{where}.")
     print_table(columns, rows)
-    print(f"{name}: {total} samples of its main thread in {seconds} s")
+    print(f"{total} samples of its main thread in {seconds} s")
 
 
 def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
@@ -406,9 +465,9 @@ def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
         return [(stack, int(count)) for stack, _, count in found]
     if re.search("permi", ended.stderr, re.IGNORECASE):
         raise CommandRefusedError(
-            f"py-spy may not look into process {pid}: allow it with 'sudo sysctl "
-            "kernel.yama.ptrace_scope=0' on Linux, with --cap-add SYS_PTRACE for a container, or "
-            "ask as root (macOS)"
+            f"py-spy is not allowed to sample process {pid}. On Linux run 'sudo sysctl "
+            "kernel.yama.ptrace_scope=0', for a container add --cap-add SYS_PTRACE, on macOS run "
+            "this command as root."
         )
     *_, said = ended.stderr.strip().splitlines() or ["it has written nothing"]
     raise CommandRefusedError(f"py-spy could not sample process {pid}: {said}")

@@ -1,4 +1,4 @@
-"""The options that commands share: values, which recording, which part of it, how much is kept."""
+"""Options that commands share: values, the recording, a part of it, and limits of retention."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
     """
     text = tokens[0].value
     if not re.fullmatch(r"[+-]?[0-9]+", text):
-        raise ValueError(f"{text!r} is no whole number")
+        raise ValueError(f"{text!r} is not a whole number")
     if abs(int(text)) >= _TOO_LARGE:
         raise ValueError(f"{text} is too large")
     return int(text)
@@ -79,7 +79,7 @@ def _row_id(_kind: Any, tokens: Sequence[Token]) -> int:
         text.isascii() and text.isdecimal() and int(text) < _TOO_LARGE
     ):  # what SQLite could have given
         return int(text)
-    raise ValueError(f"{text!r} is no id: it is a number from an answer")
+    raise ValueError(f"{text!r} is not an id. An id is a number from an answer")
 
 
 Id: TypeAlias = Annotated[int, Parameter(converter=_row_id)]
@@ -101,7 +101,7 @@ def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> d
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise InvalidInputError(f"{text!r} names no value: write {name}=VALUE")
+            raise InvalidInputError(f"{text!r} has no value. Write {name}=VALUE.")
         values[name] = value if kinds.get(name) == "str" else value_of(value)
     return values
 
@@ -122,9 +122,14 @@ def _no_constant(name: str) -> float:
 # -- which recording, which part of it, and how it is opened --
 
 _Given = ParamSpec("_Given")
-Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
+Json: TypeAlias = Annotated[
+    bool, Parameter("--json", negative=(), help="Print the answer as JSON.")
+]
 Robot: TypeAlias = Annotated[
-    str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
+    str | None,
+    Parameter(
+        "--robot", metavar="NAME", help="Name of the robot. Needed only if several robots are live."
+    ),
 ]
 # Of a `Path` the shell completes the names of files.
 DataDir: TypeAlias = Annotated[
@@ -132,12 +137,16 @@ DataDir: TypeAlias = Annotated[
     Parameter(
         "--data-dir",
         metavar="DIR",
-        help="The folder of the database and the pictures; by default mcp_data/ in the nearest "
-        "Webots project, else ~/.webots-mcp/data; also WEBOTS_MCP_DATA_DIR.",
+        help="Folder of the database and the pictures. Default: WEBOTS_MCP_DATA_DIR, else "
+        "mcp_data/ "
+        "in the nearest Webots project, else ~/.webots-mcp/data.",
     ),
 ]
 RunId: TypeAlias = Annotated[
-    Id | None, Parameter("--run", metavar="ID", help="That run, not the newest one.")
+    Id | None,
+    Parameter(
+        "--run", metavar="ID", help="Run number, from 'webots-mcp runs'. Default: the newest."
+    ),
 ]
 
 
@@ -148,15 +157,18 @@ class Where:
 
     data_dir: DataDir = None
     database: Annotated[
-        Path | None, Parameter("--database", metavar="FILE", help="The database file itself.")
+        Path | None,
+        Parameter("--database", metavar="FILE", help="Database file, if it is not in that folder."),
     ] = None
 
     def recording(self, *, read_only: bool = True) -> RecordingAccess:
         """Return the recording."""
+        from webots_mcp.cli.terminal import note_recording
         from webots_mcp.database.location import resolve_database
         from webots_mcp.store.recording import RecordingAccess
 
         where = resolve_database(self.database, self.data_dir)
+        note_recording(where[0])
         return RecordingAccess(*where, read_only=read_only, asker="cli")
 
     def typed(self) -> list[str]:
@@ -206,7 +218,7 @@ HERE: Final = Where()
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ToRobot(Where):
-    """Whom a command asks."""
+    """The robot that a command asks."""
 
     robot: Robot = None
 
@@ -214,11 +226,13 @@ class ToRobot(Where):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Waiting(ToRobot):
-    """Whom a command asks, and how long it waits for the answer."""
+    """The robot that a command asks, and how long it waits for the answer."""
 
     timeout_wall_s: Annotated[
         float | None,
-        Parameter("--timeout", metavar="S", help="Wait up to so many wall seconds (600)."),
+        Parameter(
+            "--timeout", metavar="S", help="Maximum wall-clock seconds to wait. Default: 600."
+        ),
     ] = None
 
 
@@ -228,12 +242,15 @@ class ToWebots(Waiting):
     """The same, where Webots itself can be asked as well."""
 
     force: Annotated[
-        bool, Parameter("--force", help="Press Webots' keys where nothing else works.")
+        bool, Parameter("--force", help="Press keys in the window of Webots if nothing else works.")
     ] = False
     port: Annotated[
         int | None,
         Parameter(
-            "--port", metavar="PORT", converter=whole_number, help="Of a Webots of another project."
+            "--port",
+            metavar="PORT",
+            converter=whole_number,
+            help="Port of a Webots that runs another project, such as 1235.",
         ),
     ] = None
 
@@ -247,24 +264,31 @@ class TimeRangeOptions:
     run_id: RunId = None
     last_s: Annotated[
         float | None,
-        Parameter("--last", metavar="S", help="The last so many seconds of simulation time."),
+        Parameter("--last", metavar="S", help="Only the last S seconds of simulated time."),
     ] = None
     start_s: Annotated[
-        float | None, Parameter("--start", metavar="S", help="From this simulation time on.")
+        float | None,
+        Parameter("--start", metavar="S", help="Start of the range in simulated seconds."),
     ] = None
     end_s: Annotated[
         float | None,
-        Parameter("--end", metavar="S", help="Up to, not including, this simulation time."),
+        Parameter(
+            "--end", metavar="S", help="End of the range in simulated seconds, not included."
+        ),
     ] = None
     since_wall_time: Annotated[
         str | None,
         Parameter(
-            "--since", metavar="TIME", help="From this wall time on (ISO 8601 or Unix seconds)."
+            "--since",
+            metavar="TIME",
+            help="Start of the range as a wall-clock time: 2026-05-01T03:00:00Z, or Unix seconds.",
         ),
     ] = None
     until_wall_time: Annotated[
         str | None,
-        Parameter("--until", metavar="TIME", help="Up to, not including, this wall time."),
+        Parameter(
+            "--until", metavar="TIME", help="End of the range as a wall-clock time, not included."
+        ),
     ] = None
 
     def scope(self) -> Scope:
@@ -317,7 +341,7 @@ def make_chunks_first(recording: RecordingAccess) -> None:
     from webots_mcp.cli.streams import shown_progress
     from webots_mcp.store.chunk_making import make_missing_chunks
 
-    with shown_progress("making chunks of what was recorded") as progress:
+    with shown_progress("preparing statistics") as progress:
         # A million rows of 40 values take 100 s.
         left = make_missing_chunks(recording, progress, limit_s=300.0)
     if left:
@@ -330,11 +354,10 @@ def make_chunks_first(recording: RecordingAccess) -> None:
 def _option(name: str, text: str) -> Parameter:
     """Return the option of a limit, with what holds where nobody has set one."""
     value = getattr(DEFAULT, name)
-    default = f"{value:g}" if name == _RUNS else limit_text(value)
+    text += f" Default: {value:g}." if name == _RUNS else f" Default: {limit_text(value)}."
     if isinstance(value, Limit) and value.limits:
-        default += f"; an age spares the newest {value.spared_rows:,}"
-    shown = "TIMES" if name == _RUNS else "LIMIT"
-    return Parameter(_name_of(name), metavar=shown, help=text.format(default))
+        text += f" A limit by age always keeps the newest {value.spared_rows:,} rows."
+    return Parameter(_name_of(name), metavar="TIMES" if name == _RUNS else "LIMIT", help=text)
 
 
 def _name_of(name: str) -> str:
@@ -346,29 +369,27 @@ def _name_of(name: str) -> str:
 class RetentionOptions:
     """How much is kept of what, as it was typed; by the names of `Retention`."""
 
-    state: Annotated[str | None, _option("state", "Keep so much of recorded states ({}).")] = None
+    state: Annotated[str | None, _option("state", "Limit for recorded states.")] = None
     kept_state: Annotated[
         str | None,
-        _option("kept_state", "Size limit for full-rate segments ({})."),
+        _option("kept_state", "Limit for full-rate segments."),
     ] = None
     chunk: Annotated[
         str | None,
-        _option("chunk", "Keep so much of the values in chunks, which outlive states ({})."),
+        _option("chunk", "Limit for the values in chunks, which outlive states."),
     ] = None
-    log: Annotated[str | None, _option("log", "Keep so much of log lines ({}).")] = None
+    log: Annotated[str | None, _option("log", "Limit for log lines.")] = None
     event: Annotated[
         str | None,
-        _option("event", "Keep so much of events; its age also holds for commands ({})."),
+        _option("event", "Limit for events. Its age also applies to commands."),
     ] = None
-    image: Annotated[
-        str | None, _option("image", "Keep so much of pictures with their files ({}).")
-    ] = None
+    image: Annotated[str | None, _option("image", "Limit for pictures with their files.")] = None
     outlive: Annotated[
         str | None,
         _option(
             _RUNS,
-            "Keep what is left of a run this many times longer than its states ({}), or for ever: "
-            "all.",
+            "How many times longer than its states the rest of a run is kept, or 'all' to keep it "
+            "forever.",
         ),
     ] = None
 
@@ -402,5 +423,7 @@ def _times_of(text: str) -> float:
     except ValueError:
         times = math.nan
     if not 1 <= times < math.inf:
-        raise InvalidInputError(f"{text!r} must be a number, 1 or more, or {NO_LIMIT}")
+        raise InvalidInputError(
+            f"{text!r} is not a number of times. Give a number from 1, or {NO_LIMIT}."
+        )
     return times

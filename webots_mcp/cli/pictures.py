@@ -27,11 +27,12 @@ _ROBOT: Final = ToRobot()
 
 
 def camera(
-    name: Annotated[str, Parameter("CAMERA", help="Name of the camera. Default: any.")] = "",
+    name: Annotated[str, Parameter("CAMERA", help="Camera name. Default: any camera.")] = "",
     /,
     *,
     output: Annotated[
-        Path | None, Parameter(("-o", "--output"), metavar="FILE", help="File to write.")
+        Path | None,
+        Parameter(("-o", "--output"), metavar="FILE", help="File to write. Default: camera.jpg."),
     ] = None,
     fresh: Annotated[
         bool,
@@ -42,13 +43,18 @@ def camera(
         Parameter("--at", metavar="S", help="Picture nearest to this simulated time, in seconds."),
     ] = None,
     frames: Annotated[
-        Count, Parameter("--frames", metavar="N", help="N pictures around that time, on one sheet.")
+        Count,
+        Parameter(
+            "--frames",
+            metavar="N",
+            help="Number of pictures around that time, on one sheet. Default: 1.",
+        ),
     ] = 1,
     run_id: RunId = None,
     asked: ToRobot = _ROBOT,
     json: Json = False,
 ) -> None:
-    """Save a picture of the robot's own camera: the newest, a new one, or one of the past.
+    """Save a picture of the robot's own camera: the newest, a new one, or an earlier one.
 
     webots-mcp camera --at 12.4 -o moment.jpg
     """
@@ -62,10 +68,13 @@ def camera(
 def screenshot(
     *,
     output: Annotated[
-        Path | None, Parameter(("-o", "--output"), metavar="FILE", help="File to write.")
+        Path | None,
+        Parameter(
+            ("-o", "--output"), metavar="FILE", help="File to write. Default: screenshot.jpg."
+        ),
     ] = None,
     quality: Annotated[
-        Count, Parameter("--quality", metavar="N", help="JPEG quality from 1 to 100 (90).")
+        Count, Parameter("--quality", metavar="N", help="JPEG quality from 1 to 100. Default: 90.")
     ] = 90,
     asked: Waiting = _WAITING,
     json: Json = False,
@@ -95,17 +104,18 @@ def _save(
     reply = ask(question, given, asked)
     texts = [each for each in reply.shown if isinstance(each, str)]
     picture = next((each for each in reply.shown if not isinstance(each, str)), None)
-    if picture is None:
-        raise NothingRecordedError("; ".join(texts) or "no picture was recorded")
-    if not file.suffix:
-        file = file.with_suffix("." + picture.format.replace("jpeg", "jpg"))
-    with placed(file) as aside:
-        aside.write_bytes(picture.data)
     facts: dict[str, Any] = {}
     for text in texts:  # the facts are JSON, as a model reads them
         with contextlib.suppress(ValueError):
             facts |= json.loads(text)
+    if picture is None:
+        why = facts.get("hint") or facts.get("error")
+        raise NothingRecordedError(why or "; ".join(texts) or "no picture was recorded")
+    if not file.suffix:
+        file = file.with_suffix("." + picture.format.replace("jpeg", "jpg"))
+    with placed(file) as aside:
+        aside.write_bytes(picture.data)
     facts["file"] = str(file)
     if as_json:
         return print_json(facts)
-    print_answer({"summary": f"{file} written"} | facts)
+    print_answer({"summary": f"Wrote {file}."} | facts)

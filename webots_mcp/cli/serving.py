@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import os
+import shlex
 import sys
 import threading
 import time
@@ -47,22 +48,22 @@ MAX_PORT: Final = 65_535
 def serve(
     *,
     read_only: Annotated[
-        bool, Parameter("--read-only", help="Leave out the tools that change the simulation.")
+        bool, Parameter("--read-only", help="Offer only tools that change nothing.")
     ] = False,
     tools: Annotated[
         Literal["core", "default", "all"],
         Parameter(
             "--tools",
-            help="Which tools to list: core (20 tools), default (34) or all. A tool that is not "
-            "listed still answers when it is called by name.",
+            help="Tools to list: core (20 tools), default (34) or all. Tools that are not listed "
+            "can "
+            "still be called by name.",
         ),
     ] = "default",
     output_schemas: Annotated[
         bool,
         Parameter(
             "--output-schemas",
-            help="List the schemas of the answers too, which need four times as much room as all "
-            "else.",
+            help="Also list the schemas of the answers. This makes the list five times as long.",
         ),
     ] = False,
     http: Annotated[
@@ -70,8 +71,8 @@ def serve(
         Parameter(
             "--http",
             metavar="[HOST:]PORT",
-            help="Serve many clients over HTTP, at this port of 127.0.0.1, say 8000; each gives "
-            "the token that 'webots-mcp token' shows.",
+            help="Serve many clients over HTTP at this port, such as 8000. HOST is 127.0.0.1 by "
+            "default. Clients need the token of 'webots-mcp token'.",
         ),
     ] = None,
     allow_host: Annotated[
@@ -79,45 +80,52 @@ def serve(
         Parameter(
             "--allow-host",
             metavar="NAME",
-            help="With --http: a name that clients call this computer by; needed with a HOST that "
-            "the network reaches, as are the files of TLS.",
+            help="With --http: host name that clients may use for this computer. Required, with "
+            "the "
+            "TLS files, if HOST can be reached from the network.",
         ),
     ] = (),
     tls_cert: Annotated[
         Path | None,
-        Parameter("--tls-cert", help="With --http: its certificate, with the chain, in PEM."),
+        Parameter(
+            "--tls-cert",
+            metavar="FILE",
+            help="With --http: certificate with its chain, as a PEM file.",
+        ),
     ] = None,
     tls_key: Annotated[
-        Path | None, Parameter("--tls-key", help="With --http: the certificate's key, in PEM.")
+        Path | None,
+        Parameter(
+            "--tls-key", metavar="FILE", help="With --http: key of the certificate, as a PEM file."
+        ),
     ] = None,
     notify: Annotated[
         bool,
         Parameter(
             "--notify",
             negative=(),
-            help="Tell clients that have channels (Claude Code) without being asked when a "
-            "breakpoint is hit, an expectation is violated, a controller crashed or trials are "
-            "done; see 'webots-mcp help updates'.",
+            help="Notify clients that support channels (Claude Code) when a breakpoint is hit, an "
+            "expectation is violated, a controller crashes or trials finish. See 'webots-mcp help "
+            "updates'.",
         ),
     ] = False,
     limits: RetentionOptions = _AS_BEFORE,
     recorded: Where = HERE,
 ) -> None:
-    """Serve a recording to an MCP client over stdin and stdout, or to many over HTTP.
+    """Serve a recording to an MCP client over stdin and stdout, or to many clients over HTTP.
 
-    Starts whether or not anything was recorded yet. 'webots-mcp init' tells clients of it; by
-    hand, Claude Code is told with:
+    'webots-mcp init' registers this server with clients. To register it by hand in Claude Code:
 
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
 
-    With --http 8000 it runs until Ctrl-C, and clients come and go: see 'webots-mcp help clients'.
+    It starts even if nothing was recorded yet. With --http it runs until Ctrl-C; see 'webots-mcp
+    help clients'.
 
-    While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
-    Limits belong to the database: what 'webots-mcp prune' or 'retention' has set,
-    or another server that runs, holds on, and is said.
-    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
-    commas between, or all, which keeps everything. 'webots-mcp prune --dry-run' with the same
-    limits tells what would go.
+    Unless --read-only is given, the server deletes the oldest rows beyond the limits. A LIMIT is a
+    size (500MB), an age (30d), a number of rows (100000rows), several of these joined by commas, or
+    'all' (no limit). Limits are stored in the database. Those set before by 'webots-mcp prune',
+    'webots-mcp retention' or another running server stay in force, and a message says so.
+    'webots-mcp prune --dry-run' with the same limits shows what would be deleted.
     """
     import logging
 
@@ -132,11 +140,15 @@ def serve(
 
         place = endpoint_of(http, allow_host, tls_cert, tls_key)
     elif allow_host or tls_cert or tls_key:
-        raise InvalidInputError("--allow-host, --tls-cert and --tls-key are for --http")
+        raise InvalidInputError(
+            "--allow-host, --tls-cert and --tls-key apply only to --http. Add --http PORT, or "
+            "leave "
+            "them out."
+        )
     elif sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
-            "Clients start this command themselves, see 'webots-mcp serve --help'.",
+            "MCP clients start this command themselves; 'webots-mcp init' registers it.",
             file=sys.stderr,
         )
     if asked and not read_only:
@@ -173,14 +185,14 @@ def token(
     *,
     new: Annotated[
         bool,
-        Parameter("--new", help="Make another first; the one before is refused from then on."),
+        Parameter("--new", help="Replace the token first. Clients with the old token are refused."),
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Show the token that clients of 'webots-mcp serve --http' give; one for all your projects.
+    """Show the token that clients of 'webots-mcp serve --http' need.
 
-    It is in a file that only you can read. The address of the page of 'webots-mcp view' is made
-    from it.
+    All your projects use the same token. It is stored in a file that only you can read. The address
+    of the page of 'webots-mcp view' is derived from it.
     """
     from webots_mcp.server.access_token import access_token, new_token, token_file
 
@@ -242,7 +254,7 @@ def observe(
         Parameter(
             "--robot",
             metavar="NAME",
-            help=f"The Robot node to be, with supervisor TRUE ({OBSERVER_NAME}).",
+            help=f"Robot node to run as, which has supervisor TRUE. Default: {OBSERVER_NAME}.",
         ),
     ] = OBSERVER_NAME,
     url: Annotated[
@@ -250,7 +262,7 @@ def observe(
         Parameter(
             "--url",
             metavar="URL",
-            help="Where Webots is: ipc://1234, tcp://192.168.1.5:1234; else here, at port 1234.",
+            help="Address of Webots, such as tcp://192.168.1.5:1234. Default: ipc://1234.",
         ),
     ] = None,
     period_ms: Annotated[
@@ -259,17 +271,19 @@ def observe(
             "--period-ms",
             metavar="N",
             converter=whole_number,
-            help="Milliseconds of simulation time between two rows (100).",
+            help="Simulated milliseconds between two rows. Default: 100.",
         ),
     ] = None,
     data_dir: DataDir = None,
     as_json: Json = False,
 ) -> None:
-    """Record where all robots of a running world are, as an extern controller of it.
+    """Record the positions of all robots in a running world, as an extern controller.
 
-    The world needs a robot for it, which 'webots-mcp init --observer WORLD --extern' adds; without
-    --extern Webots starts the observer itself, and this command is not needed. It ends when Webots
-    reloads the world or ends; with --json it says then where it has recorded.
+        webots-mcp observe --url ipc://1234
+
+    The world needs an observer robot, which 'webots-mcp init --observer WORLD --extern' adds.
+    Without --extern, Webots starts the observer itself and this command is not needed. It stops
+    when Webots reloads the world or quits; with --json it then reports where it recorded.
     """
     from webots_mcp.database.location import resolve_data_dir
     from webots_mcp.simulator import observer
@@ -312,62 +326,75 @@ def _connect_to(url: str | None, robot: str) -> str:
 
 
 def launch(
-    world: Annotated[Path, Parameter("WORLD", help="A .wbt file in a Webots project.")],
+    world: Annotated[
+        Path, Parameter("WORLD", help="World to open: a .wbt file in a Webots project.")
+    ],
     /,
     *,
     headless: Annotated[
-        bool, Parameter("--headless", help="Without its window and its 3D view.")
+        bool, Parameter("--headless", help="Start without window and 3D view.")
     ] = False,
     mode: Annotated[
         Literal["fast", "realtime", "pause"] | None,
-        Parameter("--mode", help="The mode that it begins with; else that of its preferences."),
+        Parameter("--mode", help="Mode to start in. Default: as in the preferences of Webots."),
     ] = None,
     stream: Annotated[
         bool,
         Parameter(
             "--stream",
-            help="Let it be steered from outside without a controller of ours; at its port the "
-            "project's files can then be read, from the network too.",
+            help="Allow steering without a controller that records. Everyone who can reach the "
+            "port "
+            "can then read files of the project.",
         ),
     ] = False,
     port: Annotated[
         int | None,
         Parameter(
             "--port",
+            metavar="PORT",
             validator=Number(gte=1, lte=MAX_PORT),
-            help="Else the first free one from 1234 on.",
+            help="Port of Webots. Default: the first free port from 1234.",
         ),
     ] = None,
     stand_in: Annotated[
         bool,
         Parameter(
             "--stand-in",
-            help="Run the world on the stand-in simulator that comes with webots-mcp, where no "
-            "Webots is installed; it ends with its last controller, or with Ctrl-C.",
+            help="Use the stand-in simulator of webots-mcp, which needs no Webots. It stops with "
+            "its "
+            "last controller, or with Ctrl-C.",
         ),
     ] = False,
     robot: Annotated[
         tuple[str, ...],
         Parameter(
             "--robot",
-            help="With --stand-in: NAME=FILE runs this file as the controller of a robot, also of "
-            "one that is `<extern>`.",
+            metavar="NAME=FILE",
+            help="With --stand-in: run FILE as the controller of the robot NAME, also if it is "
+            "`<extern>`.",
         ),
     ] = (),
     data_dir: Annotated[
         Path | None,
-        Parameter("--data-dir", help="Where controllers record; else mcp_data/ of the project."),
+        Parameter(
+            "--data-dir",
+            metavar="DIR",
+            help="Folder to record in. Default: mcp_data/ in the project.",
+        ),
     ] = None,
     patience_s: Annotated[
         float,
-        Parameter("--patience", help="Say after so many seconds why nobody has recorded yet (30)."),
+        Parameter(
+            "--patience",
+            metavar="S",
+            help="Seconds to wait for the first row before reporting why none came. Default: 30.",
+        ),
     ] = 30.0,
 ) -> int:
-    """Start Webots on a world, show and record its console, say when the first controller records.
+    """Start Webots on a world, record its console, and report the first controller that records.
 
-    Webots opens no dialogs and ends with this command, however that ends: by Ctrl-C, by SIGTERM,
-    killed. If it ends by itself, the exit code is its own. Where there is no display, xvfb-run
-    gives it one.
+    Webots opens no dialogs. It is stopped whenever this command ends, even if it is killed. If
+    Webots quits by itself, its exit code is returned. Without a display, xvfb-run provides one.
 
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """
@@ -385,18 +412,26 @@ def launch(
         permit(recording, LAUNCH, asked, create=True)
     if stand_in:
         if stream or port is not None:
-            raise InvalidInputError("--stream and --port are Webots' own: leave them out")
+            raise InvalidInputError(
+                "--stream and --port apply only to Webots, not to --stand-in. Leave them out."
+            )
         os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
         watched = recording, newest_in(recording), file, patience_s
         threading.Thread(target=_watch, args=watched, daemon=True).start()
         named = _controllers(robot)
         with StandInConsole(recording) as recorder:
             status = stand_in_simulator()(file, mode or "realtime", None, named, recorder)
-        if not _has_recorded(*watched[:2]):
-            _say("no controller has recorded; 'webots-mcp logs' shows what they printed")
+        option = _data_dir_option(recording)
+        if _has_recorded(*watched[:2]):
+            _say(f"next: 'webots-mcp check{option}' judges what was recorded")
+        else:
+            _say(f"no controller has recorded; 'webots-mcp logs{option}' shows what they printed")
         return status
     if robot:
-        raise InvalidInputError("--robot is for --stand-in: Webots runs what the world names")
+        raise InvalidInputError(
+            "--robot applies only to --stand-in: Webots runs the controllers that the world names. "
+            "Leave it out."
+        )
     start = Start(file, mode, headless, stream, port or free_port())
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
     console = _Console()
@@ -416,7 +451,9 @@ def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
     for text in robots:
         name, equals, file = text.partition("=")
         if not (name and equals and file):
-            raise InvalidInputError(f"--robot {text!r} is not NAME=FILE")
+            raise InvalidInputError(
+                f"--robot {text!r} is not of the form NAME=FILE, such as rover=rover.py"
+            )
         named[name] = file
     return named
 
@@ -443,7 +480,8 @@ def _watch(recording: RecordingAccess, before: int, world: Path, patience_s: flo
         except WebotsMCPError as error:
             return _say(str(error))
         if begun and begun[0].run_id is not None:  # those that have recorded come first
-            return _say(f"{begun[0].robot} records: run {begun[0].run_id}")
+            _say(f"{begun[0].robot} records: run {begun[0].run_id}")
+            return _say(_next_step(recording))
         if time.monotonic() > until_s:
             until_s = math.inf
             reasons = why_silent(begun, world, extern="--robot NAME=FILE runs one")
@@ -471,7 +509,7 @@ def _follow(
     webots, first = launched.webots, None
     until_s = time.monotonic() + patience_s
     while (code := webots.exit_code) is None:
-        first = first or _announce_first(launched)
+        first = first or _announce_first(launched, recorder.recording)
         if first is None and time.monotonic() > until_s:
             until_s = math.inf
             _say(f"no controller has recorded within {patience_s:g} s: {launched.silence()}")
@@ -479,19 +517,20 @@ def _follow(
         recorder.begin()
         time.sleep(_LOOK_EVERY_S)
     webots.wait_for_output()
-    if first is None and _announce_first(launched) is None:
+    if first is None and _announce_first(launched, recorder.recording) is None:
         launched.record_unfollowed_output()
         _say(launched.silence())
     return code
 
 
-def _announce_first(launched: WebotsLaunch) -> SessionStart | None:
+def _announce_first(launched: WebotsLaunch, recording: RecordingAccess) -> SessionStart | None:
     """Say which controller records first, once there is one."""
     first = launched.first_record()
     if first is not None:
         address = launched.webots.address_now()
         where = f", Webots listens at port {address.port}" if address else ""
         _say(f"{first.robot} records: run {first.run_id}{where}")
+        _say(_next_step(recording))
     return first
 
 
@@ -520,7 +559,7 @@ class _Recorder(ExitStack):
     def __init__(self, launched: WebotsLaunch, recording: RecordingAccess) -> None:
         super().__init__()
         self._launched = launched
-        self._recording = recording
+        self.recording = recording
         self._begun = False
 
     def begin(self) -> None:
@@ -530,7 +569,26 @@ class _Recorder(ExitStack):
         instance = None if self._begun else self._launched.webots.instance
         if instance is not None:
             self._begun = True
-            self.enter_context(follow_console(instance, self._recording))
+            self.enter_context(follow_console(instance, self.recording))
+
+
+def _next_step(recording: RecordingAccess) -> str:
+    """Return what to do once a robot is recorded."""
+    return (
+        'next: ask your assistant "What is the robot doing?", or run '
+        f"'webots-mcp status{_data_dir_option(recording)}' in another terminal"
+    )
+
+
+def _data_dir_option(recording: RecordingAccess) -> str:
+    """Return the option that names the recording; none where the current folder says it."""
+    from webots_mcp.contract import PROJECT_DATA_FOLDER
+    from webots_mcp.database.location import find_project
+
+    project = find_project(Path.cwd())
+    if project and project / PROJECT_DATA_FOLDER == recording.data_dir:
+        return ""
+    return f" --data-dir {shlex.quote(str(recording.data_dir))}"
 
 
 def _say(text: str) -> None:

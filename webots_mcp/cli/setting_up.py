@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shlex
+import subprocess
 import sys
 import textwrap
 from collections import Counter
@@ -13,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from webots_mcp.cli.options import HERE, Json, Parameter, Where
+from webots_mcp.cli.streams import shown_activity
 from webots_mcp.cli.terminal import print_json, print_notes, printable, terminal_width
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
@@ -31,11 +34,11 @@ class Writing:
     """Whether files are written, and how it is answered what was."""
 
     yes: Annotated[
-        bool, Parameter("--yes", negative=(), help="Change what is there without asking.")
+        bool, Parameter("--yes", negative=(), help="Change existing files without asking.")
     ] = False
     dry_run: Annotated[
         bool,
-        Parameter("--dry-run", negative=(), help="Write nothing, and say what would be written."),
+        Parameter("--dry-run", negative=(), help="Show what would be written, and write nothing."),
     ] = False
     as_json: Json = False
 
@@ -48,13 +51,16 @@ class Writing:
         if self.yes or self.dry_run:
             return
         if not sys.stdin.isatty() or self.as_json:
-            raise CommandRefusedError(f"{file} is left as it is: --yes writes it")
+            raise CommandRefusedError(
+                f"{file} was not changed, because nobody can be asked here. Repeat with --yes to "
+                f"write it."
+            )
         try:
             answer = input(f"Write {file}? [y/N] ")
         except EOFError:
             answer = ""
         if answer.strip().lower() not in ("y", "yes"):
-            raise CommandRefusedError(f"{file} is left as it is")
+            raise CommandRefusedError(f"{file} was not changed.")
 
     def require_yes_to(self, change: FileChange) -> None:
         """Show the lines that change, and ask whether they may.
@@ -91,32 +97,36 @@ _ASKING: Final = Writing()
 
 def init(
     project: Annotated[
-        str | None, Parameter("PROJECT", help="A folder in the project; else the current one.")
+        str | None, Parameter("PROJECT", help="Folder in the project. Default: the current folder.")
     ] = None,
     /,
     *,
     claude_desktop: Annotated[
         bool,
         Parameter(
-            "--claude-desktop", help="Tell Claude Desktop too, whose file is not in the project."
+            "--claude-desktop",
+            help="Also register with Claude Desktop, whose file is outside the project.",
         ),
     ] = False,
     name: Annotated[
-        str, Parameter("--name", metavar="NAME", help="What clients call the server (webots).")
+        str,
+        Parameter("--name", metavar="NAME", help="Name of the server in clients. Default: webots."),
     ] = "webots",
     http: Annotated[
         str | None,
         Parameter(
             "--http",
             metavar="URL",
-            help="Tell them of a server that runs, as http://127.0.0.1:8000/mcp; they take its "
-            "token from the environment variable WEBOTS_MCP_TOKEN.",
+            help="Register a running server instead, such as http://127.0.0.1:8000/mcp. Clients "
+            "read "
+            "its token from the environment variable WEBOTS_MCP_TOKEN.",
         ),
     ] = None,
     skills: Annotated[
         bool,
         Parameter(
-            "--skills", help="Add skills to .claude/skills and AGENTS.md; what you change, stays."
+            "--skills",
+            help="Also install skills in .claude/skills and AGENTS.md. Your own changes stay.",
         ),
     ] = False,
     patch: Annotated[
@@ -124,7 +134,7 @@ def init(
         Parameter(
             "--patch",
             metavar="FILE",
-            help="Put the bridge's lines into this controller, and do nothing else.",
+            help="Only add the lines that record to this controller, after asking.",
         ),
     ] = None,
     observer: Annotated[
@@ -132,16 +142,17 @@ def init(
         Parameter(
             "--observer",
             metavar="WORLD",
-            help="Add a robot that records where all robots are, to a copy of this world.",
+            help="Only add a robot that records all positions, to a copy of this world.",
         ),
     ] = None,
     in_place: Annotated[
-        bool, Parameter("--in-place", help="With --observer: to the world itself.")
+        bool, Parameter("--in-place", help="With --observer: change the world itself, not a copy.")
     ] = False,
     extern: Annotated[
         bool,
         Parameter(
-            "--extern", help="With --observer: to be run by 'webots-mcp observe', not by Webots."
+            "--extern",
+            help="With --observer: 'webots-mcp observe' runs it, instead of Webots.",
         ),
     ] = False,
     undo: Annotated[
@@ -149,38 +160,43 @@ def init(
         Parameter(
             "--undo",
             metavar="FILE",
-            help="Take the bridge's lines out of a controller, or the observer out of a world.",
+            help="Remove these lines from a controller, or the observer from a world.",
         ),
     ] = None,
     writing: Writing = _ASKING,
 ) -> None:
-    """Make a Webots project ready: tell MCP clients of the server, look at the controllers.
+    """Set up a Webots project: register the MCP server and list what each controller needs.
 
-    The project is the nearest folder that holds worlds/ with a world; it need not have
-    controllers/. Claude Code (.mcp.json), Cursor (.cursor/mcp.json) and VS Code (.vscode/mcp.json)
-    are told of the server, by a full path; other entries stay. In WSL, where the project is on a
-    drive of Windows, it is the server of Windows. Of each controller in Python the lines that it
-    needs are shown, the Python that Webots starts it with, and what mends that where the bridge is
-    not installed there. Nothing is changed a second time.
+        webots-mcp init ~/my_project --skills
 
-    --patch writes those lines, after a question:
+    Registers the server with Claude Code (.mcp.json), Cursor (.cursor/mcp.json) and VS Code
+    (.vscode/mcp.json); other entries stay. The project is the nearest folder with worlds/. In WSL,
+    a project on a Windows drive gets the server of Windows. Running it again changes nothing.
+
+    For each Python controller it shows the two lines that record, the Python that Webots runs it
+    with, and how to install webots-mcp there. --patch adds these lines for you:
 
         webots-mcp init --patch controllers/my_robot/my_robot.py
 
-    --skills adds pages for assistants, again after an update: why it does not move, did my edit
-    help, tune, test, a new world.
+    --skills installs guides for assistants, such as "why does it not move" and "did my edit help".
+    Repeat it after an update.
 
-    --observer adds a robot to a copy of a world (arena_observed.wbt, say), and its controller to
-    the project; then nothing has to be changed in any controller:
+    --observer records positions without changing any controller. It adds a robot to a copy of the
+    world, here arena_observed.wbt:
 
         webots-mcp init --observer worlds/arena.wbt
     """
     from webots_mcp.setup import project_edits
 
     if sum(each is not None for each in (patch, undo, observer)) > 1:
-        raise InvalidInputError("--patch, --observer and --undo exclude each other")
+        raise InvalidInputError(
+            "--patch, --observer and --undo exclude each other. Give one of them."
+        )
     if (in_place or extern) and observer is None:
-        raise InvalidInputError("--in-place and --extern say what --observer WORLD does")
+        raise InvalidInputError(
+            "--in-place and --extern apply only to --observer. Add --observer WORLD, or leave them "
+            "out."
+        )
     if observer is not None:
         _add_observer(observer, writing, in_place=in_place, extern=extern)
     elif undo is not None and undo.suffix == ".wbt":
@@ -194,26 +210,30 @@ def init(
 
 
 def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
+    from webots_mcp.database.location import find_project
+    from webots_mcp.setup import project_edits
     from webots_mcp.setup.file_change import FileChange, read
     from webots_mcp.setup.project_edits import AlreadyPatchedError
 
     if file.is_dir():
-        raise InvalidInputError(f"{file} is a folder: name the controller's file in it")
+        raise InvalidInputError(f"{file} is a folder. Name the controller's file in it.")
     before = read(file)
     if before is None:
-        raise InvalidInputError(f"there is no file {file}")
+        raise InvalidInputError(f"There is no file {file}. Check the path.")
     if file.suffix != ".py":
-        own = "'webots-mcp init' says what controllers in other languages need"
-        raise InvalidInputError(f"{file} is no file of Python, and left as it is; {own}")
+        own = "'webots-mcp init' lists what controllers in other languages need"
+        raise InvalidInputError(f"{file} is not a Python file and was not changed; {own}.")
     try:
         change = FileChange(file, before, changed(before))
     except AlreadyPatchedError as error:
         there = {"file": str(file), "outcome": "unchanged", "note": f"already patched: {error}"}
         return _print_files([there], writing)
     except InvalidInputError as error:
-        raise InvalidInputError(f"{file} is left as it is: {error}") from error
+        raise InvalidInputError(f"{file} was not changed: {error}") from error
     writing.require_yes_to(change)
-    _print_files([writing.apply(change) | {"diff": change.diff}], writing)
+    project = find_project(file.resolve().parent)
+    launch = _launch_line(project) if project and changed is project_edits.patch else None
+    _print_files([writing.apply(change) | {"diff": change.diff}], writing, then=launch)
 
 
 def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool) -> None:
@@ -245,7 +265,9 @@ def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
         return []
     change = python_change(controller, sys.executable)
     if change.before is None:
-        return [writing.apply(change)]
+        unshared = "names the Python of this machine: add it to .gitignore"
+        note = {"note": unshared} if _is_shared(change.file) else {}
+        return [writing.apply(change) | note]
     note = f"{found.error}: {found.fix}"
     return [{"file": str(change.file), "outcome": "unchanged", "note": note}]
 
@@ -284,7 +306,7 @@ def _print_files(
     for each in files:
         print(_outcome(each))
     if then and not writing.dry_run:
-        print(then)
+        print(f"Next: {then}")
 
 
 def _outcome(file: dict[str, str]) -> str:
@@ -310,8 +332,8 @@ def _make_ready(
 
     if http is not None and not re.fullmatch(r"https?://[^\s/@]+(/\S*)?", http):
         raise InvalidInputError(
-            f"--http {http!r} is no URL without user and password, such as "
-            "http://127.0.0.1:8000/mcp"
+            f"--http {http!r} is not a URL of a server without user and password. Give a URL such "
+            "as http://127.0.0.1:8000/mcp."
         )
     project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
@@ -330,15 +352,20 @@ def _make_ready(
     files += [_written(e.file, writing, e.plan) for e in managed_texts(project)] if skills else []
     controllers = [_described(found, project) for found in controllers_of(project)]
     hindrance = None if http or of_windows else client_entries.server_hindrance()
-    notes = [note for note in (border, hindrance, expected) if note]
+    shared = None if http else _machine_paths(project, files)
+    notes = [note for note in (border, hindrance, expected, shared) if note]
     found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
+    found["next"] = _next_steps(project, controllers)
     if writing.as_json:
         print_json(found | ({"note": "; ".join(notes)} if notes else {}))
     else:
         _print_project(found, notes)
     refused = [each["file"] for each in files if each["outcome"] == "refused"]
     if refused:
-        raise CommandRefusedError(f"not written: {', '.join(refused)}; the reasons are above")
+        raise CommandRefusedError(
+            f"{', '.join(refused)} could not be written. The reasons are above; fix them and "
+            f"repeat."
+        )
 
 
 def _expected(data_dir: Path, writing: Writing) -> str | None:
@@ -363,6 +390,8 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
             if schema_version(connection) == 0:
                 create_schema(connection)
             compile_project(connection, project)
+    if not any(project):
+        return None
     expected, signals = map(len, project)
     counted = f"{expected} expectation{'s' * (expected != 1)}"
     if signals:
@@ -443,76 +472,139 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
 
 
 def _print_project(found: dict[str, Any], notes: list[str]) -> None:
-    print(f"project {found['project']}\n")
+    counts = Counter(each["outcome"] for each in found["files"])
+    done = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    print(f"Project {found['project']}: files {done}.\n")
     for each in found["files"]:
         print(f"  {_outcome(each)}")
     for each in found["controllers"]:
         print(f"\n{each['file']}")
         _print_controller(each)
-    fixes = dict.fromkeys(
-        each["python"]["fix"] for each in found["controllers"] if "fix" in each.get("python", {})
-    )
-    if fixes:
-        print("\nWhat mends that:\n")
-        print("\n".join(f"    {fix}" for fix in fixes))
     if not found["controllers"]:
         notes = [
             *notes,
-            "there is no controller in controllers/. Once there is one, run this again. An extern "
-            "controller or a ROS 2 driver records with these two lines: 'from webots_mcp import "
-            "MCPBridge' and, where it has made its robot, 'bridge = MCPBridge.attach(robot)'",
+            "there is no controller in controllers/. Run this again once there is one. An extern "
+            "controller or a ROS 2 driver records with two lines: 'from webots_mcp import "
+            "MCPBridge' and, after it creates its robot, 'bridge = MCPBridge.attach(robot)'",
         ]
     print()
     print_notes(notes)
+    if found["next"]:
+        print("Next:")
+    for number, each in enumerate(found["next"], 1):
+        print(f"  {number}. {each}")
+
+
+def _next_steps(project: Path, controllers: list[dict[str, Any]]) -> list[str]:
+    """Return the commands that follow the setup of a project, and the first question."""
+    fixes = [each["python"]["fix"] for each in controllers if "fix" in each.get("python", {})]
+    steps = [
+        f"webots-mcp init --patch {_shown(project / each['lines_in'])}"
+        for each in controllers
+        if "lines" in each
+    ]
+    launch = _launch_line(project)
+    ask = "Open your assistant in the project and ask: What is the robot doing?"
+    return [*dict.fromkeys([*fixes, *steps]), *([launch] if launch else []), ask]
+
+
+def _launch_line(project: Path) -> str | None:
+    """Return the command that runs the first world of a project; None where it has no world."""
+    from webots_mcp.contract import WORLD_ENDING, WORLD_FOLDER
+    from webots_mcp.simulator.installations import installations
+
+    world = next(iter(sorted((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}"))), None)
+    if world is None:
+        return None
+    without = "" if installations() else " --stand-in"
+    why = " (no Webots was found on this machine)" if without else ""
+    return f"webots-mcp launch {_shown(world)}{without}{why}"
+
+
+def _shown(file: Path) -> str:
+    """Return a path as it is typed in the current folder."""
+    try:
+        return shlex.quote(str(file.relative_to(Path.cwd())))
+    except ValueError:
+        return shlex.quote(str(file))
+
+
+def _machine_paths(project: Path, files: Sequence[dict[str, str]]) -> str | None:
+    """Return which written files do not belong in the project's repository, and why."""
+    written = (Path(each["file"]) for each in files if "client" in each)
+    names = [str(file.relative_to(project)) for file in written if _is_shared(file, project)]
+    if not names:
+        return None
+    return (
+        f"add {', '.join(names[:-1])}{' and ' * (len(names) > 1)}{names[-1]} to .gitignore: they "
+        f"hold the path of webots-mcp on this machine, "
+        "because clients do not search your PATH. Everyone else runs 'webots-mcp init' too"
+    )
+
+
+def _is_shared(file: Path, project: Path | None = None) -> bool:
+    """Return whether a file lies in a Git repository that does not ignore it."""
+    folder = project or file.parent
+    if not file.resolve().is_relative_to(folder.resolve()):
+        return False  # of the user, not of the project
+    asked = ["git", "-C", str(folder), "check-ignore", "--quiet", str(file)]
+    try:
+        return subprocess.run(asked, capture_output=True, check=False, timeout=10).returncode == 1
+    except (OSError, subprocess.TimeoutExpired):  # there is no Git
+        return False
 
 
 def _print_controller(described: dict[str, Any]) -> None:
     if "python" not in described:
         note = f" ({described['note']})" if "note" in described else ""
-        print(f"  is {described['language']}{note}: {described['advice']}")
+        _print_folded("  ", f"is {described['language']}{note}: {described['advice']}")
         return
     if "lines" in described:
         file = described["lines_in"]
         place = f" in {file}" if file != described["file"] else ""
-        print(
-            f"  needs these lines{place}, the second after line {described['after_line']}, where "
-            f"the robot is made (or: --patch {file})\n"
+        _print_folded(
+            "  ",
+            f"needs these lines{place}, the second after line {described['after_line']}, where "
+            f"the robot is created (or: webots-mcp init --patch {file})",
         )
-        print("".join(f"      {line}\n" for line in described["lines"]))
+        print("\n" + "".join(f"      {line}\n" for line in described["lines"]))
     elif "unclear" in described:
-        print(f"  where the lines belong is not clear: {described['unclear']}")
+        _print_folded("  ", f"where to add the lines is not clear: {described['unclear']}")
     else:
         print(f"  {described['has_bridge']}")
     if "lacks" in described:
-        print(f"  {described['lacks']}")
+        _print_folded("  ", described["lacks"])
     _print_python(described["python"])
 
 
 def _print_python(python: dict[str, Any]) -> None:
     version = f", {python['executable']}, Python {python['python']}" if "python" in python else ""
-    print(f"  is started with {python['command']!r} ({python['chosen_by']}){version}")
+    _print_folded(
+        "  ", f"Webots runs it with {python['command']!r} ({python['chosen_by']}){version}"
+    )
     if "error" not in python:
         print(f"  which has webots-mcp {python['bridge']}")
         return
-    print(f"  where the bridge cannot be used: {python['error']}")
+    _print_folded("  ", f"where webots-mcp cannot be used: {python['error']}")
 
 
 def doctor(
     *,
     no_server: Annotated[
-        bool, Parameter("--no-server", help="Start no server to talk to.")
+        bool, Parameter("--no-server", help="Skip the check that starts an MCP server.")
     ] = False,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> int:
-    """Look at each link of the chain from controller to client, and say what mends it.
+    """Check every step from controller to client, and show how to fix what is wrong.
 
-    Nothing is changed. Exit code 0: nothing is wrong (there may be warnings). 1: something is
-    wrong. 2: it could not look.
+    Changes nothing. Exit code 0: nothing is wrong; there may be warnings. 1: something is wrong.
+    2: the checks could not run.
     """
     from webots_mcp.setup.doctor import all_checks, diagnose
 
-    checked = diagnose(_examined(recorded), all_checks(with_server=not no_server))
+    with shown_activity("checking"):
+        checked = diagnose(_examined(recorded), all_checks(with_server=not no_server))
     if as_json:
         print_json({"checks": [_facts(each) for each in checked]})
     else:
@@ -542,12 +634,17 @@ def _facts(checked: Checked) -> dict[str, Any]:
 
 
 def _print_checks(checked: list[Checked]) -> None:
+    counts = Counter(each.finding.verdict for each in checked)
+    wrong = counts["wrong"]
+    problems = f"{wrong} problem{'s' * (wrong != 1)} found" if wrong else "No problem found"
+    named = (
+        f"{n} {verdict}{'s' * (verdict == 'warning' and n > 1)}" for verdict, n in counts.items()
+    )
+    print(f"{problems}: {', '.join(named)}.\n")
     for check, finding in checked:
         _print_folded(f"{finding.verdict:13}  {check.name:15}  ", finding.seen)
         if finding.fix:
             _print_folded(f"{'':30}  -> ", f"{finding.fix} ({check.page})")
-    counts = Counter(each.finding.verdict for each in checked)
-    print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
 
 
 def _print_folded(head: str, text: str) -> None:
@@ -564,33 +661,38 @@ def _print_folded(head: str, text: str) -> None:
 
 def header(
     target: Annotated[
-        Path, Parameter("TARGET", help="The controller's folder, or the file (webots_mcp.h here).")
+        Path,
+        Parameter(
+            "TARGET", help="Folder of the controller, or the file to write. Default: webots_mcp.h."
+        ),
     ] = Path(),
     /,
     *,
     as_json: Json = False,
 ) -> None:
-    """Write webots_mcp.h into the folder of a controller in C or C++, which records with it.
+    """Write webots_mcp.h, with which a controller in C or C++ records.
 
         webots-mcp header controllers/my_robot
 
-    An older one is replaced. 'webots-mcp help c' has what a controller calls.
+    Replaces an older version of this file. 'webots-mcp help c' lists its functions.
     """
     from webots_mcp.contract import C_HEADER
 
     file = target / C_HEADER.name if target.is_dir() else target
     if not file.suffix.startswith(".h"):
-        raise InvalidInputError(f"there is no folder {target}; a file has to be named *.h")
+        raise InvalidInputError(
+            f"{target} is neither a folder nor a file named *.h. Name the controller's folder."
+        )
     text = C_HEADER.read_text("utf-8")
     try:
         if file.exists() and not file.read_bytes().startswith(text[:15].encode()):
-            raise InvalidInputError(f"{file} is another file: it is left as it is; name a new one")
+            raise InvalidInputError(f"{file} is another file and was not changed. Name a new file.")
         file.write_text(text, "utf-8", newline="\n")
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
     if as_json:
         return print_json({"file": str(file)})
-    print(f'{file} is written: #include "{file.name}" in the controller')
+    print(f'Wrote {file}. Next: #include "{file.name}" in the controller.')
 
 
 def completion(
@@ -605,24 +707,24 @@ def completion(
         Parameter(
             "--install",
             negative=(),
-            help="Write the script where the shell looks for it, and load it in its start-up file.",
+            help="Install the script for all later sessions, in the folder of the shell.",
         ),
     ] = False,
     values: Annotated[
         Literal["robots", "runs", "signals", "kinds"] | None,
-        Parameter("--values", help="List these names of the recording, one per line."),
+        Parameter("--values", help="List names from the recording instead, one per line."),
     ] = None,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Print the script that completes commands, options, files and recorded names at the Tab key.
+    """Print the script for Tab completion of commands, options, files and recorded names.
 
-    For one session:
+    For this session only:
 
         source <(webots-mcp completion bash)
 
-    `--install` does it for all later sessions. Install it again after an update of webots-mcp.
-    Names of robots, runs, signals and kinds of events are completed in bash and fish.
+    --install sets it up for all later sessions. Repeat that after an update of webots-mcp. Robots,
+    runs, signals and kinds of events are completed in bash and fish.
     """
     from cyclopts.completion import detect_shell
     from cyclopts.completion.detect import ShellDetectionError

@@ -27,12 +27,14 @@ def status(
     *,
     storage: Annotated[
         bool,
-        Parameter("--storage", negative=(), help="Also show sizes and limits of the recording."),
+        Parameter(
+            "--storage", negative=(), help="Also show the sizes and limits of the recording."
+        ),
     ] = False,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """List the robots: live or not, what each does and since when, and any warnings."""
+    """Show what each robot is doing, since when, and any warnings."""
     from webots_mcp.cli.asking import ask, show
     from webots_mcp.questions.list_robots import webots_list_robots
 

@@ -31,6 +31,7 @@ from webots_mcp.cli.options import (
     whole_number,
 )
 from webots_mcp.cli.terminal import clock_text, print_json, print_notes, print_table, text_of
+from webots_mcp.cli.wording import as_typed
 from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
@@ -49,45 +50,45 @@ _WHERE: Final = Where()
 
 
 def pause(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
-    """Pause the simulation; its controller goes on answering."""
+    """Pause the simulation. Questions can still be asked."""
     _control("pause", asked, as_json=json)
 
 
 def resume(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
-    """Let a paused simulation go on, in real time."""
+    """Resume a paused simulation in real time."""
     _control("resume", asked, as_json=json)
 
 
 def step(
     steps: Annotated[
-        int, Parameter("N", converter=whole_number, help="Rounds of its loop (1).")
+        int, Parameter("N", converter=whole_number, help="Number of steps. Default: 1.")
     ] = 1,
     /,
     *,
     asked: ToWebots = _WEBOTS,
     json: Json = False,
 ) -> None:
-    """Let the controller's own loop come round N times, then pause."""
+    """Run N steps of the controller's loop, then pause."""
     _control("step", asked, as_json=json, steps=steps)
 
 
 def fast(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
-    """Let the simulation run as fast as it can."""
+    """Run the simulation as fast as possible."""
     _control("fast", asked, as_json=json)
 
 
 def reset(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
     """Reset the simulation to its first state; a new run begins at time 0.
 
-    Controllers keep running with the code they have. `webots-mcp reload` restarts them.
+    Controllers are not restarted and keep their code. To restart them, use 'webots-mcp reload'.
     """
     _control("reset", asked, as_json=json)
 
 
 def reload(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
-    """Reload the world and restart its controllers with their code as it is now.
+    """Reload the world and restart its controllers with their current code.
 
-    An extern controller ends and must be started by hand.
+    Extern controllers stop and must be started again by hand.
     """
     _control("reload", asked, as_json=json)
 
@@ -99,15 +100,17 @@ def _control(command: str, asked: ToWebots, *, as_json: bool, **given: Any) -> N
 
 
 def capture(
-    reason: Annotated[str, Parameter("REASON", help="Why, as it is shown with the stretch.")],
+    reason: Annotated[str, Parameter("REASON", help="Reason, which is recorded as an event.")],
     /,
     *,
     asked: Waiting = _WAITING,
     json: Json = False,
 ) -> None:
-    """Keep the last seconds of a running controller at full rate, and the two that follow.
+    """Keep the last seconds of a running controller, and the next two, at full rate.
 
-    Each call of publish in them becomes a row, also those that the throttle drops.
+        webots-mcp capture "wheel slipped"
+
+    Every call of publish() in this time becomes a row, even calls that the rate limit would skip.
     """
     from webots_mcp.questions.send_command import webots_send_command
 
@@ -116,18 +119,20 @@ def capture(
 
 
 def parameters(
-    *settings: Annotated[str, Parameter("NAME=VALUE", help="Set these, all or none.")],
+    *settings: Annotated[
+        str, Parameter("NAME=VALUE", help="Parameters to set; all or none are changed.")
+    ],
     asked: Waiting = _WAITING,
     run_id: RunId = None,
     from_reset: Annotated[
-        bool, Parameter("--from-reset", help="Not now, but from the next reset on.")
+        bool, Parameter("--from-reset", help="Set them at the next reset instead of now.")
     ] = False,
     json: Json = False,
 ) -> None:
     """Show the parameters that a controller declares, or set some while it runs.
 
-    All are set between two rounds of its loop, or none. A reset keeps them; a reload begins with
-    those in the code.
+    Values change together, between two steps. A reset keeps them; a reload restores those in the
+    code.
 
         webots-mcp parameters kp=3.5 gait=trot
     """
@@ -141,7 +146,11 @@ def parameters(
     if not settings:
         return _show(webots_get_parameters, asked, as_json=json, run_id=run_id)
     if run_id is not None:
-        raise InvalidInputError("--run shows an earlier run; parameters are set in the current one")
+        raise InvalidInputError(
+            "--run shows the parameters of an earlier run, which cannot be changed. Leave --run "
+            "out to "
+            "set them in the current run."
+        )
     when = "reset" if from_reset else "now"
     _show(webots_set_parameters, asked, as_json=json, values=settings, when=when)
 
@@ -151,24 +160,35 @@ def signals(
         str,
         Parameter(
             "PATTERN",
-            help=r"Of signals; '\*' is any text. (\*) With --describe: FIELD=VALUE, such as "
-            "quantity=speed.",
+            help=r"Signals to list; '\*' means any text. Default: all. With --describe: "
+            "FIELD=VALUE, such as quantity=speed.",
         ),
     ],
     describe: Annotated[
         str | None,
-        Parameter("--describe", metavar="NAME", help="Say what the signals of this name mean."),
+        Parameter("--describe", metavar="SIGNAL", help="Declare what this signal means."),
     ] = None,
     undo: Annotated[
         str | None,
-        Parameter("--undo", metavar="NAME", help="Remove what was declared of these signals."),
+        Parameter("--undo", metavar="SIGNAL", help="Remove the declaration of this signal."),
     ] = None,
     meanings: Annotated[
-        bool, Parameter("--meanings", negative=(), help="List what they mean, and why.")
+        bool,
+        Parameter(
+            "--meanings", negative=(), help="List the meaning of each signal, and its source."
+        ),
     ] = False,
-    limit: Annotated[Count, Parameter("-n", metavar="N", help="Most shown (100).")] = 100,
+    limit: Annotated[
+        Count, Parameter("-n", metavar="N", help="Maximum number of signals. Default: 100.")
+    ] = 100,
     cursor: Annotated[
-        int | None, Parameter("--after", converter=whole_number, help="From the last answer.")
+        int | None,
+        Parameter(
+            "--after",
+            metavar="CURSOR",
+            converter=whole_number,
+            help="Cursor of the previous answer, to continue it.",
+        ),
     ] = None,
     run_id: RunId = None,
     asked: ToRobot = _ROBOT,
@@ -178,29 +198,32 @@ def signals(
 
         webots-mcp signals 'front*'
 
-    Describe those whose meaning is unknown or wrong. The fields are quantity, role, unit,
-    target_of, same_as, side, low and high; 'webots-mcp help meanings' lists their values. A
-    description applies to past runs too.
+    Use --describe for signals whose meaning is unknown or wrong. It applies to past runs too. The
+    fields are quantity, role, unit, target_of, same_as, side, low and high; 'webots-mcp help
+    meanings' lists their values.
 
-        webots-mcp signals --describe motors.left quantity='wheel speed' role=commanded
+        webots-mcp signals --describe motors.left quantity='wheel speed'
     """
     from webots_mcp.questions.describe_signals import webots_describe_signals, webots_list_meanings
     from webots_mcp.questions.history import webots_list_signals
 
     if describe is not None and undo is not None:
-        raise InvalidInputError("give --describe NAME or --undo NAME, not both")
+        raise InvalidInputError("--describe and --undo exclude each other. Give one of them.")
     if describe is not None:
         said = _fields_of(words)
         return _show(webots_describe_signals, asked, as_json=json, signals=[describe], **said)
     if undo is not None and words:
-        raise InvalidInputError(f"--undo takes one name: leave out {words[0]!r}")
+        raise InvalidInputError(f"--undo takes one signal. Leave out {words[0]!r}.")
     if undo is not None:
         return _show(webots_describe_signals, asked, as_json=json, signals=[undo], undo=True)
     if meanings:
         names = [*words] or None
         return _show(webots_list_meanings, asked, as_json=json, signals=names)
     if len(words) > 1:
-        raise InvalidInputError(f"give one pattern, in quotes: {words[1]!r} is too much")
+        raise InvalidInputError(
+            f"Only one pattern is allowed, and {words[1]!r} is a second one. Put the pattern in "
+            "quotes, so that the shell does not expand it."
+        )
     given = {"pattern": words[0]} if words else {}
     given |= {"limit": limit, "cursor": cursor, "run_id": run_id}
     _show(webots_list_signals, asked, as_json=json, **given)
@@ -215,7 +238,7 @@ def _fields_of(words: tuple[str, ...]) -> dict[str, Any]:
     kinds = dict.fromkeys((each for each in MEANING_FIELDS if each not in limits), "str")
     said = settings_of(words, kinds)
     if not said:
-        raise InvalidInputError("--describe NAME needs FIELD=VALUE, such as quantity=speed")
+        raise InvalidInputError("--describe needs FIELD=VALUE, such as quantity=speed")
     if unknown := [name for name in said if name not in MEANING_FIELDS]:
         fields = ", ".join(MEANING_FIELDS)
         raise InvalidInputError(f"unknown field {unknown[0]!r:.80}. Fields: {fields}")
@@ -224,30 +247,34 @@ def _fields_of(words: tuple[str, ...]) -> dict[str, Any]:
 
 def breakpoint_(
     condition: Annotated[
-        str | None, Parameter("CONDITION", help="Such as 'front_m < 0.1 for 0.5'.")
+        str | None, Parameter("CONDITION", help="Condition, such as 'front_m < 0.1 for 0.5'.")
     ] = None,
     /,
     *,
-    action: Annotated[BreakpointAction, Parameter("--action", help="At a hit (pause).")] = "pause",
+    action: Annotated[
+        BreakpointAction, Parameter("--action", help="What to do at a hit. Default: pause.")
+    ] = "pause",
     after_hits: Annotated[
-        Count, Parameter("--after-hits", metavar="N", help="Act from this hit of a run on (1).")
+        Count,
+        Parameter("--after-hits", metavar="N", help="Act from the Nth hit of a run. Default: 1."),
     ] = 1,
     breakpoint_id: Annotated[
-        Id | None, Parameter("--remove", metavar="ID", help="Remove the one with this id.")
+        Id | None, Parameter("--remove", metavar="ID", help="Remove the breakpoint with this id.")
     ] = None,
     asked: ToRobot = _ROBOT,
     json: Json = False,
 ) -> None:
-    """Pause, or take note, when a condition begins to hold; without one, list the breakpoints.
+    """Set a breakpoint, which pauses or logs when a condition begins to hold, or list them.
 
         webots-mcp breakpoint 'front_m < 0.1' --action log
 
-    It is asked of every published state, stored, and armed again after a reset or reload.
+    Without CONDITION it lists the breakpoints. Every published state is checked. Breakpoints stay
+    armed after a reset or reload.
     """
     from webots_mcp.questions import set_breakpoints
 
     if condition is not None and breakpoint_id is not None:
-        raise InvalidInputError("give a condition to set, or --remove ID, not both")
+        raise InvalidInputError("A condition and --remove exclude each other. Give one of them.")
     if breakpoint_id is not None:
         remove = set_breakpoints.webots_remove_breakpoint
         return _show(remove, asked, as_json=json, breakpoint_id=breakpoint_id)
@@ -258,12 +285,14 @@ def breakpoint_(
 
 
 def field(
-    path: Annotated[str, Parameter("PATH", help="Such as ROVER.translation or BALL.physics.mass.")],
+    path: Annotated[
+        str, Parameter("PATH", help="Node or field: ROVER, ROVER.translation, BALL.physics.mass.")
+    ],
     value: Annotated[
         str | None,
         Parameter(
             "VALUE",
-            help="Set it: '[0, 1, 0.04]', 0.5, true, a text.",
+            help="New value, such as '[0, 1, 0.04]', 0.5, true or a text.",
             allow_leading_hyphen=True,
         ),
     ] = None,
@@ -275,23 +304,25 @@ def field(
             "--start",
             metavar="N",
             converter=whole_number,
-            help="Show its entries from this one on.",
+            help="First entry to show of a long list. Default: 0.",
         ),
     ] = None,
-    stop: Annotated[bool, Parameter("--stop", help="Take the speed of its node too.")] = False,
+    stop: Annotated[
+        bool, Parameter("--stop", help="Also set the speed of the node to zero.")
+    ] = False,
     asked: ToRobot = _ROBOT,
     json: Json = False,
 ) -> None:
-    """Show a field of the scene tree, or all fields of a node; or set one.
+    """Show a field of the scene tree or all fields of a node, or set a field.
 
-    What is set is recorded as an event; a reset puts it back.
+    A change is recorded as an event. A reset restores the old value.
 
         webots-mcp field ROVER.translation '[0, 1, 0.04]'
     """
     from webots_mcp.questions.edit_scene import webots_get_field, webots_set_field
 
     if stop and value is None:
-        raise InvalidInputError("--stop goes with a VALUE that is set")
+        raise InvalidInputError("--stop goes with a VALUE to set. Add it, or leave --stop out.")
     if value is None:
         return _show(webots_get_field, asked, as_json=json, path=path, start=start)
     _show(webots_set_field, asked, as_json=json, path=path, value=value, stop=stop)
@@ -311,17 +342,19 @@ def _has(question: Question, argument: str) -> bool:
 
 def audit(
     *,
-    number: Annotated[Count, Parameter("-n", metavar="N", help="The newest N (20).")] = 20,
+    number: Annotated[
+        Count, Parameter("-n", metavar="N", help="Number of requests. Default: 20.")
+    ] = 20,
     refused: Annotated[
-        bool, Parameter("--refused", negative=(), help="Only what a rule has refused.")
+        bool, Parameter("--refused", negative=(), help="Only requests that a rule refused.")
     ] = False,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Who asked for what that changes something, and what became of it; newest first.
+    """List requests that change something: who asked, for what, and the outcome; newest first.
 
-    MCP clients, this command line and the page; see 'webots-mcp help policy'. No row is ever
-    deleted.
+    Covers MCP clients, this command line and the page. These rows are never deleted. For rules that
+    refuse requests see 'webots-mcp help policy'.
     """
     from webots_mcp.store.requests import newest_requests
 
@@ -330,7 +363,9 @@ def audit(
     if json:
         return print_json({"requests": found})
     if not found:
-        return print("no request was refused" if refused else "nothing was asked for yet")
+        return print("No request was refused." if refused else "No request was made yet.")
+    what = "refused requests" if refused else "requests"
+    print(f"The newest {len(found)} {what}, newest first:")
     print_table(
         ("id", "when", "at_s", "by", "tool", "arguments", "outcome", "commands"),
         [_request_row(each) for each in found],
@@ -362,8 +397,8 @@ class TrialOptions:
         Parameter(
             "--jobs",
             metavar="N",
-            help="At most N trials at once, each in a simulator of its own (1; with --scheduler as "
-            "many as its workers can run).",
+            help="Maximum number of trials at once, each in its own simulator. Default: 1, or with "
+            "--scheduler as many as its workers can run.",
         ),
     ] = None
     scheduler: Annotated[
@@ -371,7 +406,7 @@ class TrialOptions:
         Parameter(
             "--scheduler",
             metavar="ADDRESS",
-            help="On the workers of a Dask cluster, such as tcp://HOST:8786.",
+            help="Run trials on the workers of this Dask cluster, such as tcp://HOST:8786.",
         ),
     ] = None
     ship_to: Annotated[
@@ -379,15 +414,15 @@ class TrialOptions:
         Parameter(
             "--ship-to",
             metavar="URL",
-            help="With --scheduler: large recordings come through this pool, and stay in it.",
+            help="With --scheduler: pool through which large recordings are sent, and kept.",
         ),
     ] = None
     stand_in: Annotated[
-        bool, Parameter("--stand-in", help="On the stand-in instead of Webots.")
+        bool, Parameter("--stand-in", help="Use the stand-in simulator, not Webots.")
     ] = False
     again: Annotated[
         bool,
-        Parameter("--again", help="From the start, also where all trials of the plan are done."),
+        Parameter("--again", help="Start over, even if all trials of the plan are done."),
     ] = False
 
 
@@ -395,7 +430,9 @@ _DEFAULTS: Final = TrialOptions()
 
 
 def trials(
-    plan: Annotated[Path, Parameter("PLAN", help="A .toml file: see 'webots-mcp help trials'.")],
+    plan: Annotated[
+        Path, Parameter("PLAN", help="Plan file (.toml); see 'webots-mcp help trials'.")
+    ],
     /,
     *,
     options: TrialOptions = _DEFAULTS,
@@ -404,7 +441,7 @@ def trials(
         Parameter(
             "--search",
             metavar="SAMPLER",
-            help="Search the plan's [ranges]: tpe or random, by Optuna (pip install optuna).",
+            help="Sampler that searches the [ranges] of the plan with Optuna.",
         ),
     ] = None,
     plot: Annotated[
@@ -412,30 +449,30 @@ def trials(
         Parameter(
             "--plot",
             metavar="FILE",
-            help="A .png or .svg file: the scores over the parameters.",
+            help="Also draw the scores over the parameters: .png or .svg.",
         ),
     ] = None,
     so_far: Annotated[
         bool,
         Parameter(
             "--so-far",
-            help="Only print what is over, also while another process works on it.",
+            help="Only show the trials that are done, even while another process runs them.",
         ),
     ] = False,
     recorded: Where = _WHERE,
     json: Json = False,
 ) -> None:
-    """Try sets of parameters in runs of their own, score each run, and rank the sets.
+    """Run a plan of trials: one run per set of parameters, scored and ranked.
 
         webots-mcp trials plan.toml --jobs 4 --search tpe
 
-    Each trial runs in a simulator and a data folder of its own; what it recorded is merged into
-    the recording, where its run can be looked at like any other.
+    Each trial runs in its own simulator and data folder. Its run is then merged into the recording
+    and can be queried like any other run. After Ctrl-C, the same command continues where it
+    stopped.
 
-    With --scheduler the trials run on the workers of a Dask cluster, each of which has to have the
-    resource simulator=1: dask worker tcp://HOST:8786 --resources simulator=1 --nthreads 1
+    With --scheduler, start each Dask worker with the resource simulator=1:
 
-    Ended by Ctrl-C or killed, the same command goes on with what is left.
+        dask worker tcp://HOST:8786 --resources simulator=1 --nthreads 1
     """
     from webots_mcp.steering.trial_plan import read_plan
 
@@ -480,7 +517,10 @@ def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManage
     if options.scheduler is not None:
         return _cluster(options, plan)
     if options.ship_to is not None:
-        raise InvalidInputError("--ship-to is for --scheduler: what runs here is merged as it is")
+        raise InvalidInputError(
+            "--ship-to applies only to --scheduler: trials on this machine need no pool. Leave it "
+            "out."
+        )
     command_of = stand_in if options.stand_in else webots
     command_of(plan.world)
     return nullcontext(LocalSimulators(command_of, options.jobs or 1))
@@ -543,7 +583,10 @@ def _begun_set(
     with recording.reader() as connection:
         known = find_trial_set(connection, _text_of(plan, options))
     if known is None:
-        raise NothingRecordedError(f"no trials of {file} were begun with these options")
+        raise NothingRecordedError(
+            f"No trials of {file} were started with these options. Start them with 'webots-mcp "
+            f"trials {file}'."
+        )
     return known
 
 
@@ -614,13 +657,14 @@ def _show_trials(
             json.dumps({"trial_set_id": set_id, **_as_json(ranking), "runs": runs, "notes": notes})
         )
         return
+    print(as_typed(ranking.verdict))
     print_table(
-        ("rank", "parameters", "mean", "least", "greatest", "scores", "pruned", "failed", "why"),
+        ("rank", "parameters", "mean", "min", "max", "scores", "pruned", "failed", "why"),
         [_row(number, each) for number, each in enumerate(ranking.sets, 1)],
     )
     ids = [each.run_id for each in found if each.run_id is not None]
     where = f"runs {min(ids)} to {max(ids)}" if ids else "no run was recorded"
-    print_notes([ranking.verdict, f"trial set {set_id}, {where}; score: {plan.score}", *notes])
+    print_notes([f"trial set {set_id}, {where}; score: {plan.score}", *notes])
 
 
 def _row(number: int, ranked: Any) -> list[Any]:

@@ -12,6 +12,7 @@ import contextlib
 import io
 import select
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator
 from typing import Any, Final, TextIO, cast
@@ -126,6 +127,36 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
         yield show
     finally:
         rewrite(sys.stderr)
+
+
+@contextlib.contextmanager
+def shown_activity(doing: str) -> Generator[None]:
+    """Show on stderr for how long something has been running whose amount is not known.
+
+    On a terminal it is one line from the second second on, which vanishes at the end; elsewhere a
+    line every 3 s, so that short work stays silent.
+    """
+    ended = threading.Event()
+    stream, is_terminal = sys.stderr, sys.stderr.isatty()
+    started_s = time.monotonic()
+
+    def show() -> None:
+        while not ended.wait(1.0 if is_terminal else _PLAIN_INTERVAL_S):
+            text = f"{doing}: {time.monotonic() - started_s:.0f} s"
+            with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
+                if is_terminal:
+                    rewrite(stream, text)
+                else:
+                    print(f"webots-mcp: {text}", file=stream, flush=True)
+
+    thread = threading.Thread(target=show, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        rewrite(stream)
 
 
 @contextlib.contextmanager

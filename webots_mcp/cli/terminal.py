@@ -69,11 +69,11 @@ _LESS_IMPORTANT: Final = (
     "sha256", "git_commit", "world", "controller", "route", "database", "began_by", "kind_of",
     "own_ms", "step_wait_ms", "real_time_factor", "took_wall_s", "deviation", "pace", "command_id",
     "actions", "runs", "row_count", "age_s", "more", "set_by", "source", "live", "first_id",
-    "arguments",
+    "arguments", "by", "at_s",
 )  # fmt: skip
 # Columns that stay as long as two columns fit.
 _MOST_IMPORTANT: Final = frozenset(
-    {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode"}
+    {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode", "tool"}
 )
 # Columns whose words have a colour, and the colours of those words.
 _COLOURED_COLUMNS: Final = frozenset({"outcome", "status", "level", "ended_by", "verdict"})
@@ -101,11 +101,22 @@ class Display(NamedTuple):
 
 _USUAL: Final = Display()
 _display: ContextVar[Display] = ContextVar("display", default=_USUAL)
+_recording_read: ContextVar[str] = ContextVar("recording_read", default="")
 
 
 def set_display(display: Display) -> None:
     """Show the answers of this command in this way."""
     _display.set(display)
+
+
+def note_recording(database: object) -> None:
+    """Remember which recording the command reads, for an error with `--verbose`."""
+    _recording_read.set(str(database))
+
+
+def recording_read() -> str:
+    """Return the database of the recording that the command reads; empty where it reads none."""
+    return _recording_read.get()
 
 
 def is_verbose() -> bool:
@@ -184,12 +195,15 @@ def _styled(line: str, style: str) -> str:
 
 def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:
     """Return what there is to know about an answer, whole."""
-    lines = textwrap.wrap(
-        f"note: {printable(as_typed(text))}",
+    note = f"note: {printable(as_typed(text))}"
+    if width >= _LAYOUT.endless:
+        return [" ".join(note.split())]
+    return textwrap.wrap(
+        note,
         min(width, _LAYOUT.paragraph),
         subsequent_indent=_LAYOUT.indent,
+        break_on_hyphens=False,
     )
-    return lines if width < _LAYOUT.endless else [" ".join(map(str.strip, lines))]
 
 
 def print_notes(notes: Iterable[str], file: TextIO | None = None) -> None:
@@ -387,6 +401,11 @@ def id_ranges(numbers: Sequence[int]) -> str | None:
     return ", ".join(" to ".join(map(str, part)) for part in parts) or None
 
 
+def runs_named(numbers: Sequence[int]) -> str:
+    """Return runs as the subject of a sentence: run 4; runs 1 to 3, 7."""
+    return f"{'run' if len(numbers) == 1 else 'runs'} {id_ranges(numbers) or 'none'}"
+
+
 def clock_text(wall_time_s: float) -> str:
     """Return a wall time in local time."""
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(wall_time_s))
@@ -451,6 +470,8 @@ class _Layout:
                 yield line
                 continue
             yield f"{name}:"
+            if name == "verdicts":
+                part = _as_typed_texts(part)
             # In rows of a database null is a value.
             if name == "result" and "rows" in part and not self._is_of_command:
                 part = part | {
@@ -487,6 +508,17 @@ class _Layout:
 
     def _wrapped(self, texts: Iterable[str]) -> list[str]:
         return textwrap.wrap(", ".join(texts), self._paragraph, subsequent_indent=_LAYOUT.indent)
+
+
+def _as_typed_texts(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return texts of our own, such as what to do where nothing was searched, as typed."""
+    typed: dict[str, Any] = {}
+    for name, value in part.items():
+        if isinstance(value, dict):
+            typed[name] = _as_typed_texts(cast("dict[str, Any]", value))
+        else:
+            typed[name] = as_typed(value) if isinstance(value, str) else value
+    return typed
 
 
 def _without_lists(

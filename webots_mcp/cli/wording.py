@@ -7,6 +7,7 @@ option each is typed by. Hints that name a tool name the command that gives the 
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable
 from contextvars import ContextVar
 from typing import Final, NamedTuple
@@ -22,14 +23,23 @@ _OTHERS: Final = {  # by tool: those that are answered by a command of another n
     "list_signals": "signals", "describe_signals": "signals --describe",
     "list_meanings": "signals --meanings", "get_field": "field", "diagnose_setup": "doctor",
     "plot": "plot", "report": "report",
-    "simulation_control": "send", "world_reset": "reset", "world_reload": "reload",
+    "simulation_control": "pause", "set_field": "field", "get_timeline": "events --one-by-one",
+    "world_reset": "reset", "world_reload": "reload",
     "launch_world": "launch", "list_robots": "status", "get_world_info": "status --verbose",
     "get_camera": "camera", "take_screenshot": "screenshot", "check_run": "check",
 }  # fmt: skip
 _FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
     "start the server with --data-dir or --database": "give --data-dir or --database",
     "the resource webots://schema": "'.schema' in the sqlite3 shell",
+    "pause, step or reset use webots_simulation_control": "pause, step or reset use the commands "
+    "of these names",
+    "For all fields of one node use webots_get_field; to change one use webots_set_field": "To "
+    "show or change the fields of one node use webots_get_field",
+    "what no other tool answers": "what no other command answers",
 }
+_CONTROL: Final = re.compile(  # the tool whose argument is the name of a command
+    r"webots_simulation_control\((?:command=)?['\"](\w+)['\"](?:, robot=['\"]([\w .-]+)['\"])?\)"
+)
 _running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 
 
@@ -75,12 +85,19 @@ def as_typed(text: str) -> str:
 
 def _text_as_typed(text: str) -> str:
     for of_a_client, of_a_person in _FOR_A_CLIENT.items():
-        text = text.replace(of_a_client, of_a_person)
+        words = r"\s+".join(map(re.escape, of_a_client.split()))
+        text = re.sub(words, lambda _, said=of_a_person: said, text)
+    text = _CONTROL.sub(_control_as_typed, text)
     text = re.sub(r"webots_(?P<tool>\w+)(?:\(\w+=(?P<id>\d+)\))?", _command_for, text)
     typed = {each.name: each.typed for each in _running.get()}
     for each in _running.get():
         shown = f"{each.typed} {each.value_name}" if each.typed.startswith("-") else each.typed
         text = re.sub(rf"{_UNQUOTED}{each.name}=(\[['.]+\]|\.\.\.)", shown, text)
+        text = re.sub(
+            rf"{_UNQUOTED}{each.name}=\[('?[\w.*]+'?)(?:, ('?[\w.*]+'?))?\]",
+            lambda found, typed=each.typed: " ".join(filter(None, (typed, found[1], found[2]))),
+            text,
+        )
         text = re.sub(rf"{_UNQUOTED}{each.name}=true\b", each.typed, text)
         text = re.sub(rf"{_UNQUOTED}{each.name}=false\b", each.turned_off or each.typed, text)
         text = re.sub(rf"{_UNQUOTED}{each.name}=", f"{each.typed} ", text)
@@ -90,7 +107,7 @@ def _text_as_typed(text: str) -> str:
     if not words:
         return text
     for form in (
-        rf"(?<=\bwith )(?:this )?({words}){_NOT_ON}",
+        rf"(?<=\b[Ww]ith )(?:this )?({words}){_NOT_ON}",
         rf"(?<=\bsee )({words}){_NOT_ON}",
         rf"{_UNQUOTED}({words})(?= for more)",
     ):
@@ -104,6 +121,12 @@ def commands_by_tool() -> dict[str, str]:
     from webots_mcp.cli.commands import COMMANDS
 
     return {each.name.removeprefix("webots_"): name for name, each in COMMANDS.items()} | _OTHERS
+
+
+def _control_as_typed(found: re.Match[str]) -> str:
+    """Return the command that gives the same order, to the same robot."""
+    robot = f" --robot {shlex.quote(found[2])}" if found[2] else ""
+    return f"'webots-mcp {found[1]}{robot}'"
 
 
 def _command_for(found: re.Match[str]) -> str:

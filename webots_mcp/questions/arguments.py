@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MAX_WAIT_S: Final = 90
 FOR_A_PERSON: Final = "person"  # the context of a validation: whoever waits can press Ctrl-C
 LONGEST_NAME: Final = 200
-_CURSOR: Final = "Continues the previous answer: its `cursor`."
+_CURSOR: Final = "Cursor of the previous answer, to continue it."
 
 
 def _as_id(value: int) -> int:

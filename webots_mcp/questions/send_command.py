@@ -129,7 +129,7 @@ def webots_list_commands(
     recording: RecordingAccess,
     limit: Annotated[int, Field(ge=1, le=200, description="Maximum number of commands.")] = 10,
     status: Annotated[
-        CommandStatus | None, Field(description="Only commands with this status.")
+        CommandStatus | None, Field(description="Only commands of this status.")
     ] = None,
     cursor: Cursor = None,
     robot: RobotName = None,

@@ -32,13 +32,15 @@ def ask(lab: Lab, runs: Recorded, capsys: pytest.CaptureFixture[str]) -> Ask:
 
 
 def test_robots_runs_and_trial_sets_are_listed(ask: Ask) -> None:
-    robots = [line.split()[:4] for line in ask("pool", "POOL").splitlines()]
+    answer, *table = ask("pool", "POOL").splitlines()
+    robots = [line.split()[:4] for line in table]
+    assert answer.startswith("2 robots in ")
     assert robots[0] == ["robot", "recordings", "runs", "rows"]
     assert sorted(robots[1:]) == [["drone", "1", "1", "4"], ["rover", "1", "2", "16"]]
     assert "wall 1" in ask("pool", "POOL", "runs", "--robot", "rover")
     assert "wall 3" not in ask("pool", "POOL", "runs", "--robot", "rover")
-    assert "2 robots in all: -n shows more" in ask("pool", "POOL", "-n", "1")
-    assert ask("pool", "POOL", "trials").splitlines()[1].split()[3:5] == ["3", "2"]
+    assert "the first 1 of which are shown (-n shows more)" in ask("pool", "POOL", "-n", "1")
+    assert ask("pool", "POOL", "trials").splitlines()[2].split()[3:5] == ["3", "2"]
 
 
 def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
@@ -86,10 +88,11 @@ def test_an_answer_has_the_limits_of_sql_and_is_json_for_strict_readers(ask: Ask
 def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None:
     words = ("fetch", "--from", "POOL", "--data-dir", str(lab.here), "--robot", "rover")
     assert ask(*words).splitlines() == [
-        f"fetched from {lab.url}: run 1 to 2",
-        "of run 1 to 2 only chunks were shipped, no rows ('webots-mcp ship --full' does)",
+        f"Fetched runs 1 to 2 from {lab.url}.",
+        "Only chunks were shipped of runs 1 to 2, and no states. To ship states use 'webots-mcp "
+        "ship --full'.",
     ]
-    assert ask(*words).splitlines()[1] == "here already: run 1 to 2"
+    assert ask(*words).splitlines()[1] == "Already in this recording: runs 1 to 2."
     told = json.loads(ask(*words, "--json"))
     assert (told["fetched_run_ids"], told["known_run_ids"]) == ([], [1, 2])
     assert told["not_taken"] == {"going_on": [], "not_wholly_shipped": []}

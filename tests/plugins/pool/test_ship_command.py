@@ -18,7 +18,7 @@ def test_two_pools_at_once_are_refused(
 ) -> None:
     two = ["--to", "/srv/one", "--to", "/srv/two"]
     assert main(["ship", "--data-dir", str(shipped.folder), *two]) == 2
-    assert "one call ships to one pool" in capsys.readouterr().err
+    assert "one command ships to one pool" in capsys.readouterr().err
 
 
 def test_a_password_in_the_url_is_refused_and_printed_nowhere(
@@ -36,7 +36,7 @@ def test_a_pause_without_anything_to_wait_for_is_refused(
 ) -> None:
     asked = ["ship", "--data-dir", str(shipped.folder), "--to", "/srv/pool", "--every", "5"]
     assert main(asked) == 2
-    assert "--every is for --follow" in capsys.readouterr().err
+    assert "--every applies only to --follow" in capsys.readouterr().err
 
 
 def test_programs_read_in_one_object_what_was_sent_or_why_not(
@@ -63,7 +63,7 @@ def test_a_recording_is_shipped_to_postgresql_as_it_is(
     assert "state 1200" in capsys.readouterr().out
     assert pooled(postgres.url(pool), shipped.uuid) == shipped.rows()
     assert main(line) == 0
-    assert "has everything already" in capsys.readouterr().out
+    assert "already has everything" in capsys.readouterr().out
 
 
 def test_a_server_that_is_not_there_is_said(
@@ -106,5 +106,5 @@ def test_values_that_a_pool_cannot_hold_are_said(
         server: Server = request.getfixturevalue("postgres")
         url = server.url(server.new_database())
     assert main(["ship", "--data-dir", str(shipped.folder), "--to", url]) == 0
-    said = "in whose place is what comes nearest: log.level 1, log.message 1"
+    said = "replaced by the nearest ones: log.level 1, log.message 1"
     assert said in capsys.readouterr().out

@@ -86,16 +86,16 @@ def demo(
     *,
     data_dir: Annotated[
         Path | None,
-        Parameter("--data-dir", metavar="DIR", help="Where to record (~/.webots-mcp/demo)."),
+        Parameter(
+            "--data-dir", metavar="DIR", help="Folder to record in. Default: ~/.webots-mcp/demo."
+        ),
     ] = None,
-    keep: Annotated[
-        bool, Parameter("--keep", help="Leave the robot running until Ctrl-C.")
-    ] = False,
+    keep: Annotated[bool, Parameter("--keep", help="Keep the robot running until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Run a robot on the stand-in simulator and talk to it: no Webots needed, under 30 s.
+    """Drive a simulated robot and ask it questions, in under 30 s and without Webots.
 
-    With --json the conversation appears on stderr, and then its answers as one object on stdout.
+    With --json the conversation goes to stderr, and its answers to stdout as one object.
     """
     chosen = full_path(data_dir) if data_dir is not None else None
     run(chosen or DEFAULT_DATA_DIR, keep=keep, as_json=as_json)

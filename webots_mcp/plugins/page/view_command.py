@@ -23,24 +23,25 @@ def view(
             "--port",
             converter=whole_number,
             validator=Number(gte=0, lte=MAX_PORT),
-            help=f"Of 127.0.0.1; 0 for any that is free ({_PORT}).",
+            metavar="PORT",
+            help=f"Port of the page; 0 for any free port. Default: {_PORT}.",
         ),
     ] = _PORT,
     no_browser: Annotated[
-        bool, Parameter("--no-browser", help="Only say the address of the page.")
+        bool, Parameter("--no-browser", help="Print the address of the page, and open no browser.")
     ] = False,
     read_only: Annotated[
         bool,
-        Parameter("--read-only", help="Without buttons and inputs that steer the robot."),
+        Parameter("--read-only", help="Leave out the controls that steer the simulation."),
     ] = False,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Show a recording as a page in the browser, live: signals, the way, pictures, the log.
+    """Show a recording live in the browser: signals, the path, pictures and the log.
 
-    The page is for this computer only (127.0.0.1) and needs no network. Its buttons pause, resume,
-    step and reset the simulation and set parameters, as the commands of the same names do. Ctrl-C
-    ends it, and the robots do not notice. With --json its address is printed as {"url": ...}.
+    The page is served on this computer only (127.0.0.1). Its controls pause, resume, step and reset
+    the simulation and set parameters, like the commands of these names. Ctrl-C stops the page, not
+    the simulation. With --json the address is printed as {"url": ...}.
     """
     import webbrowser
     from contextlib import suppress

@@ -11,8 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 from cyclopts.validators import Number
 
 from webots_mcp.cli.options import HERE, Count, Json, Parameter, Where
-from webots_mcp.cli.streams import shown_progress
-from webots_mcp.cli.terminal import clock_text, id_ranges, print_json, print_notes, print_table
+from webots_mcp.cli.streams import shown_activity, shown_progress
+from webots_mcp.cli.terminal import (
+    clock_text,
+    print_json,
+    print_notes,
+    print_table,
+    runs_named,
+)
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plugins.pool.pool_contents import (
     RunFilter,
@@ -40,19 +46,20 @@ def fetch(
         Parameter(
             "--from",
             metavar="URL",
-            help="The pool: postgresql://HOST/DATABASE, a folder, s3://BUCKET/PREFIX, ...",
+            help="Pool: a folder, postgresql://HOST/DATABASE or s3://BUCKET/PREFIX.",
         ),
     ],
     choice: RunFilter = _ALL,
     recorded: Where = HERE,
     json: Json = False,
 ) -> int:
-    """Bring runs of a pool back into a recording here, for every command, tool and plot.
+    """Fetch runs from a pool into a local recording.
 
-    They come with their sessions, commands, trials and what was shipped of their pictures, each
-    once however often it is fetched; what is here is left as it is. Of a run of which chunks were
-    shipped and no states, the chunks come: the values of all of its signals. A run that goes on or
-    is still being shipped is not taken: fetch it again when it is whole.
+        webots-mcp fetch --from ./pool --label baseline
+
+    Runs come with their sessions, commands, trials and shipped pictures. Fetching again changes
+    nothing. If only chunks of a run were shipped, the values of all its signals come, but no
+    states. Runs that are still recording or being shipped are skipped; fetch them later.
     """
     from webots_mcp.plugins.pool.fetching import fetch as fetch_runs
     from webots_mcp.plugins.pool.pool_contents import open_pool
@@ -86,29 +93,29 @@ def _as_data(found: FetchResult) -> dict[str, Any]:
 
 
 def _print_fetched(found: FetchResult, address: str) -> None:
-    def ids(uuids: Iterable[str]) -> str | None:
-        return id_ranges([found.runs[uuid] for uuid in uuids])
+    def runs(uuids: Iterable[str]) -> str:
+        return runs_named([found.runs[uuid] for uuid in uuids])
 
-    print(f"fetched from {address}: run {id_ranges(found.come) or 'none'}")
+    print(f"Fetched {runs_named(found.come) if found.come else 'no new run'} from {address}.")
     if found.known:
-        print(f"here already: run {ids(found.known)}")
+        print(f"Already in this recording: {runs(found.known)}.")
     if found.only_chunks:
         print(
-            f"of run {ids(found.only_chunks)} only chunks were shipped, no rows "
-            "('webots-mcp ship --full' does)"
+            f"Only chunks were shipped of {runs(found.only_chunks)}, and no states. To ship states "
+            "use 'webots-mcp ship --full'."
         )
     if found.unchunked:
         print(
-            f"of run {ids(found.unchunked)} not all rows are in chunks: retention had deleted "
-            "those, or the recording could not be written where it was shipped ('webots-mcp ship "
-            "--full' ships rows that are still there)"
+            f"Some rows are missing in {runs(found.unchunked)}: retention had deleted them, or the "
+            "recording was read-only when it was shipped. 'webots-mcp ship --full' ships the rows "
+            "that still exist."
         )
     if found.going_on:
-        print(f"not taken: {_named(found.going_on)} goes on, or nobody has shipped its end")
+        print(f"Skipped {_named(found.going_on)}: still recording, or its end was not shipped yet.")
     if found.arriving:
         print(
-            f"not taken: {_named(found.arriving)} is not wholly shipped yet; where it was recorded "
-            "'webots-mcp ship' goes on, as it was given before; then fetch it again"
+            f"Skipped {_named(found.arriving)}: only partly shipped. Repeat 'webots-mcp ship' on "
+            "the machine that recorded it, then fetch again."
         )
 
 
@@ -118,30 +125,37 @@ def _named(uuids: Sequence[str]) -> str:
 
 
 def pool(
-    url: Annotated[str, Parameter("URL", help="postgresql://HOST/DATABASE, a folder, s3://...")],
+    url: Annotated[
+        str,
+        Parameter("URL", help="Pool: a folder, postgresql://HOST/DATABASE or s3://BUCKET/PREFIX."),
+    ],
     part: Annotated[
         Literal["robots", "runs", "trials"],
-        Parameter("PART", help="What to list (robots)."),
+        Parameter("PART", help="What to list. Default: robots."),
     ] = "robots",
     /,
     *,
     sql: Annotated[
         str | None,
         Parameter(
-            "--sql", metavar="SELECT", help="One SELECT in the language of the pool, in quotes."
+            "--sql",
+            metavar="SELECT",
+            help="Run this SELECT, in the SQL of the pool (PostgreSQL or DuckDB).",
         ),
     ] = None,
     max_rows: Annotated[
         Count,
-        Parameter("-n", metavar="N", help="The newest N, or N rows (20); of a SELECT up to 1000."),
+        Parameter(
+            "-n", metavar="N", help="Maximum number of rows, up to 1000 with --sql. Default: 20."
+        ),
     ] = 20,
     choice: RunFilter = _ALL,
     json: Json = False,
 ) -> None:
-    """List what is in a pool, or ask it one SELECT; nothing is changed.
+    """List robots, runs or trials in a pool, or run one SELECT on it. Changes nothing.
 
-    A SELECT ends after a minute (over Parquet files after 20 seconds, or 1 GB of memory), and its
-    values are cut to 200 characters.
+    A SELECT is stopped after 60 s; over Parquet files after 20 s or 1 GB of memory. Values are cut
+    to 200 characters.
 
         webots-mcp pool ./pool runs --robot rover
 
@@ -154,13 +168,16 @@ def pool(
             answer = opened.select(sql, max_rows)
             return print_json(asdict(answer)) if json else _print_answer(answer)
         listed = _listed(opened, part, choice)
+        address = opened.address
     total = len(listed.found)
     if json:
         shown = [vars(each) for each in listed.found[:max_rows]]
         return print_json({listed.key: shown, "total": total})
-    print_table(listed.columns, listed.rows[:max_rows])
-    if total > max_rows:
-        print_notes([f"{total} {listed.key.replace('_', ' ')} in all: -n shows more"])
+    kind = listed.key.replace("_", " ").removesuffix("s" if total == 1 else "")
+    more = f", the first {max_rows} of which are shown (-n shows more)" * (total > max_rows)
+    print(f"{total or 'No'} {kind} in {address}{more}.")
+    if total:
+        print_table(listed.columns, listed.rows[:max_rows])
 
 
 class _List(NamedTuple):
@@ -222,45 +239,44 @@ def ship(
         Parameter(
             "--to",
             metavar="URL",
-            help="The pool: postgresql://[USER@]HOST/DATABASE, a folder, or s3://BUCKET/PREFIX "
-            "and the like.",
+            help="Pool: a folder, postgresql://[USER@]HOST/DATABASE or s3://BUCKET/PREFIX.",
         ),
     ],
     follow: Annotated[
-        bool, Parameter("--follow", help="Go on with what comes, until Ctrl-C.")
+        bool, Parameter("--follow", help="Keep shipping new rows until Ctrl-C.")
     ] = False,
     full: Annotated[
         bool,
         Parameter(
             "--full",
-            help="Ship all states; else only those of full-rate segments, and the chunks of all.",
+            help="Ship every state. Default: chunks of all states, and full-rate segments.",
         ),
     ] = False,
-    pictures: Annotated[
-        bool, Parameter("--pictures", help="Ship the files of pictures as well.")
-    ] = False,
+    pictures: Annotated[bool, Parameter("--pictures", help="Also ship the picture files.")] = False,
     pause_s: Annotated[
         float | None,
         Parameter(
             "--every",
-            metavar="SECONDS",
+            metavar="S",
             validator=Number(gte=0.1, lte=86_400),
-            help="With --follow, how long to wait between two looks (2; for files 60).",
+            help="With --follow: seconds between two shipments. Default: 2 for PostgreSQL, 60 for "
+            "files.",
         ),
     ] = None,
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Ship a recording to a pool, where the recordings of many machines are.
+    """Ship a recording to a pool, which collects recordings of many machines.
 
-    The pool is a PostgreSQL database, or a dataset of Parquet files in a folder or an object store.
-    The recording is only read, but that runs whose process was killed are ended. What the pool has
-    is not sent again, so that this may be killed and started again at any time; a run that another
-    recording has shipped stays that one's.
+        webots-mcp ship --to postgresql://HOST/lab --follow
 
-    Runs, commands, events, log lines, parameters, trials, chunks and full-rate segments are
-    shipped, with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file,
-    never from the URL.
+    A pool is a PostgreSQL database, or a set of Parquet files in a folder or an object store. Rows
+    that the pool already has are not sent again, so this can be stopped and restarted at any time.
+    A run that was shipped from another recording is left to that recording.
+
+    Ships runs, commands, events, log lines, parameters, trials, chunks and full-rate segments. The
+    only change to the recording is that runs of killed processes are marked as ended. Passwords
+    come from PGPASSWORD, ~/.pgpass or a service file, never from the URL.
     """
     from webots_mcp.plugins.pool.pool_contents import is_postgres, open_pool
     from webots_mcp.plugins.pool.pool_interface import redacted
@@ -270,11 +286,15 @@ def ship(
 
     if len(urls) > 1:
         raise InvalidInputError(
-            f"--to is given {len(urls)} times: one call ships to one pool; start another "
-            "for the other"
+            f"--to was given {len(urls)} times, but one command ships to one pool. Start one "
+            f"command "
+            "per pool."
         )
     if pause_s is not None and not follow:
-        raise InvalidInputError("--every is for --follow: without it, everything is shipped once")
+        raise InvalidInputError(
+            "--every applies only to --follow: without it, everything is shipped once. Add "
+            "--follow."
+        )
     (url,) = urls
     connect = functools.partial(open_pool, url, ships=True)
     order = ShippingJob(recorded.recording(), connect, full, pictures)
@@ -287,7 +307,8 @@ def ship(
             )  # Shorter pauses would make many small files.
             follow_recording(order, report, _say, pause_s or default_s)
         else:
-            ship_once(order, report)
+            with shown_activity(f"shipping to {redacted(url)}"):
+                ship_once(order, report)
             is_done = True
     finally:
         is_reported = json and isinstance(sys.exc_info()[1], WebotsMCPError)  # As the only object.
@@ -306,9 +327,9 @@ def _show_report(address: str, report: ShippingReport, *, is_done: bool, as_json
     sent = [f"{table} {rows}" for table, rows in sorted(report.rows.items()) if rows]
     sent += [f"pictures {report.pictures}"] if report.pictures else []
     if sent:
-        print(f"sent to {address}: {', '.join(sent)}")
+        print(f"Shipped to {address}: {', '.join(sent)}.")
     elif is_done:
-        print(f"{address} has everything already")
+        print(f"Nothing to ship: {address} already has everything.")
     print_notes(notes)
 
 
@@ -319,14 +340,13 @@ def _notes(report: ShippingReport) -> list[str]:
     if report.replaced:
         altered = [f"{column} {values}" for column, values in sorted(report.replaced.items())]
         notes.append(
-            "values that the pool cannot hold, in whose place is what comes nearest: "
-            + ", ".join(altered)
+            "values that the pool cannot hold, replaced by the nearest ones: " + ", ".join(altered)
         )
     if report.lost_pictures:
-        notes.append(f"pictures that are not there any more: {report.lost_pictures}")
+        notes.append(f"missing picture files: {report.lost_pictures}")
     for recording in sorted(set(report.foreign.values())):
         runs = [uuid for uuid, owner in report.foreign.items() if owner == recording]
         notes.append(
-            f"{len(runs)} runs are left to the recording {recording}, which shipped them before"
+            f"{len(runs)} runs were skipped: the recording {recording} shipped them before"
         )
     return notes

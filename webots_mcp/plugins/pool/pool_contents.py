@@ -174,30 +174,31 @@ class RunFilter:
     """Options that choose runs: those to which all given options apply."""
 
     run_uuid: Annotated[
-        str | None, _option("--run", "UUID", "The run of that UUID, or that begins so.")
+        str | None, _option("--run", "UUID", "Only the run with this UUID, or its first letters.")
     ] = None
     label: Annotated[
-        str | None, _option("--label", "TEXT", "Runs with that label; '*' is any letters.")
+        str | None, _option("--label", "TEXT", "Only runs with this label; '*' means any text.")
     ] = None
     trials: Annotated[
         str | None,
         _option(
             "--trials",
             "UUID",
-            "The runs of the trial set of that UUID, or that begins so; and its trials.",
+            "Only the runs of the trial set with this UUID, or its first letters.",
         ),
     ] = None
-    robot: Annotated[str | None, _option("--robot", "NAME", "Runs of that robot.")] = None
+    robot: Annotated[str | None, _option("--robot", "NAME", "Only runs of this robot.")] = None
     since: Annotated[
         str | None,
         _option(
             "--since",
             "TIME",
-            "Runs that went on after this wall time (ISO 8601 or Unix seconds).",
+            "Only runs that ended after this wall-clock time: 2026-05-01T03:00:00Z, or Unix "
+            "seconds.",
         ),
     ] = None
     until: Annotated[
-        str | None, _option("--until", "TIME", "Runs that began before this wall time.")
+        str | None, _option("--until", "TIME", "Only runs that began before this wall-clock time.")
     ] = None
 
 

@@ -23,29 +23,35 @@ def prove(
     *,
     webots: Annotated[
         Path | None,
-        Parameter("--webots", metavar="PATH", help="Its folder or program; else as launch finds."),
+        Parameter(
+            "--webots",
+            metavar="WEBOTS",
+            help="Folder or program of Webots. Default: as for 'webots-mcp launch'.",
+        ),
     ] = None,
     only: Annotated[
         list[str] | None,
-        Parameter("--only", metavar="CHECK", help="Only this check; may be repeated."),
+        Parameter("--only", metavar="CHECK", help="Run only this check; can be repeated."),
     ] = None,
     patience_s: Annotated[
         int,
         Parameter(
             "--patience",
+            metavar="S",
             converter=whole_number,
             validator=Number(gte=1, lte=3600),
-            help="Seconds from a start to the first row, at most (60).",
+            help="Maximum seconds from a start to the first row. Default: 60.",
         ),
     ] = 60,
     as_json: Json = False,
 ) -> int:
-    """Try on the Webots of this machine what we know of it from its sources alone.
+    """Test on your Webots what webots-mcp assumes about it. This takes a few minutes.
 
-    Starts it a few times without its window, on a world of its own in a temporary folder, and says
-    of each statement of 'webots-mcp help webots' whether it is so. This takes some minutes. What
-    --json prints names no file, user or machine: please send it with an issue. The exit code
-    is 1 if anything is otherwise.
+        webots-mcp prove --json
+
+    Starts Webots several times without a window, on a temporary world, and checks each statement of
+    'webots-mcp help webots'. The output of --json names no file, user or machine: please attach it
+    to an issue. Exit code 1: a statement does not hold.
     """
     from webots_mcp.contract import VERSION
     from webots_mcp.plugins.prove.fact_checks import CHECKS

@@ -141,7 +141,7 @@ class _FigureSet:
         """Draw signals of a run over time, and its path."""
         key, drawn = f"signals {run_id}", names or ["*"]
         self._add(key, f"the signals of run {run_id}", self._signals, [whole], drawn)
-        self._add(f"way {run_id}", f"the way of run {run_id}", self._way, [whole])
+        self._add(f"way {run_id}", f"the path of run {run_id}", self._way, [whole])
 
     def overlaid(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> None:
         """Draw the same of two runs over each other."""

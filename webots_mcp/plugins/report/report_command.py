@@ -22,40 +22,47 @@ from webots_mcp.cli.terminal import print_json, print_notes, printable
 @only_reading
 def report(
     *run_ids: Annotated[
-        Id, Parameter("RUN", help="One run, or two beside each other; none: the newest.")
+        Id, Parameter("RUN", help="One run, or two to compare. Default: the newest run.")
     ],
     output: Annotated[
         Path | None,
         Parameter(
             ("--output", "-o"),
             metavar="FILE",
-            help="A .html file; else run-RUN.html in this folder.",
+            help="File to write (.html). Default: run-RUN.html in this folder.",
         ),
     ] = None,
     overwrite: Annotated[
-        bool, Parameter("--overwrite", help="Also if it is there already.")
+        bool, Parameter("--overwrite", help="Overwrite the file if it exists.")
     ] = False,
     signals: Annotated[
         list[str] | None,
         Parameter(
             "--signal",
-            metavar="NAME",
-            help="Draw this signal, with '*'; may be repeated. Else those that changed most.",
+            metavar="SIGNAL",
+            help="Signal to draw; '*' means any text. Can be repeated. Default: those that changed "
+            "most.",
         ),
     ] = None,
     max_mb: Annotated[
         float,
-        Parameter("--max-mb", metavar="MB", help="How large the file may become, 2 to 100 (10)."),
+        Parameter(
+            "--max-mb",
+            metavar="MB",
+            help="Maximum size of the file in megabytes, from 2 to 100. Default: 10.",
+        ),
     ] = 10.0,
     robot: Robot = None,
     as_json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Write a run, or two beside each other, as one HTML file to read and to send.
+    """Write a report about a run, or a comparison of two runs, as one HTML file.
 
-    What ran (code, commit, parameters, world), what happened (events with the seconds around them,
-    trends and the timeline in words), interactive figures, the way, pictures, commands and log. The
-    file needs nothing else and opens without a network.
+        webots-mcp report 3 4 -o comparison.html
+
+    The report shows what ran (code, commit, parameters, world), what happened (events, trends,
+    timeline), interactive figures, the path, pictures, commands and the log. The file is
+    self-contained and needs no network.
     """
     from webots_mcp.plugins.report.making import (
         file_name,
@@ -90,5 +97,5 @@ def report(
             }
         )
     held = "".join(f", {name} {count}" for name, count in made.holds.items()).replace(",", ";", 1)
-    print(f"{file}: {printable(made.title)}, {size(len(made.html))}{held}")
+    print(f"Wrote {file}: {printable(made.title)}, {size(len(made.html))}{held}")
     print_notes([f"left out: {each}" for each in made.left_out])

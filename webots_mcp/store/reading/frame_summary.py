@@ -552,7 +552,9 @@ def _in_force(
     if at_begin is None:
         return None
     row = _first_of_last_equal(before, signal, at_begin.value) if since else rows
-    return at_begin if row == rows else Point(float(before.times[row]), at_begin.value)
+    if row == rows:
+        return at_begin
+    return Point(float(before.rows(row, row + 1).times[0]), at_begin.value)
 
 
 def _is_hidden(before: Frame, signal: RegisteredSignal, time_s: float) -> bool:

@@ -347,9 +347,10 @@ class Frame:
         coded: list[tuple[slice, Indexes]] = []
         known: dict[object, int] = {}  # a flag equals a number, so that the type is in the key
         labels: list[Value | Replaced] = []
-        for at, values in source.values(column, start, stop):
+        for at, values in source.values(column, start, stop, into=numbers):
             inside = slice(at, at + len(values.numbers))
-            numbers[inside] = values.numbers
+            if values.numbers.base is not numbers:
+                numbers[inside] = values.numbers
             if values.codes is None:
                 plain.append(inside)
                 continue

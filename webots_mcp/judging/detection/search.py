@@ -230,7 +230,17 @@ def motion_in(frame: Frame, known: dict[str, RegisteredSignal], options: EventOp
         for name, each in known.items()
         if options.position or each.role or each.stated or meanings[name].quantity in _OF_MOTION
     ]
-    here = {name for name in telling if any(row.held(name).any() for row in rows)}
+    known_of_all = frame.whole_statistics()  # of a short run, without opening its chunks
+    if known_of_all is None:
+        here = {name for name in telling if any(row.held(name).any() for row in rows)}
+    else:
+        always = {name for name, each in known_of_all.items() if each.row_count == len(frame)}
+        some = known_of_all.keys() - always
+        here = {
+            name
+            for name in telling
+            if name in always or (name in some and any(row.held(name).any() for row in rows))
+        }
     return find_motion(known, options, here)
 
 

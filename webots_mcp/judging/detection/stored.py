@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -25,8 +26,9 @@ from webots_mcp.store.reading.frame_summary import (
     change_points,
     frame_around,
     rhythm_in,
+    rows_around,
 )
-from webots_mcp.store.reading.segment import Segment, full_rate_segments
+from webots_mcp.store.reading.segment import Segment, full_rate_segments, read_so_far
 from webots_mcp.store.reading.unread import Unread
 from webots_mcp.store.run_rows import count_kept_frames
 
@@ -66,9 +68,9 @@ _REFUSED: Final = (
 END_OF_RUN: Final = "the end of the run"
 _LAST_ROWS: Final = 21  # of a run: they tell what is usual at its end
 _ENDED: Final = "SELECT last_sim_time_s FROM run WHERE id = ? AND end_reason IS NOT NULL"
-_RUN_WALLS: Final = (
-    "SELECT started_wall_time_s, coalesce((SELECT min(n.started_wall_time_s) FROM run n "
-    "WHERE n.robot_id = r.robot_id AND n.id > r.id), 9e99) FROM run r WHERE id = ?"
+_RUN_WALLS: Final = (  # of all runs of its robot: one by one, all later ones of each are read
+    "SELECT id, started_wall_time_s FROM run "
+    "WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) ORDER BY id DESC"
 )
 
 
@@ -96,7 +98,11 @@ def _recorded(search: Search) -> Segment:
 def gap_events(search: Search) -> Iterator[Event]:
     """Where rows are missing: gaps that the segment touches, also all around it."""
     segment = _recorded(search)
-    around = frame_around(search.connection, segment, search.deadline)
+    whole = search.whole
+    if whole.unread or whole.cut_at_s is not None or search.segment.full_rate:
+        around = frame_around(search.connection, segment, search.deadline)
+    else:  # the run is read already, from its first row to its newest one
+        around = rows_around(whole, segment)
     _note_unread(search, "gap", around.cut_at_s)
     asked = search.segment
     for e in around.unread:
@@ -265,7 +271,7 @@ def command_events(search: Search) -> Iterator[Event]:
         details: dict[str, Any] = {"status": "refused", "by": by, "rule": rule}
         yield Event("command", search.segment.run_id, time_s, time_s, wall_s, tool, details)
     connection, here = search.connection, search.segment
-    start_wall_s, end_wall_s = connection.execute(_RUN_WALLS, (here.run_id,)).fetchone()
+    start_wall_s, end_wall_s = _walls_of(connection, here.run_id)
     walls_s = max(start_wall_s, here.wall_start_s), min(end_wall_s, here.wall_end_s)
     rows = connection.execute(_COMMANDS, (here.run_id, *walls_s, MOST_OF_A_KIND)).fetchall()
     _note_older(search, "command", len(rows))
@@ -285,6 +291,17 @@ def command_events(search: Search) -> Iterator[Event]:
         ongoing = status in ("pending", "claimed")
         place = (here.run_id, start_s, end_s, wall_s)
         yield Event("command", *place, action, details, ongoing=ongoing)
+
+
+def _walls_of(connection: sqlite3.Connection, run_id: int) -> tuple[float, float]:
+    """When a run began, and when the first of its robot's later runs did."""
+    known: dict[int, tuple[float, float]] = read_so_far(connection).setdefault("run walls", {})
+    if run_id not in known:
+        next_s = 9e99
+        for each, start_s in connection.execute(_RUN_WALLS, (run_id,)):
+            known[each] = start_s, next_s
+            next_s = min(next_s, start_s)
+    return known[run_id]
 
 
 def _sim_time_at(search: Search, wall_s: float) -> float | None:

@@ -446,8 +446,8 @@ def read_frame(
         full_rate: Of a segment that is kept at full rate, each call of `publish` is a row.
         every_call: Of any segment each call is a row that is in a kept stretch.
     """
-    asked = (segment.run_id, segment.start_s, segment.end_s, segment.full_rate and full_rate)
-    memo = read_so_far(connection)
+    asked = (segment.start_s, segment.end_s, segment.full_rate and full_rate)
+    memo = read_so_far(connection).setdefault(("frames", segment.run_id), {})
     if (source := memo.get((*asked, every_call)) or _wider(memo, asked, every_call)) is not None:
         return _framed(source.twin(), segment, None)
     source, cut_at_s = _source_of(
@@ -460,16 +460,16 @@ def read_frame(
 
 
 def _wider(
-    memo: Mapping[tuple[int, float, float, bool, bool], FrameSource],
-    asked: tuple[int, float, float, bool],
+    memo: Mapping[tuple[float, float, bool, bool], FrameSource],
+    asked: tuple[float, float, bool],
     every_call: bool,
 ) -> FrameSource | None:
     """Return what a longer segment of the run was read from, where that is the same."""
-    run_id, start_s, end_s, at_full_rate = asked
+    start_s, end_s, at_full_rate = asked
     if at_full_rate or every_call:
         return None
-    for (other_id, first_s, last_s, *kinds), source in memo.items():
-        is_longer = other_id == run_id and first_s <= start_s and last_s >= end_s
+    for (first_s, last_s, *kinds), source in memo.items():
+        is_longer = first_s <= start_s and last_s >= end_s
         if is_longer and not any(kinds) and source.may_serve(start_s, end_s):
             return source
     return None

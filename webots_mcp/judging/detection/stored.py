@@ -295,7 +295,7 @@ def command_events(search: Search) -> Iterator[Event]:
 
 def _walls_of(connection: sqlite3.Connection, run_id: int) -> tuple[float, float]:
     """When a run began, and when the first of its robot's later runs did."""
-    known: dict[int, tuple[float, float]] = read_so_far(connection).setdefault("run walls", {})
+    known: dict[int, tuple[float, float]] = read_so_far(connection).setdefault(_RUN_WALLS, {})
     if run_id not in known:
         next_s = 9e99
         for each, start_s in connection.execute(_RUN_WALLS, (run_id,)):

@@ -328,7 +328,8 @@ class Frame:
         """The edges of its chunks, and the least and greatest wall time of each; NaN: not known."""
         edges, source = self._edges, self._source
         if source.order is not None:
-            return edges, *np.full((2, len(edges) - 1), np.nan)
+            unknown: Array = np.full(len(edges) - 1, np.nan)
+            return edges, unknown, unknown
         table = source.statistics(WALL_TIMES)[source.parts(self._start, self._stop)]
         least, greatest = (Statistics._fields.index(end) for end in ("min", "max"))
         return edges, table[:, least], table[:, greatest]

@@ -273,7 +273,8 @@ def _suspects(intervals: Array) -> Indexes:
     if len(intervals) < 3:
         return np.zeros(0, np.intp)
     near = _GAPS.around // 2 + 1
-    least = np.pad(intervals, near, constant_values=np.inf)
+    beyond = np.full(near, np.inf)
+    least = np.concatenate((beyond, intervals, beyond))
     window = 1
     while window < near:  # the minimum of each `near` intervals, from those of half as many
         step = min(window, near - window)

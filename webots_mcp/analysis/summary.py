@@ -258,6 +258,10 @@ def find_spikes(times: Array, values: Array, turn: float | None = None) -> list[
     recorded = values
     values = values if turn is None else unwrap(values, turn)
     sizes = np.abs(values[1:-1] - (values[:-2] + values[2:]) / 2)
+    # Where the largest one cannot stand out from half of them, their median need not be known.
+    least = float(sizes.max()) * (0.6745 / SPIKE_SCORE) * (1 + 1e-9)
+    if np.count_nonzero(sizes < least) <= len(sizes) // 2:
+        return []
     mad = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
     limit = SPIKE_SCORE * (mad / 0.6745 if mad > 0 else 1.2533 * float(sizes.mean()))
     rows = np.flatnonzero(sizes > limit) + 1

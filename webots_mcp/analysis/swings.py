@@ -425,7 +425,7 @@ def _ends(bends: Array, first: int, last: int, period: float) -> slice:
     """Where the swing that [first, last) is part of begins and ends."""
     clipped = _clipped(bends, CLIPPED * median(np.abs(bends[first:last])))
     pieces = _pieces(clipped[first:last], period)
-    period, _, _ = _sines(pieces, np.ones_like(pieces), period)
+    period = _best_period(pieces, np.ones_like(pieces), period)
     begin = _begin(clipped, first, period)
     return slice(begin, len(bends) - _begin(clipped[::-1], len(bends) - last, period))
 
@@ -496,14 +496,19 @@ def _pieces(values: Array, period: float) -> Array:
     return np.reshape(values[: count * rows], (count, rows))
 
 
-def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
-    """The best period about the given one, and the heights and values of its sines."""
+def _best_period(pieces: Array, weights: Array, period: float) -> float:
+    """The period about the given one whose sines explain most."""
     _, _, gains = _fits(pieces, weights, period * np.array(TRIED))
     low, middle, high = gains.sum(axis=0).tolist()
     bend = 2 * middle - low - high  # of the parabola through them: its vertex is the best
     most = TRIED[2] - 1
     aside = (high - low) / (2 * bend) if bend > 0 else math.copysign(1.0, high - low)
-    period *= 1 + most * max(-FARTHEST, min(FARTHEST, aside))
+    return period * (1 + most * max(-FARTHEST, min(FARTHEST, aside)))
+
+
+def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
+    """The best period about the given one, and the heights and values of its sines."""
+    period = _best_period(pieces, weights, period)
     sines, cosines, _ = _fits(pieces, weights, np.array([period]))
     places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
     angles: Array = places * (2 * np.pi / period)

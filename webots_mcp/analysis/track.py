@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from math import log, sqrt
 from typing import Final
@@ -316,6 +317,7 @@ def kept_alike(rows: int) -> Array:
     return np.append(alike / alike[0], 0.0)
 
 
+@lru_cache(8)  # the runs of a robot mostly have the same rate of rows
 def _parabola(rows: int) -> Array:
     """The matrix that turns so many values into those of the parabola of least squares."""
     place = np.arange(rows, dtype=np.float64) - rows // 2

@@ -148,15 +148,20 @@ def pack(values: Decoded) -> EncodedChunk:
     )
 
 
-def decode(encoded: EncodedChunk, rows: int) -> Decoded:
+def decode(encoded: EncodedChunk, rows: int, into: Array | None = None) -> Decoded:
     """The values of some rows.
+
+    Args:
+        encoded: The chunk.
+        rows: How many.
+        into: Takes their numbers, where every row holds one; None for a new array.
 
     Raises:
         DamagedChunkError: The bytes are not what `encode` makes of so many rows.
     """
     try:
         if encoded.codes is None:
-            numbers: Array = np.empty(rows)
+            numbers: Array = np.empty(rows) if into is None else into
             _decompress(encoded, numbers)
             return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
@@ -560,7 +565,11 @@ def statistics_by_signal(
 
 
 def values_in(
-    connection: sqlite3.Connection, run_id: int, signal_id: int, wanted: Mapping[int, int]
+    connection: sqlite3.Connection,
+    run_id: int,
+    signal_id: int,
+    wanted: Mapping[int, int],
+    into: Mapping[int, Array] | None = None,
 ) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
     """The values of a signal in some groups, by their ids, in no order; none of those that lack it.
 
@@ -571,7 +580,9 @@ def values_in(
         run_id: Of which run.
         signal_id: Of which signal; or times or ids.
         wanted: How many rows each group has, by its id.
+        into: Arrays that take the numbers of some groups; see `decode`.
     """
+    into = into or {}
     values_query = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
     query, asked = (
         values_query,
@@ -587,7 +598,8 @@ def values_in(
         if rows is None:
             continue
         try:
-            yield group_id, decode(EncodedChunk(codec, numbers, codes, labels), rows)
+            encoded = EncodedChunk(codec, numbers, codes, labels)
+            yield group_id, decode(encoded, rows, into.get(group_id))
         except DamagedChunkError as error:
             yield group_id, error
 

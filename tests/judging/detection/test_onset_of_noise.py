@@ -44,3 +44,16 @@ def test_noise_in_few_rows_is_not_searched() -> None:
     with recorded(Situation("few rows", draw, (), 120, 0.2)) as asked:
         verdicts = asked.events("degradation").verdicts
     assert "640 rows" in str(verdicts.reasons["degradation"])
+
+
+def test_judged_signals_come_in_the_order_in_which_they_were_published() -> None:
+    names = [f"{place}_{device}" for device in ("gyro", "accel") for place in "bfacedgh"]
+
+    def draw(t: Array, random: Random) -> Columns:
+        steady = {"front_distance_m": 2 + noise(random, t, 0.003)}
+        return {name: noise(random, t, 0.01) for name in names} | steady
+
+    with recorded(Situation("many gyros", draw, (), 60, 0.05)) as asked:
+        verdicts = asked.events("degradation").verdicts
+    judged = list(verdicts.coverage["degradation"].signals)
+    assert [name for name in judged if name in names] == names

@@ -44,7 +44,7 @@ def degradation_events(search: Search) -> Iterator[Event]:
         for name, meaning in search.meanings.items()
         if meaning.is_sensed and meaning.quantity in _STEADY and search.known[name].is_number
     ]
-    wanted = {each.name for each in search.signals}
+    wanted = dict.fromkeys(each.name for each in search.signals)  # in their order, always the same
     signals = [each for each in signals if each.name in wanted and not each.is_index]
     shaken = [
         search.known[name]

@@ -9,7 +9,7 @@ from webots_mcp.analysis.arrays import longest_usual_s, usual_interval_s
 from webots_mcp.judging.detection.kinds import Alike, Event
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.judging.detection.stored import note_unread, recorded_segment
-from webots_mcp.store.reading.frame_summary import frame_around, rhythm_in
+from webots_mcp.store.reading.frame_summary import frame_around, rhythm_in, rows_around
 from webots_mcp.store.reading.unread import Unread
 
 END_OF_RUN: Final = "the end of the run"
@@ -20,7 +20,11 @@ _ENDED: Final = "SELECT last_sim_time_s FROM run WHERE id = ? AND end_reason IS 
 def gap_events(search: Search) -> Iterator[Event]:
     """Where rows are missing: gaps that the segment touches, also all around it."""
     segment = recorded_segment(search)
-    around = frame_around(search.connection, segment, search.deadline)
+    whole = search.whole
+    if whole.unread or whole.cut_at_s is not None or search.segment.full_rate:
+        around = frame_around(search.connection, segment, search.deadline)
+    else:  # the run is read already, from its first row to its newest one
+        around = rows_around(whole, segment)
     note_unread(search, "gap", around.cut_at_s)
     asked = search.segment
     for e in around.unread:

@@ -230,7 +230,17 @@ def motion_in(frame: Frame, known: dict[str, RegisteredSignal], options: EventOp
         for name, each in known.items()
         if options.position or each.role or each.stated or meanings[name].quantity in _OF_MOTION
     ]
-    here = {name for name in telling if any(row.held(name).any() for row in rows)}
+    known_of_all = frame.whole_statistics()  # of a short run, without opening its chunks
+    if known_of_all is None:
+        here = {name for name in telling if any(row.held(name).any() for row in rows)}
+    else:
+        always = {name for name, each in known_of_all.items() if each.row_count == len(frame)}
+        some = known_of_all.keys() - always
+        here = {
+            name
+            for name in telling
+            if name in always or (name in some and any(row.held(name).any() for row in rows))
+        }
     return find_motion(known, options, here)
 
 
@@ -353,12 +363,24 @@ class ModeUses:
         motion: Motion,
         options: EventOptions,
         deadline: Deadline,
+        noise: RunNoise | None = None,
     ) -> None:
+        """Prepare to read the run.
+
+        Args:
+            connection: Any.
+            run: The run that is searched.
+            motion: Which signals tell.
+            options: What counts as standing.
+            deadline: For the other runs.
+            noise: Of the run, where it is known already.
+        """
         self.run_id = run.run_id
         self.is_cut = False
         self._motion = motion
         self._options = options
         self._frames = self._runs(connection, run, deadline)
+        self._noise = noise if noise is not None and len(run) <= MOST_ROWS else None
         self._known: dict[str, ModeUse] = {}
 
     def of(self, mode: str) -> ModeUse:
@@ -367,7 +389,8 @@ class ModeUses:
             if (frame := next(self._frames, None)) is None:
                 break
             self.is_cut |= frame.cut_at_s is not None
-            for name, use in uses_in(frame, self._motion, self._options):
+            noise = self._noise if frame.run_id == self.run_id else None
+            for name, use in uses_in(frame, self._motion, self._options, noise):
                 self._known[name] = self._known.get(name, ModeUse()).with_more(use)
         return self._known.get(mode, ModeUse())
 
@@ -388,8 +411,17 @@ class ModeUses:
                 yield read_frame(connection, whole, deadline).rows(0, MOST_ROWS)
 
 
-def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tuple[str, ModeUse]]:
-    """What a robot did in the modes of a frame, by its mean places in half a second each."""
+def uses_in(
+    frame: Frame, motion: Motion, options: EventOptions, noise: RunNoise | None = None
+) -> Iterator[tuple[str, ModeUse]]:
+    """What a robot did in the modes of a frame, by its mean places in half a second each.
+
+    Args:
+        frame: The rows.
+        motion: Which signals tell.
+        options: What counts as standing.
+        noise: Of the frame, where it is known already.
+    """
     if motion.mode is None or motion.position is None:
         return
     codes, labels = frame.coded(motion.mode.name)
@@ -402,7 +434,8 @@ def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tup
     starts = np.flatnonzero(np.append(True, ~same))
     counts = np.diff(starts, append=len(rows))
     times, x, y = (np.add.reduceat(each, starts) / counts for each in (times, x, y))
-    left_m = RunNoise(frame, motion).position_m / median(counts) ** 0.5
+    noise = noise or RunNoise(frame, motion)
+    left_m = noise.position_m / median(counts) ** 0.5
     codes: Indexes = codes[starts]
     changes = np.flatnonzero(np.diff(codes)) + 1
     visits = np.searchsorted(changes, np.arange(len(codes)), "right")

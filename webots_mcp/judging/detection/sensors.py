@@ -203,7 +203,13 @@ class _Resting:
     def _rows_with(self, value: float) -> int:
         """How many rows of the run have a value; once many are asked for, of the sorted ones."""
         if len(self._counts) < FEW_VALUES:
-            return int(np.count_nonzero(self.search.whole.numbers(self.signal.name) == value))
+            whole = self.search.whole
+            zones = whole.zone_map(self.signal.name)
+            may_have = (zones.min <= value) & (value <= zones.max)
+            constant = may_have & (zones.min == zones.max)
+            opened = whole.opened(self.signal.name, may_have & ~constant)
+            counts = [np.count_nonzero(numbers == value) for _, numbers in opened]
+            return int(zones.value_count[constant].sum()) + sum(map(int, counts))
         ends = (np.searchsorted(self._sorted, value, side) for side in ("left", "right"))
         first, stop = map(int, ends)
         return stop - first

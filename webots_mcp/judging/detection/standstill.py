@@ -505,8 +505,8 @@ def standstills_in(search: Search) -> Findings:
     motion, run, asked = search.motion, search.frame, search.asked or search.segment
     if search.whole.cut_at_s is None and not asked.full_rate:
         run = search.whole
-    uses = ModeUses(search.connection, run, motion, search.options, search.deadline)
-    noise = RunNoise(run, motion)
+    noise = search.noise if run is search.whole else RunNoise(run, motion)
+    uses = ModeUses(search.connection, run, motion, search.options, search.deadline, noise)
     first, stop = run.places([asked.start_s, asked.end_s]).tolist()
     found = Findings()
     for margin in (MARGIN_ROWS, len(run)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -24,7 +25,7 @@ from webots_mcp.store.reading.frame_summary import (
     Point,
     change_points,
 )
-from webots_mcp.store.reading.segment import Segment, full_rate_segments
+from webots_mcp.store.reading.segment import Segment, full_rate_segments, read_so_far
 from webots_mcp.store.run_rows import count_kept_frames
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
@@ -60,9 +61,9 @@ _REFUSED: Final = (
     "SELECT sim_time_s, wall_time_s, tool, client || ' (' || transport || ')', rule FROM request "
     f"{_IN_SEGMENT} AND rule IS NOT NULL "
 )
-_RUN_WALLS: Final = (
-    "SELECT started_wall_time_s, coalesce((SELECT min(n.started_wall_time_s) FROM run n "
-    "WHERE n.robot_id = r.robot_id AND n.id > r.id), 9e99) FROM run r WHERE id = ?"
+_RUN_WALLS: Final = (  # of all runs of its robot: one by one, all later ones of each are read
+    "SELECT id, started_wall_time_s FROM run "
+    "WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) ORDER BY id DESC"
 )
 
 
@@ -223,7 +224,7 @@ def command_events(search: Search) -> Iterator[Event]:
         details: dict[str, Any] = {"status": "refused", "by": by, "rule": rule}
         yield Event("command", search.segment.run_id, time_s, time_s, wall_s, tool, details)
     connection, here = search.connection, search.segment
-    start_wall_s, end_wall_s = connection.execute(_RUN_WALLS, (here.run_id,)).fetchone()
+    start_wall_s, end_wall_s = _walls_of(connection, here.run_id)
     walls_s = max(start_wall_s, here.wall_start_s), min(end_wall_s, here.wall_end_s)
     rows = connection.execute(_COMMANDS, (here.run_id, *walls_s, MOST_OF_A_KIND)).fetchall()
     _note_older(search, "command", len(rows))
@@ -243,6 +244,17 @@ def command_events(search: Search) -> Iterator[Event]:
         ongoing = status in ("pending", "claimed")
         place = (here.run_id, start_s, end_s, wall_s)
         yield Event("command", *place, action, details, ongoing=ongoing)
+
+
+def _walls_of(connection: sqlite3.Connection, run_id: int) -> tuple[float, float]:
+    """When a run began, and when the first of its robot's later runs did."""
+    known: dict[int, tuple[float, float]] = read_so_far(connection).setdefault(_RUN_WALLS, {})
+    if run_id not in known:
+        next_s = 9e99
+        for each, start_s in connection.execute(_RUN_WALLS, (run_id,)):
+            known[each] = start_s, next_s
+            next_s = min(next_s, start_s)
+    return known[run_id]
 
 
 def _sim_time_at(search: Search, wall_s: float) -> float | None:

@@ -349,14 +349,21 @@ def _off_target(
 def _recent_range(times: Array, aims: Array) -> tuple[Array, Array]:
     """The minimum and maximum of a target in the last 3 s, in which a follower may lag."""
     first = np.searchsorted(times, times - OFF_S)
-    low, high = np.array(aims), np.array(aims)
-    steps = np.flatnonzero(np.diff(aims)) + 1
-    if not len(steps):
-        return low, high
+    if not np.diff(aims).any():
+        return np.array(aims), np.array(aims)
     width = int(np.max(np.arange(len(times)) - first)) + 1
     padded = [np.concatenate((np.full(width - 1, each), aims)) for each in (np.inf, -np.inf)]
-    windows = [np.lib.stride_tricks.sliding_window_view(each, width) for each in padded]
-    return windows[0].min(axis=1), windows[1].max(axis=1)
+    return _of_each(np.minimum, padded[0], width), _of_each(np.maximum, padded[1], width)
+
+
+def _of_each(least_or_most: np.ufunc, values: Array, width: int) -> Array:
+    """The minimum or maximum of each so many values, from those of half as many."""
+    done = 1
+    while done < width:
+        step = min(done, width - done)
+        values = least_or_most(values[:-step], values[step:])
+        done += step
+    return values
 
 
 class _Cells(NamedTuple):

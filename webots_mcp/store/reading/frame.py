@@ -324,6 +324,16 @@ class Frame:
         start, stop = self.places([start_s, end_s]).tolist()
         return self.rows(start, stop)
 
+    def bounds_of_wall_times(self) -> tuple[Indexes, Array, Array]:
+        """The edges of its chunks, and the least and greatest wall time of each; NaN: not known."""
+        edges, source = self._edges, self._source
+        if source.order is not None:
+            unknown: Array = np.full(len(edges) - 1, np.nan)
+            return edges, unknown, unknown
+        table = source.statistics(WALL_TIMES)[source.parts(self._start, self._stop)]
+        least, greatest = (Statistics._fields.index(end) for end in ("min", "max"))
+        return edges, table[:, least], table[:, greatest]
+
     def _decoded(self, column: Column) -> Decoded:
         """All values; those of several chunks share their labels."""
         if (part := self._part_of_whole(column)) is not None:
@@ -338,9 +348,10 @@ class Frame:
         coded: list[tuple[slice, Indexes]] = []
         known: dict[object, int] = {}  # a flag equals a number, so that the type is in the key
         labels: list[Value | Replaced] = []
-        for at, values in source.values(column, start, stop):
+        for at, values in source.values(column, start, stop, into=numbers):
             inside = slice(at, at + len(values.numbers))
-            numbers[inside] = values.numbers
+            if values.numbers.base is not numbers:
+                numbers[inside] = values.numbers
             if values.codes is None:
                 plain.append(inside)
                 continue
@@ -436,8 +447,8 @@ def read_frame(
         full_rate: Of a segment that is kept at full rate, each call of `publish` is a row.
         every_call: Of any segment each call is a row that is in a kept stretch.
     """
-    asked = (segment.run_id, segment.start_s, segment.end_s, segment.full_rate and full_rate)
-    memo = read_so_far(connection)
+    asked = (segment.start_s, segment.end_s, segment.full_rate and full_rate)
+    memo = read_so_far(connection).setdefault(("frames", segment.run_id), {})
     if (source := memo.get((*asked, every_call)) or _wider(memo, asked, every_call)) is not None:
         return _framed(source.twin(), segment, None)
     source, cut_at_s = _source_of(
@@ -450,16 +461,16 @@ def read_frame(
 
 
 def _wider(
-    memo: Mapping[tuple[int, float, float, bool, bool], FrameSource],
-    asked: tuple[int, float, float, bool],
+    memo: Mapping[tuple[float, float, bool, bool], FrameSource],
+    asked: tuple[float, float, bool],
     every_call: bool,
 ) -> FrameSource | None:
     """Return what a longer segment of the run was read from, where that is the same."""
-    run_id, start_s, end_s, at_full_rate = asked
+    start_s, end_s, at_full_rate = asked
     if at_full_rate or every_call:
         return None
-    for (other_id, first_s, last_s, *kinds), source in memo.items():
-        is_longer = other_id == run_id and first_s <= start_s and last_s >= end_s
+    for (first_s, last_s, *kinds), source in memo.items():
+        is_longer = first_s <= start_s and last_s >= end_s
         if is_longer and not any(kinds) and source.may_serve(start_s, end_s):
             return source
     return None
@@ -571,13 +582,36 @@ def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Fr
         whole = Frame(source, 0, source.rows, cut_at_s)
     start, stop = whole.places([segment.start_s, segment.end_s]).tolist()
     if math.isfinite(segment.wall_start_s) or math.isfinite(segment.wall_end_s):
-        walls = whole.wall_times[start:stop]
-        inside = np.flatnonzero((walls >= segment.wall_start_s) & (walls < segment.wall_end_s))
-        stop = start + int(inside[-1]) + 1 if len(inside) else start
-        start += int(inside[0]) if len(inside) else 0
+        start, stop = _in_wall_time(whole.rows(start, stop), segment, start)
     source.bounds = start, stop
     source.frames[source.bounds] = None
     return Frame(source, start, stop, cut_at_s)
+
+
+def _in_wall_time(rows: Frame, segment: Segment, at: int) -> tuple[int, int]:
+    """From the first to the last row that was recorded in the wall time of a segment.
+
+    Only the chunks at both ends are opened, as far as the statistics of the others say enough.
+
+    Args:
+        rows: The rows of its simulation time.
+        segment: Which wall time.
+        at: The place of their first one.
+    """
+    edges, first_s, last_s = rows.bounds_of_wall_times()
+    # Where nothing is known of a chunk, it may have such rows.
+    possible = np.flatnonzero(~((last_s < segment.wall_start_s) | (first_s >= segment.wall_end_s)))
+
+    def inside(part: int) -> Indexes:
+        walls = rows.rows(int(edges[part]), int(edges[part + 1])).wall_times
+        fits = (walls >= segment.wall_start_s) & (walls < segment.wall_end_s)
+        return edges[part] + np.flatnonzero(fits)
+
+    first = next((found for part in possible.tolist() if len(found := inside(part))), None)
+    if first is None:
+        return at, at
+    last = next(found for part in reversed(possible.tolist()) if len(found := inside(part)))
+    return at + int(first[0]), at + int(last[-1]) + 1
 
 
 def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:

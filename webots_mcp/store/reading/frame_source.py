@@ -123,7 +123,12 @@ class FrameSource:
         return slice(first, int(np.searchsorted(self.first_rows, stop)) if start < stop else first)
 
     def values(
-        self, column: Column, start: int, stop: int, wanted: Indexes | None = None
+        self,
+        column: Column,
+        start: int,
+        stop: int,
+        wanted: Indexes | None = None,
+        into: Array | None = None,
     ) -> Iterator[tuple[int, Decoded]]:
         """Yield the values in rows [start, stop), a part at a time, each with its first row.
 
@@ -132,11 +137,21 @@ class FrameSource:
             start: The first row, from which places are counted.
             stop: The row after the last.
             wanted: Which of the parts; None for all. Parts without values are left out.
+            into: Takes the numbers of the rows, as far as they can be decoded right into it: then
+                those that are yielded are a part of it.
         """
         parts = self.parts(start, stop)
         places = range(parts.start, parts.stop)
         edges = self.first_rows.tolist()
-        for place, values in self._of_parts(column, places if wanted is None else wanted.tolist()):
+        targets: dict[int, Array] = {}
+        if into is not None:
+            targets = {
+                place: into[edges[place] - start : edges[place + 1] - start]
+                for place in places
+                if start <= edges[place] and edges[place + 1] <= stop
+            }
+        asked = places if wanted is None else wanted.tolist()
+        for place, values in self._of_parts(column, asked, targets):
             first, behind = edges[place], edges[place + 1]
             if start <= first and behind <= stop:
                 yield first - start, values
@@ -146,7 +161,9 @@ class FrameSource:
             part = Decoded(values.numbers[inside], codes, values.labels, values.is_whole)
             yield max(0, first - start), part
 
-    def _of_parts(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
+    def _of_parts(
+        self, column: Column, places: Sequence[int], into: Mapping[int, Array] | None = None
+    ) -> Iterator[tuple[int, Decoded]]:
         if isinstance(column, str) and column in self.derived:
             for place, times in self._of_parts(SIM_TIMES, places):
                 yield place, self.derived[column](times.numbers)
@@ -156,7 +173,7 @@ class FrameSource:
                 yield place, self._item(column, place)
             return
         groups = len(self._group_ids)
-        yield from self._of_groups(column, [place for place in places if place < groups])
+        yield from self._of_groups(column, [place for place in places if place < groups], into)
         rows = _of_rows(self.columns, column) or ()
         for place in (each for each in places if each >= groups and len(rows)):
             first = (place - groups) * chunk_making.GROUP_ROWS
@@ -204,8 +221,10 @@ class FrameSource:
             self.note(Unread(*span, f"{column}: {why}"), column)
         return decoded_of(values)
 
-    def _of_groups(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
-        """Yield the values that the chunks of some groups hold."""
+    def _of_groups(
+        self, column: Column, places: Sequence[int], into: Mapping[int, Array] | None
+    ) -> Iterator[tuple[int, Decoded]]:
+        """Yield the values that the chunks of some groups hold; `into` has arrays for some."""
         signal_id = self._signal_id(column)
         if signal_id is None or not places:
             return
@@ -214,7 +233,11 @@ class FrameSource:
         of_group = dict(zip(ids, places, strict=True))
         wanted = dict(zip(ids, np.diff(self.first_rows)[at].tolist(), strict=True))
         missing = dict(of_group) if signal_id <= SIM_TIMES else {}  # each group has times and ids
-        for group_id, values in values_in(self.connection, self.run_id, signal_id, wanted):
+        targets: dict[int, Array] = {}
+        if into:
+            targets = {ids[n]: into[place] for n, place in enumerate(places) if place in into}
+        found = values_in(self.connection, self.run_id, signal_id, wanted, targets)
+        for group_id, values in found:
             missing.pop(group_id, None)
             place = of_group[group_id]
             if isinstance(values, Decoded):

@@ -215,6 +215,11 @@ def _time_of(
 def frame_around(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame:
     """A segment with some rows before and after it: a gap at its end, or all around it, shows."""
     run = read_frame(connection, Segment(segment.run_id, -math.inf, math.inf), deadline)
+    return rows_around(run, segment)
+
+
+def rows_around(run: Frame, segment: Segment) -> Frame:
+    """The same of a frame that has all rows of the run."""
     start, stop = run.places([segment.start_s, segment.end_s]).tolist()
     return run.rows(start - _ROWS_AROUND, stop + _ROWS_AROUND)
 
@@ -552,7 +557,9 @@ def _in_force(
     if at_begin is None:
         return None
     row = _first_of_last_equal(before, signal, at_begin.value) if since else rows
-    return at_begin if row == rows else Point(float(before.times[row]), at_begin.value)
+    if row == rows:
+        return at_begin
+    return Point(float(before.rows(row, row + 1).times[0]), at_begin.value)
 
 
 def _is_hidden(before: Frame, signal: RegisteredSignal, time_s: float) -> bool:

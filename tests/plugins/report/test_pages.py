@@ -27,7 +27,7 @@ from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.plugins.report.making import Report, make_report
 from webots_mcp.plugins.report.opening import most_important
 from webots_mcp.plugins.report.run_comparison import verdict_of, with_repeats
-from webots_mcp.plugins.report.words import cut, length, number
+from webots_mcp.plugins.report.words import cut, describe_event, length, number
 
 EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
 
@@ -105,7 +105,7 @@ def test_two_runs_are_compared_by_their_checks_first(
 def measure(
     name: str, first: float, second: float, different: bool | None, by: tuple[float, float] | None
 ) -> Measure:
-    spread = [Spread(each, each, each) for each in (first, second)]
+    spread: list[Spread | None] = [Spread(each, each, each) for each in (first, second)]
     return Measure(name, spread, [None, different], [None, None], [None, by])
 
 
@@ -139,6 +139,14 @@ def test_runs_of_equal_code_and_parameters_count_as_repeats(recorded: Recorded) 
     one, other, third, fourth, fifth = run_ids
     assert with_repeats(recorded.connection, [one, other]) == [one, third, other, fourth, fifth]
     assert with_repeats(recorded.connection, [one, third]) == [one, third], "they are repeats"
+
+
+def test_a_jump_of_several_items_of_an_array_is_described_by_what_they_share() -> None:
+    before, after = {"before": 1.0, "after": 0.5}, {"before": 1.0}
+    one = Event("jump", 1, 2.0, 3.0, 0.0, "lidar.3", before | {"back": 1.0})
+    assert describe_event(one) == "lidar.3: 1 → 0.5, then back to 1"
+    several = Event("jump", 1, 2.0, 3.0, 0.0, "lidar.*", after)
+    assert describe_event(several) == "lidar.*: before 1"
 
 
 def test_a_crash_and_events_of_failed_checks_come_before_longer_ones() -> None:

@@ -25,6 +25,7 @@ from webots_mcp.plugins.report.opening import (
     MOMENTS,
     ModeInterval,
     Opening,
+    event_name,
     most_important,
     opening_of,
 )
@@ -449,7 +450,7 @@ def _outstanding(
 
 def _moment(event: Event, stored: Found, verdicts: Verdicts) -> EventContext:
     lasted = f", for {length(event.duration_s)}" if event.duration_s else ""
-    kind = event.kind.replace("_", " ").capitalize()
+    kind = capitalised(event_name(event).replace("_", " "))
     title = f"{kind} at {time_at(event.start_s)} s{lasted}"
     columns = ("at [s]", "kind", "what")
     moment = EventContext(

@@ -183,18 +183,26 @@ def most_important(
     seen: dict[str, int] = {}
     rounds: list[tuple[int, int]] = []
     for place, event in enumerate(ranked):
-        name = _importance_name(event)
+        name = event_name(event)
         seen[name] = seen.get(name, 0) + 1
         rounds.append((seen[name], place))
     chosen = [ranked[place] for _, place in sorted(rounds)[:most]]
     return sorted(chosen, key=lambda each: each.start_s)
 
 
+def event_name(event: Event) -> str:
+    """Return the kind of an event; of a log line its level, of a bridge event what it is."""
+    if event.kind == "log":
+        return "error" if event.name == "critical" else event.name or event.kind
+    what = event.details.get("what") if event.kind == "bridge_event" else None
+    return str(what) if what in _BY_IMPORTANCE else event.kind
+
+
 def _severity(event: Event, bad: Sequence[Finding]) -> int:
     """Return how bad an event is by what the checks made of it."""
     if event.kind in _ALWAYS_FIRST:
         return -1
-    if _importance_name(event) in ("error", "violation"):
+    if event_name(event) in ("error", "violation"):
         return _OF_FAILED_CHECK
     kinds = {check.name: check.kinds for check in CHECKS}
     outcomes = [
@@ -206,16 +214,8 @@ def _severity(event: Event, bad: Sequence[Finding]) -> int:
 
 
 def _importance(event: Event) -> int:
-    name = _importance_name(event)
+    name = event_name(event)
     return _BY_IMPORTANCE.index(name) if name in _BY_IMPORTANCE else len(_BY_IMPORTANCE)
-
-
-def _importance_name(event: Event) -> str:
-    """Return the kind of an event; of a log line its level, of a bridge event what it is."""
-    if event.kind == "log":
-        return "error" if event.name == "critical" else event.name or event.kind
-    what = event.details.get("what") if event.kind == "bridge_event" else None
-    return str(what) if what in _BY_IMPORTANCE else event.kind
 
 
 def _check_importance(finding: Finding) -> tuple[int, int]:
@@ -297,7 +297,7 @@ def _lanes(
         return []
     by_kind: dict[str, list[Event]] = {}
     for event in sorted(events, key=_importance):
-        by_kind.setdefault(event.kind, []).append(event)
+        by_kind.setdefault(event_name(event), []).append(event)
     anchors = {id(event): f"moment-{run_id}-{number}" for number, event in enumerate(moments)}
     places = {(each.kind, each.name, each.start_s): anchors[id(each)] for each in moments}
     lanes: list[TimelineLane] = []

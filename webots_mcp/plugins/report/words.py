@@ -193,7 +193,7 @@ def _describe_others(event: Event) -> str:
 
 
 def _describe_fall(event: Event) -> str:
-    tilted = f"tilted by {number(event.details.get('tilt_deg'))}°"
+    tilted = f"tilted by {format_value(event.details.get('tilt_deg'))}°"
     who = f"{event.name} " if event.name else ""
     after = "got up again" if event.details.get("got_up") else "stayed down"
     return f"{who}fell: {tilted}, {after}"
@@ -203,7 +203,7 @@ def _describe_stay(event: Event) -> str:
     """Return where it stood, and what says that it should have moved."""
     details = event.details
     place = ", ".join(
-        f"{axis} {number(details[f'{axis}_m'])} m" for axis in "xyz" if f"{axis}_m" in details
+        f"{axis} {format_value(details[f'{axis}_m'])} m" for axis in "xyz" if f"{axis}_m" in details
     )
     what = "did not move" if event.kind == "stuck" else "stood still"
     said = f"{what} at {place}" if place else what
@@ -215,10 +215,11 @@ def _describe_stay(event: Event) -> str:
 
 def _describe_jump(event: Event) -> str:
     details = event.details
+    if not {"before", "after"} <= details.keys():  # several items of an array, to other values
+        return _describe_others(event)
+    before, after = format_value(details["before"]), format_value(details["after"])
     back = f", then back to {format_value(details['back'])}" if "back" in details else ""
-    return (
-        f"{event.name}: {format_value(details['before'])} → {format_value(details['after'])}{back}"
-    )
+    return f"{event.name}: {before} → {after}{back}"
 
 
 _WORDS: Final[Mapping[str, Callable[[Event], str]]] = {

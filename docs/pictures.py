@@ -98,11 +98,11 @@ def draw_plots(data_dir: Path, images: Path) -> None:
 
 
 def photograph_report(browser: Any, data_dir: Path, images: Path) -> None:
-    """The part of a report that says what happened, as a browser shows it."""
+    """The beginning of a report, which says what happened, as a browser shows it."""
     file = data_dir / "run.html"
     _run("report", "1", "-o", str(file), "--data-dir", str(data_dir))
     page = browser.new_page(viewport={"width": 900, "height": 900})
-    page.goto(f"{file.as_uri()}#happened-1")
+    page.goto(file.as_uri())
     page.wait_for_function(FIGURES_ARE_THERE, timeout=120_000)
     _save(page, images / "report.png")
 

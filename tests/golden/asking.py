@@ -270,7 +270,9 @@ def _report(connection: sqlite3.Connection, recording: GoldenRecording, folder: 
     """The headings of a report of the run and what it holds; its words are those of the answers."""
     scope = Scope(robot=recording.robot, run_id=recording.run_id)
     report = make_report(connection, [find_range(connection, scope).segments[0].run_id], folder)
-    headings = re.findall(r"<h[1-3][^>]*>(.*?)</h[1-3]>", report.html.decode(), re.DOTALL)
+    headings = re.findall(
+        r"<(?:h[1-3]|summary)[^>]*>(.*?)</(?:h[1-3]|summary)>", report.html.decode(), re.DOTALL
+    )
     texts = [" ".join(Shown(each.encode()).text.split()) for each in headings]
     return {"holds": report.holds, "left out": report.left_out, "headings": texts}
 

@@ -15,6 +15,31 @@ DRAWN = "() => [...document.querySelectorAll('[data-figure]')].every(each => eac
 CURVES = """() => [...document.querySelectorAll('[data-figure]')]
     .flatMap(each => each.figure.data.curves ?? [])
     .map(curve => Math.max(...(curve.high ?? curve.mean)))"""
+# The text with the least contrast to its ground (WCAG 2.2); translucent grounds are none of ours.
+LEAST_CONTRAST = """() => {
+    const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+    const light = (text) => {
+        const [r, g, b] = parts(text).slice(0, 3).map((each) => each / 255)
+            .map((each) => each <= 0.04045 ? each / 12.92 : ((each + 0.055) / 1.055) ** 2.4);
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+    };
+    const ground = (each) => {
+        for (; each; each = each.parentElement) {
+            const found = getComputedStyle(each).backgroundColor;
+            if ((parts(found)[3] ?? 1) > 0) return found;
+        }
+        return "rgb(255, 255, 255)";
+    };
+    let least = { ratio: 99 };
+    for (const each of document.querySelectorAll("main :not(svg *)")) {
+        const own = [...each.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
+        if (!own || each.closest("svg, script")) continue;
+        const [a, b] = [light(getComputedStyle(each).color), light(ground(each))];
+        const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+        if (ratio < least.ratio) least = { ratio, text: each.textContent.slice(0, 60) };
+    }
+    return least;
+}"""
 VIEW = """() => JSON.stringify(document.querySelector('[data-figure="signals 1"]').figure.view.x)"""
 
 
@@ -48,6 +73,18 @@ def _ask(asked: list[str], request: Any) -> None:
     asked.append(request.url)
 
 
+def unfolded(opened: Any, key: str) -> Any:
+    """Return a figure of the details, unfolded and in view."""
+    opened.evaluate(
+        "key => { const figure = document.querySelector(`[data-figure='${key}']`);"
+        " figure.closest('details').open = true }",
+        key,
+    )
+    figure = opened.locator(f'[data-figure="{key}"]')
+    figure.scroll_into_view_if_needed()
+    return figure
+
+
 def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(
     opened: Any, both: Report, recording: sqlite3.Connection
 ) -> None:
@@ -61,8 +98,7 @@ def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(
     assert any(abs(high - greatest) < 1e-9 for high in opened.evaluate(CURVES))
 
     before = opened.evaluate(VIEW)
-    figure = opened.locator('[data-figure="signals 1"]')
-    figure.scroll_into_view_if_needed()
+    figure = unfolded(opened, "signals 1")
     box = figure.bounding_box()
     opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + 80)
     opened.keyboard.down("Control")
@@ -72,8 +108,7 @@ def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(
 
 
 def test_the_values_of_all_are_told_at_the_pointer_and_a_click_hides_a_curve(opened: Any) -> None:
-    figure = opened.locator('[data-figure="signals 1"]')
-    figure.scroll_into_view_if_needed()
+    figure = unfolded(opened, "signals 1")
     box = figure.bounding_box()
     opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + 80)
     told = figure.locator(".told")
@@ -93,3 +128,44 @@ def test_pictures_are_seen(opened: Any) -> None:
     )
     assert widths
     assert min(widths) > 0
+
+
+def test_a_link_to_folded_details_unfolds_them(opened: Any) -> None:
+    details = opened.locator("#log-2")
+    opened.evaluate("() => { document.querySelector('#log-2').open = false }")
+    opened.locator('nav a[href="#log-2"]').click()
+    opened.wait_for_function("() => document.querySelector('#log-2').open")
+    assert details.locator("table").is_visible()
+
+
+def test_nothing_is_wider_than_a_telephone(opened: Any) -> None:
+    before = opened.viewport_size
+    opened.evaluate("() => document.querySelectorAll('details').forEach(each => each.open = true)")
+    opened.set_viewport_size({"width": 390, "height": 800})
+    width = opened.evaluate("document.documentElement.scrollWidth")
+    opened.set_viewport_size(before)
+    assert width <= 390
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_texts_have_enough_contrast(opened: Any, scheme: Any) -> None:
+    opened.emulate_media(color_scheme=scheme)
+    least = opened.evaluate(LEAST_CONTRAST)
+    opened.emulate_media(color_scheme="light")
+    assert least["ratio"] >= 4.5, least
+
+
+def test_it_prints_on_a4_within_the_width_of_the_paper(opened: Any) -> None:
+    before = opened.viewport_size
+    opened.emulate_media(media="print")
+    opened.set_viewport_size({"width": 680, "height": 960})  # A4 without margins of 15 mm
+    width = opened.evaluate("document.documentElement.scrollWidth")
+    folded = opened.evaluate(
+        "() => getComputedStyle(document.querySelector('main > details:not(.many)'),"
+        " '::details-content').contentVisibility"
+    )
+    opened.emulate_media(media="screen")
+    opened.set_viewport_size(before)
+    assert width <= 680
+    assert folded == "visible"
+    assert opened.pdf(format="A4").startswith(b"%PDF")

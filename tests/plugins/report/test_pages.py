@@ -16,16 +16,18 @@ from PIL import Image
 
 from tests.plugins.report.conftest import Shown
 from tests.recordings.rows import Recorded
+from webots_mcp.analysis.summary import Spread
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
 from webots_mcp.judging.checks import CheckedRun
 from webots_mcp.judging.checks.finding import Finding
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.run_measures import Measure
 from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.plugins.report.making import Report, make_report
 from webots_mcp.plugins.report.opening import most_important
-from webots_mcp.plugins.report.run_comparison import verdict_of
-from webots_mcp.plugins.report.words import cut, length, number
+from webots_mcp.plugins.report.run_comparison import verdict_of, with_repeats
+from webots_mcp.plugins.report.words import cut, describe_event, length, number
 
 EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
 
@@ -49,7 +51,7 @@ def test_durations_and_cut_texts_are_told_in_words() -> None:
 
 def test_it_tells_events_with_the_seconds_around_them(page: Shown) -> None:
     moments = page.text[page.text.index("Most important moments") :]
-    moments = moments[: moments.index("What ran")]
+    moments = moments[: moments.index("Checks")]
     assert re.search(r"\w+ at [\d.]+ s", moments)
     assert "of the timeline around it" in moments
     assert "grasp(): failed" in page.text
@@ -60,7 +62,7 @@ def test_it_begins_with_what_happened_then_moments_then_checks_then_details(page
     chapter = page.text[page.text.rindex("Run 1 of rover") :]
     places = [
         chapter.index(each)
-        for each in ("rover ran for", "Most important moments", "Checks", "What ran", "Events")
+        for each in ("rover ran for", "Most important moments", "Checks", "Details", "Events (")
     ]
     assert places == sorted(places)
     assert re.search(r"(Failed|Passed|Not judged)[\w ]* rover ran for [\w. ]+ and ", chapter)
@@ -75,7 +77,7 @@ def test_each_kind_has_a_moment_before_any_has_a_second_and_falls_come_first() -
     stuck = [event("stuck", 4.0, 3.0), event("stuck", 20.0, 9.0)]
     fall = event("fall", 30.0)
     assert most_important([*jumps, *stuck, fall]) == [jumps[0], stuck[1], fall]
-    assert most_important([*stuck, fall], 2) == [stuck[1], fall]
+    assert most_important([*stuck, fall], most=2) == [stuck[1], fall]
     assert most_important(stuck) == stuck
 
 
@@ -84,18 +86,120 @@ def checked(run_id: int, outcome: Outcome) -> CheckedRun:
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "said"),
+    ("first", "second", "words", "said"),
     [
-        ("fail", "pass", "Run 2 did better: its checks passed, those of run 1 failed (keeps pace"),
-        ("pass", "warn", "Run 1 did better"),
-        ("pass", "pass", "Neither run did better by its checks: both passed."),
-        ("pass", "not judged", "Cannot tell which run did better"),
+        ("fail", "pass", "better", "Run 2 did better: its checks passed, those of run 1 failed"),
+        ("pass", "warn", "worse", "Run 1 did better"),
+        ("pass", "pass", "cannot tell", "Neither run did better by its checks: both passed."),
+        ("pass", "not judged", "cannot tell", "Cannot tell which run did better"),
     ],
 )
 def test_two_runs_are_compared_by_their_checks_first(
-    first: Outcome, second: Outcome, said: str
+    first: Outcome, second: Outcome, words: str, said: str
 ) -> None:
-    assert said in verdict_of([checked(1, first), checked(2, second)], ())
+    verdict = verdict_of([checked(1, first), checked(2, second)], ())
+    assert verdict.words == words
+    assert said in verdict.text
+
+
+def measure(
+    name: str, first: float, second: float, different: bool | None, by: tuple[float, float] | None
+) -> Measure:
+    spread: list[Spread | None] = [Spread(each, each, each) for each in (first, second)]
+    return Measure(name, spread, [None, different], [None, None], [None, by])
+
+
+def test_repeats_decide_which_run_did_better_with_measure_and_interval() -> None:
+    both = [checked(1, "pass"), checked(2, "pass")]
+    faster = verdict_of(both, [measure("time_to_goal_s", 14.0, 11.0, True, (-4.0, -2.0))])
+    assert faster.words == "better"
+    assert "Run 2 did better: time_to_goal_s 11 instead of 14" in faster.text
+    assert "the difference is -4 to -2 (90 % interval of means)" in faster.text
+    slower = verdict_of(both, [measure("time_to_goal_s", 11.0, 14.0, True, (2.0, 4.0))])
+    assert slower.words == "worse"
+    alike = verdict_of(both, [measure("distance_m", 5.0, 5.1, False, (-0.1, 0.3))])
+    assert alike.words == "not different"
+    open_question = verdict_of(both, [measure("distance_m", 5.0, 5.1, None, (-1.0, 3.0))])
+    assert open_question.words == "cannot tell"
+
+
+def test_runs_of_equal_code_and_parameters_count_as_repeats(recorded: Recorded) -> None:
+    robot = recorded.robot()
+    run_ids: list[int] = []
+    for speed in (3, 8, 3, 8, 8):
+        run_ids.append(robot.begin_run("reset"))
+        robot.state(0.0, {"x": 0.0})
+        robot.state(10.0, {"x": 1.0})
+        recorded.connection.execute(
+            "INSERT INTO parameter_value "
+            "(run_id, name, sim_time_s, wall_time_s, value, is_default, set_by) "
+            "VALUES (?, 'speed', 0, 0, ?, 0, 'code')",
+            (robot.run_id, speed),
+        )
+    one, other, third, fourth, fifth = run_ids
+    assert with_repeats(recorded.connection, [one, other]) == [one, third, other, fourth, fifth]
+    assert with_repeats(recorded.connection, [one, third]) == [one, third], "they are repeats"
+
+
+def test_a_jump_of_several_items_of_an_array_is_described_by_what_they_share() -> None:
+    before, after = {"before": 1.0, "after": 0.5}, {"before": 1.0}
+    one = Event("jump", 1, 2.0, 3.0, 0.0, "lidar.3", before | {"back": 1.0})
+    assert describe_event(one) == "lidar.3: 1 → 0.5, then back to 1"
+    several = Event("jump", 1, 2.0, 3.0, 0.0, "lidar.*", after)
+    assert describe_event(several) == "lidar.*: before 1"
+
+
+def test_a_crash_and_events_of_failed_checks_come_before_longer_ones() -> None:
+    stuck, slip, crash = event("stuck", 4.0, 30.0), event("slip", 3.0, 1.0), event("crash", 40.0)
+    failed = CheckedRun(1, "rover", (Finding("fail", "slipped", 3.0, name="wheels grip"),))
+    assert most_important([stuck, slip, crash], failed, 2) == [slip, crash]
+    assert most_important([stuck, slip], failed, 1) == [slip]
+    assert most_important([stuck, slip], None, 1) == [stuck]
+
+
+def test_a_report_of_a_crash_shows_the_last_seconds(recorded: Recorded, tmp_path: Path) -> None:
+    robot = recorded.robot()
+    for step in range(50):
+        robot.state(step * 0.1, {"pose": {"x": step * 0.1, "y": 0.0}, "elapsed_s": step * 0.1})
+    robot.end_run("crashed")
+    report = make_report(recorded.connection, [robot.run_id], tmp_path)
+    text = Shown(report.html).text
+    assert "its controller crashed." in text
+    assert "Crash at 4.900 s" in text
+    assert 'data-figure="moment 1 0"' in report.html.decode()
+    drawn = report.html.decode().split('data-figure="signals 1"')[1].split("</script>")[0]
+    assert "pose.x" in drawn
+    assert "elapsed_s" not in drawn, "a clock over time shows nothing"
+
+
+def test_a_fall_is_shown_with_the_signals_it_is_judged_by(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    robot = recorded.robot()
+    for step in range(600):
+        time_s = step * 0.05
+        roll = 1.57 if time_s > 15 else 0.0
+        state = {"pose": {"x": min(time_s, 15) * 0.2, "y": 0.0}, "roll": roll, "pitch": 0.0}
+        robot.state(time_s, state | {"noise_v": step % 7})
+    robot.end_run("finished")
+    html = make_report(recorded.connection, [robot.run_id], tmp_path).html
+    text = Shown(html).text
+    assert re.search(r"Failed rover ran for 30 s and its controller finished\. Fell once", text)
+    assert "Fell: tilted by 90°, stayed down" in text
+    figure = html.decode().split("Fall at ")[1].split("</script>")[0]
+    assert '"name":"roll"' in figure
+    assert '"name":"pose.x"' not in figure
+
+
+def test_what_could_not_be_judged_is_one_paragraph_with_the_call_that_declares_meanings(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    robot = recorded.robot()
+    for step in range(50):
+        robot.state(step * 0.1, {"qz": float(step % 5)})
+    text = Shown(make_report(recorded.connection, [robot.run_id], tmp_path).html).text
+    (line,) = re.findall(r"\d+ checks could not be judged: .*? Details", text)
+    assert "To declare what a signal means: webots_describe_signals(signals=['qz']" in line
 
 
 def test_a_report_names_a_newer_start_that_recorded_no_run(

@@ -16,10 +16,21 @@ from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import KINDS, Found, search_events, stored_kinds
 from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
-from webots_mcp.judging.verdicts import Verdicts
+from webots_mcp.judging.verdicts import AS_STUCK, Verdicts
+from webots_mcp.plotting.intervals import at_resolution, lane_of
+from webots_mcp.plotting.plotted_runs import plotted_runs
 from webots_mcp.plugins.report.grid import Grid, GridRow
-from webots_mcp.plugins.report.opening import MOMENTS, Opening, most_important, opening_of
+from webots_mcp.plugins.report.opening import (
+    CRASH,
+    MOMENTS,
+    ModeInterval,
+    Opening,
+    event_name,
+    most_important,
+    opening_of,
+)
 from webots_mcp.plugins.report.words import (
+    capitalised,
     clock,
     counted,
     cut,
@@ -65,10 +76,18 @@ class _ChapterLimits:
     """Entries of the timeline around an event."""
     mode_values: int = 20
     """Values of a mode."""
+    timeline_steps: int = 400
+    """Steps of time in which the timeline shows a mode."""
+    moment_signals: int = 4
+    """Signals that are drawn with a moment."""
+    clock_fit: float = 0.999
+    """Share of its variance that a straight line explains, from which on a time is a clock."""
 
 
 _LIMITS: Final = _ChapterLimits()
 
+_CLOCK_UNITS: Final = frozenset({"s", "ms", "us", "µs", "ns", "min"})
+_CLOCK_NAMES: Final = frozenset({"t", "time", "timestamp", "clock", "elapsed", "step", "steps"})
 _ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)
 """Events of the bridge that need no context."""
 _MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
@@ -92,6 +111,7 @@ class EventContext:
     """An event with the seconds around it.
 
     Attributes:
+        signals: Signals that show it, the most telling first.
         values: Values of a few signals at its start.
         lines: Entries of the timeline around it.
     """
@@ -101,6 +121,7 @@ class EventContext:
     says: str
     values: str
     lines: Grid
+    signals: Sequence[str] = ()
 
     @property
     def start_s(self) -> float:
@@ -217,14 +238,14 @@ def chapter_of(
     parameters = budget.fit("parameters", _parameters(connection, run_id))
     found = each_alone.in_groups(known_signals(connection, whole))
     stored = _stored(connection, whole, deadline_s / 3)
-    outstanding = _outstanding(connection, found)
-    moments = [_moment(each, stored) for each in outstanding]
-    opening = opening_of(
-        info, checked, run.started_sim_time_s, _that_matter(each_alone), outstanding
-    )
+    matter = [*_crash(info, run.last_sim_time_s), *_that_matter(each_alone)]
+    outstanding = _outstanding(connection, each_alone, matter, checked)
+    moments = [_moment(each, stored, each_alone.verdicts) for each in outstanding]
     course = trends(connection, whole, limit=500, deadline_s=deadline_s / 3)
     (run_trends,) = course.runs
     mode = _mode(run_trends)
+    modes = _mode_intervals(connection, whole, mode.name, deadline_s / 6) if mode else []
+    opening = opening_of(info, checked, run.started_sim_time_s, matter, outstanding, modes)
     travelled, why_not = _travelled(connection, run_id)
     return Chapter(
         info, whole, title,
@@ -245,7 +266,11 @@ def chapter_of(
         timeline=budget.fit("timeline", _timeline(connection, stored), newest=True),
         log=budget.fit("log", _log(connection, run_id), newest=True),
         numbers=run_trends.total,
-        changed_most=[each.name for each in run_trends.numbers if each.shape != "constant"],
+        changed_most=[
+            each.name
+            for each in run_trends.numbers
+            if each.shape != "constant" and not _is_clock(each)
+        ],
         found=each_alone,
         images=[each for each in stored.events if each.kind == "image"],
         notes=tuple(
@@ -363,8 +388,12 @@ def _findings(verdicts: Verdicts) -> list[str]:
     """Return sentences on the kinds of events that were found, and that were not."""
     found = [f"{kind} ({count})" for kind, count in verdicts.found.items()]
     said = [f"Found: {', '.join(found)}."] if found else []
-    said += [f"Looked for and not found: {', '.join(verdicts.far)}."] if verdicts.far else []
-    said += [f"Not found; nearest was: {kind} ({what})." for kind, what in verdicts.nearest.items()]
+    said += [f"Searched and not found: {', '.join(verdicts.far)}."] if verdicts.far else []
+    said += [
+        f"Not found: {kind}. Nearest: {what}."
+        for kind, what in verdicts.nearest.items()
+        if what != AS_STUCK
+    ]
     return said
 
 
@@ -391,18 +420,43 @@ def _that_matter(found: Found) -> list[Event]:
     return [*matter, *(each for each in found.events if _mark(each))]
 
 
-def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
+def _crash(info: RunInfo, ended_s: float) -> list[Event]:
+    """Return the crash that ended a run as an event."""
+    if info.end_reason != "crashed":
+        return []
+    wall_s = info.started_wall_time_s + info.wall_duration_s
+    details = {"says": "the controller crashed or was killed"}
+    return [Event(CRASH, info.run_id, ended_s, ended_s, wall_s, details=details)]
+
+
+def _is_clock(trend: Trend) -> bool:
+    """Return whether a signal is a time or counts steps, so that its curve shows nothing."""
+    last_word = trend.name.rpartition(".")[2].rpartition("_")[2]
+    is_time = trend.unit in _CLOCK_UNITS or last_word in _CLOCK_NAMES
+    is_even = trend.r2 is not None and trend.r2 >= _LIMITS.clock_fit
+    return is_time and is_even and trend.monotonic == "rising"
+
+
+def _outstanding(
+    connection: sqlite3.Connection, found: Found, matter: Sequence[Event], checked: CheckedRun
+) -> list[Event]:
     """Return the few events that are shown with picture, curves and context."""
-    chosen = most_important(_that_matter(found))
-    return list(found.only(chosen).page(connection, MOMENTS).events)
+    chosen = most_important(matter, checked)
+    crashes = [each for each in chosen if each.kind == CRASH]
+    others = [each for each in chosen if each.kind != CRASH]
+    shown = [*found.only(others).page(connection, MOMENTS).events, *crashes]
+    return sorted(shown, key=lambda each: each.start_s)
 
 
-def _moment(event: Event, stored: Found) -> EventContext:
-    many = f", the first of {event.count}" if event.count > 1 else ""
-    lasted = f", for {length(event.duration_s)}" if event.duration_s and not many else ""
-    title = f"{event.kind} at {time_at(event.start_s)} s{lasted}{many}"
+def _moment(event: Event, stored: Found, verdicts: Verdicts) -> EventContext:
+    lasted = f", for {length(event.duration_s)}" if event.duration_s else ""
+    kind = capitalised(event_name(event).replace("_", " "))
+    title = f"{kind} at {time_at(event.start_s)} s{lasted}"
     columns = ("at [s]", "kind", "what")
-    moment = EventContext(event, title, describe_event(event), _around(event), Grid(columns, ()))
+    moment = EventContext(
+        event, title, _says(event), _around(event), Grid(columns, ()),
+        _telling_signals(event, verdicts),
+    )  # fmt: skip
     around = [
         each for each in stored.events
         if moment.start_s <= each.start_s <= moment.end_s and each.kind != "image"
@@ -416,6 +470,34 @@ def _moment(event: Event, stored: Found) -> EventContext:
         for each in shown
     ]
     return replace(moment, lines=Grid(columns, rows, left_out=len(around) - len(shown)))
+
+
+def _says(event: Event) -> str:
+    """Return what happened; only a name of a signal keeps its first letter."""
+    said = describe_event(event)
+    return said if event.name else capitalised(said)
+
+
+def _telling_signals(event: Event, verdicts: Verdicts) -> list[str]:
+    """Return the signals of an event: its own, else those that its kind is judged by.
+
+    Of these one of each branch comes first: the position and the wheels, not three coordinates. For
+    kinds without signals they are those of motion.
+    """
+    if event.name is not None and event.kind not in ("log", "command", "bridge_event"):
+        return [event.name]
+    judged = [
+        verdicts.coverage[kind] for kind in (event.kind, "stuck") if kind in verdicts.coverage
+    ]
+    found = next((each for each in judged if each.signals), None)
+    names = list(found.signals) if found is not None else list[str]()
+    places: dict[str, int] = {}
+    order: list[tuple[int, int]] = []
+    for place, name in enumerate(names):
+        branch = name.rpartition(".")[0] or name
+        places[branch] = places.get(branch, 0) + 1
+        order.append((places[branch], place))
+    return [names[place] for _, place in sorted(order)[: _LIMITS.moment_signals]]
 
 
 def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
@@ -478,7 +560,7 @@ def _trends(run: RunTrends) -> Grid:
     ]
     rows += [GridRow([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
     notes = [f"Without a value: {', '.join(run.without_value[:50])}."] if run.without_value else []
-    columns = ("signal", "unit", "what it did", "mean", "deviation", "least", "greatest")
+    columns = ("signal", "unit", "what it did", "mean", "deviation", "minimum", "maximum")
     return Grid(columns, rows, notes, left_out=run.total - len(run.numbers))
 
 
@@ -506,6 +588,17 @@ def _mode(run: RunTrends) -> StateTrend | None:
     return next((state for state in run.states if state.name == name), None)
 
 
+def _mode_intervals(
+    connection: sqlite3.Connection, whole: TimeRange, name: str, deadline_s: float
+) -> list[ModeInterval]:
+    """Return when a mode had which value, as far as that was read in time."""
+    (part,) = plotted_runs(connection, [whole], [name], _LIMITS.timeline_steps, deadline_s)
+    lanes = [lane_of(columns, part.run, part.end_s) for columns in part.run.changes]
+    step_s = (part.end_s - part.run.start_s) / _LIMITS.timeline_steps
+    intervals = [each for lane in lanes for each in at_resolution(lane.intervals, step_s)]
+    return [ModeInterval(each.value, each.start_s, each.end_s) for each in intervals]
+
+
 def _mode_shares(mode: StateTrend) -> list[ModeShare]:
     whole_s = sum(mode.time_by_value_s.values())
     return [
@@ -531,7 +624,7 @@ def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], 
     ]
     if distance is None or speed is None:
         return [], why_not
-    went = f"It went {number(distance.median)} m, at {number(speed.median)} m/s in the mean."
+    went = f"It went {number(distance.median)} m, {number(speed.median)} m/s on average."
     return [went], why_not
 
 

@@ -21,8 +21,8 @@ from webots_mcp.store.registered_signals import RegisteredSignal
 
 MOST_SIGNALS: Final = 16
 _ROOM: Final = Room(points=500, panels=12, lanes=8, rows=16)
-_EVENT_ROOM: Final = Room(points=200, panels=2, lanes=1, rows=0)
-_EVENT_PX: Final = 700
+_EVENT_ROOM: Final = Room(points=200, panels=3, lanes=1, rows=0)
+_EVENT_PX: Final = 460  # so narrow that its letters can be read on a telephone
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,19 @@ def figures_of(
     both = both if names else [*differing[:MOST_SIGNALS]] or both
     both = [name for name in both if all(name in each for each in known)]
     count = max(map(len, chosen.values()), default=0)
+    with_events = True
     while True:
         first = {run_id: had[:count] for run_id, had in chosen.items()}
-        drawn = _draw_all(connection, chapters, first, both[:count], with_events=count > 1)
+        drawn = _draw_all(connection, chapters, first, both[:count], with_events=with_events)
         if not both[:count] and len([each for each in chapters if each.range is not None]) > 1:
             drawn.not_drawn.append(f"the signals of both runs: {_why_none(known, names)}")
         made = _embedded(drawn.drawn)
         if made.size_bytes <= budget_bytes:
             return replace(made, left_out=[*_curves_missing(chapters, first), *drawn.not_drawn])
-        if count <= 1:
+        if count <= 1 and not with_events:
             return Figures(left_out=("the figures: they would take more than the file may",))
-        count //= 2
+        with_events = count > 1
+        count = max(count // 2, 1)
 
 
 def _curves_missing(chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]) -> list[str]:
@@ -164,9 +166,9 @@ class _FigureSet:
         return way_figure(plot, notes, obstacles_of(self._connection, ranges))
 
     def around(self, chapter: Chapter, moment: EventContext) -> None:
-        """Draw the signals of an event, or the usual ones, in the seconds around it."""
-        about = [moment.event.name] if moment.event.name else []
-        for names in filter(None, (about, list(moment.event.around))):
+        """Draw the signals that show an event, or the usual ones, in the seconds around it."""
+        usual = chapter.changed_most[: _EVENT_ROOM.panels]
+        for names in filter(None, (moment.signals, list(moment.event.around), usual)):
             # The event may have no signal, or one without a value at that time.
             with suppress(InvalidInputError, NothingRecordedError):
                 self.drawn[moment_key(chapter, moment)] = self._seconds(chapter, moment, names)

@@ -27,6 +27,11 @@ def cut(text: str, longest: int = LONGEST_TEXT) -> str:
     return f"{text[:longest]} … ({len(text)} characters)"
 
 
+def capitalised(text: str) -> str:
+    """Return a text with a capital letter at its start; the rest stays as it is."""
+    return f"{text[:1].upper()}{text[1:]}"
+
+
 def number(value: float | None, span: float = 0.0) -> str:
     """Return a number with four digits, or an empty text for None.
 
@@ -187,6 +192,36 @@ def _describe_others(event: Event) -> str:
     return ": ".join(filter(None, (event.name, "; ".join(said))))
 
 
+def _describe_fall(event: Event) -> str:
+    tilted = f"tilted by {format_value(event.details.get('tilt_deg'))}°"
+    who = f"{event.name} " if event.name else ""
+    after = "got up again" if event.details.get("got_up") else "stayed down"
+    return f"{who}fell: {tilted}, {after}"
+
+
+def _describe_stay(event: Event) -> str:
+    """Return where it stood, and what says that it should have moved."""
+    details = event.details
+    place = ", ".join(
+        f"{axis} {format_value(details[f'{axis}_m'])} m" for axis in "xyz" if f"{axis}_m" in details
+    )
+    what = "did not move" if event.kind == "stuck" else "stood still"
+    said = f"{what} at {place}" if place else what
+    if details.get("evidence_for"):
+        said += f"; evidence that it should have moved: {details['evidence_for']}"
+    against = details.get("evidence_against")
+    return f"{said}; evidence against: {against}" if against else said
+
+
+def _describe_jump(event: Event) -> str:
+    details = event.details
+    if not {"before", "after"} <= details.keys():  # several items of an array, to other values
+        return _describe_others(event)
+    before, after = format_value(details["before"]), format_value(details["after"])
+    back = f", then back to {format_value(details['back'])}" if "back" in details else ""
+    return f"{event.name}: {before} → {after}{back}"
+
+
 _WORDS: Final[Mapping[str, Callable[[Event], str]]] = {
     "change": _describe_change,
     "log": _describe_log,
@@ -195,4 +230,8 @@ _WORDS: Final[Mapping[str, Callable[[Event], str]]] = {
     "bridge_event": _describe_noticed,
     "image": _describe_image,
     "gap": _describe_gap,
+    "fall": _describe_fall,
+    "stuck": _describe_stay,
+    "standstill": _describe_stay,
+    "jump": _describe_jump,
 }

@@ -165,8 +165,8 @@ def most_important(
     """Return the few events that matter most, in the order of time.
 
     A crash and falls come first, then events of checks that failed, then of checks that warned,
-    then others. Equal ones come in the order of their kind's severity, of one kind first the one that a
-    check names, then the longest. Each kind has one event before any has a second.
+    then others. Equal ones come by the severity of their kinds, of one kind first the one that a check
+    names, then the longest. Each kind has one event before any has a second.
     """
     bad = checked.of("fail", "warn") if checked is not None else []
     ranked = sorted(

@@ -169,6 +169,39 @@ def test_a_signal_is_found_by_typing_and_moved_to_another_panel(
     assert tab.page.locator("body").inner_text().count("battery_v") > 0
 
 
+def test_signals_are_a_tree_with_values_and_units_and_a_slash_begins_a_search(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.column("pose.0", "t")
+    branch = tab.page.locator("#signals details", has_text="pose").first
+    expect(branch.locator(".signal")).to_have_count(2, timeout=PATIENCE_MS)
+    expect(branch.locator(".swatch path").first).to_be_attached(timeout=PATIENCE_MS)
+    tab.page.keyboard.press("/")
+    tab.page.keyboard.type("voltage")
+    row = tab.page.locator(".signal")
+    expect(row).to_have_count(1, timeout=PATIENCE_MS)
+    expect(row).to_contain_text("battery_v")
+    expect(row.locator(".value")).to_have_attribute("data-unit", "V", timeout=PATIENCE_MS)
+    expect(row.locator(".value")).not_to_be_empty()
+    row.drag_to(tab.page.locator("#signal-figure"), target_position={"x": 300, "y": 60})
+    panels = f"() => ({FIGURES})[0].panels"
+    tab.page.wait_for_function(f"() => ({panels})()[0].includes('battery_v')")
+    assert tab.errors == []
+
+
+def test_what_a_robot_does_not_have_takes_no_room(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "still")
+    expect(tab.page.locator("#signals .signal")).to_have_count(1, timeout=PATIENCE_MS)
+    expect(tab.page.locator("#right")).to_be_hidden(timeout=PATIENCE_MS)
+    expect(tab.page.locator("#log")).to_be_hidden()
+
+
 def test_the_values_of_all_are_told_at_the_pointer_and_in_a_replay(
     opened: Callable[[Server], Tab], told: Server
 ) -> None:
@@ -271,6 +304,9 @@ def test_it_survives_a_purge_a_database_that_goes_away_and_a_server_that_stops(
     server = serve(tmp_path)
     tab = opened(server)
     tab.says("no controller with an MCPBridge has recorded there yet")
+    expect(tab.page.get_by_role("button", name="Copy")).to_have_count(2)
+    tab.says("bridge = MCPBridge.attach(robot)")
+    expect(tab.page.locator("main")).to_be_hidden()
     write_story(tmp_path)
     tab.choose("robot", "rover")
     tab.column("pose.0", "mean")

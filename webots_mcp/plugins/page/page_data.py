@@ -25,22 +25,32 @@ from webots_mcp.errors import (
     UnknownSignalError,
     WebotsMCPError,
 )
+from webots_mcp.extras.requirements import quoted
 from webots_mcp.judging.checks import check_run
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.obstacles import obstacles_of
-from webots_mcp.signals.naming import spelled_out
+from webots_mcp.signals.naming import flatten, spelled_out
 from webots_mcp.store.ages import age_in_words
+from webots_mcp.store.chunks import parse
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
+from webots_mcp.store.meanings import meanings_of
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robot_status import RUNNING
 from webots_mcp.store.robots import list_robots, nothing_recorded, without_observers
 from webots_mcp.store.run_parameters import described
-from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
+from webots_mcp.store.run_rows import (
+    StoredImage,
+    current_run,
+    fetch_run,
+    newest_image,
+    newest_state,
+    opened,
+)
 from webots_mcp.store.runs import RunInfo, list_runs
 
 
@@ -56,6 +66,8 @@ class _PageLimits:
     """Characters of a log line or an error."""
     signal_names: int = 2000
     """Names of signals to choose from."""
+    value_characters: int = 40
+    """Characters of a text that is shown next to the name of its signal."""
     robots: int = 10
     """Robots on one map."""
     checked_runs: int = 20
@@ -160,6 +172,7 @@ def robot_status(
                           robot_id=view.robot.id)  # fmt: skip
         runs = list_runs(connection, robot=view.robot.name, limit=_LIMITS.runs).runs
         settable = steers and is_newest
+        names = list(catalogue(connection, view.subject))[: _LIMITS.signal_names] if run else []
         return _status(header) | {
             "robot": view.robot.name,
             "run": run.id if run else None,
@@ -167,9 +180,8 @@ def robot_status(
             "until": header["sim_time_s"],
             "robots": [robot.name for robot in robots],
             "runs": _with_outcomes(recording, runs),
-            "names": list(catalogue(connection, view.subject))[: _LIMITS.signal_names]
-            if run
-            else [],
+            "names": names,
+            "values": _newest_values(connection, run.id, names) if run else [],
             "lines": [_line(each) for each in newest_lines(connection, asked, _LIMITS.log_lines)],
             "parameters": [_parameter(each) for each in described(connection, run)] if run else [],
             "settable": settable,
@@ -190,6 +202,35 @@ def _view(connection: sqlite3.Connection, request: PageRequest) -> RobotView:
     return view_of(connection, robot, now_s, run)
 
 
+def _newest_values(
+    connection: sqlite3.Connection, run_id: int, names: Sequence[str]
+) -> list[float | str | None]:
+    """Return the values of the newest row in the order of the names; None where it has none."""
+    state = newest_state(connection, run_id)
+    values = flatten(parse(state.data)) if state and isinstance(state.data, str) else {}
+    return [_shown_value(values.get(name)) for name in names]
+
+
+def _shown_value(value: float | str | None) -> float | str | None:
+    if isinstance(value, str):
+        return spelled_out(value[: _LIMITS.value_characters])
+    return value if value is None or math.isfinite(value) else None
+
+
+def describe_signals(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
+    """Return the unit and the meaning in words of each signal of a robot."""
+    with recording.reader() as connection:
+        known = catalogue(connection, _view(connection, request).subject)
+    meanings = meanings_of(known)
+    return {
+        name: {
+            "unit": spelled_out(known[name].unit or meanings[name].unit or ""),
+            "meaning": spelled_out(meanings[name].words or ""),
+        }
+        for name in list(known)[: _LIMITS.signal_names]
+    }
+
+
 def _status(header: Mapping[str, Any]) -> dict[str, Any]:
     """Return whether the robot's time is advancing, and the age of the shown data."""
     text = "no data yet"
@@ -200,8 +241,11 @@ def _status(header: Mapping[str, Any]) -> dict[str, Any]:
     return {"pill": header["status"], "kind": kind, "text": run + text, "why": header["why"] or ""}
 
 
-def problem(error: Exception) -> dict[str, Any]:
-    """Return why nothing can be read; `unknown` names the choices that became invalid."""
+def problem(error: Exception, recording: RecordingAccess) -> dict[str, Any]:
+    """Return why nothing can be read; `unknown` names the choices that became invalid.
+
+    Where nothing is recorded yet, `steps` are texts with lines to copy that begin a recording.
+    """
     waits = isinstance(error, (NoDatabaseError, NothingRecordedError))
     why = str(error)
     if not isinstance(error, WebotsMCPError):
@@ -219,7 +263,23 @@ def problem(error: Exception) -> dict[str, Any]:
         "pill": "nothing recorded yet" if waits else "cannot be read",
         "kind": "standing" if waits else "problem",
         "text": spelled_out(why), "why": "", "unknown": unknown,
+        "steps": _first_steps(recording) if waits else [],
     }  # fmt: skip
+
+
+def _first_steps(recording: RecordingAccess) -> list[dict[str, str]]:
+    command = ["webots-mcp", "demo", "--keep", "--data-dir", str(recording.data_dir)]
+    return [
+        {
+            "text": "Add two lines to the robot's controller, below the line that creates its "
+            "robot. Then start the simulation.",
+            "code": "from webots_mcp import MCPBridge\nbridge = MCPBridge.attach(robot)",
+        },
+        {
+            "text": "Or watch a demo robot first. It needs no Webots, and drives until Ctrl-C.",
+            "code": spelled_out(quoted(command)),
+        },
+    ]
 
 
 def run_title(run: RunInfo) -> str:

@@ -25,7 +25,14 @@ from urllib.parse import parse_qsl
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
-from webots_mcp.plugins.page.page_data import draw, page_request, picture, problem, robot_status
+from webots_mcp.plugins.page.page_data import (
+    describe_signals,
+    draw,
+    page_request,
+    picture,
+    problem,
+    robot_status,
+)
 from webots_mcp.plugins.page.page_orders import steer, tune
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.store.recording import RecordingAccess
@@ -337,10 +344,10 @@ class _Request(BaseHTTPRequestHandler):
         try:
             answer = question(self._page, asked)
         except WebotsMCPError as error:
-            answer = problem(error)
+            answer = problem(error, self._page.recording)
         except Exception as error:  # noqa: BLE001 - Otherwise the page would silently stop.
             self._page.log_once(error)
-            answer = problem(error)
+            answer = problem(error, self._page.recording)
         self._answer(200, json.dumps(answer).encode(), "application/json")
 
     def _refuse(self, status: int, why: str) -> None:
@@ -376,6 +383,10 @@ def _answer_figures(server: PageServer, asked: dict[str, str]) -> dict[str, Any]
     return drawn
 
 
+def _answer_signals(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return {"signals": describe_signals(server.recording, page_request(asked))}
+
+
 def _answer_picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
     return picture(server.recording, page_request(asked))
 
@@ -393,4 +404,9 @@ def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> d
     return tune(server.steered, robot, name, body["value"])
 
 
-_QUESTIONS: Final = {"look": _answer_status, "draw": _answer_figures, "picture": _answer_picture}
+_QUESTIONS: Final = {
+    "look": _answer_status,
+    "draw": _answer_figures,
+    "picture": _answer_picture,
+    "signals": _answer_signals,
+}

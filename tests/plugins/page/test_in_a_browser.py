@@ -269,6 +269,9 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     tab.page.get_by_role("button", name="Pause").click()
     tab.says("pause: done")
     tab.says("paused")
+    expect(tab.page.get_by_role("button", name="Pause", pressed=True)).to_be_enabled(
+        timeout=PATIENCE_MS
+    )
     stands = newest(driven, "SELECT max(sim_time_s) FROM state")
     tab.page.get_by_role("button", name="Step").click()
     tab.says("step: done")
@@ -291,6 +294,24 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     tab.says("running")
     tab.page.wait_for_function(f"() => ({FIGURES})[0]?.curves?.[0].t.at(-1) < {reached}")
     assert tab.errors == []
+
+
+def test_buttons_are_off_with_the_reason_where_nobody_can_obey(
+    opened: Callable[[Server], Tab], serve: Callable[..., Server], story: Path
+) -> None:
+    tab = opened(serve(story))
+    tab.choose("robot", "rover")
+    for name in ("Pause", "Resume", "Step", "Reset"):
+        button = tab.page.get_by_role("button", name=name)
+        expect(button).to_be_disabled(timeout=PATIENCE_MS)
+        expect(button).to_have_attribute("title", re.compile("controller of rover is not running"))
+    tab.page.evaluate("command('pause', {order: 'pause'})")
+    refusal = tab.page.locator("#said details")
+    expect(refusal).to_be_visible(timeout=PATIENCE_MS)
+    short = refusal.locator("summary").inner_text()
+    assert short.startswith("pause: ")
+    assert len(short) < 140
+    assert len(refusal.text_content() or "") > len(short)
 
 
 def newest(server: Server, query: str) -> Any:

@@ -16,6 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from webots_mcp.database.pauses import PAUSED
 from webots_mcp.errors import (
     InvalidInputError,
     NoDatabaseError,
@@ -89,11 +90,11 @@ Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 _log: Final = logging.getLogger(__name__)
 _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
 _OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
-"""Marks of ended runs by database, run and start. The result of a check of them is final."""
-_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp lights")
+"""Outcomes of ended runs by database, run and start. The result of a check of them is final."""
+_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")
 """Checks runs in the background, so that no request waits for a check."""
-_NO_OUTCOME: Final = "⚪"
-"""Mark of runs that were not checked yet, or cannot be checked."""
+_NO_OUTCOME: Final = "not checked"
+"""Outcome of runs that were not checked yet, or cannot be checked."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +186,8 @@ def robot_status(
             "lines": [_line(each) for each in newest_lines(connection, asked, _LIMITS.log_lines)],
             "parameters": [_parameter(each) for each in described(connection, run)] if run else [],
             "settable": settable,
+            "live": view.robot.live,
+            "pace": _pace(header["status"]) if is_newest else "",
             "picture": image.id if image else None,
         }
 
@@ -202,12 +205,17 @@ def _view(connection: sqlite3.Connection, request: PageRequest) -> RobotView:
     return view_of(connection, robot, now_s, run)
 
 
+def _pace(status: str) -> str:
+    """Return `running` or `paused`; empty where the status is neither."""
+    return next((pace for pace in (RUNNING, PAUSED) if status.startswith(pace)), "")
+
+
 def _newest_values(
     connection: sqlite3.Connection, run_id: int, names: Sequence[str]
 ) -> list[float | str | None]:
     """Return the values of the newest row in the order of the names; None where it has none."""
     state = newest_state(connection, run_id)
-    values = flatten(parse(state.data)) if state and isinstance(state.data, str) else {}
+    values = flatten(parse(state.data)) if state else {}
     return [_shown_value(values.get(name)) for name in names]
 
 
@@ -290,19 +298,20 @@ def run_title(run: RunInfo) -> str:
 
 
 def _with_outcomes(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
-    """Return the runs to choose from; ended runs with a mark of the outcome of their check."""
+    """Return the runs to choose from; ended runs with the outcome of their check."""
     choices: list[dict[str, Any]] = []
     marked = 0
     for run in runs:
-        title = run_title(run)
+        outcome = ""
         if run.end_reason and marked < _LIMITS.checked_runs:
             marked += 1
             key = (str(recording.database), run.run_id, run.started_wall_time_s)
             if key not in _OUTCOMES:
                 _OUTCOMES[key] = _NO_OUTCOME
                 _CHECKING.submit(_check, recording, key)
-            title += f" {_OUTCOMES[key]}"
-        choices.append({"id": run.run_id, "title": title})
+            outcome = _OUTCOMES[key]
+        title = " · ".join(filter(None, (run_title(run), outcome)))
+        choices.append({"id": run.run_id, "title": title, "outcome": outcome})
     return choices
 
 
@@ -311,7 +320,9 @@ def _check(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
     try:
         with recording.reader() as connection:
             outcome = check_run(connection, key[1], deadline_s=_LIMITS.check_s).outcome
-        _OUTCOMES[key] = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}.get(outcome, _NO_OUTCOME)
+        _OUTCOMES[key] = {"fail": "failed", "warn": "warned", "pass": "passed"}.get(
+            outcome, _NO_OUTCOME
+        )
     except (WebotsMCPError, sqlite3.Error):
         del _OUTCOMES[key]
     except Exception:  # noqa: BLE001 - No request waits for it and could report it.

@@ -33,7 +33,12 @@ from webots_mcp.plugins.page.page_data import (
     problem,
     robot_status,
 )
-from webots_mcp.plugins.page.page_orders import steer, tune
+from webots_mcp.plugins.page.page_orders import (
+    WebotsSearch,
+    steer,
+    tune,
+    why_not_steerable,
+)
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.store.recording import RecordingAccess
 
@@ -95,6 +100,7 @@ class PageServer(ThreadingHTTPServer):
         self.recording, self.read_only = recording, read_only
         self.steered = replace(recording, read_only=False)
         self.chunk_maker = ChunkMaker(recording)
+        self.webots = WebotsSearch(recording)
         self._tabs: dict[str, float] = {}  # Monotonic time of the last request of each tab.
         self._logged: set[str] = set()
         self._waiting: dict[socket.socket, float] = {}  # Since when each waits for a request.
@@ -372,8 +378,11 @@ class _Request(BaseHTTPRequestHandler):
 
 def _answer_status(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
     found = robot_status(server.recording, page_request(asked), steers=not server.read_only)
-    orders = () if server.read_only else ORDERS
-    return found | {"orders": orders, "rounds": server.chunk_maker.rounds}
+    answer = found | {"orders": (), "why_off": "", "rounds": server.chunk_maker.rounds}
+    if not server.read_only:
+        answer["orders"] = ORDERS
+        answer["why_off"] = why_not_steerable(found["robot"], server.webots, is_live=found["live"])
+    return answer
 
 
 def _answer_figures(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:

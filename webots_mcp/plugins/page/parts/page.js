@@ -99,7 +99,8 @@ function show(answer) {
   showParameters(answer.parameters, answer.settable);
   showLog(answer.lines);
   if (answer.picture !== lastPicture) showPicture(answer.picture);
-  showOrders(answer.orders);
+  showOrders(answer.orders, answer.pace, answer.why_off);
+  showOutcome(answer.runs.find(({ id }) => id === answer.run)?.outcome ?? "");
 }
 
 function offer(id, options, value) {
@@ -447,20 +448,42 @@ addEventListener("keydown", (event) => {
   }
 });
 
-function showOrders(orders) {
-  if (by("orders").childElementCount === orders.length) return;
-  by("orders").replaceChildren(...orders.map((order) => {
-    const button = element("button", { textContent: order[0].toUpperCase() + order.slice(1) });
-    button.addEventListener("click", () => command(order, { order }));
-    return button;
-  }));
+/** The orders; the one whose state holds is pressed, and all are off where nobody can obey. */
+function showOrders(orders, pace, whyOff) {
+  const place = by("orders");
+  if (place.childElementCount !== orders.length) {
+    place.replaceChildren(...orders.map((order) => {
+      const button = element("button", { textContent: order[0].toUpperCase() + order.slice(1) });
+      button.dataset.order = order;
+      button.addEventListener("click", () => command(order, { order }));
+      return button;
+    }));
+  }
+  place.title = whyOff; // a button that is off shows no title of its own everywhere
+  const states = { pause: "paused", resume: "running" };
+  for (const button of place.children) {
+    const state = states[button.dataset.order];
+    button.disabled = whyOff !== "";
+    button.title = whyOff || (state && state === pace ? `The simulation is ${pace}.` : "");
+    if (state) button.ariaPressed = String(!whyOff && state === pace);
+  }
+}
+
+/** The outcome of the checks of a run: as a word, with a shape of its own. */
+function showOutcome(outcome) {
+  const place = by("outcome");
+  place.hidden = outcome === "";
+  place.className = outcome.replace(" ", "-");
+  if (place.textContent !== outcome) place.textContent = outcome;
 }
 
 async function command(what, body) {
   by("said").textContent = `${what}: …`;
   try {
-    const { text, is_done } = await ask("steer", { robot: shown.robot }, body);
-    by("said").textContent = text;
+    const { text, details, is_done } = await ask("steer", { robot: shown.robot }, body);
+    by("said").replaceChildren(details
+      ? element("details", {}, element("summary", { textContent: text }), details)
+      : text ?? "cannot be sent");
     if (!is_done) showParameters(shown.parameters, shown.settable, true);
   } catch (error) {
     by("said").textContent = error.message;

@@ -25,7 +25,7 @@ PATIENCE_MS = 120_000
 FIGURES = "[...document.querySelectorAll('.figure')].map(each => each.figure?.data)"
 CURVE = f"name => ({FIGURES})[0]?.curves?.find(each => each.name === name)"
 MODE = f"() => ({FIGURES})[0]?.lanes?.[0]?.held.map(each => each[0])"
-VIEW = "() => document.getElementById('signal-figure').figure?.frames[0].x"
+VIEW = "() => document.getElementById('signal-figure').figure?.view.x"
 
 
 class Tab:
@@ -218,6 +218,68 @@ def test_the_values_of_all_are_told_at_the_pointer_and_in_a_replay(
     expect(shown).to_contain_text("20.000 s", timeout=PATIENCE_MS)
     expect(tab.page.locator("#way-figure .overlay circle")).to_have_count(1)
     assert "at=20" in tab.page.url
+
+
+def test_a_click_on_a_log_line_or_an_event_and_the_keys_move_the_cursor_everywhere(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 1, 119)
+    line = tab.page.locator("#log p[data-time]").first
+    line.click()
+    at = float(line.get_attribute("data-time") or "nan")
+    assert cursor(tab) == [at, at]
+    expect(tab.page.locator("#log .at-cursor")).to_have_count(1)
+    tab.page.keyboard.press("Escape")
+    assert cursor(tab) == [None, None]
+    figure = "document.getElementById('signal-figure').figure"
+    event_s = tab.page.evaluate(f"{figure}.data.events[0].held[0][1]")
+    share = tab.page.evaluate(
+        f"({figure}.px({figure}.frames[0], {event_s}) + 3) / {figure}.svg.viewBox.baseVal.width"
+    )
+    tab.point(share)
+    tab.page.mouse.down()
+    tab.page.mouse.up()
+    assert cursor(tab) == [event_s, event_s]
+    tab.page.keyboard.press("ArrowRight")
+    moved_s = cursor(tab)[0]
+    assert moved_s is not None
+    assert event_s < moved_s < event_s + 5
+    tab.page.keyboard.press(" ")
+    tab.page.wait_for_function(f"() => {figure}.at > {moved_s} + 0.1")
+    tab.page.keyboard.press(" ")
+    assert tab.errors == []
+
+
+def cursor(tab: Tab) -> list[float | None]:
+    """The times at which the two figures show their cursors."""
+    places = "['signal-figure', 'way-figure']"
+    return tab.page.evaluate(f"{places}.map(id => document.getElementById(id).figure.at)")
+
+
+def test_a_view_whose_rows_are_loaded_needs_no_request(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "last 10 s")
+    tab.until("pose.0", 111, 119)
+    tab.page.wait_for_function("() => wanted.signals !== null")
+    tab.page.wait_for_function("() => drawnScope && isLoaded(figures.signals.figure.view.x)")
+    tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
+    asked = sum("/draw?" in url for url in tab.asked)
+    tab.page.locator("#signal-figure > svg").focus()
+    for key in ("+", "+", "-"):
+        tab.page.keyboard.press(key)
+    for _ in range(5):
+        tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
+    start_s, end_s = tab.view()
+    assert end_s - start_s == pytest.approx(8, rel=0.1)
+    assert sum("/draw?" in url for url in tab.asked) == asked
 
 
 def test_all_robots_stand_on_one_map_and_a_narrow_window_holds_the_page(

@@ -46,6 +46,7 @@ from webots_mcp.store.robots import list_robots, nothing_recorded, without_obser
 from webots_mcp.store.run_parameters import described
 from webots_mcp.store.run_rows import (
     StoredImage,
+    camera_frames,
     current_run,
     fetch_run,
     newest_image,
@@ -110,6 +111,7 @@ class PageRequest:
         window_s: Length of the shown end of the run in simulated seconds; None for the whole run.
         view: Start and end of the zoomed time range.
         all_robots: Whether the map shows the newest runs of all robots.
+        at_s: Simulation time of the cursor; None for the newest picture.
         width_px: Width of the signals.
         side_px: Side length of the map.
         height_px: Height that the signals may fill.
@@ -123,6 +125,7 @@ class PageRequest:
     window_s: float | None = None
     view: tuple[float, float] | None = None
     all_robots: bool = False
+    at_s: float | None = None
     width_px: int = 700
     side_px: int = 330
     height_px: int = 500
@@ -147,6 +150,7 @@ def page_request(asked: Mapping[str, str]) -> PageRequest:
             window_s=float(asked["window"]) if asked.get("window") else None,
             view=(float(view[0]), float(view[1])) if view else None,
             all_robots=bool(asked.get("all")),
+            at_s=float(asked["at"]) if asked.get("at") else None,
             width_px=min(max(int(asked.get("width") or 700), 300), 4000),
             side_px=min(max(int(asked.get("side") or 330), 250), 4000),
             height_px=min(max(int(asked.get("height") or 500), 0), 4000),
@@ -329,11 +333,17 @@ def _check(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
         _log.exception("run %d cannot be judged", key[1])
 
 
-def _line(line: LogLine) -> dict[str, str]:
+def _line(line: LogLine) -> dict[str, Any]:
     at = "" if line.sim_time_s is None else f"{line.sim_time_s:.3f} s"
     message = spelled_out(line.message[: _LIMITS.line_characters])
     kind = _LEVELS.get(line.level, "plain")
-    return {"at": at, "level": spelled_out(line.level), "kind": kind, "message": message}
+    return {
+        "time": line.sim_time_s,
+        "at": at,
+        "level": spelled_out(line.level),
+        "kind": kind,
+        "message": message,
+    }
 
 
 def _parameter(parameter: Mapping[str, Any]) -> dict[str, Any]:
@@ -350,10 +360,17 @@ def _bound(value: float | None) -> str:
 
 
 def picture(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
-    """Return the newest picture of a run as a data URI, and its caption."""
+    """Return a picture of a run as a data URI, and its caption.
+
+    It is the newest picture, or the picture that is nearest to the cursor.
+    """
     with recording.reader() as connection:
         run = _view(connection, request).run
-        image: StoredImage | None = newest_image(connection, run.id) if run else None
+        image: StoredImage | None = None
+        if run and request.at_s is not None:
+            image = next(iter(camera_frames(connection, run.id, at_s=request.at_s)), None)
+        if run and image is None:
+            image = newest_image(connection, run.id)
     if image is None:
         return {"uri": None, "caption": "no picture recorded yet"}
     caption = spelled_out(f"{image.device or image.kind} at {image.sim_time_s:.3f} s")

@@ -6,6 +6,7 @@ const REST_MS = 250; // between two drawings, at least, and so that they take a 
 const TAB = Math.random().toString(36).slice(2);
 const by = (id) => document.getElementById(id);
 const DRAGGED = "application/x-webots-mcp-signal";
+const SNAP_PX = 8; // a click so near to an event means the event
 const FEW_SIGNALS = 40; // so many are shown without a click on their branch
 const figures = { signals: by("signal-figure"), way: by("way-figure") };
 
@@ -23,6 +24,7 @@ let names = []; // the signals of the robot
 let meanings = {}; // their units, and what they mean
 let describedOf = ""; // the robot, run and signals that they are of
 let drawnOf = ""; // what the figures show
+let drawnScope = ""; // the same without the part of the time that is zoomed to
 let drawnUntil = null; // the simulation time up to which they do
 let isCut = false; // whether not all could be read in time
 let nextDrawing = 0;
@@ -119,10 +121,49 @@ function showLog(lines) {
   const text = JSON.stringify(lines);
   if (by("log").dataset.lines === text) return;
   by("log").dataset.lines = text;
-  const rows = lines.map(({ at, level, kind, message }) => element("p", { className: kind },
-    element("time", { textContent: at }), element("b", { textContent: level }), message));
+  const rows = lines.map(({ time, at, level, kind, message }) => {
+    const row = element("p", { className: kind },
+      element("time", { textContent: at }), element("b", { textContent: level }), message);
+    if (time !== null) {
+      row.dataset.time = time;
+      row.title = "Click to move the cursor there";
+      row.addEventListener("click", () => getSelection().isCollapsed && moveCursor(time));
+    }
+    return row;
+  });
   by("log").replaceChildren(...rows);
   by("log").hidden = rows.length === 0;
+  markLog();
+}
+
+let pictureAt = null; // the time of the cursor for which the picture was read
+let isReadingPicture = false;
+
+/** Show the picture that is nearest to the cursor; one request at a time. */
+async function showPictureAt() {
+  if (isReadingPicture || !shown || shown.picture === null || pictureAt === wanted.at) return;
+  isReadingPicture = true;
+  try {
+    while (pictureAt !== wanted.at) {
+      pictureAt = wanted.at;
+      await showPicture(shown.picture);
+    }
+  } catch { // The next look reports why; the next move of the cursor asks again.
+    pictureAt = null;
+  }
+  isReadingPicture = false;
+}
+
+/** Mark the last line that was logged up to the cursor, and bring it into view. */
+function markLog() {
+  const at = wanted.at === null ? null : Number(wanted.at);
+  const marked = at === null ? null : [...by("log").children].filter((row) => Number(row.dataset.time) <= at + 1e-9)
+    .reduce((last, row) => (last && Number(last.dataset.time) >= Number(row.dataset.time) ? last : row), null);
+  const before = by("log").querySelector(".at-cursor");
+  if (before === marked) return;
+  before?.classList.remove("at-cursor");
+  marked?.classList.add("at-cursor");
+  if (marked) by("log").scrollTop = marked.offsetTop - by("log").offsetTop - by("log").clientHeight + marked.offsetHeight;
 }
 
 async function showPicture(key) {
@@ -131,7 +172,7 @@ async function showPicture(key) {
     by("picture").replaceChildren();
     return arrange();
   }
-  const { uri, caption } = await ask("picture", { robot: shown.robot, run: shown.run });
+  const { uri, caption } = await ask("picture", { robot: shown.robot, run: shown.run, at: wanted.at ?? "" });
   const image = uri ? [element("img", { src: uri, alt: "" })] : [];
   by("picture").replaceChildren(...image, element("figcaption", { textContent: caption }));
   arrange();
@@ -190,6 +231,8 @@ async function draw() {
     const key = JSON.stringify([parameters, shown.started]);
     const hasGrown = shown.until !== drawnUntil && !wanted.view;
     if (key === drawnOf && !hasGrown && !(isCut && shown.rounds !== isCut)) continue;
+    const scope = JSON.stringify([{ ...parameters, view: null }, shown.started]);
+    if (scope === drawnScope && !isCut && isLoaded(wanted.view)) continue;
     const busy = setTimeout(() => (by("busy").hidden = false), 300);
     const began = performance.now();
     const until = shown.until;
@@ -207,6 +250,7 @@ async function draw() {
         change({ signals: drawing.names });
         if (!wanted.view) drawnOf = JSON.stringify([{ ...parameters, signals: JSON.stringify(wanted.signals) }, shown.started]);
       }
+      drawnScope = JSON.stringify([{ ...parameters, signals: JSON.stringify(wanted.signals), view: null }, shown.started]);
       replayRange(drawing.bounds);
     } catch (error) {
       by("notes").textContent = error.message;
@@ -216,6 +260,14 @@ async function draw() {
     by("busy").hidden = true;
     nextDrawing = performance.now() + Math.max(REST_MS, 4 * (performance.now() - began));
   }
+}
+
+/** Whether each row of a view is in the figure, so that nothing has to be read for it. */
+function isLoaded(view) {
+  const data = figures.signals.figure?.data;
+  if (!view || !data?.curves.length || data.curves.some((curve) => curve.low)) return false;
+  const [from, to] = data.frames[0].x;
+  return view[0] >= from - 1e-9 && view[1] <= to + 1e-9;
 }
 
 function put(which, markup) {
@@ -230,10 +282,11 @@ function put(which, markup) {
   if (wanted.at !== null) figure.tell(Number(wanted.at));
   else if (pointed) figure.tell(pointed);
   if (which === "way") {
-    figure.pointed = (time) => figures.signals.figure?.tell(time);
+    figure.pointed = (time) => (time === null ? restoreCursor() : figures.signals.figure?.tell(time));
     return;
   }
-  figure.pointed = (time) => figures.way.figure?.tell(time, []);
+  figure.pointed = (time) => (time === null ? restoreCursor() : figures.way.figure?.tell(time, []));
+  if (wanted.view && isLoaded(wanted.view)) figure.show(wanted.view);
   figure.changed = (isWhole) => change({ view: isWhole ? null : figure.view.x });
   figure.reset = () => figure.changed(true);
   figure.moved = moveTo;
@@ -276,13 +329,56 @@ function replayRange(bounds) {
 
 function showAt(time) {
   wanted.at = time === null ? null : String(time);
-  for (const place of Object.values(figures)) place.figure?.tell(time);
+  restoreCursor();
   by("at-says").textContent = time === null ? "" : `${time.toFixed(2)} s`;
+  by("follow").hidden = time === null;
+  markLog();
+  showPictureAt();
 }
+
+/** Let all figures show the cursor, or none if there is none. */
+function restoreCursor() {
+  const time = wanted.at === null ? null : Number(wanted.at);
+  figures.signals.figure?.tell(time);
+  figures.way.figure?.tell(time, []);
+}
+
+/** Move the cursor; figures, log and picture follow. */
+function moveCursor(time) {
+  if (time === null) by("at").value = by("at").max;
+  else by("at").value = time;
+  showAt(time);
+  change({});
+}
+
+/** The start of the event that is nearest to a time, if it is near in the figure; else the time. */
+function snapped(figure, time) {
+  const [from, to] = figure.view.x;
+  const near = (SNAP_PX / figure.frames[0].width) * (to - from);
+  const starts = figure.data.events.flatMap(({ held }) => held.map(([, start]) => start));
+  const nearest = starts.reduce((best, each) => (Math.abs(each - time) < Math.abs(best - time) ? each : best), Infinity);
+  return Math.abs(nearest - time) <= near ? nearest : time;
+}
+
+let pressedAt = null;
+for (const place of Object.values(figures)) {
+  place.addEventListener("pointerdown", (event) => { pressedAt = [event.clientX, event.clientY]; });
+  place.addEventListener("click", (event) => {
+    const figure = place.figure;
+    const isDragged = pressedAt && Math.hypot(event.clientX - pressedAt[0], event.clientY - pressedAt[1]) > 4;
+    if (!figure || isDragged || event.detail > 1 || event.target.closest("[data-hides]")) return;
+    if (figure.isPlane) return void (figure.at !== null && moveCursor(figure.at));
+    const spot = figure.spot(event);
+    const frame = figure.frameAt(spot);
+    if (frame >= 0) moveCursor(snapped(figure, figure.valueX(figure.frames[frame], spot[0])));
+  });
+  place.addEventListener("dblclick", () => moveCursor(null));
+}
+by("follow").addEventListener("click", () => moveCursor(null));
 
 by("at").addEventListener("input", () => showAt(Number(by("at").value)));
 by("at").addEventListener("change", () => change({}));
-by("at").addEventListener("dblclick", () => (showAt(null), change({})));
+by("at").addEventListener("dblclick", () => moveCursor(null));
 by("play").addEventListener("click", () => {
   const slider = by("at");
   by("play").textContent = playing ? "▶" : "⏸";
@@ -439,14 +535,34 @@ function tick(chosen) {
   colourSignals();
 }
 
+/** Move the cursor by shares of the shown time; from its end, where there is no cursor yet. */
+function stepCursor(share) {
+  const figure = figures.signals.figure;
+  if (!figure || by("replay").hidden) return;
+  const [from, to] = figure.view.x;
+  const [low, high] = [Number(by("at").min), Number(by("at").max)];
+  const time = (wanted.at === null ? Math.min(to, high) : Number(wanted.at)) + share * (to - from);
+  moveCursor(Math.min(Math.max(time, low), high));
+}
+
 addEventListener("keydown", (event) => {
-  const isTyping = event.target.matches("input:not([type=checkbox]):not([type=range]), select, textarea");
+  const { target } = event;
+  const isTyping = target.matches("input:not([type=checkbox]):not([type=range]), select, textarea");
   if (isTyping || event.ctrlKey || event.altKey || event.metaKey) return;
-  if (event.key === "/") {
-    event.preventDefault();
-    by("find").focus();
-  }
-});
+  const isFree = !target.matches("input");
+  const share = event.shiftKey ? 0.1 : 0.01;
+  const does = {
+    "/": () => by("find").focus(),
+    Escape: () => moveCursor(null),
+    " ": isFree && !target.matches("button, summary") && !by("replay").hidden && (() => by("play").click()),
+    ArrowLeft: isFree && (() => stepCursor(-share)),
+    ArrowRight: isFree && (() => stepCursor(share)),
+  }[event.key];
+  if (!does) return;
+  event.preventDefault();
+  event.stopPropagation(); // A figure would move with the arrows.
+  does();
+}, true);
 
 /** The orders; the one whose state holds is pressed, and all are off where nobody can obey. */
 function showOrders(orders, pace, whyOff) {

@@ -538,7 +538,7 @@ function tick(chosen) {
 /** Move the cursor by shares of the shown time; from its end, where there is no cursor yet. */
 function stepCursor(share) {
   const figure = figures.signals.figure;
-  if (!figure || by("replay").hidden) return;
+  if (!figure) return;
   const [from, to] = figure.view.x;
   const [low, high] = [Number(by("at").min), Number(by("at").max)];
   const time = (wanted.at === null ? Math.min(to, high) : Number(wanted.at)) + share * (to - from);
@@ -550,13 +550,16 @@ addEventListener("keydown", (event) => {
   const isTyping = target.matches("input:not([type=checkbox]):not([type=range]), select, textarea");
   if (isTyping || event.ctrlKey || event.altKey || event.metaKey) return;
   const isFree = !target.matches("input");
+  const hasReplay = !by("replay").hidden;
+  // Without a cursor the arrows move a figure that has the focus, which it does itself.
+  const movesCursor = isFree && hasReplay && (wanted.at !== null || !target.closest(".figure"));
   const share = event.shiftKey ? 0.1 : 0.01;
   const does = {
     "/": () => by("find").focus(),
     Escape: () => moveCursor(null),
-    " ": isFree && !target.matches("button, summary") && !by("replay").hidden && (() => by("play").click()),
-    ArrowLeft: isFree && (() => stepCursor(-share)),
-    ArrowRight: isFree && (() => stepCursor(share)),
+    " ": isFree && hasReplay && !target.matches("button, summary") && (() => by("play").click()),
+    ArrowLeft: movesCursor && (() => stepCursor(-share)),
+    ArrowRight: movesCursor && (() => stepCursor(share)),
   }[event.key];
   if (!does) return;
   event.preventDefault();

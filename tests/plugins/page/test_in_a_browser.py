@@ -25,7 +25,7 @@ PATIENCE_MS = 120_000
 FIGURES = "[...document.querySelectorAll('.figure')].map(each => each.figure?.data)"
 CURVE = f"name => ({FIGURES})[0]?.curves?.find(each => each.name === name)"
 MODE = f"() => ({FIGURES})[0]?.lanes?.[0]?.held.map(each => each[0])"
-VIEW = "() => document.getElementById('signal-figure').figure?.frames[0].x"
+VIEW = "() => document.getElementById('signal-figure').figure?.view.x"
 
 
 class Tab:
@@ -169,6 +169,39 @@ def test_a_signal_is_found_by_typing_and_moved_to_another_panel(
     assert tab.page.locator("body").inner_text().count("battery_v") > 0
 
 
+def test_signals_are_a_tree_with_values_and_units_and_a_slash_begins_a_search(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.column("pose.0", "t")
+    branch = tab.page.locator("#signals details", has_text="pose").first
+    expect(branch.locator(".signal")).to_have_count(2, timeout=PATIENCE_MS)
+    expect(branch.locator(".swatch path").first).to_be_attached(timeout=PATIENCE_MS)
+    tab.page.keyboard.press("/")
+    tab.page.keyboard.type("voltage")
+    row = tab.page.locator(".signal")
+    expect(row).to_have_count(1, timeout=PATIENCE_MS)
+    expect(row).to_contain_text("battery_v")
+    expect(row.locator(".value")).to_have_attribute("data-unit", "V", timeout=PATIENCE_MS)
+    expect(row.locator(".value")).not_to_be_empty()
+    row.drag_to(tab.page.locator("#signal-figure"), target_position={"x": 300, "y": 60})
+    panels = f"() => ({FIGURES})[0].panels"
+    tab.page.wait_for_function(f"() => ({panels})()[0].includes('battery_v')")
+    assert tab.errors == []
+
+
+def test_what_a_robot_does_not_have_takes_no_room(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "still")
+    expect(tab.page.locator("#signals .signal")).to_have_count(1, timeout=PATIENCE_MS)
+    expect(tab.page.locator("#right")).to_be_hidden(timeout=PATIENCE_MS)
+    expect(tab.page.locator("#log")).to_be_hidden()
+
+
 def test_the_values_of_all_are_told_at_the_pointer_and_in_a_replay(
     opened: Callable[[Server], Tab], told: Server
 ) -> None:
@@ -185,6 +218,68 @@ def test_the_values_of_all_are_told_at_the_pointer_and_in_a_replay(
     expect(shown).to_contain_text("20.000 s", timeout=PATIENCE_MS)
     expect(tab.page.locator("#way-figure .overlay circle")).to_have_count(1)
     assert "at=20" in tab.page.url
+
+
+def test_a_click_on_a_log_line_or_an_event_and_the_keys_move_the_cursor_everywhere(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 1, 119)
+    line = tab.page.locator("#log p[data-time]").first
+    line.click()
+    at = float(line.get_attribute("data-time") or "nan")
+    assert cursor(tab) == [at, at]
+    expect(tab.page.locator("#log .at-cursor")).to_have_count(1)
+    tab.page.keyboard.press("Escape")
+    assert cursor(tab) == [None, None]
+    figure = "document.getElementById('signal-figure').figure"
+    event_s = tab.page.evaluate(f"{figure}.data.events[0].held[0][1]")
+    share = tab.page.evaluate(
+        f"({figure}.px({figure}.frames[0], {event_s}) + 3) / {figure}.svg.viewBox.baseVal.width"
+    )
+    tab.point(share)
+    tab.page.mouse.down()
+    tab.page.mouse.up()
+    assert cursor(tab) == [event_s, event_s]
+    tab.page.keyboard.press("ArrowRight")
+    moved_s = cursor(tab)[0]
+    assert moved_s is not None
+    assert event_s < moved_s < event_s + 5
+    tab.page.keyboard.press(" ")
+    tab.page.wait_for_function(f"() => {figure}.at > {moved_s} + 0.1")
+    tab.page.keyboard.press(" ")
+    assert tab.errors == []
+
+
+def cursor(tab: Tab) -> list[float | None]:
+    """The times at which the two figures show their cursors."""
+    places = "['signal-figure', 'way-figure']"
+    return tab.page.evaluate(f"{places}.map(id => document.getElementById(id).figure.at)")
+
+
+def test_a_view_whose_rows_are_loaded_needs_no_request(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "last 10 s")
+    tab.until("pose.0", 111, 119)
+    tab.page.wait_for_function("() => wanted.signals !== null")
+    tab.page.wait_for_function("() => drawnScope && isLoaded(figures.signals.figure.view.x)")
+    tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
+    asked = sum("/draw?" in url for url in tab.asked)
+    tab.page.locator("#signal-figure > svg").focus()
+    for key in ("+", "+", "-"):
+        tab.page.keyboard.press(key)
+    for _ in range(5):
+        tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
+    start_s, end_s = tab.view()
+    assert end_s - start_s == pytest.approx(8, rel=0.1)
+    assert sum("/draw?" in url for url in tab.asked) == asked
 
 
 def test_all_robots_stand_on_one_map_and_a_narrow_window_holds_the_page(
@@ -236,6 +331,9 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     tab.page.get_by_role("button", name="Pause").click()
     tab.says("pause: done")
     tab.says("paused")
+    expect(tab.page.get_by_role("button", name="Pause", pressed=True)).to_be_enabled(
+        timeout=PATIENCE_MS
+    )
     stands = newest(driven, "SELECT max(sim_time_s) FROM state")
     tab.page.get_by_role("button", name="Step").click()
     tab.says("step: done")
@@ -260,6 +358,24 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     assert tab.errors == []
 
 
+def test_buttons_are_off_with_the_reason_where_nobody_can_obey(
+    opened: Callable[[Server], Tab], serve: Callable[..., Server], story: Path
+) -> None:
+    tab = opened(serve(story))
+    tab.choose("robot", "rover")
+    for name in ("Pause", "Resume", "Step", "Reset"):
+        button = tab.page.get_by_role("button", name=name)
+        expect(button).to_be_disabled(timeout=PATIENCE_MS)
+        expect(button).to_have_attribute("title", re.compile("controller of rover is not running"))
+    tab.page.evaluate("command('pause', {order: 'pause'})")
+    refusal = tab.page.locator("#said details")
+    expect(refusal).to_be_visible(timeout=PATIENCE_MS)
+    short = refusal.locator("summary").inner_text()
+    assert short.startswith("pause: ")
+    assert len(short) < 140
+    assert len(refusal.text_content() or "") > len(short)
+
+
 def newest(server: Server, query: str) -> Any:
     with closing(connect(server.data_dir / DATABASE_NAME, "reader")) as connection:
         return connection.execute(query).fetchone()[0]
@@ -271,6 +387,9 @@ def test_it_survives_a_purge_a_database_that_goes_away_and_a_server_that_stops(
     server = serve(tmp_path)
     tab = opened(server)
     tab.says("no controller with an MCPBridge has recorded there yet")
+    expect(tab.page.get_by_role("button", name="Copy")).to_have_count(2)
+    tab.says("bridge = MCPBridge.attach(robot)")
+    expect(tab.page.locator("main")).to_be_hidden()
     write_story(tmp_path)
     tab.choose("robot", "rover")
     tab.column("pose.0", "mean")

@@ -46,17 +46,19 @@ def test_the_page_is_for_this_computer(told: Server, host: str) -> None:
     assert "webots-mcp" in text
 
 
-def test_behind_each_run_that_is_over_there_comes_the_light_of_its_check(told: Server) -> None:
-    def lights() -> dict[int, str]:
+def test_each_ended_run_is_listed_with_the_outcome_of_its_check_in_words(told: Server) -> None:
+    def outcomes() -> dict[int, str]:
         status, text = answer(told, "look?robot=rover")
         assert status == 200
-        return {run["id"]: run["title"][-1] for run in json.loads(text)["runs"]}
+        runs = json.loads(text)["runs"]
+        assert all(run["title"].endswith(run["outcome"]) for run in runs)
+        return {run["id"]: run["outcome"] for run in runs}
 
-    shown = wait_for(lights, lambda found: "⚪" not in found.values())
+    shown = wait_for(outcomes, lambda found: "not checked" not in found.values())
     where = ["--data-dir", str(told.data_dir)]
     checked = {number: main(["check", str(number), *where]) for number in shown}
     assert set(checked.values()) == {0, 1}
-    assert {number: "🟢🔴"[code] for number, code in checked.items()} == shown
+    assert {number: ("passed", "failed")[code] for number, code in checked.items()} == shown
 
 
 @pytest.mark.parametrize("path", ["", "page.js", "look", "draw"])

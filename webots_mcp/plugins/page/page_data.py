@@ -16,6 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from webots_mcp.database.pauses import PAUSED
 from webots_mcp.errors import (
     InvalidInputError,
     NoDatabaseError,
@@ -25,22 +26,33 @@ from webots_mcp.errors import (
     UnknownSignalError,
     WebotsMCPError,
 )
+from webots_mcp.extras.requirements import quoted
 from webots_mcp.judging.checks import check_run
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.obstacles import obstacles_of
-from webots_mcp.signals.naming import spelled_out
+from webots_mcp.signals.naming import flatten, spelled_out
 from webots_mcp.store.ages import age_in_words
+from webots_mcp.store.chunks import parse
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
+from webots_mcp.store.meanings import meanings_of
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robot_status import RUNNING
 from webots_mcp.store.robots import list_robots, nothing_recorded, without_observers
 from webots_mcp.store.run_parameters import described
-from webots_mcp.store.run_rows import StoredImage, current_run, fetch_run, newest_image, opened
+from webots_mcp.store.run_rows import (
+    StoredImage,
+    camera_frames,
+    current_run,
+    fetch_run,
+    newest_image,
+    newest_state,
+    opened,
+)
 from webots_mcp.store.runs import RunInfo, list_runs
 
 
@@ -56,6 +68,8 @@ class _PageLimits:
     """Characters of a log line or an error."""
     signal_names: int = 2000
     """Names of signals to choose from."""
+    value_characters: int = 40
+    """Characters of a text that is shown next to the name of its signal."""
     robots: int = 10
     """Robots on one map."""
     checked_runs: int = 20
@@ -77,11 +91,11 @@ Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 _log: Final = logging.getLogger(__name__)
 _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
 _OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
-"""Marks of ended runs by database, run and start. The result of a check of them is final."""
-_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp lights")
+"""Outcomes of ended runs by database, run and start. The result of a check of them is final."""
+_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")
 """Checks runs in the background, so that no request waits for a check."""
-_NO_OUTCOME: Final = "⚪"
-"""Mark of runs that were not checked yet, or cannot be checked."""
+_NO_OUTCOME: Final = "not checked"
+"""Outcome of runs that were not checked yet, or cannot be checked."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +111,7 @@ class PageRequest:
         window_s: Length of the shown end of the run in simulated seconds; None for the whole run.
         view: Start and end of the zoomed time range.
         all_robots: Whether the map shows the newest runs of all robots.
+        at_s: Simulation time of the cursor; None for the newest picture.
         width_px: Width of the signals.
         side_px: Side length of the map.
         height_px: Height that the signals may fill.
@@ -110,6 +125,7 @@ class PageRequest:
     window_s: float | None = None
     view: tuple[float, float] | None = None
     all_robots: bool = False
+    at_s: float | None = None
     width_px: int = 700
     side_px: int = 330
     height_px: int = 500
@@ -134,6 +150,7 @@ def page_request(asked: Mapping[str, str]) -> PageRequest:
             window_s=float(asked["window"]) if asked.get("window") else None,
             view=(float(view[0]), float(view[1])) if view else None,
             all_robots=bool(asked.get("all")),
+            at_s=float(asked["at"]) if asked.get("at") else None,
             width_px=min(max(int(asked.get("width") or 700), 300), 4000),
             side_px=min(max(int(asked.get("side") or 330), 250), 4000),
             height_px=min(max(int(asked.get("height") or 500), 0), 4000),
@@ -160,6 +177,7 @@ def robot_status(
                           robot_id=view.robot.id)  # fmt: skip
         runs = list_runs(connection, robot=view.robot.name, limit=_LIMITS.runs).runs
         settable = steers and is_newest
+        names = list(catalogue(connection, view.subject))[: _LIMITS.signal_names] if run else []
         return _status(header) | {
             "robot": view.robot.name,
             "run": run.id if run else None,
@@ -167,12 +185,13 @@ def robot_status(
             "until": header["sim_time_s"],
             "robots": [robot.name for robot in robots],
             "runs": _with_outcomes(recording, runs),
-            "names": list(catalogue(connection, view.subject))[: _LIMITS.signal_names]
-            if run
-            else [],
+            "names": names,
+            "values": _newest_values(connection, run.id, names) if run else [],
             "lines": [_line(each) for each in newest_lines(connection, asked, _LIMITS.log_lines)],
             "parameters": [_parameter(each) for each in described(connection, run)] if run else [],
             "settable": settable,
+            "live": view.robot.live,
+            "pace": _pace(header["status"]) if is_newest else "",
             "picture": image.id if image else None,
         }
 
@@ -190,6 +209,40 @@ def _view(connection: sqlite3.Connection, request: PageRequest) -> RobotView:
     return view_of(connection, robot, now_s, run)
 
 
+def _pace(status: str) -> str:
+    """Return `running` or `paused`; empty where the status is neither."""
+    return next((pace for pace in (RUNNING, PAUSED) if status.startswith(pace)), "")
+
+
+def _newest_values(
+    connection: sqlite3.Connection, run_id: int, names: Sequence[str]
+) -> list[float | str | None]:
+    """Return the values of the newest row in the order of the names; None where it has none."""
+    state = newest_state(connection, run_id)
+    values = flatten(parse(state.data)) if state else {}
+    return [_shown_value(values.get(name)) for name in names]
+
+
+def _shown_value(value: float | str | None) -> float | str | None:
+    if isinstance(value, str):
+        return spelled_out(value[: _LIMITS.value_characters])
+    return value if value is None or math.isfinite(value) else None
+
+
+def describe_signals(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
+    """Return the unit and the meaning in words of each signal of a robot."""
+    with recording.reader() as connection:
+        known = catalogue(connection, _view(connection, request).subject)
+    meanings = meanings_of(known)
+    return {
+        name: {
+            "unit": spelled_out(known[name].unit or meanings[name].unit or ""),
+            "meaning": spelled_out(meanings[name].words or ""),
+        }
+        for name in list(known)[: _LIMITS.signal_names]
+    }
+
+
 def _status(header: Mapping[str, Any]) -> dict[str, Any]:
     """Return whether the robot's time is advancing, and the age of the shown data."""
     text = "no data yet"
@@ -200,8 +253,11 @@ def _status(header: Mapping[str, Any]) -> dict[str, Any]:
     return {"pill": header["status"], "kind": kind, "text": run + text, "why": header["why"] or ""}
 
 
-def problem(error: Exception) -> dict[str, Any]:
-    """Return why nothing can be read; `unknown` names the choices that became invalid."""
+def problem(error: Exception, recording: RecordingAccess) -> dict[str, Any]:
+    """Return why nothing can be read; `unknown` names the choices that became invalid.
+
+    Where nothing is recorded yet, `steps` are texts with lines to copy that begin a recording.
+    """
     waits = isinstance(error, (NoDatabaseError, NothingRecordedError))
     why = str(error)
     if not isinstance(error, WebotsMCPError):
@@ -219,7 +275,23 @@ def problem(error: Exception) -> dict[str, Any]:
         "pill": "nothing recorded yet" if waits else "cannot be read",
         "kind": "standing" if waits else "problem",
         "text": spelled_out(why), "why": "", "unknown": unknown,
+        "steps": _first_steps(recording) if waits else [],
     }  # fmt: skip
+
+
+def _first_steps(recording: RecordingAccess) -> list[dict[str, str]]:
+    command = ["webots-mcp", "demo", "--keep", "--data-dir", str(recording.data_dir)]
+    return [
+        {
+            "text": "Add two lines to the robot's controller, below the line that creates its "
+            "robot. Then start the simulation.",
+            "code": "from webots_mcp import MCPBridge\nbridge = MCPBridge.attach(robot)",
+        },
+        {
+            "text": "Or watch a demo robot first. It needs no Webots, and drives until Ctrl-C.",
+            "code": spelled_out(quoted(command)),
+        },
+    ]
 
 
 def run_title(run: RunInfo) -> str:
@@ -230,19 +302,20 @@ def run_title(run: RunInfo) -> str:
 
 
 def _with_outcomes(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
-    """Return the runs to choose from; ended runs with a mark of the outcome of their check."""
+    """Return the runs to choose from; ended runs with the outcome of their check."""
     choices: list[dict[str, Any]] = []
     marked = 0
     for run in runs:
-        title = run_title(run)
+        outcome = ""
         if run.end_reason and marked < _LIMITS.checked_runs:
             marked += 1
             key = (str(recording.database), run.run_id, run.started_wall_time_s)
             if key not in _OUTCOMES:
                 _OUTCOMES[key] = _NO_OUTCOME
                 _CHECKING.submit(_check, recording, key)
-            title += f" {_OUTCOMES[key]}"
-        choices.append({"id": run.run_id, "title": title})
+            outcome = _OUTCOMES[key]
+        title = " · ".join(filter(None, (run_title(run), outcome)))
+        choices.append({"id": run.run_id, "title": title, "outcome": outcome})
     return choices
 
 
@@ -251,18 +324,26 @@ def _check(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
     try:
         with recording.reader() as connection:
             outcome = check_run(connection, key[1], deadline_s=_LIMITS.check_s).outcome
-        _OUTCOMES[key] = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}.get(outcome, _NO_OUTCOME)
+        _OUTCOMES[key] = {"fail": "failed", "warn": "warned", "pass": "passed"}.get(
+            outcome, _NO_OUTCOME
+        )
     except (WebotsMCPError, sqlite3.Error):
         del _OUTCOMES[key]
     except Exception:  # noqa: BLE001 - No request waits for it and could report it.
         _log.exception("run %d cannot be judged", key[1])
 
 
-def _line(line: LogLine) -> dict[str, str]:
+def _line(line: LogLine) -> dict[str, Any]:
     at = "" if line.sim_time_s is None else f"{line.sim_time_s:.3f} s"
     message = spelled_out(line.message[: _LIMITS.line_characters])
     kind = _LEVELS.get(line.level, "plain")
-    return {"at": at, "level": spelled_out(line.level), "kind": kind, "message": message}
+    return {
+        "time": line.sim_time_s,
+        "at": at,
+        "level": spelled_out(line.level),
+        "kind": kind,
+        "message": message,
+    }
 
 
 def _parameter(parameter: Mapping[str, Any]) -> dict[str, Any]:
@@ -279,10 +360,17 @@ def _bound(value: float | None) -> str:
 
 
 def picture(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
-    """Return the newest picture of a run as a data URI, and its caption."""
+    """Return a picture of a run as a data URI, and its caption.
+
+    It is the newest picture, or the picture that is nearest to the cursor.
+    """
     with recording.reader() as connection:
         run = _view(connection, request).run
-        image: StoredImage | None = newest_image(connection, run.id) if run else None
+        image: StoredImage | None = None
+        if run and request.at_s is not None:
+            image = next(iter(camera_frames(connection, run.id, at_s=request.at_s)), None)
+        if run and image is None:
+            image = newest_image(connection, run.id)
     if image is None:
         return {"uri": None, "caption": "no picture recorded yet"}
     caption = spelled_out(f"{image.device or image.kind} at {image.sim_time_s:.3f} s")

@@ -25,8 +25,20 @@ from urllib.parse import parse_qsl
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
-from webots_mcp.plugins.page.page_data import draw, page_request, picture, problem, robot_status
-from webots_mcp.plugins.page.page_orders import steer, tune
+from webots_mcp.plugins.page.page_data import (
+    describe_signals,
+    draw,
+    page_request,
+    picture,
+    problem,
+    robot_status,
+)
+from webots_mcp.plugins.page.page_orders import (
+    WebotsSearch,
+    steer,
+    tune,
+    why_not_steerable,
+)
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.store.recording import RecordingAccess
 
@@ -88,6 +100,7 @@ class PageServer(ThreadingHTTPServer):
         self.recording, self.read_only = recording, read_only
         self.steered = replace(recording, read_only=False)
         self.chunk_maker = ChunkMaker(recording)
+        self.webots = WebotsSearch(recording)
         self._tabs: dict[str, float] = {}  # Monotonic time of the last request of each tab.
         self._logged: set[str] = set()
         self._waiting: dict[socket.socket, float] = {}  # Since when each waits for a request.
@@ -337,10 +350,10 @@ class _Request(BaseHTTPRequestHandler):
         try:
             answer = question(self._page, asked)
         except WebotsMCPError as error:
-            answer = problem(error)
+            answer = problem(error, self._page.recording)
         except Exception as error:  # noqa: BLE001 - Otherwise the page would silently stop.
             self._page.log_once(error)
-            answer = problem(error)
+            answer = problem(error, self._page.recording)
         self._answer(200, json.dumps(answer).encode(), "application/json")
 
     def _refuse(self, status: int, why: str) -> None:
@@ -365,8 +378,11 @@ class _Request(BaseHTTPRequestHandler):
 
 def _answer_status(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
     found = robot_status(server.recording, page_request(asked), steers=not server.read_only)
-    orders = () if server.read_only else ORDERS
-    return found | {"orders": orders, "rounds": server.chunk_maker.rounds}
+    answer = found | {"orders": (), "why_off": "", "rounds": server.chunk_maker.rounds}
+    if not server.read_only:
+        answer["orders"] = ORDERS
+        answer["why_off"] = why_not_steerable(found["robot"], server.webots, is_live=found["live"])
+    return answer
 
 
 def _answer_figures(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
@@ -374,6 +390,10 @@ def _answer_figures(server: PageServer, asked: dict[str, str]) -> dict[str, Any]
     if drawn.get("is_cut") and server.chunk_maker.says:
         drawn["notes"].insert(0, server.chunk_maker.says)
     return drawn
+
+
+def _answer_signals(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return {"signals": describe_signals(server.recording, page_request(asked))}
 
 
 def _answer_picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
@@ -393,4 +413,9 @@ def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> d
     return tune(server.steered, robot, name, body["value"])
 
 
-_QUESTIONS: Final = {"look": _answer_status, "draw": _answer_figures, "picture": _answer_picture}
+_QUESTIONS: Final = {
+    "look": _answer_status,
+    "draw": _answer_figures,
+    "picture": _answer_picture,
+    "signals": _answer_signals,
+}

@@ -247,7 +247,7 @@ def test_a_controller_whose_steps_no_bridge_saw_is_told_of_while_it_lives_and_wh
     assert lives.verdict == "wrong" and UNMOVED in lives.seen
     assert ended.verdict == "warning" and UNSEEN in ended.seen
     assert all(
-        SEE_STEPS in found.seen and "troubleshooting simulation" in (found.fix or "")
+        SEE_STEPS in found.seen and "help troubleshooting simulation" in (found.fix or "")
         for found in (lives, ended)
     )
 

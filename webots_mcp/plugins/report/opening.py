@@ -28,6 +28,11 @@ _BY_IMPORTANCE: Final = (
     "missing", "flat", "jump", "oscillation", "warning", "bridge_event", "standstill", "gap",
     "change",
 )  # fmt: skip
+# What checks without kinds of events are about, or what counts of their kinds.
+_ENDS_WELL: Final = "ends well"
+_KINDS_OF_CHECKS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {_ENDS_WELL: (CRASH,), "logs no errors": ("error",), "keeps expectations": ("violation",)}
+)
 _ALWAYS_FIRST: Final = (CRASH, "fall")
 _OF_FAILED_CHECK, _OF_WARNING, _OTHER = range(3)  # severities, the worst first
 _MOST_LANES: Final = 8
@@ -221,6 +226,7 @@ def _importance(event: Event) -> int:
 def _check_importance(finding: Finding) -> tuple[int, int]:
     """Return the place of a check that found something: by outcome, then by its kinds of events."""
     kinds = next((check.kinds for check in CHECKS if check.name == finding.name), ())
+    kinds = _KINDS_OF_CHECKS.get(finding.name, kinds)
     places = [_BY_IMPORTANCE.index(kind) for kind in kinds if kind in _BY_IMPORTANCE]
     return _JUDGED_BADLY[finding.outcome], min(places, default=len(_BY_IMPORTANCE))
 
@@ -231,9 +237,11 @@ def _happened(info: RunInfo, bad: Sequence[Finding]) -> str:
     first = f"{info.robot} ran for {length(info.duration_s)} and {ended}."
     if not bad:
         return f"{first} No check found anything wrong."
-    more = [each.name for each in bad[1:]]
+    # How it ended was just said.
+    lead = next((each for each in bad if each.name != _ENDS_WELL), bad[0])
+    more = [each.name for each in bad if each is not lead]
     also = f" {counted(len(more), 'more check')} found something: {', '.join(more)}."
-    return f"{first} {_sentence(bad[0])}{also if more else ''}"
+    return f"{first} {_sentence(lead)}{also if more else ''}"
 
 
 def _sentence(finding: Finding) -> str:

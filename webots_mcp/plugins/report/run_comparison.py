@@ -227,7 +227,9 @@ def _by_figures(measures: Sequence[Measure]) -> str:
     different = [each for each in measures if each.different and each.different[-1]]
     if not different:
         known = next(each for each in measures if each.interval and each.interval[-1])
-        return f"In the repeats of both, no figure is known to differ: {_with_interval(known)}."
+        why = next((f": {each}" for each in known.reasons[::-1] if each), "")
+        said = f"In the repeats of both, no figure is known to differ{why}."
+        return f"{said} The first figure: {_with_interval(known)}."
     said = "; ".join(_with_interval(each) for each in different[:_MOST_DECIDED])
     return f"What differs by more than repeats do: {said}."
 

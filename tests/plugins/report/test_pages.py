@@ -121,6 +121,7 @@ def test_repeats_decide_which_run_did_better_with_measure_and_interval() -> None
     assert alike.words == "not different"
     open_question = verdict_of(both, [measure("distance_m", 5.0, 5.1, None, (-1.0, 3.0))])
     assert open_question.words == "cannot tell"
+    assert "distance_m 5.1 instead of 5 (+2 %), the difference is -1 to +3" in open_question.text
 
 
 def test_runs_of_equal_code_and_parameters_count_as_repeats(recorded: Recorded) -> None:
@@ -161,12 +162,13 @@ def test_a_report_of_a_crash_shows_the_last_seconds(recorded: Recorded, tmp_path
     robot = recorded.robot()
     for step in range(50):
         robot.state(step * 0.1, {"pose": {"x": step * 0.1, "y": 0.0}, "elapsed_s": step * 0.1})
+    robot.log(4.8, "ZeroDivisionError: division by zero", "error")
     robot.end_run("crashed")
     report = make_report(recorded.connection, [robot.run_id], tmp_path)
     text = Shown(report.html).text
-    assert "its controller crashed." in text
+    assert "its controller crashed. 1 error; first: ZeroDivisionError" in text
     assert "Crash at 4.900 s" in text
-    assert 'data-figure="moment 1 0"' in report.html.decode()
+    assert 'data-figure="moment 1 1"' in report.html.decode()
     drawn = report.html.decode().split('data-figure="signals 1"')[1].split("</script>")[0]
     assert "pose.x" in drawn
     assert "elapsed_s" not in drawn, "a clock over time shows nothing"

@@ -27,6 +27,11 @@ CRASH: Final = "crash"  # the end of a run whose controller crashed, as an event
 _SEVERITIES: Final[Mapping[str, int]] = MappingProxyType(
     {CRASH: 100, "error": 95, "breakpoint": 75, "warning": 25}
 )
+# What checks without kinds of events are about, or what counts of their kinds.
+_ENDS_WELL: Final = "ends well"
+_KINDS_OF_CHECKS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {_ENDS_WELL: (CRASH,), "logs no errors": ("error",), "keeps expectations": ("violation",)}
+)
 _ALWAYS_FIRST: Final = (CRASH, "fall")
 _OF_FAILED_CHECK, _OF_WARNING, _OTHER = range(3)  # severities, the worst first
 _MOST_LANES: Final = 8
@@ -165,8 +170,8 @@ def most_important(
     """Return the few events that matter most, in the order of time.
 
     A crash and falls come first, then events of checks that failed, then of checks that warned,
-    then others. Equal ones come by the severity of their kinds, of one kind first the one that a check
-    names, then the longest. Each kind has one event before any has a second.
+    then others. Equal ones come by the severity of their kinds, of one kind first the one that a
+    check names, then the longest. Each kind has one event before any has a second.
     """
     bad = checked.of("fail", "warn") if checked is not None else []
     ranked = sorted(
@@ -221,6 +226,7 @@ def _importance(name: str) -> int:
 def _check_importance(finding: Finding) -> tuple[int, int]:
     """Return the place of a check that found something: by outcome, then by its kinds of events."""
     kinds = next((check.kinds for check in CHECKS if check.name == finding.name), ())
+    kinds = _KINDS_OF_CHECKS.get(finding.name, kinds)
     return _JUDGED_BADLY[finding.outcome], -max(map(_importance, kinds), default=0)
 
 
@@ -230,9 +236,11 @@ def _happened(info: RunInfo, bad: Sequence[Finding]) -> str:
     first = f"{info.robot} ran for {length(info.duration_s)} and {ended}."
     if not bad:
         return f"{first} No check found anything wrong."
-    more = [each.name for each in bad[1:]]
+    # How it ended was just said.
+    lead = next((each for each in bad if each.name != _ENDS_WELL), bad[0])
+    more = [each.name for each in bad if each is not lead]
     also = f" {counted(len(more), 'more check')} found something: {', '.join(more)}."
-    return f"{first} {_sentence(bad[0])}{also if more else ''}"
+    return f"{first} {_sentence(lead)}{also if more else ''}"
 
 
 def _sentence(finding: Finding) -> str:

@@ -226,7 +226,10 @@ def _by_figures(measures: Sequence[Measure]) -> str:
         )
     different = [each for each in measures if each.different and each.different[-1]]
     if not different:
-        return "In the repeats of both, no figure is known to differ."
+        known = next(each for each in measures if each.interval and each.interval[-1])
+        why = next((f": {each}" for each in known.reasons[::-1] if each), "")
+        said = f"In the repeats of both, no figure is known to differ{why}."
+        return f"{said} The first figure: {_with_interval(known)}."
     said = "; ".join(_with_interval(each) for each in different[:_MOST_DECIDED])
     return f"What differs by more than repeats do: {said}."
 
@@ -251,7 +254,7 @@ def _says(found: Comparison) -> list[str]:
         f"The first {length(found.compared_s)} of each run are compared: {second} with {first}."
     ]
     said += [
-        f"{name}: {first} {_values(first_had)}, {second} {_values(second_had)}."
+        f"{name}: {_values(second_had)} instead of {_values(first_had)}."
         for name, first_had, second_had in _differing_parameters(found)
     ]
     for each in found.measures:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from typing import Any, Final, cast
 
+from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.kinds import Event
 
 LONGEST_TEXT: Final = 1_000
@@ -233,5 +234,5 @@ _WORDS: Final[Mapping[str, Callable[[Event], str]]] = {
     "fall": _describe_fall,
     "stuck": _describe_stay,
     "standstill": _describe_stay,
-    "jump": _describe_jump,
+    JUMP.name: _describe_jump,
 }

@@ -64,6 +64,22 @@ def test_a_gait_that_becomes_larger_as_commanded_is_no_warning() -> None:
     assert check.outcome == "pass"
 
 
+@pytest.mark.parametrize("interval_s", [0.032, 0.1])
+@pytest.mark.parametrize(("doubles_s", "outcome"), [(12.0, "warn"), (np.inf, "pass")])
+def test_a_height_that_swings_more_and_more_is_found_though_the_target_ends_with_a_landing(
+    interval_s: float, doubles_s: float, outcome: str
+) -> None:
+    def draw(t: Array, random: Random) -> Columns:
+        aim = np.clip(3 - 0.4 * np.maximum(t - 70, 0), 0.1, 3)
+        size = 0.05 * 2 ** (np.clip(t - 25, 0, 45) / doubles_s)
+        swing = size * np.sin(TURN * t / 2.4) * (t < 70)
+        return {"altitude_m": aim + swing + noise(random, t, 0.01), "altitude_target_m": aim}
+
+    with recorded(Situation("growing height", draw, (), 80, interval_s)) as asked:
+        (check,) = (each for each in asked.checked.findings if each.name == "stays stable")
+    assert check.outcome == outcome
+
+
 def test_of_steady_oscillations_hardly_one_is_said_to_grow() -> None:
     told = 0
     for number in range(40):

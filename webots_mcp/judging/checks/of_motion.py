@@ -236,7 +236,11 @@ def stays_stable(run: RunUnderCheck) -> Examined:
 
 
 def _target_grew(run: RunUnderCheck, growing: Event, target: str | None) -> bool:
-    """Whether the target of an oscillation went to and fro twice as far at its end as well."""
+    """Whether the target of an oscillation went to and fro twice as far at its end as well.
+
+    How far it went to and fro is what it moved beyond the way from its first value to its last: a
+    target that steps or ramps once, as for a landing, did not.
+    """
     if target is None:
         return False
     two_s = 2 * float(growing.details["period_s"])
@@ -244,11 +248,14 @@ def _target_grew(run: RunUnderCheck, growing: Event, target: str | None) -> bool
         (growing.start_s, growing.start_s + two_s),
         (growing.end_s - two_s, just_after(growing.end_s)),
     )
-    ranges: list[float] = []
+    moved: list[float] = []
     for span in ends:
         values = run.frame.between(*span).usable(target)[1]
-        ranges.append(float(np.ptp(values)) if len(values) else 0.0)
-    return ranges[1] >= GROWS * ranges[0] and ranges[1] > 0
+        if not len(values):
+            return False
+        moved.append(float(np.abs(np.diff(values)).sum() - abs(values[-1] - values[0])))
+    rounding = float(np.finfo(np.float64).eps * len(values) * np.abs(values).max())
+    return moved[1] >= GROWS * moved[0] and moved[1] > rounding
 
 
 # -- attitude --------------------------------------------------------------------------------------

@@ -91,10 +91,15 @@ def oscillation_events(search: Search) -> Iterator[Event]:
 
 
 def _may_swing(search: Search, signal: RegisteredSignal) -> bool:
-    """Whether a signal tells of motion by its name, or is a measured angle: what hangs swings."""
+    """Whether a signal tells of motion by its name, or is a measured height or angle.
+
+    What flies or floats swings in height, what hangs swings in an angle.
+    """
     if _SWINGING.search(in_snake_case(signal.name)):
         return True
     meaning = search.meanings[signal.name]
+    if meaning.quantity == "height":
+        return not is_asked_for(signal.name)
     is_angle = signal.turn is not None or angle_unit_of(signal) is not None
     is_angle &= meaning.quantity in _SWINGING_ANGLES
     return (is_angle or meaning.quantity == "angle") and not is_asked_for(signal.name)

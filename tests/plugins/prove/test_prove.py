@@ -186,7 +186,7 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
     ("options", "said"),
     [
         (["--only", "flying"], "--only 'flying' is none of installed, "),
-        (["--patience", "nan"], "'nan' is no whole number"),
+        (["--patience", "nan"], "'nan' is not a whole number"),
         (["--webots", "nowhere"], "nowhere is neither the folder nor the program of a Webots"),
     ],
 )

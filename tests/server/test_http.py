@@ -242,7 +242,7 @@ async def test_it_ends_at_once_while_clients_wait(
         ("--http 0 --tls-cert x.pem --tls-key y.pem", "cannot be used"),
         ("--http http://x", "is not [HOST:]PORT"),
         ("--http 70000", "is not [HOST:]PORT"),
-        ("--allow-host robots.lab", "are for --http"),
+        ("--allow-host robots.lab", "apply only to --http"),
     ],
 )
 async def test_what_would_be_open_to_others_is_refused(

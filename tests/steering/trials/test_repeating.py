@@ -83,16 +83,16 @@ def test_a_reset_that_leaves_something_is_to_blame_and_a_reload_is_not(
     ]
     (reset,) = answer["reset"]["repeats"]
     assert reset["verdict"].startswith("unlike from the first row on, at 0.016 s: x by ")
-    assert answer["verdict"].startswith("the reset is to blame: processes of their own repeat")
+    assert answer["verdict"].startswith("the reset is the cause: runs in processes of their own are identical")
 
     said = repeat("--by", "reset", "-n", "3", "--for", "0.5")
     assert "reset:\n" in said and " and 2 of 2 others part; run " in said
 
 
 def test_what_cannot_be_repeated_is_refused(project: Path, repeat: Repeat) -> None:
-    assert "takes two runs" in repeat("-n", "1", "--for", "1", status=2)
+    assert "at least two runs are needed" in repeat("-n", "1", "--for", "1", status=2)
     assert "--for nan" in repeat(*in_processes(project), "--for", "nan", status=2)
-    assert "are for --by process" in repeat("--for", "1", "--stand-in", status=2)
+    assert "apply only to processes" in repeat("--for", "1", "--stand-in", status=2)
     assert "no database" in repeat("--for", "1", status=2)
     refused = repeat("nowhere.wbt", "--by", "process", "--stand-in", "--for", "1", status=2)
     assert "no file " in refused

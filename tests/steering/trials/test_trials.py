@@ -65,7 +65,7 @@ def test_a_finished_plan_is_only_shown_and_again_begins_anew(
 
     assert first.stdout == shown.stdout
     assert "1 of 1 trials were done before" in shown.stderr
-    assert "note: one parameter set" in shown.stdout
+    assert "one parameter set: there is nothing to compare" in shown.stdout
     assert "trial set 2" in again.stdout
     assert rows(project, "SELECT count(*) FROM run") == [(2,)]
 
@@ -121,7 +121,7 @@ def test_what_is_over_so_far_is_ranked_and_who_leads_is_told(
     assert run("--so-far").stdout == whole.stdout
 
     plan('score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0]')
-    assert "no trials of " in run("--so-far").stderr
+    assert "No trials of " in run("--so-far").stderr
 
 
 @pytest.mark.parametrize(

@@ -370,9 +370,9 @@ def test_the_command_writes_the_header_and_no_other_file(
     assert file.read_bytes() == C_HEADER.read_bytes()
     (tmp_path / "mine.h").write_text("#define MINE")
     assert main(["header", str(tmp_path / "mine.h")]) == 2
-    assert "it is left as it is" in capsys.readouterr().err
+    assert "was not changed" in capsys.readouterr().err
     assert main(["header", str(tmp_path / "mistyped")]) == 2
-    assert "there is no folder" in capsys.readouterr().err
+    assert "neither a folder nor a file named *.h" in capsys.readouterr().err
     assert len(C_HEADER.read_text().splitlines()) <= 600
 
 

@@ -36,10 +36,10 @@ def say(filed: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_retain_sets_a_limit_and_deletes_nothing(say: Say, filed: Recorded) -> None:
-    assert say("retain", "--keep-states", "30rows", "--keep-runs", "all") == ""
+    assert "Limits are set" in say("retention", "--keep-states", "30rows", "--keep-runs", "all")
     assert filed.rows() == {1: 20, 2: 20}
     assert in_force(filed.connection).state.rows == 30
-    status = " ".join(say("status").split())
+    status = " ".join(say("status", "--storage").split())
     assert "states 30rows (set by retain, " in status
     assert "runs all (set by retain, " in status
     assert "logs 100.0 MB" in status.split("defaults")[1]

@@ -43,7 +43,7 @@ async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
         assert "column" in await refused(score="last(distance")
         assert "distance" in await refused(until="distanc > 3")
         assert "It is not said when to stop" in await refused(for_s=None)
-        assert "both" in await refused(score=None)
+        assert "an end" in await refused(score=None)
         assert "it excludes parameters and score" in await refused(trial_set=1)
         assert "No trial set 1 is recorded: none was started yet" in await fail(
             client, "webots_run_trials", trial_set=1

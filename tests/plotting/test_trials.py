@@ -84,7 +84,7 @@ def test_what_cannot_be_drawn_is_refused(tried: Tried) -> None:
         plot_trials(connection, 1, ["kq"])
     with pytest.raises(InvalidInputError, match="3 parameters are named, but only one or two"):
         plot_trials(connection, 1, ["kp", "ki", "kd"])
-    with pytest.raises(InvalidInputError, match="No trial set 7 is recorded. The newest is 1"):
+    with pytest.raises(InvalidInputError, match=r"No trial set 7 is recorded\. The newest is 1"):
         plot_trials(connection, 7)
     tried(({"kp": 1.0}, None))
     with pytest.raises(NothingRecordedError, match="No trial of set 2 has a score"):

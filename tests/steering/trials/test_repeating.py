@@ -83,7 +83,7 @@ def test_a_reset_that_leaves_something_is_to_blame_and_a_reload_is_not(
     ]
     (reset,) = answer["reset"]["repeats"]
     assert reset["verdict"].startswith("unlike from the first row on, at 0.016 s: x by ")
-    assert answer["verdict"].startswith("the reset is the cause: runs in processes of their own are identical")
+    assert answer["verdict"].startswith("the reset is the cause: runs in processes of")
 
     said = repeat("--by", "reset", "-n", "3", "--for", "0.5")
     assert "reset:\n" in said and " and 2 of 2 others part; run " in said

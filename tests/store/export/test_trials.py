@@ -82,5 +82,5 @@ def test_parquet_reads_back_with_types(connection: sqlite3.Connection) -> None:
 
 
 def test_a_set_that_is_not_there_is_named(connection: sqlite3.Connection) -> None:
-    with pytest.raises(InvalidInputError, match="No trial set 9 is recorded. The newest is 2"):
+    with pytest.raises(InvalidInputError, match=r"No trial set 9 is recorded\. The newest is 2"):
         TrialTable.of(connection, 9)

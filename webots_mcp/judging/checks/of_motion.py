@@ -249,12 +249,14 @@ def _target_grew(run: RunUnderCheck, growing: Event, target: str | None) -> bool
         (growing.end_s - two_s, just_after(growing.end_s)),
     )
     moved: list[float] = []
+    largest = 0.0
     for span in ends:
         values = run.frame.between(*span).usable(target)[1]
         if not len(values):
             return False
-        moved.append(float(np.abs(np.diff(values)).sum() - abs(values[-1] - values[0])))
-    rounding = float(np.finfo(np.float64).eps * len(values) * np.abs(values).max())
+        moved.append(float(np.abs(np.diff(values)).sum()) - abs(float(values[-1] - values[0])))
+        largest = max(largest, len(values) * float(np.abs(values).max()))
+    rounding = float(np.finfo(np.float64).eps) * largest
     return moved[1] >= GROWS * moved[0] and moved[1] > rounding
 
 

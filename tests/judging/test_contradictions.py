@@ -73,7 +73,7 @@ def contradictions(
     if _has_leap(found.events) and outcomes["stays in place"] == "pass":
         wrong.append("the position jumped, and it stays in place")
     for check in CHECKS:
-        unsearched = [kind for kind in check.kinds if found.verdicts.unlooked(kind)]
+        unsearched = [kind for kind in check.kinds if found.verdicts.why_unsearched(kind)]
         undecided = [
             kind
             for kind in _REPORTED_BY.keys() & {*check.kinds}

@@ -55,7 +55,7 @@ def verdicts_of(verdicts: Verdicts, *, in_short: bool = False) -> KindVerdicts:
     if in_short:
         reasons = {
             kind: ("no data is recorded for it",)
-            if verdicts.unlooked(kind) and not each.lacks("unread")
+            if verdicts.why_unsearched(kind) and not each.reasons_for("unread")
             else said
             for kind, said in verdicts.reasons.items()
             for each in (verdicts.coverage.get(kind, Coverage()),)

@@ -203,7 +203,7 @@ class RunOutcome(NamedTuple):
         has_mode: Its mode is known: one in which it never was took no time.
         events: How many of each kind.
         unknown: What is not known of it, or not wholly, with why.
-        unlooked: Kinds that were not searched at all, or not in rows that could not be read.
+        unsearched: Kinds that were not searched at all, or not in rows that could not be read.
         complete: All rows were searched.
         searched: Whether events were searched in it.
     """
@@ -214,7 +214,7 @@ class RunOutcome(NamedTuple):
     has_mode: bool
     events: Counter[str]
     unknown: dict[str, tuple[str, ...]]
-    unlooked: frozenset[str]
+    unsearched: frozenset[str]
     complete: bool
     searched: bool
 
@@ -225,7 +225,7 @@ class RunOutcome(NamedTuple):
 
     def events_of(self, kind: str) -> int | None:
         """How many events of a kind, where that is known."""
-        return self.events[kind] if self.complete and kind not in self.unlooked else None
+        return self.events[kind] if self.complete and kind not in self.unsearched else None
 
 
 def outcomes_of(
@@ -497,9 +497,9 @@ def outcome_of(
     figures |= {f"{_SHARE}{mode}": share for mode, share in shares.items()}
     if not shares:
         unknown["share of each mode"] = (OUT_OF_TIME if deadline.passed else unread or NO_MODE,)
-    counts, unlooked = Counter[str](), frozenset[str]()
+    counts, unsearched = Counter[str](), frozenset[str]()
     if part.searched:
-        counts, unlooked, of_events = _event_counts(connection, part, options, deadline)
+        counts, unsearched, of_events = _event_counts(connection, part, options, deadline)
         unknown |= of_events
     return RunOutcome(
         run_id,
@@ -508,7 +508,7 @@ def outcome_of(
         bool(shares),
         counts,
         unknown,
-        unlooked,
+        unsearched,
         not deadline.passed,
         part.searched,
     )
@@ -522,15 +522,15 @@ def _event_counts(
     verdicts, counts = found.verdicts, Counter(event.kind for event in found.events)
     kinds = sorted(asked_kinds(options), key=lambda kind: not kind.stored)
     in_order = {kind.name: counts[kind.name] for kind in kinds if counts[kind.name]}
-    unlooked = {e for e in verdicts.reasons if verdicts.unlooked(e) or verdicts.unread(e)}
+    unsearched = {e for e in verdicts.reasons if verdicts.why_unsearched(e) or verdicts.unread(e)}
     unknown: dict[str, tuple[str, ...]] = {}
     if deadline.passed:
         unknown[f"events{_RATE}"] = (OUT_OF_TIME,)
     else:
         unknown |= {f"{kind}{_RATE}": reasons for kind, reasons in verdicts.reasons.items()}
     if not expectations_of(connection, part.segment.run_id):
-        unlooked.add(VIOLATION)  # a run of which nothing was expected has not met it
-    return Counter(in_order), frozenset(unlooked), unknown
+        unsearched.add(VIOLATION)  # a run of which nothing was expected has not met it
+    return Counter(in_order), frozenset(unsearched), unknown
 
 
 def _mode_shares(

@@ -105,8 +105,8 @@ class Coverage:
         """Why something was not judged; what many runs share is said once."""
         return tuple(reasons_of_runs([each.reason for each in self.missing]))
 
-    def lacks(self, cause: Cause) -> list[str]:
-        """Return the reasons of one cause."""
+    def reasons_for(self, cause: Cause) -> list[str]:
+        """Return the reasons of what was not judged for one cause."""
         return reasons_of_runs([each.reason for each in self.missing if each.cause == cause])
 
     def note_missing(self, reason: str, cause: Cause | None = None) -> None:
@@ -186,7 +186,7 @@ def outcome_of(made: Fault | Coverage, sources: Mapping[str, Source]) -> tuple[O
         return made.severity, made.evidence
     held = ": ".join(filter(None, (made.says, made.words)))
     for cause in ("unread", "undecided", "absent"):
-        if (lacking := made.lacks(cause)) and (cause != "absent" or made.is_empty):
+        if (lacking := made.reasons_for(cause)) and (cause != "absent" or made.is_empty):
             more = [held] if cause == "unread" and held and not made.is_empty else []
             return _WITHOUT[cause], "; ".join([*lacking, *more])
     if made.is_empty:
@@ -261,10 +261,10 @@ class Verdicts:
     def _nowhere(self) -> list[str]:
         return [kind for kind in self.not_found if kind not in self.reasons]
 
-    def unlooked(self, kind: str) -> str | None:
-        """Why a kind was not looked for anywhere; None if it was, at least in a part."""
-        looked = kind in self.found or kind in self.not_found
-        return None if looked else self.not_searched.get(kind)
+    def why_unsearched(self, kind: str) -> str | None:
+        """Return why a kind was searched nowhere; None if it was searched, at least in a part."""
+        is_searched = kind in self.found or kind in self.not_found
+        return None if is_searched else self.not_searched.get(kind)
 
     def knows(self, kind: str) -> bool:
         """Whether a kind was searched, or is said not to have been."""

@@ -145,7 +145,7 @@ def compose_trajectory(
         connection, ranges, names, deadline_s=_LAYOUT.signals_share * deadline.left_s
     )
     tracks: list[PlottedPath] = []
-    unlooked: list[str] = []
+    unsearched: list[str] = []
     for part in parts:
         modes = _lane(part, mode) if len(parts) == 1 else None
         marks = [_flagged(part, flag) for flag in flags]
@@ -153,7 +153,7 @@ def compose_trajectory(
         if events:
             stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline.left_s, found)
             marks.insert(0, stuck)
-            unlooked += notes
+            unsearched += notes
         tracks.append(PlottedPath(part.name, path, modes, marks))
     if not any(track.path.places for track in tracks):
         if not all(track.path.is_whole for track in tracks):
@@ -167,7 +167,7 @@ def compose_trajectory(
     metres = None if position else "m"
     labels = (_label(x, metres), _label(y, metres))
     axes = TrajectoryAxes(title_of(parts), *labels, tracks, mode)
-    return axes, tuple(dict.fromkeys((*_notes(parts, tracks), *unlooked)))
+    return axes, tuple(dict.fromkeys((*_notes(parts, tracks), *unsearched)))
 
 
 def position_of(

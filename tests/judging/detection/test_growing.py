@@ -1,4 +1,4 @@
-"""An oscillation of what hangs or turns is searched, and growth is told from a single push."""
+"""Oscillations of what hangs, turns or flies are searched; one push is not taken for growth."""
 
 from __future__ import annotations
 

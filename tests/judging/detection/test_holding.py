@@ -1,4 +1,4 @@
-"""A grip that is lost under an unchanged command is told from one that lets go as commanded."""
+"""A grip that is lost under an unchanged command is found; letting go as commanded is not one."""
 
 from __future__ import annotations
 

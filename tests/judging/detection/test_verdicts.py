@@ -59,7 +59,7 @@ def test_where_no_signal_is_searched_for_swings_nothing_is_absent(
     start_run(empty).publish(0.0, {"temp_c": 20.0})
     asked = EventOptions(kinds=("oscillation",))
     told = find_events(empty, find_range(empty, Scope()), asked).verdicts
-    assert told.unlooked("oscillation") == told.gaps["oscillation"]
+    assert told.why_unsearched("oscillation") == told.gaps["oscillation"]
     assert "rest" not in told.gaps["oscillation"]
 
 

@@ -174,8 +174,8 @@ class RunUnderCheck:
             NotSearchableError: Why it cannot.
         """
         for kind in check.kinds:
-            if why := self.found.verdicts.unlooked(kind):
-                undecided = self.coverage_of(kind).lacks("undecided")
+            if why := self.found.verdicts.unsearched(kind):
+                undecided = self.coverage_of(kind).reasons_for("undecided")
                 raise NotSearchableError(why, "undecided" if undecided else None)
             if not self.found.verdicts.knows(kind):
                 raise NotSearchableError(check.needs)

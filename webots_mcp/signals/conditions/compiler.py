@@ -192,7 +192,7 @@ class Evaluator:
         values = {name: read(state) for name, read in self._readers.items()}
         return values | dict(zip(names, place or (None, None), strict=True)) if names else values
 
-    def lacks(self, state: State) -> set[str]:
+    def missing_names(self, state: State) -> set[str]:
         """What the condition reads and a state has no value of: signals, and `POSITION`."""
         state = self._as_dict(state)
         lacking = {name for name, read in self._readers.items() if read(state) is None}
@@ -609,7 +609,7 @@ class Violated:
             and is_meant
             and not (is_first and asked.needs_two)
             and elapsed_s >= asked.takes_s - SAME_TIME_S
-            and (asked.asks_missing or not self._expected.lacks(state))
+            and (asked.asks_missing or not self._expected.missing_names(state))
         )
         if asked.within_s is None:
             return decides

@@ -280,7 +280,7 @@ def _unsearched(verdicts: Verdicts) -> list[str]:
     Where a picture shows no number there is none to be judged, which is no news.
     """
     of_numbers = {kind.name for kind in drawn_kinds() if kind.of_numbers}
-    nowhere = [kind for kind in verdicts.reasons if verdicts.unsearched(kind) is not None]
+    nowhere = [kind for kind in verdicts.reasons if verdicts.why_unsearched(kind) is not None]
     undrawn = [kind for kind in nowhere if kind in of_numbers]
     lacking = [kind for kind in nowhere if kind not in undrawn and _is_absent(verdicts, kind)]
     notes = list[str]()

@@ -155,7 +155,7 @@ class RobotRecording:
                 connection, whole, wanted, limit=sys.maxsize, group=False, deadline_s=math.inf
             )
         for kind in kinds:
-            if (why := found.verdicts.unsearched(kind)) is not None:
+            if (why := found.verdicts.why_unsearched(kind)) is not None:
                 raise NothingRecordedError(f"{kind} could not be looked for: {why}")
         unread = [each for kind in found.verdicts.reasons for each in found.verdicts.unread(kind)]
         _require_all(f"run {subject.run_id} of robot {subject.robot!r}", unread)

@@ -174,7 +174,7 @@ class RunUnderCheck:
             NotSearchableError: Why it cannot.
         """
         for kind in check.kinds:
-            if why := self.found.verdicts.unsearched(kind):
+            if why := self.found.verdicts.why_unsearched(kind):
                 undecided = self.coverage_of(kind).reasons_for("undecided")
                 raise NotSearchableError(why, "undecided" if undecided else None)
             if not self.found.verdicts.knows(kind):

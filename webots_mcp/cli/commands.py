@@ -10,6 +10,22 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.extras.plugin_registry import plugin_commands
 
+START, NOW, PAST, STEER, RUNS, DATA, SERVER = (
+    "Start", "Watch", "Ask", "Steer", "Experiments", "Recordings", "Server and set-up",
+)  # fmt: skip
+GROUPS: Final = (START, NOW, PAST, STEER, RUNS, DATA, SERVER)
+_Q: Final = "webots_mcp.questions"
+_CLI: Final = "webots_mcp.cli"
+# The commands of everyday use, in their order; `--help --all` shows the rest.
+EVERYDAY: Final = (
+    "demo", "init", "launch", "doctor", "status", "view", "logs", "check", "events", "plot",
+    "compare", "report",
+)  # fmt: skip
+FORMER_NAMES: Final = {
+    "requests": "audit", "keep": "capture", "label": "annotate", "retain": "retention",
+    "diff": "first-difference", "repeat": "repeatability",
+}  # fmt: skip
+
 
 class CommandEntry(NamedTuple):
     """Where a command is found: a question, or a function whose parameters are its options."""
@@ -23,12 +39,6 @@ class CommandEntry(NamedTuple):
         return getattr(importlib.import_module(self.module), self.name)
 
 
-START, NOW, PAST, STEER, RUNS, DATA, SERVER = (
-    "Start", "Watch", "Ask", "Steer", "Experiments", "Recordings", "Server and set-up",
-)  # fmt: skip
-GROUPS: Final = (START, NOW, PAST, STEER, RUNS, DATA, SERVER)
-_Q: Final = "webots_mcp.questions"
-_CLI: Final = "webots_mcp.cli"
 _OF_THE_CORE: Final = {
     "init": CommandEntry(START, f"{_CLI}.setting_up", "init"),
     "launch": CommandEntry(START, f"{_CLI}.serving", "launch"),
@@ -79,15 +89,6 @@ _OF_THE_CORE: Final = {
     "audit": CommandEntry(SERVER, f"{_CLI}.steering", "audit"),
     "completion": CommandEntry(SERVER, f"{_CLI}.setting_up", "completion"),
 }
-# The commands of everyday use, in their order; `--help --all` shows the rest.
-EVERYDAY: Final = (
-    "demo", "init", "launch", "doctor", "status", "view", "logs", "check", "events", "plot",
-    "compare", "report",
-)  # fmt: skip
-FORMER_NAMES: Final = {
-    "requests": "audit", "keep": "capture", "label": "annotate", "retain": "retention",
-    "diff": "first-difference", "repeat": "repeatability",
-}  # fmt: skip
 COMMANDS: Final[dict[str, CommandEntry]] = _OF_THE_CORE | {
     each.name: CommandEntry(each.group, *each.function.split(":")) for each in plugin_commands()
 }

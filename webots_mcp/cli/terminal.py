@@ -34,6 +34,27 @@ _HEAD: Final = {
 }
 _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
 _NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
+# Columns that a narrow table does without first, least important first; then those on the right.
+_LESS_IMPORTANT: Final = (
+    "sha256", "git_commit", "world", "controller", "route", "database", "began_by", "kind_of",
+    "own_ms", "step_wait_ms", "real_time_factor", "took_wall_s", "deviation", "pace", "command_id",
+    "actions", "runs", "row_count", "age_s", "more", "set_by", "source", "live", "first_id",
+    "arguments", "by", "at_s",
+)  # fmt: skip
+# Columns that stay as long as two columns fit.
+_MOST_IMPORTANT: Final = frozenset(
+    {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode", "tool"}
+)
+# Columns whose words have a colour, and the colours of those words.
+_COLOURED_COLUMNS: Final = frozenset({"outcome", "status", "level", "ended_by", "verdict"})
+_COLOURS: Final[Sequence[tuple[str, frozenset[str]]]] = (
+    ("green", frozenset({"done", "pass", "running", "ok", "finished"})),
+    ("bold red", frozenset({"fail", "failed", "lost", "error", "critical", "crashed", "wrong"})),
+    (
+        "yellow",
+        frozenset({"warn", "warning", "expired", "cancelled", "pruned", "not judged", "paused"}),
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -64,27 +85,6 @@ class TextLayout:
 
 
 _LAYOUT: Final = TextLayout()
-# Columns that a narrow table does without first, least important first; then those on the right.
-_LESS_IMPORTANT: Final = (
-    "sha256", "git_commit", "world", "controller", "route", "database", "began_by", "kind_of",
-    "own_ms", "step_wait_ms", "real_time_factor", "took_wall_s", "deviation", "pace", "command_id",
-    "actions", "runs", "row_count", "age_s", "more", "set_by", "source", "live", "first_id",
-    "arguments", "by", "at_s",
-)  # fmt: skip
-# Columns that stay as long as two columns fit.
-_MOST_IMPORTANT: Final = frozenset(
-    {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode", "tool"}
-)
-# Columns whose words have a colour, and the colours of those words.
-_COLOURED_COLUMNS: Final = frozenset({"outcome", "status", "level", "ended_by", "verdict"})
-_COLOURS: Final[Sequence[tuple[str, frozenset[str]]]] = (
-    ("green", frozenset({"done", "pass", "running", "ok", "finished"})),
-    ("bold red", frozenset({"fail", "failed", "lost", "error", "critical", "crashed", "wrong"})),
-    (
-        "yellow",
-        frozenset({"warn", "warning", "expired", "cancelled", "pruned", "not judged", "paused"}),
-    ),
-)
 
 
 class Display(NamedTuple):

@@ -89,6 +89,7 @@ LOSE: Final = (
     "UPDATE command SET status = 'lost', finished_wall_time_s = :now, error = :why "
     "WHERE id = :id AND status = 'claimed'"
 )
+_T = TypeVar("_T")
 
 
 class QueuedCommand(NamedTuple):
@@ -280,9 +281,6 @@ def _encode_params(params: Mapping[str, Any]) -> str:
             "to a file and send its path."
         )
     return text
-
-
-_T = TypeVar("_T")
 
 
 def _while_busy(execute: Callable[[], _T], attempts: int = _ATTEMPTS) -> _T:

@@ -120,6 +120,41 @@ _MORE_UNITS: Final[dict[str, Quantity]] = {  # as words at the end of a name
     "lx": "light", "c": "temperature", "celsius": "temperature", "k": "temperature",
     "kelvin": "temperature", "mv": "voltage", "ma": "current",
 }  # fmt: skip
+_OF_POSES: Final[dict[str, Quantity]] = {"x": "x", "y": "y", "z": "height", "yaw": "heading"}
+# A quantity that may be nothing at any time: an actuator is off, a foot is in the air, it is dark.
+CAN_BE_OFF: Final = frozenset[Quantity | None]((
+    "speed", "turn rate", "wheel speed", "motor speed", "joint speed", "force", "torque", "current",
+    "pressure", "light", "acceleration", "angular velocity", "power",
+))  # fmt: skip
+# A quantity that cannot step away and back between two rows: its mass or capacity forbids it.
+INERT: Final = frozenset[Quantity | None]((
+    "x", "y", "height", "heading", "roll", "pitch", "joint position", "voltage", "temperature",
+    "percentage", "energy",
+))  # fmt: skip
+ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint position", "angle"))
+_NO_SENSOR: Final = frozenset[Quantity | None]((
+    None, "colour", "count", "flag", "mode", "text", "time",
+))  # fmt: skip
+_NEARLY_A_TURN: Final = 0.9  # of a turn, that an angle leaps where its scale ends
+_FEW_LEVELS: Final = 8  # different values of something that is quantised
+_LEAST_VALUES: Final = 20  # of fewer values nothing follows
+_CHOICES: Final[dict[str, tuple[str, ...]]] = {
+    "quantity": QUANTITIES, "role": ROLES, "side": SIDES,
+}  # fmt: skip
+_DIRECTIONS: Final = frozenset(
+    ("front", "rear", "left", "right", "center", "middle", "side", "sensor", "obstacle")
+)
+_DRIVING: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
+_NO_SPEED: Final = frozenset((
+    "position", "angle", "tick", "distance", "torque", "force", "current", "power", "temperature",
+    "radius", "base", "track", "width", "slip", "contact", "gain", "count", "voltage", "limit",
+    "encoder", "odometry",
+))  # fmt: skip
+_OF_SPEEDS: Final = frozenset((
+    "speed", "velocity", "robot", "forward", "linear", "command", "target", "measured", "actual",
+    "m", "mm", "cm", "s", "km", "h", "ps", "mps", "setpoint", "desired", "reference", "body",
+    "gps", "base", "odometry",
+))  # fmt: skip
 
 
 @lru_cache(maxsize=_REMEMBERED)
@@ -243,22 +278,6 @@ class Meaning(NamedTuple):
         return self.role in ("commanded", "target")
 
 
-_OF_POSES: Final[dict[str, Quantity]] = {"x": "x", "y": "y", "z": "height", "yaw": "heading"}
-# A quantity that may be nothing at any time: an actuator is off, a foot is in the air, it is dark.
-CAN_BE_OFF: Final = frozenset[Quantity | None]((
-    "speed", "turn rate", "wheel speed", "motor speed", "joint speed", "force", "torque", "current",
-    "pressure", "light", "acceleration", "angular velocity", "power",
-))  # fmt: skip
-# A quantity that cannot step away and back between two rows: its mass or capacity forbids it.
-INERT: Final = frozenset[Quantity | None]((
-    "x", "y", "height", "heading", "roll", "pitch", "joint position", "voltage", "temperature",
-    "percentage", "energy",
-))  # fmt: skip
-ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint position", "angle"))
-_NO_SENSOR: Final = frozenset[Quantity | None]((
-    None, "colour", "count", "flag", "mode", "text", "time",
-))  # fmt: skip
-
 UNKNOWN: Final = Meaning(why="its name does not say what it is")
 
 
@@ -335,10 +354,6 @@ def meanings_by_name(
 
 # -- meanings that only the values tell ----------------------------------------------------------
 
-_NEARLY_A_TURN: Final = 0.9  # of a turn, that an angle leaps where its scale ends
-_FEW_LEVELS: Final = 8  # different values of something that is quantised
-_LEAST_VALUES: Final = 20  # of fewer values nothing follows
-
 
 def meaning_by_behaviour(values: Sequence[float]) -> Meaning:
     """Return what the values of a signal tell where neither a person, a device nor its name does.
@@ -398,9 +413,6 @@ class DeclaredMeaning(NamedTuple):
 
 
 MEANING_FIELDS: Final = DeclaredMeaning._fields[1:]
-_CHOICES: Final[dict[str, tuple[str, ...]]] = {
-    "quantity": QUANTITIES, "role": ROLES, "side": SIDES,
-}  # fmt: skip
 
 
 class StatedMeaning(NamedTuple):
@@ -682,22 +694,6 @@ def _motion_in(
     if is_speed and said <= _OF_SPEEDS:
         return "speed"
     return None
-
-
-_DIRECTIONS: Final = frozenset(
-    ("front", "rear", "left", "right", "center", "middle", "side", "sensor", "obstacle")
-)
-_DRIVING: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
-_NO_SPEED: Final = frozenset((
-    "position", "angle", "tick", "distance", "torque", "force", "current", "power", "temperature",
-    "radius", "base", "track", "width", "slip", "contact", "gain", "count", "voltage", "limit",
-    "encoder", "odometry",
-))  # fmt: skip
-_OF_SPEEDS: Final = frozenset((
-    "speed", "velocity", "robot", "forward", "linear", "command", "target", "measured", "actual",
-    "m", "mm", "cm", "s", "km", "h", "ps", "mps", "setpoint", "desired", "reference", "body",
-    "gps", "base", "odometry",
-))  # fmt: skip
 
 
 def _has_other_side(name: str, side: str, names: frozenset[str]) -> bool:

@@ -62,43 +62,9 @@ from webots_mcp.store.registered_signals import (
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.run_rows import reading_texts
 
-
-@dataclass(frozen=True)
-class ChunkMakingSizes:
-    """Sizes and steps of making chunks, in bytes where nothing else is said.
-
-    Attributes:
-        ids_per_step: State ids that one step of the search for new rows covers.
-        first_piece: Size of the first write, from which the next ones are adapted.
-        per_chunk: What writing one chunk costs in addition to its content, as a size.
-        state_row: A row of `state` without its text: run, two times and lengths.
-        statistics: A row of `chunk` without its compressed values.
-        chunk_indexes: The entries of a chunk in both indexes, as measured.
-        batch_rows: Rows that are put into chunks between two checks of the deadline.
-        page_head: The head of a page of SQLite.
-        cell_head: Pointer, length and id of a row in a page.
-        overflow_link: The link to the next page of a row that is longer than a page.
-    """
-
-    ids_per_step: int = 20_000
-    first_piece: int = 100_000
-    per_chunk: int = 5_000
-    state_row: int = 25
-    statistics: int = 115
-    chunk_indexes: int = 110
-    batch_rows: int = 2000
-    page_head: int = 8
-    cell_head: int = 7
-    overflow_link: int = 4
-
-
-_SIZES: Final = ChunkMakingSizes()
-
-
 GROUP_ROWS: Final = 1024
 MIN_ROWS_AT_END: Final = 32  # fewer rows at the end of a run are not put into chunks
 _NO_LIMIT: Final = 2**62
-
 _COLUMNS: Final = (
     "run_id",
     "signal_id",
@@ -147,6 +113,38 @@ _LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
 MIN_ROWS_ON_DEMAND: Final = 2000  # a question reads fewer as they are
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
 INDEX_BYTES: Final = 21  # an entry (run_id, sim_time_s, id) of a time index, measured
+
+
+@dataclass(frozen=True)
+class ChunkMakingSizes:
+    """Sizes and steps of making chunks, in bytes where nothing else is said.
+
+    Attributes:
+        ids_per_step: State ids that one step of the search for new rows covers.
+        first_piece: Size of the first write, from which the next ones are adapted.
+        per_chunk: What writing one chunk costs in addition to its content, as a size.
+        state_row: A row of `state` without its text: run, two times and lengths.
+        statistics: A row of `chunk` without its compressed values.
+        chunk_indexes: The entries of a chunk in both indexes, as measured.
+        batch_rows: Rows that are put into chunks between two checks of the deadline.
+        page_head: The head of a page of SQLite.
+        cell_head: Pointer, length and id of a row in a page.
+        overflow_link: The link to the next page of a row that is longer than a page.
+    """
+
+    ids_per_step: int = 20_000
+    first_piece: int = 100_000
+    per_chunk: int = 5_000
+    state_row: int = 25
+    statistics: int = 115
+    chunk_indexes: int = 110
+    batch_rows: int = 2000
+    page_head: int = 8
+    cell_head: int = 7
+    overflow_link: int = 4
+
+
+_SIZES: Final = ChunkMakingSizes()
 
 
 class Made(NamedTuple):

@@ -20,30 +20,8 @@ from typing import Any, Final, cast
 
 from webots_mcp.database.connection import shipped_statements
 
-
-@dataclass(frozen=True)
-class ValidRange:
-    """The range of values that a bridge writes.
-
-    Attributes:
-        max_sim_time_s: Maximum simulation time.
-        max_wall_time_s: Maximum Unix time: the end of the year 9999.
-        max_integer: No id or count is larger, and a float holds it exactly.
-        max_float: Maximum absolute value of a number.
-    """
-
-    max_sim_time_s: float = 1e10
-    max_wall_time_s: float = 253_402_300_799.0
-    max_integer: int = 2**53
-    max_float: float = 1.7e308
-
-
-_VALID: Final = ValidRange()
-
-
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
 _SHOWN: Final = 5
-
 _OBJECTS: Final = frozenset(
     {"robot.devices", "session.versions", "session.actions", "state.data", "state.replaced",
      "kept_state.data", "kept_state.replaced",
@@ -70,6 +48,26 @@ _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "
                   "retention_limit", "parameter", "parameter_value", "breakpoint", "trial_set",
                   "trial", "kept_stretch", "kept_state", "console_line",
                   "row_group", "chunk", "request")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ValidRange:
+    """The range of values that a bridge writes.
+
+    Attributes:
+        max_sim_time_s: Maximum simulation time.
+        max_wall_time_s: Maximum Unix time: the end of the year 9999.
+        max_integer: No id or count is larger, and a float holds it exactly.
+        max_float: Maximum absolute value of a number.
+    """
+
+    max_sim_time_s: float = 1e10
+    max_wall_time_s: float = 253_402_300_799.0
+    max_integer: int = 2**53
+    max_float: float = 1.7e308
+
+
+_VALID: Final = ValidRange()
 
 
 class InvalidValues:

@@ -58,6 +58,46 @@ from webots_mcp.errors import warn
 from webots_mcp.signals import register as signal_register
 from webots_mcp.signals.naming import flatten
 
+BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
+MAINTAINER_BUDGET_S: Final = 1.0  # in each of its rounds, so that its lease does not run out
+LONGEST_LINE_BYTES: Final = 4_000_000
+# The values of each kind: (n)umbers, (c)ounts, (s)trings, (o)bjects. Those with a capital letter
+# may be null. For these and for those with a question mark null stands for what does not fit.
+_FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
+    "run": ("s uuid?", "S world", "N step_ms", "s reason?", "n wall_time?", "n sim_time?"),
+    "state": ("n sim_time", "n wall_time", "o data", "O replaced"),
+    "event": ("n sim_time", "n wall_time", "s kind", "S name", "O data"),
+    "log": ("n sim_time", "n wall_time", "s level", "S source", "s message", "S logger"),
+    "run end": ("s reason?", "n now?", "n sim_time?"),
+    "session end": ("s reason?", "n now?", "C dropped", "S error"),
+}
+_SESSION_FIELDS: Final = (
+    "c pid?", "n started_wall_time_s?", "S host", "C parent_pid", "O environment", "S controller",
+    "O versions", "C throttle_interval",
+)  # fmt: skip
+_NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
+_REASONS: Final[dict[str, str]] = {"run": "start", "run end": "finished", "session end": "finished"}
+# Of statements, which bridges alone know.
+_UNGIVEN: Final = dict.fromkeys(("rows", "monotonic", "own", "step_wait", "steps"))
+_KNOWN: Final = (
+    "SELECT id, robot_id, last_adopted_entry, (SELECT data FROM state WHERE run_id = "
+    "(SELECT max(id) FROM run WHERE session_id = session.id) ORDER BY sim_time_s DESC, id DESC "
+    "LIMIT 1), (SELECT uuid FROM run WHERE session_id = session.id ORDER BY id DESC LIMIT 1) "
+    "FROM session WHERE uuid = ?"
+)
+_SEEN_SESSION: Final = (
+    "UPDATE session SET last_seen_wall_time_s = max(last_seen_wall_time_s, :wall), "
+    "ended_wall_time_s = max(ended_wall_time_s, :wall) WHERE id = :session"
+)
+# Rows of a run that has ended came late: it was ended as its process was found gone.
+_SEEN_RUN: Final = (
+    "UPDATE run SET last_wall_time_s = max(last_wall_time_s, :wall), "
+    "last_sim_time_s = max(last_sim_time_s, :sim), "
+    "ended_wall_time_s = max(ended_wall_time_s, :wall), "
+    "row_count = CASE WHEN ended_wall_time_s IS NULL THEN row_count + :rows ELSE "
+    "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE uuid = :run"
+)
+
 
 @dataclass(frozen=True)
 class JournalLimits:
@@ -80,49 +120,6 @@ class JournalLimits:
 
 
 _LIMITS: Final = JournalLimits()
-
-
-BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
-MAINTAINER_BUDGET_S: Final = 1.0  # in each of its rounds, so that its lease does not run out
-LONGEST_LINE_BYTES: Final = 4_000_000
-
-# The values of each kind: (n)umbers, (c)ounts, (s)trings, (o)bjects. Those with a capital letter
-# may be null. For these and for those with a question mark null stands for what does not fit.
-_FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
-    "run": ("s uuid?", "S world", "N step_ms", "s reason?", "n wall_time?", "n sim_time?"),
-    "state": ("n sim_time", "n wall_time", "o data", "O replaced"),
-    "event": ("n sim_time", "n wall_time", "s kind", "S name", "O data"),
-    "log": ("n sim_time", "n wall_time", "s level", "S source", "s message", "S logger"),
-    "run end": ("s reason?", "n now?", "n sim_time?"),
-    "session end": ("s reason?", "n now?", "C dropped", "S error"),
-}
-_SESSION_FIELDS: Final = (
-    "c pid?", "n started_wall_time_s?", "S host", "C parent_pid", "O environment", "S controller",
-    "O versions", "C throttle_interval",
-)  # fmt: skip
-_NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
-_REASONS: Final[dict[str, str]] = {"run": "start", "run end": "finished", "session end": "finished"}
-# Of statements, which bridges alone know.
-_UNGIVEN: Final = dict.fromkeys(("rows", "monotonic", "own", "step_wait", "steps"))
-
-_KNOWN: Final = (
-    "SELECT id, robot_id, last_adopted_entry, (SELECT data FROM state WHERE run_id = "
-    "(SELECT max(id) FROM run WHERE session_id = session.id) ORDER BY sim_time_s DESC, id DESC "
-    "LIMIT 1), (SELECT uuid FROM run WHERE session_id = session.id ORDER BY id DESC LIMIT 1) "
-    "FROM session WHERE uuid = ?"
-)
-_SEEN_SESSION: Final = (
-    "UPDATE session SET last_seen_wall_time_s = max(last_seen_wall_time_s, :wall), "
-    "ended_wall_time_s = max(ended_wall_time_s, :wall) WHERE id = :session"
-)
-# Rows of a run that has ended came late: it was ended as its process was found gone.
-_SEEN_RUN: Final = (
-    "UPDATE run SET last_wall_time_s = max(last_wall_time_s, :wall), "
-    "last_sim_time_s = max(last_sim_time_s, :sim), "
-    "ended_wall_time_s = max(ended_wall_time_s, :wall), "
-    "row_count = CASE WHEN ended_wall_time_s IS NULL THEN row_count + :rows ELSE "
-    "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE uuid = :run"
-)
 
 
 class _Faults(NamedTuple):

@@ -19,6 +19,21 @@ from webots_mcp.contract import LOG_LEVELS, LogLevel, LogSource
 from webots_mcp.store.reading.ranges import Scope, moment_of
 from webots_mcp.store.run_rows import columns_of
 
+COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it is worth
+OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
+# Of several robots in a simulation Webots does not show which one printed a line. Its lines
+# belong to none of them: they stand in the run of any of them, and are shown for all.
+_COMPANIONS: Final = (
+    "SELECT id FROM session WHERE robot_id <> :robot_id "
+    "AND instance IN (SELECT instance FROM session WHERE robot_id = :robot_id)"
+)
+_CONSOLE_OF: Final = f"(source IN {OF_CONSOLE} AND +run_id IN ({{}}))"
+_ASKED: Final = "'#' || t.id, t.action"
+_SETTLED_S: Final = "t.finished_wall_time_s"
+MOST_WAITING: Final = 500  # of one Webots; the newest are kept
+_NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
+_CONSOLE_COLUMNS: Final = "wall_time_s, level, source, message, logger"
+
 
 @dataclass(frozen=True)
 class ConsoleLimits:
@@ -52,8 +67,6 @@ class ConsoleLimits:
 _CONSOLE: Final = ConsoleLimits()
 
 
-COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it is worth
-OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
 _RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
 _SAYING: Final = (
     "(:text = '' OR instr(lower(message), :text) > 0) "
@@ -64,22 +77,11 @@ _MATCHING: Final = (
     "AND sim_time_s >= :start_s AND sim_time_s < :end_s "
     f"AND (:before_id IS NULL OR id < :before_id) AND {_SAYING}"
 )
-# Of several robots in a simulation Webots does not show which one printed a line. Its lines
-# belong to none of them: they stand in the run of any of them, and are shown for all.
-_COMPANIONS: Final = (
-    "SELECT id FROM session WHERE robot_id <> :robot_id "
-    "AND instance IN (SELECT instance FROM session WHERE robot_id = :robot_id)"
-)
-_CONSOLE_OF: Final = f"(source IN {OF_CONSOLE} AND +run_id IN ({{}}))"
 _BESIDE_ROBOT: Final = (
     "FROM log WHERE (+run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) OR "
     + _CONSOLE_OF.format(f"SELECT id FROM run WHERE session_id IN ({_COMPANIONS})")
     + f") {_MATCHING}"
 )
-_ASKED: Final = "'#' || t.id, t.action"
-_SETTLED_S: Final = "t.finished_wall_time_s"
-MOST_WAITING: Final = 500  # of one Webots; the newest are kept
-_NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -304,9 +306,6 @@ def _joined(*parts: object) -> str:
 # after Webots has started, or has started a controller that records, and before the next run
 # begins, waits in a table of its own: it is most often what a controller printed before it
 # recorded, or why it never did.
-
-
-_CONSOLE_COLUMNS: Final = "wall_time_s, level, source, message, logger"
 
 
 class Said(NamedTuple):

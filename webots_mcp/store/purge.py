@@ -26,35 +26,7 @@ from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force
 from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, ids_of, plan
 from webots_mcp.store.run_rows import inside
 
-
-@dataclass(frozen=True)
-class PurgeLimits:
-    """How a purge is divided, so that robots can write meanwhile.
-
-    Attributes:
-        chunked_rows: Rows that are put into chunks before their states are deleted.
-        rest_s: Minimum time between two writes.
-        hurried_rest_s: The same where no robot records; a checkpoint still gets its turn.
-        rests: Time between two writes in units of the last write: the lock is held for a tenth of
-            the time.
-        failures: Attempts to take the write lock before a purge is given up.
-        spare_pages: Maximum number of pages, 10 MB, that stay free in the file for the next rows; a
-            fortieth of the file where that is less.
-    """
-
-    chunked_rows: int = 4096
-    rest_s: float = 0.005
-    hurried_rest_s: float = 0.001
-    rests: int = 9
-    failures: int = 200
-    spare_pages: int = 2500
-
-
-_LIMITS: Final = PurgeLimits()
-
-
 BATCH_ROWS: Final = 500
-
 _NOT_GOING: Final = (
     "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
     "OR NOT EXISTS (SELECT 1 FROM {table} WHERE id = going.id)"
@@ -92,6 +64,40 @@ _BEFORE_DELETION: Final = {
     "run": (_FORGET_SESSIONS,),
 }
 _DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
+_PATHS: Final = {  # of the pictures that go with rows
+    "image": "SELECT path FROM image WHERE id IN (SELECT id FROM temp.going)",
+    "run": "SELECT path FROM image WHERE run_id IN (SELECT id FROM temp.going)",
+}
+INTERVAL_S: Final = 60.0  # between two checks; one of ten million rows takes about a second
+BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
+
+
+@dataclass(frozen=True)
+class PurgeLimits:
+    """How a purge is divided, so that robots can write meanwhile.
+
+    Attributes:
+        chunked_rows: Rows that are put into chunks before their states are deleted.
+        rest_s: Minimum time between two writes.
+        hurried_rest_s: The same where no robot records; a checkpoint still gets its turn.
+        rests: Time between two writes in units of the last write: the lock is held for a tenth of
+            the time.
+        failures: Attempts to take the write lock before a purge is given up.
+        spare_pages: Maximum number of pages, 10 MB, that stay free in the file for the next rows; a
+            fortieth of the file where that is less.
+    """
+
+    chunked_rows: int = 4096
+    rest_s: float = 0.005
+    hurried_rest_s: float = 0.001
+    rests: int = 9
+    failures: int = 200
+    spare_pages: int = 2500
+
+
+_LIMITS: Final = PurgeLimits()
+
+
 _STEPS: Final = {
     table: AtomicStatements(
         f"purge_{table}",
@@ -102,12 +108,6 @@ _STEPS: Final = {
     )
     for table in ("state", "chunk", "kept_state", "log", "event", "image", "command", "run")
 }
-_PATHS: Final = {  # of the pictures that go with rows
-    "image": "SELECT path FROM image WHERE id IN (SELECT id FROM temp.going)",
-    "run": "SELECT path FROM image WHERE run_id IN (SELECT id FROM temp.going)",
-}
-INTERVAL_S: Final = 60.0  # between two checks; one of ten million rows takes about a second
-BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
 
 
 @dataclass

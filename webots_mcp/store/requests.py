@@ -26,6 +26,17 @@ from webots_mcp.errors import ConsentRequiredError, DatabaseError, NoDatabaseErr
 from webots_mcp.store.policy import LAUNCH, Policy, policies_of
 from webots_mcp.store.recording import RecordingAccess
 
+_SECRET: Final = re.compile(
+    r"token|passw|passphrase|secret|credential|authori[sz]ation|bearer|"
+    r"(^|[_\W])(pwd|pass|auth)($|[_\W\d])|(^|[_\W])key|key$|apikey",
+    re.IGNORECASE,
+)
+_PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")  # of an address
+_LEFT_OUT: Final = "(left out)"
+AGREED: Final = "the person agreed"
+_ASKED: Final = "the person is asked"
+_END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
+
 
 @dataclass(frozen=True)
 class RequestLimits:
@@ -43,18 +54,6 @@ class RequestLimits:
 
 
 _LIMITS: Final = RequestLimits()
-
-
-_SECRET: Final = re.compile(
-    r"token|passw|passphrase|secret|credential|authori[sz]ation|bearer|"
-    r"(^|[_\W])(pwd|pass|auth)($|[_\W\d])|(^|[_\W])key|key$|apikey",
-    re.IGNORECASE,
-)
-_PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")  # of an address
-_LEFT_OUT: Final = "(left out)"
-AGREED: Final = "the person agreed"
-_ASKED: Final = "the person is asked"
-_END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
 
 
 class Requester(NamedTuple):

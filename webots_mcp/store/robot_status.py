@@ -50,26 +50,6 @@ from webots_mcp.store.run_rows import (
 from webots_mcp.store.sessions import SessionRecord, companions, left_holding
 from webots_mcp.store.why_ended import unseen_report, why_ended
 
-
-@dataclass(frozen=True)
-class _StatusLimits:
-    """How long a loop may take before its state is named.
-
-    Attributes:
-        unpublished_s: Wall time without a row after which `publish` counts as forgotten.
-        unpublished_intervals: The same, in usual intervals between two rows.
-        beginning_s: Time that the first step may take: Webots loads, or compiles shaders.
-        slow_steps: Usual steps that one step may last before the world counts as standing.
-    """
-
-    unpublished_s: float = 5.0
-    unpublished_intervals: float = 10.0
-    beginning_s: float = 10.0
-    slow_steps: float = 3.0
-
-
-_LIMITS: Final = _StatusLimits()
-
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
 STARTING: Final = "starting"
@@ -93,6 +73,26 @@ PRESS_PLAY: Final = (
     "press play in Webots if it is paused there: only a person can resume it while the controller "
     "is inside step(); else check what its loop is waiting for"
 )
+
+
+@dataclass(frozen=True)
+class _StatusLimits:
+    """How long a loop may take before its state is named.
+
+    Attributes:
+        unpublished_s: Wall time without a row after which `publish` counts as forgotten.
+        unpublished_intervals: The same, in usual intervals between two rows.
+        beginning_s: Time that the first step may take: Webots loads, or compiles shaders.
+        slow_steps: Usual steps that one step may last before the world counts as standing.
+    """
+
+    unpublished_s: float = 5.0
+    unpublished_intervals: float = 10.0
+    beginning_s: float = 10.0
+    slow_steps: float = 3.0
+
+
+_LIMITS: Final = _StatusLimits()
 
 
 class Status(NamedTuple):

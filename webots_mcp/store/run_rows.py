@@ -23,6 +23,19 @@ from webots_mcp.signals.naming import nearest_first
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+_RECENT_TIMES: Final = (
+    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+# A blob is greater than any number or text: a time that is not a number is found too, and reported.
+_LATER_THAN_ANY: Final = b"\xff"
+# Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
+_ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
+OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
+STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
+PICTURES: Final = (".png", ".jpg", ".jpeg")
+MAX_FILE_BYTES: Final = 64_000_000
+_OF_CAMERA: Final = f"kind IN ('camera', '{KEPT_FRAME}')"
 
 
 @dataclass(frozen=True)
@@ -53,21 +66,6 @@ class RowLimits:
 
 
 _LIMITS: Final = RowLimits()
-
-
-_RECENT_TIMES: Final = (
-    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
-)
-# A blob is greater than any number or text: a time that is not a number is found too, and reported.
-_LATER_THAN_ANY: Final = b"\xff"
-# Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
-_ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
-OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
-STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
-PICTURES: Final = (".png", ".jpg", ".jpeg")
-MAX_FILE_BYTES: Final = 64_000_000
-_OF_CAMERA: Final = f"kind IN ('camera', '{KEPT_FRAME}')"
 
 
 def columns_of(row: type[Any]) -> str:

@@ -33,34 +33,10 @@ from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.run_rows import reading_texts
 
-
-@dataclass(frozen=True)
-class QueryLimits:
-    """Limits of a query, which keep its process and its answer small.
-
-    Attributes:
-        value_bytes: Maximum size of one value; SQLite would build values of 1 GB.
-        error_characters: Length at which an error is cut.
-        offered_columns: Columns that are offered instead of an unknown one.
-        heap_bytes: Maximum memory of SQLite.
-        grace_s: Wall time after SQLite's own deadline, which keeps the rows found so far.
-    """
-
-    value_bytes: int = 10_000_000
-    error_characters: int = 300
-    offered_columns: int = 20
-    heap_bytes: int = 400_000_000
-    grace_s: float = 0.3
-
-
-_LIMITS: Final = QueryLimits()
-
-
 MOST_ROWS: Final = 1000
 MAX_BYTES: Final = 20_000  # about 5,000 tokens
 MAX_TEXT: Final = 200  # characters of one value
 MAX_COLUMNS: Final = 100  # a row of so many such values still fits into memory
-
 _READING: Final = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
@@ -69,8 +45,6 @@ _REFUSED_FUNCTIONS: Final = frozenset(
 )
 TOO_LARGE: Final = "it needs too much memory: read fewer or shorter values at a time"
 _MOST_NAMED: Final = 2  # tables whose columns are offered, even if none is like it
-
-Cell = int | float | str | None
 LINE: Final = (sys.executable, "-m", __name__)
 # Modules are looked for here first, so that no file of the user's folder is taken for one.
 FOLDER: Final = Path(__file__).parents[2]  # which holds the package
@@ -98,6 +72,31 @@ _BOOKKEEPING_COLUMNS: Final = (
     "mode_before_pause",
     "is_chunked",
 )
+
+
+@dataclass(frozen=True)
+class QueryLimits:
+    """Limits of a query, which keep its process and its answer small.
+
+    Attributes:
+        value_bytes: Maximum size of one value; SQLite would build values of 1 GB.
+        error_characters: Length at which an error is cut.
+        offered_columns: Columns that are offered instead of an unknown one.
+        heap_bytes: Maximum memory of SQLite.
+        grace_s: Wall time after SQLite's own deadline, which keeps the rows found so far.
+    """
+
+    value_bytes: int = 10_000_000
+    error_characters: int = 300
+    offered_columns: int = 20
+    heap_bytes: int = 400_000_000
+    grace_s: float = 0.3
+
+
+_LIMITS: Final = QueryLimits()
+
+
+Cell = int | float | str | None
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,13 @@ _GOAL: Final = (
 _MOVES: Final = "the position; a commanded speed, speeds of wheels, or a mode"
 _AIMS: Final = "a target beside its measurement: `arm.target`, `arm.position`"
 _TWO: Final = "two positions of the robot, such as gps and odometry"
+UNDERSTOOD: Final = "signals understood"  # never changes what the run comes to
+_MOST_UNKNOWN: Final = 5  # names in the evidence
+_JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
+_OFF, _FALL = (targets.OFF_TARGET.name,), (fall.FALL.name,)
+_SWINGS: Final = (oscillation.OSCILLATION.name,)
+_SLIP: Final = (slip.SLIP.name,)
+_NOISE: Final = (degradation.DEGRADATION.name,)
 
 
 def keeps_pace(run: RunUnderCheck) -> Examined:
@@ -331,10 +338,6 @@ def reaches_goal(run: RunUnderCheck) -> Examined:
     return Fault("fail", f"{goal}: not reached ({ended})", at_s, 1, run.more("command"))
 
 
-UNDERSTOOD: Final = "signals understood"  # never changes what the run comes to
-_MOST_UNKNOWN: Final = 5  # names in the evidence
-
-
 def understands_signals(run: RunUnderCheck) -> Examined:
     """Not judged where numeric signals have an unknown meaning: no other check is about them."""
     changes: Counter[str] = Counter()
@@ -370,11 +373,6 @@ def _whole_array(name: str) -> str:
 
 # -- all of them -----------------------------------------------------------------------------------
 
-_JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
-_OFF, _FALL = (targets.OFF_TARGET.name,), (fall.FALL.name,)
-_SWINGS: Final = (oscillation.OSCILLATION.name,)
-_SLIP: Final = (slip.SLIP.name,)
-_NOISE: Final = (degradation.DEGRADATION.name,)
 CHECKS: Final[list[Check]] = [
     Check("moves when commanded", of_motion.moves_when_commanded, _MOVES, ("stuck", "standstill")),
     Check("rests when commanded", of_motion.rests_when_commanded, _MOVES, of_values=True),

@@ -55,6 +55,8 @@ from webots_mcp.store.run_rows import (
 )
 from webots_mcp.store.runs import RunInfo, list_runs
 
+_LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
+
 
 @dataclass(frozen=True)
 class _PageLimits:
@@ -89,7 +91,6 @@ _LIMITS: Final = _PageLimits()
 Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 
 _log: Final = logging.getLogger(__name__)
-_LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
 _OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
 """Outcomes of ended runs by database, run and start. The result of a check of them is final."""
 _CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")

@@ -42,6 +42,21 @@ from webots_mcp.plugins.page.page_orders import (
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.store.recording import RecordingAccess
 
+HOST: Final = LOOPBACK[0]
+ORDERS: Final = ("pause", "resume", "step", "reset")
+_PARTS: Final = Path(__file__).parent / "parts"
+_TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+# No other page may embed the page or learn its address. It loads only its own files.
+_HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; "
+    "style-src 'self' 'unsafe-inline'; img-src data:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
 
 @dataclass(frozen=True)
 class PageLimits:
@@ -65,21 +80,7 @@ class PageLimits:
 
 LIMITS: Final = PageLimits()
 
-HOST: Final = LOOPBACK[0]
-ORDERS: Final = ("pause", "resume", "step", "reset")
 _log: Final = logging.getLogger(__name__)
-_PARTS: Final = Path(__file__).parent / "parts"
-_TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
-# No other page may embed the page or learn its address. It loads only its own files.
-_HEADERS: Final = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; "
-    "style-src 'self' 'unsafe-inline'; img-src data:; connect-src 'self'; base-uri 'none'; "
-    "form-action 'none'; frame-ancestors 'none'",
-    "X-Frame-Options": "DENY",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
 
 
 class PageServer(ThreadingHTTPServer):

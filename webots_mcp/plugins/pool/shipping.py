@@ -52,6 +52,23 @@ from webots_mcp.store.merging import settled
 from webots_mcp.store.recording import RecordingAccess, name_of
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
+# Names in the progress: the last shipped picture file, and the last state of a full-rate segment.
+_PICTURE: Final = "picture"
+_STRETCH: Final = "kept_stretch/"
+_LAST: Final = "SELECT coalesce(max(id), 0) FROM {}"
+# The last group before the first incomplete one: groups with lower ids are not checked again.
+LAST_GROUP: Final = (
+    "SELECT coalesce((SELECT min(id) - 1 FROM row_group WHERE is_complete = 0), "
+    "(SELECT max(id) FROM row_group), 0)"
+)
+# States that were not shipped with a full-rate segment. The parameter is a JSON object of the last
+# shipped state by id of the segment.
+_UNSENT: Final = (
+    "id NOT IN (SELECT s.id FROM json_each(?) sent JOIN kept_stretch k ON k.id = sent.key "
+    "JOIN state s ON s.run_id = k.run_id AND s.id > ? AND s.id <= sent.value "
+    "AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)"
+)
+
 
 @dataclass(frozen=True)
 class _ShippingLimits:
@@ -78,23 +95,6 @@ class _ShippingLimits:
 
 
 _LIMITS: Final = _ShippingLimits()
-
-# Names in the progress: the last shipped picture file, and the last state of a full-rate segment.
-_PICTURE: Final = "picture"
-_STRETCH: Final = "kept_stretch/"
-_LAST: Final = "SELECT coalesce(max(id), 0) FROM {}"
-# The last group before the first incomplete one: groups with lower ids are not checked again.
-LAST_GROUP: Final = (
-    "SELECT coalesce((SELECT min(id) - 1 FROM row_group WHERE is_complete = 0), "
-    "(SELECT max(id) FROM row_group), 0)"
-)
-# States that were not shipped with a full-rate segment. The parameter is a JSON object of the last
-# shipped state by id of the segment.
-_UNSENT: Final = (
-    "id NOT IN (SELECT s.id FROM json_each(?) sent JOIN kept_stretch k ON k.id = sent.key "
-    "JOIN state s ON s.run_id = k.run_id AND s.id > ? AND s.id <= sent.value "
-    "AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)"
-)
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,15 @@ from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import RunInfo, run_info
 from webots_mcp.store.sessions import SessionRecord, fetch_session
 
+_CLOCK_UNITS: Final = frozenset({"s", "ms", "us", "µs", "ns", "min"})
+_CLOCK_NAMES: Final = frozenset({"t", "time", "timestamp", "clock", "elapsed", "step", "steps"})
+_MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
+# Fractions of the bytes of texts. What a table leaves unused goes to the next ones.
+_SHARES: Final = {
+    "checks": 0.05, "parameters": 0.05, "moments": 0.1, "events": 0.15, "trends": 0.15,
+    "commands": 0.1, "timeline": 0.2, "log": 0.2,
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class _ChapterLimits:
@@ -86,16 +95,8 @@ class _ChapterLimits:
 
 _LIMITS: Final = _ChapterLimits()
 
-_CLOCK_UNITS: Final = frozenset({"s", "ms", "us", "µs", "ns", "min"})
-_CLOCK_NAMES: Final = frozenset({"t", "time", "timestamp", "clock", "elapsed", "step", "steps"})
 _ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)
 """Events of the bridge that need no context."""
-_MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
-# Fractions of the bytes of texts. What a table leaves unused goes to the next ones.
-_SHARES: Final = {
-    "checks": 0.05, "parameters": 0.05, "moments": 0.1, "events": 0.15, "trends": 0.15,
-    "commands": 0.1, "timeline": 0.2, "log": 0.2,
-}  # fmt: skip
 
 
 class ModeShare(NamedTuple):

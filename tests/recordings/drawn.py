@@ -22,7 +22,7 @@ from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 CHECKOUT: Final = Path(__file__).parents[2]

@@ -20,7 +20,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge, unpacked, write_bundle
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.runs import run_info
 
 SIGNALS = (

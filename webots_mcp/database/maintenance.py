@@ -33,7 +33,7 @@ from webots_mcp.database.connection import (
     require_current,
     text_of,
 )
-from webots_mcp.database.leases import JobLease, give_back, take
+from webots_mcp.database.job_leases import JobLease, give_back, take
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn

@@ -32,7 +32,7 @@ from webots_mcp.answers.budget import (
 from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
-from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.checks.check import Finding
 from webots_mcp.judging.comparison import (
     COMPARE_DEADLINE_S,
     Comparison,

@@ -35,8 +35,8 @@ from pydantic import ValidationError
 from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import compact_json, cut_text
 from webots_mcp.errors import WebotsMCPError
+from webots_mcp.questions.argument_errors import faults_of, shown_value
 from webots_mcp.questions.declaring import Caller, Question, Reply
-from webots_mcp.questions.faults import faults_of, shown_value
 from webots_mcp.server.consent import ask_with_consent
 from webots_mcp.signals.naming import harmless_first, perhaps_meant
 from webots_mcp.store.recording import RecordingAccess

@@ -26,7 +26,7 @@ from webots_mcp.database.connection import (
     AtomicStatements,
     FrozenConnection,
 )
-from webots_mcp.database.leases import holder_of
+from webots_mcp.database.job_leases import holder_of
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import DatabaseError, warn
 from webots_mcp.signals.register import MAX_SIGNALS

@@ -34,7 +34,7 @@ from webots_mcp.database.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.database.leases import JobLease, still_held
+from webots_mcp.database.job_leases import JobLease, still_held
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.database.queue import any_unfinished
@@ -60,7 +60,7 @@ from webots_mcp.store.journal_intake import (
 from webots_mcp.store.loop_evidence import ask_stuck
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
-from webots_mcp.store.retention import Asked
+from webots_mcp.store.retention_limits import Asked
 from webots_mcp.store.robot_status import Status, decide_status, stopped_for
 from webots_mcp.store.robots import RobotRecord, console_trouble
 from webots_mcp.store.run_rows import RunRecord, StateRecord, current_run, newest_state

@@ -16,9 +16,9 @@ from webots_mcp.database.location import Database
 from webots_mcp.database.queue import CommandQueue, list_commands
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.checks import CHECKS, check_run
+from webots_mcp.judging.detection.event import Event as FoundEvent
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event as FoundEvent
 from webots_mcp.judging.divergence import compare_repeats
 from webots_mcp.signals.conditions.compiler import read_expectation
 from webots_mcp.signals.parameter import Value as ParameterValue

@@ -11,7 +11,7 @@ import pytest
 from tests.recordings.rows import RecordedRobot
 from tests.store.test_meanings import state
 from webots_mcp.judging.checks import check_run
-from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.checks.check import Finding
 
 
 @pytest.fixture

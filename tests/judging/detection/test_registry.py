@@ -13,9 +13,9 @@ import webots_mcp
 from tests.recordings.rover import Recorder
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection import events
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events, timeline
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.plotting.plotted_runs import event_lanes, plotted_runs
 from webots_mcp.store.reading.ranges import Scope, find_range

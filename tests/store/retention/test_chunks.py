@@ -22,7 +22,7 @@ from webots_mcp.store.reading.catalogue import list_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, whole_run
 from webots_mcp.store.reading.segment import Deadline
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 
 NO_STATES = Limit(rows=0, spared_rows=0)

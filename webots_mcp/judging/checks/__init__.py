@@ -15,8 +15,8 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.analysis.arrays import Array, np
 from webots_mcp.analysis.levels import level_changes
 from webots_mcp.errors import ConditionFailedError, UnknownSignalError
-from webots_mcp.judging.checks import of_motion, of_sensors
-from webots_mcp.judging.checks.finding import (
+from webots_mcp.judging.checks import motion_checks, sensor_checks
+from webots_mcp.judging.checks.check import (
     Check,
     Examined,
     Finding,
@@ -39,9 +39,9 @@ from webots_mcp.judging.detection.condition import (
     expectations_of,
     judge_expectation,
 )
+from webots_mcp.judging.detection.event import NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
-from webots_mcp.judging.detection.kinds import NotSearchableError
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.judging.verdicts import WORST_FIRST, Coverage, Fault, Outcome, outcome_of
 from webots_mcp.signals.conditions.compiler import Expectation
@@ -374,19 +374,21 @@ def _whole_array(name: str) -> str:
 # -- all of them -----------------------------------------------------------------------------------
 
 CHECKS: Final[list[Check]] = [
-    Check("moves when commanded", of_motion.moves_when_commanded, _MOVES, ("stuck", "standstill")),
-    Check("rests when commanded", of_motion.rests_when_commanded, _MOVES, of_values=True),
-    Check("follows its targets", of_motion.follows_targets, _AIMS, _OFF),
-    Check("stays stable", of_motion.stays_stable, "numbers", _SWINGS),
-    Check("wheels grip", of_motion.wheels_grip, "a position; speeds of wheels", _SLIP),
-    Check("estimates agree", of_motion.estimates_agree, _TWO, of_values=True),
-    Check("stays upright", of_motion.stays_upright, "roll and pitch", _FALL),
-    Check("stays in place", of_motion.stays_in_place, "the position", _JUMP),
-    Check("sensors speak", of_sensors.sensors_speak, "numbers", ("missing",), of_values=True),
-    Check("sensors live", of_sensors.sensors_live, "numbers", _FLAT, of_values=True),
-    Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
-    Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", _JUMP),
-    Check("sensors keep their noise", of_sensors.sensors_keep_noise, "numbers", _NOISE),
+    Check(
+        "moves when commanded", motion_checks.moves_when_commanded, _MOVES, ("stuck", "standstill")
+    ),
+    Check("rests when commanded", motion_checks.rests_when_commanded, _MOVES, of_values=True),
+    Check("follows its targets", motion_checks.follows_targets, _AIMS, _OFF),
+    Check("stays stable", motion_checks.stays_stable, "numbers", _SWINGS),
+    Check("wheels grip", motion_checks.wheels_grip, "a position; speeds of wheels", _SLIP),
+    Check("estimates agree", motion_checks.estimates_agree, _TWO, of_values=True),
+    Check("stays upright", motion_checks.stays_upright, "roll and pitch", _FALL),
+    Check("stays in place", motion_checks.stays_in_place, "the position", _JUMP),
+    Check("sensors speak", sensor_checks.sensors_speak, "numbers", ("missing",), of_values=True),
+    Check("sensors live", sensor_checks.sensors_live, "numbers", _FLAT, of_values=True),
+    Check("sensors within limits", sensor_checks.sensors_within_limits, "numbers", of_values=True),
+    Check("sensors drop nothing", sensor_checks.sensors_drop_nothing, "numbers", _JUMP),
+    Check("sensors keep their noise", sensor_checks.sensors_keep_noise, "numbers", _NOISE),
     Check("keeps pace", keeps_pace, "rows", of_values=True),
     Check("misses no steps", misses_no_steps, "rows", ("gap",), of_values=True),
     Check("logs no errors", logs_no_errors, "", ("log",)),

@@ -36,7 +36,7 @@ from webots_mcp.errors import (
     InvalidInputError,
     UnknownSignalError,
 )
-from webots_mcp.judging.detection.kinds import (
+from webots_mcp.judging.detection.event import (
     Alike,
     Event,
     NotAskedError,

@@ -23,11 +23,11 @@ from webots_mcp.judging.detection import (
     sensors,
     slip,
     standstill,
-    stored,
+    stored_events,
     targets,
 )
+from webots_mcp.judging.detection.event import Event, count_by_kind
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.kinds import Event, count_by_kind
 from webots_mcp.judging.detection.search import EventKind, Search, events_touching, find_motion
 from webots_mcp.judging.verdicts import SearchCoverage, Verdicts
 from webots_mcp.signals.naming import flatten
@@ -63,9 +63,9 @@ _NO_CURSOR: Final = (
     "unchanged, or leave cursor out to begin at the start."
 )
 KINDS: Final[list[EventKind]] = [
-    stored.RUN,
+    stored_events.RUN,
     gap.GAP,
-    stored.CHANGE,
+    stored_events.CHANGE,
     standstill.STANDSTILL,
     standstill.STUCK,
     condition.CONDITION,
@@ -78,11 +78,11 @@ KINDS: Final[list[EventKind]] = [
     fall.FALL,
     slip.SLIP,
     degradation.DEGRADATION,
-    stored.COMMAND,
-    stored.LOG,
-    stored.NOTICED,
-    stored.KEPT,
-    stored.IMAGE,
+    stored_events.COMMAND,
+    stored_events.LOG,
+    stored_events.NOTICED,
+    stored_events.KEPT,
+    stored_events.IMAGE,
 ]
 
 

@@ -8,9 +8,9 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from webots_mcp.judging.checks import CHECKS, UNDERSTOOD, CheckedRun
-from webots_mcp.judging.checks.finding import Finding, Outcome
+from webots_mcp.judging.checks.check import Finding, Outcome
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.events import KINDS
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.plugins.report.words import (
     capitalised,
     counted,

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeAlias, cast
 
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
-from webots_mcp.signals.conditions.generated_code import FunctionWriter
+from webots_mcp.signals.conditions.function_writer import FunctionWriter
 from webots_mcp.signals.conditions.signal_values import (
     SAME_TIME_S,
     Changed,

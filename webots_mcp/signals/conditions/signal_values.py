@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from webots_mcp.errors import ConditionFailedError
-from webots_mcp.signals.conditions.generated_code import FunctionWriter
+from webots_mcp.signals.conditions.function_writer import FunctionWriter
 from webots_mcp.signals.naming import (
     FARTHEST_M,
     INDEXES,

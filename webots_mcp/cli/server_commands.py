@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.launch import SessionStart, WebotsLaunch
     from webots_mcp.simulator.orders import WebotsLine
     from webots_mcp.store.recording import RecordingAccess
-    from webots_mcp.store.retention import Asked
+    from webots_mcp.store.retention_limits import Asked
 
 _AS_BEFORE: Final = RetentionOptions()
 _URL: Final = "WEBOTS_CONTROLLER_URL"
@@ -234,7 +234,7 @@ def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
     """Set the limits where that is this server's to do; say which others hold."""
     from webots_mcp.errors import NoDatabaseError
     from webots_mcp.store.recording import RecordingAccess
-    from webots_mcp.store.retention import ask
+    from webots_mcp.store.retention_limits import ask
 
     try:
         with RecordingAccess(database, data_dir).writer() as connection:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from webots_mcp.cli.data import write_picture
 from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.options import (
     HERE,
@@ -30,6 +29,7 @@ from webots_mcp.cli.options import (
     Where,
     whole_number,
 )
+from webots_mcp.cli.recording_commands import write_picture
 from webots_mcp.cli.terminal import clock_text, print_json, print_notes, print_table, text_of
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.contract import BreakpointAction

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 from webots_mcp.judging.detection.condition import every_call_of
+from webots_mcp.judging.detection.event import Event, NotSearchableError
 from webots_mcp.judging.detection.events import Found
-from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import Motion, RunNoise, Search
 from webots_mcp.judging.verdicts import Coverage, Fault, JudgedInterval, Outcome, cause_of
 from webots_mcp.signals.conditions.compiler import Expectation

@@ -136,7 +136,7 @@ def serve(
     asked = limits.asked()
     place = None
     if http is not None:
-        from webots_mcp.server.http_server import endpoint_of
+        from webots_mcp.server.endpoint import endpoint_of
 
         place = endpoint_of(http, allow_host, tls_cert, tls_key)
     elif allow_host or tls_cert or tls_key:

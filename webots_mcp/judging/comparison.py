@@ -38,7 +38,7 @@ from webots_mcp.judging.run_measures import (
     reasons_of,
 )
 from webots_mcp.judging.run_sampling import SampledRun, shared_interval_s
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import listed
 from webots_mcp.signals.parameter import Value
 from webots_mcp.store.reading import frame_summary

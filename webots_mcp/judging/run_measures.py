@@ -23,11 +23,12 @@ from webots_mcp.analysis.summary import (
 )
 from webots_mcp.analysis.track import PathLength, tracks_of, travelled
 from webots_mcp.judging.detection.condition import VIOLATION, expectations_of
+from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
+from webots_mcp.judging.detection.events import Found, search_events
 from webots_mcp.judging.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
 from webots_mcp.judging.run_sampling import SampledRun
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_summary import MOST_VALUES, change_points, spelled

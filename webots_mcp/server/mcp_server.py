@@ -29,9 +29,10 @@ from mcp.types import (
 from pydantic import ValidationError
 
 from webots_mcp.contract import VERSION
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.schema import create_schema
 from webots_mcp.database.session_cleanup import reap_if_dead
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.questions import all_questions

@@ -23,7 +23,7 @@ from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.events import search_events
 from webots_mcp.judging.trends import trends
 from webots_mcp.signals.conditions import parse_condition
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import flatten
 from webots_mcp.steering.run_command import (
     ACTION,

@@ -45,7 +45,8 @@ from webots_mcp.contract import (
     recorded_name,
 )
 from webots_mcp.database import processes, session_cleanup, waiting_file
-from webots_mcp.database.connection import identify_files, in_transaction
+from webots_mcp.database.connection import identify_files
+from webots_mcp.database.transactions import in_transaction
 from webots_mcp.database.waiting_file import (
     FORMAT,
     STATEMENTS,

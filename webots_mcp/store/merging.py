@@ -20,15 +20,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final, get_args
 
 from webots_mcp.contract import DATABASE_NAME, REMOTE_SILENCE_S, host_name
-from webots_mcp.database.connection import (
-    FrozenConnection,
-    connect,
-    create_schema,
-    require_shipped,
-    transaction,
-)
+from webots_mcp.database.connection import FrozenConnection, connect
 from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
+from webots_mcp.database.schema import create_schema, require_shipped
 from webots_mcp.database.session_cleanup import end_session, reap
+from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.signals.meaning import MEANING_FIELDS

@@ -14,7 +14,8 @@ from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.test_size import bytes_by_name
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.signals import register as signal_register
 from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
 from webots_mcp.store.purge import prune, purge

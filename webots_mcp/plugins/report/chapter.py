@@ -10,11 +10,12 @@ from typing import Final, NamedTuple
 
 from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.judging.checks import CheckedRun, check_run
+from webots_mcp.judging.checks.check_run import CheckedRun, check_run
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.event import Event
+from webots_mcp.judging.detection.event_kinds import KINDS, stored_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import KINDS, Found, search_events, stored_kinds
+from webots_mcp.judging.detection.events import Found, search_events
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.judging.verdicts import AS_STUCK, Verdicts
 from webots_mcp.plotting.intervals import at_resolution, lane_of

@@ -132,8 +132,7 @@ def export(
     if trial_set is not None and part.scope() != Scope():
         raise InvalidInputError(
             "--trials cannot be combined with a robot, run or range of states, because trials are "
-            "a "
-            "table of their own. Leave one of them out."
+            "a table of their own. Leave one of them out."
         )
     recording = recorded.recording()
     if file is None:
@@ -171,8 +170,7 @@ def _require_for_stdout(form: str, *, as_json: bool) -> None:
     if as_json:
         raise InvalidInputError(
             "--json describes an exported file, and none was named. Name one with -o, or write "
-            "states "
-            "as JSON with --format jsonl."
+            "states as JSON with --format jsonl."
         )
 
 

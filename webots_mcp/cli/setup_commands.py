@@ -118,8 +118,7 @@ def init(
             "--http",
             metavar="URL",
             help="Register a running server instead, such as http://127.0.0.1:8000/mcp. Clients "
-            "read "
-            "its token from the environment variable WEBOTS_MCP_TOKEN.",
+            "read its token from the environment variable WEBOTS_MCP_TOKEN.",
         ),
     ] = None,
     skills: Annotated[

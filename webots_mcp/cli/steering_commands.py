@@ -148,8 +148,7 @@ def parameters(
     if run_id is not None:
         raise InvalidInputError(
             "--run shows the parameters of an earlier run, which cannot be changed. Leave --run "
-            "out to "
-            "set them in the current run."
+            "out to set them in the current run."
         )
     when = "reset" if from_reset else "now"
     _show(webots_set_parameters, asked, as_json=json, values=settings, when=when)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from webots_mcp.analysis.levels import level_changes
+from webots_mcp.analysis.rank_and_count_tests import level_changes
 
 
 def test_changes_are_found_where_they_are() -> None:

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np
-from webots_mcp.analysis.rare import is_rare, may_shares_differ, verdicts_on_shares
+from webots_mcp.analysis.path_length import PathLength, tracks_of, travelled
+from webots_mcp.analysis.rank_and_count_tests import is_rare, may_shares_differ, verdicts_on_shares
 from webots_mcp.analysis.summary import (
     MIN_REPEATED,
     Spread,
@@ -21,7 +22,6 @@ from webots_mcp.analysis.summary import (
     spread_of,
     verdicts_on,
 )
-from webots_mcp.analysis.track import PathLength, tracks_of, travelled
 from webots_mcp.judging.detection.condition import VIOLATION, expectations_of
 from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions

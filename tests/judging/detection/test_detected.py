@@ -19,7 +19,7 @@ from tests.judging.detection.measuring import measure
 from tests.judging.detection.writing import write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
-from webots_mcp.analysis.swings import MUCH_SLOWER
+from webots_mcp.analysis.oscillations import MUCH_SLOWER
 from webots_mcp.judging.detection import standstill
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events

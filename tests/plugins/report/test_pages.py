@@ -24,8 +24,8 @@ from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.run_measures import Measure
 from webots_mcp.judging.verdicts import Outcome
-from webots_mcp.plugins.report.making import Report, make_report
-from webots_mcp.plugins.report.opening import most_important
+from webots_mcp.plugins.report.chapter_opening import most_important
+from webots_mcp.plugins.report.make_report import Report, make_report
 from webots_mcp.plugins.report.run_comparison import verdict_of, with_repeats
 from webots_mcp.plugins.report.words import cut, describe_event, length, number
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np
-from webots_mcp.analysis.levels import level_changes
+from webots_mcp.analysis.rank_and_count_tests import level_changes
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.judging.checks.check import (
     Examined,

@@ -17,7 +17,7 @@ from webots_mcp.analysis.arrays import (
     np,
     usual_interval_s,
 )
-from webots_mcp.analysis.swings import (
+from webots_mcp.analysis.oscillations import (
     LEAST_HALF_SWINGS,
     Swing,
     find_swings,

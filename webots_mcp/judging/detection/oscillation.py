@@ -17,20 +17,20 @@ from webots_mcp.analysis.arrays import (
     np,
     usual_interval_s,
 )
-from webots_mcp.analysis.fast_swings import (
+from webots_mcp.analysis.fast_oscillations import (
     LEAST_FAST_ROWS,
     LONGEST_FAST_ROWS,
     SwingCourse,
     course_of,
     find_fast_swings,
 )
-from webots_mcp.analysis.summary import unwrap
-from webots_mcp.analysis.swings import (
+from webots_mcp.analysis.oscillations import (
     SLOW_HALF_SWINGS,
     EvenRows,
     Swing,
     swings_in,
 )
+from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import EventKind, Search

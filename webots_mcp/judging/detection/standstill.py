@@ -9,13 +9,13 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, runs_of
-from webots_mcp.analysis.still_intervals import (
+from webots_mcp.analysis.path_length import SmoothedTrack, track_of
+from webots_mcp.analysis.standstills import (
     MOST_AROUND,
     NEARLY,
     find_standstills,
     shortest_seen_s,
 )
-from webots_mcp.analysis.track import SmoothedTrack, track_of
 from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import (

@@ -13,7 +13,7 @@ from webots_mcp.judging.checks.check_run import CheckedRun
 from webots_mcp.judging.comparison import Comparison, Difference, compare_runs
 from webots_mcp.judging.run_measures import GOAL_REACHED, Measure
 from webots_mcp.judging.verdicts import WORST_FIRST
-from webots_mcp.plugins.report.grid import Grid, GridRow
+from webots_mcp.plugins.report.tables import Grid, GridRow
 from webots_mcp.plugins.report.words import cut, format_value, length, number
 from webots_mcp.signals import naming
 from webots_mcp.store.run_parameters import RunParameter, parameters_of

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, np
-from webots_mcp.analysis.track import SmoothedTrack
+from webots_mcp.analysis.path_length import SmoothedTrack
 
 WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide
 SETTLED_SHARE: Final = 0.2  # of the radius: within it of the place is where a standstill begins

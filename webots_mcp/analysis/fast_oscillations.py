@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
-from webots_mcp.analysis.swings import EvenRows, Swing
+from webots_mcp.analysis.oscillations import EvenRows, Swing
 
 LONGEST_FAST_ROWS: Final = 7.0  # of a period; longer ones are found by their bends
 FALSE_ALARMS: Final = 1e-6  # of a window without an oscillation

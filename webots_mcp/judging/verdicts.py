@@ -21,7 +21,6 @@ WORST_FIRST: Final[tuple[Outcome, ...]] = (
     "fail", "not looked at", "warn", "pass", "not judged", "not applicable",
 )  # fmt: skip
 AS_STUCK: Final = "reported as stuck"  # of standstills, where both kinds are asked for
-_TIMED_OUT: Final = "time limit reached"
 _WITHOUT: Final[dict[Cause, Outcome]] = {
     "absent": "not applicable", "undecided": "not judged", "unread": "not looked at",
 }  # fmt: skip
@@ -157,7 +156,7 @@ class Fault(NamedTuple):
 
 def cause_of(reason: str) -> Cause:
     """Return the cause that a reason tells: there was no time to read, or something is absent."""
-    return "unread" if reason.startswith(NOT_READ) or _TIMED_OUT in reason else "absent"
+    return "unread" if reason.startswith(NOT_READ) or "time limit reached" in reason else "absent"
 
 
 # -- checks ------------------------------------------------------------------------------------

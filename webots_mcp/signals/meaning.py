@@ -144,7 +144,6 @@ _CHOICES: Final[dict[str, tuple[str, ...]]] = {
 _DIRECTIONS: Final = frozenset(
     ("front", "rear", "left", "right", "center", "middle", "side", "sensor", "obstacle")
 )
-_DRIVING: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
 _NO_SPEED: Final = frozenset((
     "position", "angle", "tick", "distance", "torque", "force", "current", "power", "temperature",
     "radius", "base", "track", "width", "slip", "contact", "gain", "count", "voltage", "limit",
@@ -668,7 +667,12 @@ def _motion_in(
     """Which speed it is, of robot, wheel, motor or joint; None where it is no speed."""
     is_rate = unit in ("rad/s", "deg/s", "rpm")
     is_speed = bool(said & {"speed", "velocity"}) or unit in ("m/s", "cm/s", "mm/s", "km/h")
-    if not (is_rate or is_speed or base in _DRIVING or said & {"command", "motor", "wheel"}):
+    if not (
+        is_rate
+        or is_speed
+        or base in ("commanded_speed", "speed", "wheel", "commanded_wheel")
+        or said & {"command", "motor", "wheel"}
+    ):
         return None
     if said & _FREE_MOTORS:
         return "motor speed"

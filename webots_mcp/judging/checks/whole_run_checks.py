@@ -39,23 +39,6 @@ _FALSE_ALARMS: Final = 1e-3  # that a run of one pace is divided
 _LONGEST_MESSAGE: Final = 120
 _MUCH: Final = 0.05  # of the run, or of its rows
 _HABIT: Final = 3  # so many times: its code does it
-_RESET_BY: Final = (
-    "SELECT count(*) FROM command WHERE session_id = :session AND status = 'done' "
-    "AND (action IN ('reset', 'reload', 'load_world', 'quit') "
-    "OR action = 'run' AND json_extract(params, '$.reset')) "
-    "AND claimed_wall_time_s BETWEEN :last - 30 AND :last + 30"
-)
-_ENDS_OF_SESSION: Final = (
-    "SELECT count(*) FROM run WHERE session_id = ? AND end_reason = 'reset' AND id <> ?"
-)
-_LOST: Final = "SELECT rows_waiting, last_error FROM session WHERE id = ?"
-_GOAL: Final = (
-    "SELECT json_extract(params, '$.until'), json_extract(result, '$.ended'), "
-    "json_extract(result, '$.advanced_s'), json_extract(result, '$.sim_time_s') FROM command "
-    "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
-    "AND json_extract(result, '$.run_id') = ? AND json_extract(params, '$.until') IS NOT NULL "
-    "ORDER BY id DESC LIMIT 1"
-)
 _MOST_UNKNOWN: Final = 5  # names in the evidence
 
 
@@ -192,10 +175,21 @@ def ends_well(run: RunUnderCheck) -> Examined:
         return _of_end(run, f"it ended: {reason}")
     last_s = run.info.started_wall_time_s + run.info.wall_duration_s
     asked = {"session": session, "last": last_s}
-    if run.search.connection.execute(_RESET_BY, asked).fetchone()[0]:
+    if run.search.connection.execute(
+        "SELECT count(*) FROM command WHERE session_id = :session AND status = 'done' "
+        "AND (action IN ('reset', 'reload', 'load_world', 'quit') "
+        "OR action = 'run' AND json_extract(params, '$.reset')) "
+        "AND claimed_wall_time_s BETWEEN :last - 30 AND :last + 30",
+        asked,
+    ).fetchone()[0]:
         return _of_end(run, f"it ended by a {reason} that a command asked for")
     others = (session, run.info.run_id)
-    habit = int(run.search.connection.execute(_ENDS_OF_SESSION, others).fetchone()[0])
+    habit = int(
+        run.search.connection.execute(
+            "SELECT count(*) FROM run WHERE session_id = ? AND end_reason = 'reset' AND id <> ?",
+            others,
+        ).fetchone()[0]
+    )
     if reason == "reset" and habit >= _HABIT:  # other runs of the session
         return _of_end(run, f"it ended by a reset, as {habit} others of its session")
     evidence = f"it ended by a {reason} that no command asked for: by hand, or by code"
@@ -217,7 +211,9 @@ def loses_no_rows(run: RunUnderCheck) -> Examined:
     if not run.info.row_count:
         return Fault("warn", f"run {run.info.run_id} has no state row: call bridge.publish")
     verb = "were" if run.info.purged_rows else "are"  # they were deleted since
-    waiting, error = run.search.connection.execute(_LOST, (run.info.session_id,)).fetchone()
+    waiting, error = run.search.connection.execute(
+        "SELECT rows_waiting, last_error FROM session WHERE id = ?", (run.info.session_id,)
+    ).fetchone()
     if run.info.end_reason and waiting:
         left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
         return Fault("warn", left)
@@ -288,7 +284,13 @@ def _violated(run: RunUnderCheck, each: Expectation, held: Adherence, evidence: 
 def reaches_goal(run: RunUnderCheck) -> Examined:
     """Fails where the condition of its last run command, or trial, did not come to hold."""
     asked = (run.robot_id, run.info.run_id)
-    row = run.search.connection.execute(_GOAL, asked).fetchone()
+    row = run.search.connection.execute(
+        "SELECT json_extract(params, '$.until'), json_extract(result, '$.ended'), "
+        "json_extract(result, '$.advanced_s'), json_extract(result, '$.sim_time_s') FROM command "
+        "WHERE robot_id = ? AND action = 'run' AND json_valid(result) AND json_extract(result, "
+        "'$.run_id') = ? AND json_extract(params, '$.until') IS NOT NULL ORDER BY id DESC LIMIT 1",
+        asked,
+    ).fetchone()
     if row is None:
         raise NotSearchableError("no finished run command had a goal: webots_run(until=...)")
     goal, ended, took_s, at_s = row

@@ -30,12 +30,16 @@ from webots_mcp.analysis.arrays import (
 )
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
+# Of a period above `SEARCH.slow_period_s`.
+SLOW_HALF_SWINGS: Final = 12
+SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 
 
 class _SearchSettings(NamedTuple):
     """How windows are searched for the signs of a sine, in means of rows."""
 
-    slow_period_s: float = 5.0  # beyond, bends of a way come as regularly by chance ...
+    # Beyond, bends of a path come as regularly by chance, but hardly ever `SLOW_HALF_SWINGS` times.
+    slow_period_s: float = 5.0
     # Of a level, in means. What the first or the last one explains best is seen by another level.
     periods: tuple[float, ...] = (7.1, 8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.2, 18.4)
     shift: int = 3  # means: about a quarter of these periods
@@ -55,9 +59,6 @@ class _SearchSettings(NamedTuple):
 
 
 SEARCH: Final = _SearchSettings()
-
-SLOW_HALF_SWINGS: Final = 12  # ... but hardly ever so many
-SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 
 
 class _FitSettings(NamedTuple):

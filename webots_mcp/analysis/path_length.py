@@ -14,6 +14,8 @@ from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np, rhythm_of
 
+_PLACES: Final = ("x", "y", "raw_x", "raw_y")
+
 
 class _SmoothingSettings(NamedTuple):
     """How positions are smoothed, and when a leg of the path is one."""
@@ -28,8 +30,6 @@ class _SmoothingSettings(NamedTuple):
 
 
 SMOOTHING: Final = _SmoothingSettings()
-
-_PLACES: Final = ("x", "y", "raw_x", "raw_y")
 
 
 class _LongStepSettings(NamedTuple):

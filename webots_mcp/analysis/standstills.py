@@ -12,6 +12,9 @@ from typing import Final, NamedTuple
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, np
 from webots_mcp.analysis.path_length import SmoothedTrack
 
+NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
+MOST_AROUND: Final = 5
+
 
 class _StandstillSettings(NamedTuple):
     """When a robot counts as standing still, and how closely positions are compared."""
@@ -40,9 +43,6 @@ class _StandstillSettings(NamedTuple):
 
 
 STANDSTILL: Final = _StandstillSettings()
-
-NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
-MOST_AROUND: Final = 5
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,10 @@ class ControllerVariables:
         from webots_mcp.bridge.inspection.watches import MOST_EVERY, Watches
 
         path = parse_path(params.get("path"), self.inspector.secrets())
-        stop, every = params.get("stop") or False, params.get("every") or 1
+        stop, every = (
+            default if params.get(name) is None else params[name]
+            for name, default in (("stop", False), ("every", 1))
+        )
         if type(stop) is not bool:
             raise InvalidInputError(f"stop must be true or false, not {stop!r:.80}")
         if type(every) is not int or not 1 <= every <= MOST_EVERY:

@@ -28,13 +28,10 @@ _NOTHING: Final = (
     "no inspection is recorded in this run: the variables are recorded at the hits of a breakpoint "
     "(webots_breakpoint), violations of an expectation, logged errors and hangs"
 )
-Path = Annotated[
-    str,
-    Field(
-        max_length=200,
-        description="Variable of the controller: self.pid.integral, path[3] or table['x'].",
-    ),
-]
+_PATH: Final = Field(
+    max_length=200,
+    description="Variable of the controller: self.pid.integral, path[3] or table['x'].",
+)
 
 
 @question(
@@ -49,10 +46,10 @@ Path = Annotated[
 async def webots_inspect_controller(
     recording: RecordingAccess,
     caller: Caller,
-    path: Path | None = None,
+    path: Annotated[str | None, _PATH] = None,
     event_id: Annotated[
         Id | None,
-        Field(description="Event to look at, from webots_find_events. Default: now."),
+        Field(description="Event of which to show them, from webots_find_events. Default: now."),
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,
@@ -88,7 +85,7 @@ async def webots_inspect_controller(
 )  # fmt: skip
 async def webots_watch(
     recording: RecordingAccess,
-    path: Path,
+    path: Annotated[str, _PATH],
     caller: Caller,
     every: Annotated[
         int, Field(ge=1, le=1_000_000, description="Record it in one of so many states.")

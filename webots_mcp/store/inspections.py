@@ -45,8 +45,7 @@ class Inspection(NamedTuple):
         """The innermost line, such as `nav.py:123, turn()`."""
         if not self.frames:
             return None
-        inner = self.frames[0]
-        return f"{inner.get('at')}, {inner.get('function')}()"
+        return f"{self.frames[0]['at']}, {self.frames[0]['function']}()"
 
 
 def inspection_at(connection: sqlite3.Connection, event_id: int) -> Inspection | None:
@@ -83,4 +82,15 @@ def _inspection(row: tuple[Any, ...]) -> Inspection:
 def _frames_of(data: dict[str, Any]) -> list[dict[str, Any]]:
     frames = data.get("frames")
     each = cast("list[Any]", frames) if isinstance(frames, list) else []
-    return [cast("dict[str, Any]", frame) for frame in each if isinstance(frame, dict)]
+    return [_frame(cast("dict[str, Any]", frame)) for frame in each if isinstance(frame, dict)]
+
+
+def _frame(found: dict[str, Any]) -> dict[str, Any]:
+    """Return a frame with all its members, whatever program has written it."""
+    source, variables = found.get("source"), found.get("variables")
+    return {
+        "at": str(found.get("at")),
+        "function": str(found.get("function")),
+        "source": list(map(str, cast("list[Any]", source))) if isinstance(source, list) else [],
+        "variables": variables if isinstance(variables, dict) else {},
+    }

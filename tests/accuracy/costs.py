@@ -81,8 +81,8 @@ def answers(bench: Bench) -> Iterator[str]:
     core, whole, _ = (counts_of(anyio.run(server[tier].list_tools)) for tier in TIERS)
     memory.close()
     yield (
-        f"Half of {len(every)} answers have at most {median(every):,.0f} tokens, the longest "
-        f"{max(every):,}; the list of the {whole.tools} tools has {whole.tokens:,}."
+        f"Half of {len(every)} answers have at most {median(every):,.0f} tokens, the list of the "
+        f"{whole.tools} tools has {whole.tokens:,}. The longest answer has {max(every):,}."
     )
     yield _READ.format(
         budget=f"{ANSWER_TOKENS:,}",

@@ -53,7 +53,7 @@ published is compared with the database. States that a lock kept out of the data
 file next to it, and the next process ingests them. The machine was not switched off: without
 `fsync` in the loop, a power cut may cost the newest states."""
 _INTERRUPTED: Final = """\
-Ctrl-C is sent at instructions of the bridge's writing code, of which these were drawn:"""
+Ctrl-C is sent at randomly chosen instructions of the code with which the bridge writes:"""
 
 
 def _number(text: str) -> int:

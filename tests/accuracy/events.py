@@ -71,7 +71,7 @@ def events(bench: Bench) -> Iterator[str]:
         hours=f"{quiet.minutes / 60:.0f}",
     )
     for heading, cell in (("found / true", _truth), ("begin, end off", _errors)):
-        head = ("kind of event", "a row each", *(f"{each}: {heading}" for each in LEVELS))
+        head = ("kind of event", "a row every", *(f"{each}: {heading}" for each in LEVELS))
         yield table(head, _rows(cells, cell))
     poor = list(_poor(cells)) or ["- none"]
     yield f"Results below {100 * _POOR:.0f} %, with the recordings that cause most of them:"
@@ -120,7 +120,7 @@ def _measured(bench: Bench) -> dict[Cell, list[tuple[str, Tally]]]:
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
         reports = pool.map(_report, settings, repeat(cases))
         for (interval_s, noise), report in zip(settings, reports, strict=True):
-            bench.say(f"events: a row each {duration(interval_s)}, {LEVELS[noise]}")
+            bench.say(f"events: a row every {duration(interval_s)}, {LEVELS[noise]}")
             for (recording, judged, _), tally in report.tallies.items():
                 found.setdefault((judged, interval_s, noise), []).append((recording, tally))
     return found
@@ -173,7 +173,7 @@ def _errors(tally: Tally, interval_s: float) -> str:
 def _poor(cells: dict[Cell, list[tuple[str, Tally]]]) -> Iterator[str]:
     for (judged, interval_s, noise), tallies in cells.items():
         whole = _sum(tally for _, tally in tallies)
-        where = f"- {MEASURES[judged][1]}, a row each {duration(interval_s)}, {LEVELS[noise]}"
+        where = f"- {MEASURES[judged][1]}, a row every {duration(interval_s)}, {LEVELS[noise]}"
         if (whole.recall if whole.recall is not None else 1.0) < _POOR:
             missed = ((each, tally.incidents - tally.found) for each, tally in tallies)
             found = share(whole.found, whole.incidents)

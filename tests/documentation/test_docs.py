@@ -83,7 +83,7 @@ def test_the_page_of_the_bridge_names_every_action_that_is_built_in_and_no_other
         ("bridge.md", f"No call waits longer than {MAX_WAIT_S} s"),
         ("bridge.md", f"the nearest distance in each of {WORDS[SECTORS]} sectors"),
         ("bridge.md", f"their number and the nearest {WORDS[MOST_OBJECTS]}"),
-        ("bridge.md", f"Keeps the last seconds, and the next {WORDS[KEEP_AFTER_S]}"),
+        ("bridge.md", f"keeps the last seconds, and the next {WORDS[KEEP_AFTER_S]}"),
         ("limits.md", f"No tool waits longer than {MAX_WAIT_S} s"),
         ("limits.md", f"under {ANSWER_TOKENS:,} tokens"),
         ("limits.md", f"up to {LARGE_ANSWER_TOKENS:,}"),

@@ -20,9 +20,9 @@ from tests.judging.detection.labelled import SETTING, Measure, Setting
 from tests.judging.detection.measuring import Report, measure
 from tests.judging.detection.sensing import READING_NOISES_M
 from tests.judging.detection.swinging import NOISE_SHARE_LEVELS
-from webots_mcp.judging.checks import CHECKS
+from webots_mcp.judging.checks.check_run import CHECKS
+from webots_mcp.judging.detection.event_kinds import KINDS
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import KINDS
 
 INTERVALS_S: Final = (0.016, 0.064, 0.16, 0.5)
 LEVELS: Final = ("no noise", "little", "much")

@@ -22,9 +22,10 @@ from webots_mcp.bridge.lidar_summary import SECTORS
 from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import described, names
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
-from webots_mcp.database.connection import OLDEST_SQLITE, SCHEMA_FILE
-from webots_mcp.judging.checks import CHECKS
-from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.database.connection import OLDEST_SQLITE
+from webots_mcp.database.schema import SCHEMA_FILE
+from webots_mcp.judging.checks.check_run import CHECKS
+from webots_mcp.judging.detection.event_kinds import kind_names
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.arguments import MAX_WAIT_S
 from webots_mcp.server.mcp_server import create_server

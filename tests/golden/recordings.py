@@ -19,7 +19,8 @@ from tests.recordings.drawn import draw_story, sum_up, sum_up_file
 from tests.recordings.rover import Recorder
 from webots_mcp import MCPBridge
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 

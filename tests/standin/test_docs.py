@@ -9,8 +9,8 @@ from typing import Any
 import controller
 from controller.surface import MEMBERS, Lacking, lacking
 
-from webots_mcp.standin.devices import DEVICES
 from webots_mcp.standin.protos import BUILT_IN
+from webots_mcp.standin.simulated_devices import DEVICES
 from webots_mcp.standin.vrml import NODE_TYPES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "standin.md").read_text(encoding="utf-8")

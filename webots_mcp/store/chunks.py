@@ -23,7 +23,8 @@ from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.analysis.arrays import Array, Indexes, inner, np
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import DatabaseError, MalformedRowError
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
 

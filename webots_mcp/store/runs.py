@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.database.connection import transaction
 from webots_mcp.database.pauses import paused_s
 from webots_mcp.database.session_cleanup import find_dead_sessions
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.parameter import Value
 from webots_mcp.store.reading.segment import in_one_snapshot

@@ -13,7 +13,7 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import np
 from webots_mcp.contract import INSPECTION_EVENT, LOG_LEVELS
 from webots_mcp.database.stored_breakpoints import VIOLATION
-from webots_mcp.judging.detection.kinds import (
+from webots_mcp.judging.detection.event import (
     Alike,
     Event,
     NotSearchableError,

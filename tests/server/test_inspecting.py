@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from tests.recordings.rows import Recorded
@@ -69,9 +71,8 @@ async def test_a_rule_of_the_project_forbids_it(connect: Connect, driver: Driver
             assert "not allowed" in await fail(client, tool, **given)
 
 
-def _last_inspection(found: dict[str, object]) -> int:
+def _last_inspection(found: dict[str, Any]) -> int:
     events = found["events"]
-    assert isinstance(events, dict)
     columns = events["columns"]
     details = [dict(zip(columns, row, strict=True)).get("details") for row in events["rows"]]
     return next(each["event_id"] for each in details[::-1] if each and "event_id" in each)

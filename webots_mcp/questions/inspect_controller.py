@@ -30,7 +30,7 @@ _NOTHING: Final = (
 )
 _PATH: Final = Field(
     max_length=200,
-    description="Variable of the controller: self.pid.integral, path[3] or table['x'].",
+    description="Variable of the controller, such as self.pid.integral or path[3].",
 )
 
 
@@ -88,7 +88,7 @@ async def webots_watch(
     path: Annotated[str, _PATH],
     caller: Caller,
     every: Annotated[
-        int, Field(ge=1, le=1_000_000, description="Record it in one of so many states.")
+        int, Field(ge=1, le=1_000_000, description="Record it in every Nth state.")
     ] = 1,
     stop: Annotated[bool, Field(description="Watch it no longer.")] = False,
     robot: RobotName = None,

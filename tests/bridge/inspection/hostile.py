@@ -71,7 +71,7 @@ class Masked:
     """Its class pretends to be another, and its `__dict__` is a property."""
 
     @property
-    def __class__(self) -> Any:
+    def __class__(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         calls.append("__class__")
         return int
 

@@ -90,7 +90,7 @@ class Metres(float):
         ("a" * 200, "a" * 120 + "..."),
         ([1, (2, 3)], [1, [2, 3]]),
         (deque([1]), [1]),
-        (OrderedDict(a=1), {"a": 1}),
+        (OrderedDict[str, int](a=1), {"a": 1}),
         (defaultdict(int, {2: 3}), {"2": 3}),
         (list(range(20)), [*range(8), "... 20 in all"]),
         (Mode.DRIVE, "Mode.DRIVE"),

@@ -19,6 +19,7 @@ from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.judging.verdicts import AS_STUCK, Verdicts
 from webots_mcp.plotting.intervals import at_resolution, lane_of
 from webots_mcp.plotting.plotted_runs import plotted_runs
+from webots_mcp.plugins.report.controller_variables import ShownVariables, shown_variables
 from webots_mcp.plugins.report.grid import Grid, GridRow
 from webots_mcp.plugins.report.opening import (
     CRASH,
@@ -106,21 +107,6 @@ class ModeShare(NamedTuple):
     value: str
     time: str
     percent: float
-
-
-class ShownFrame(NamedTuple):
-    """A function of the controller that was being executed: its line, source and variables."""
-
-    place: str
-    source: Sequence[str]
-    variables: Sequence[tuple[str, str]]
-
-
-class ShownVariables(NamedTuple):
-    """An inspection of the controller."""
-
-    title: str
-    frames: Sequence[ShownFrame]
 
 
 @dataclass(frozen=True)
@@ -496,21 +482,8 @@ def _moment(
     return replace(
         moment,
         lines=Grid(columns, rows, left_out=len(around) - len(shown)),
-        variables=inspection and _shown_variables(inspection),
+        variables=inspection and shown_variables(inspection),
     )
-
-
-def _shown_variables(inspection: Inspection) -> ShownVariables:
-    frames = [
-        ShownFrame(
-            f"{each['at']}, {each['function']}()",
-            each["source"],
-            [(name, format_value(value)) for name, value in each["variables"].items()],
-        )
-        for each in inspection.frames
-    ]
-    at = f"{time_at(inspection.sim_time_s)} s ({inspection.cause}: {inspection.name})"
-    return ShownVariables(f"Variables of the controller at {at}", frames)
 
 
 def _says(event: Event) -> str:

@@ -13,6 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+from unittest.mock import patch
 
 from tests.bridge.conftest import eager, send
 from tests.recordings.drawn import draw_story, sum_up, sum_up_file
@@ -170,6 +171,9 @@ def _record_loss(recorder: Recorder, robot_id: int, session_id: int) -> None:
     """What the controller says of the part that it lost, and a command that it could not do."""
     at = recorder.at(DROPPED_S)
     recorder.insert("log", **at, level="error", source="controller", message="the part fell")
+    frame = {"at": "arm.py:12", "function": "lift", "variables": {"grip": "loose", "part": None}}
+    data = json.dumps({"cause": "error", "frames": [frame]})
+    recorder.insert("event", **at, kind="inspection", name="the part fell", data=data)
     recorder.insert(
         "command", robot_id=robot_id, action="grasp", params="{}", status="failed",
         created_wall_time_s=at["wall_time_s"], expires_wall_time_s=at["wall_time_s"] + 10,

@@ -20,6 +20,7 @@ from webots_mcp.cli import described, names
 from webots_mcp.database.schema import SCHEMA_FILE
 from webots_mcp.judging.divergence import PartedSignal
 from webots_mcp.questions.describe_signals import MEANING_COLUMNS
+from webots_mcp.questions.inspect_controller import INSPECTION_COLUMNS
 from webots_mcp.questions.list_and_compare_runs import (
     CHECK_COLUMNS,
     DIFFERENCE_COLUMNS,
@@ -122,6 +123,7 @@ def test_each_table_of_an_answer_has_its_columns_with_their_meaning() -> None:
         ("ParametersAnswer.parameters", COLUMNS_OF_PARAMETERS),
         ("CommandsAnswer.commands", COMMAND_COLUMNS),
         ("BreakpointsAnswer.breakpoints", BREAKPOINT_COLUMNS),
+        ("InspectionAnswer.inspections", INSPECTION_COLUMNS),
         ("SignalsAnswer.signals", SIGNAL_COLUMNS),
         ("SignalMeaningsAnswer.signals", MEANING_COLUMNS),
         ("RunTrendTables.numbers", TREND_COLUMNS),

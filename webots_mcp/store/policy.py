@@ -61,6 +61,8 @@ TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "set_parameters": ("webots_set_parameters",),
     "arm_breakpoints": (),
     "keep": (),
+    "inspect": ("webots_inspect_controller",),
+    "watch": ("webots_watch",),
     "get_scene": ("webots_get_scene",),
     "get_field": ("webots_get_scene", "webots_get_field"),
     "set_field": ("webots_edit_scene", "webots_set_field"),

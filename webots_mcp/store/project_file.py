@@ -30,6 +30,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, recorded_name
 from webots_mcp.database.location import find_project
+from webots_mcp.database.secret_names import TABLE, check_table
 from webots_mcp.database.stored_breakpoints import OF_PROJECT
 from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError, warn
@@ -81,6 +82,7 @@ def read_project(file: Path) -> ProjectFile:
     """
     text, content = load_toml(file)
     content.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
+    check_table(file, content.pop(TABLE, {}))  # which bridges read themselves
     signals = content.pop("signals", {})
     entries: list[Any] = content.pop("expect", [])
     is_list = type(entries) is list and all(type(each) is dict for each in entries)
@@ -89,7 +91,7 @@ def read_project(file: Path) -> ProjectFile:
             f"{next(iter(content))!r} is unknown" if content else "'expect' is no list of tables"
         )
         raise InvalidInputError(
-            f"{file}: {found}; it holds tables [[expect]], [signals] and [allow]"
+            f"{file}: {found}; it holds tables [[expect]], [signals], [inspect] and [allow]"
         )
     tables = cast("list[dict[str, Any]]", entries)
     if len(tables) > MAX_BREAKPOINTS:

@@ -25,6 +25,7 @@ from urllib.parse import parse_qsl
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.interactive_svg import figure_part
 from webots_mcp.plugins.page.page_data import (
+    controller_variables,
     describe_signals,
     draw,
     page_request,
@@ -402,6 +403,10 @@ def _answer_picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]
     return picture(server.recording, page_request(asked))
 
 
+def _answer_variables(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return controller_variables(server.recording, page_request(asked))
+
+
 def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
     robot = asked.get("robot", "")
     if body.get("order") in ORDERS:
@@ -420,6 +425,7 @@ _QUESTIONS: Final = {
     "draw": _answer_figures,
     "picture": _answer_picture,
     "signals": _answer_signals,
+    "variables": _answer_variables,
 }
 
 

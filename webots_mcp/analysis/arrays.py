@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
@@ -85,6 +86,8 @@ def median(values: Array) -> float:
         middle = len(bounds) // 2
         least, most = bounds[[middle - _MARGIN, middle + _MARGIN]]
         below = int(np.count_nonzero(values < least))
+        if least == most and below <= low and high < below + int(np.count_nonzero(values == least)):
+            return float(least)
         inside = values[(values >= least) & (values <= most)]
         if below <= low and high < below + len(inside):  # they are the ones in the middle
             values, low, high = inside, low - below, high - below
@@ -165,6 +168,12 @@ class Runs:
 
     def __len__(self) -> int:
         return len(self.starts)
+
+
+@lru_cache(1)  # the same for all
+def no_runs() -> Runs:
+    """Return none at all."""
+    return _runs(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0))
 
 
 def runs_of(holds: Flags, times: Array) -> Runs:

@@ -193,8 +193,10 @@ def with_extremes_of(
 
 def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:
     """The usable ones of numbers that may be NaN, with their times."""
+    if len(numbers) and numbers.min() >= -LARGEST and numbers.max() <= LARGEST:  # none is NaN
+        return times, numbers
     usable = np.abs(numbers) <= LARGEST
-    return (times, numbers) if usable.all() else (times[usable], numbers[usable])
+    return times[usable], numbers[usable]
 
 
 # -- what it does over time: slope, spikes, rest, slow change --------------------------------------

@@ -302,7 +302,10 @@ def _resolution(values: Array) -> float:
     """The smallest step of values; 0 of so few that something is switched."""
     steps: Array = np.abs(np.diff(values))
     low, high = float(values.min()), float(values.max())
-    least = float(steps.min(where=steps > SAME_NUMBER * max(high, -low), initial=np.inf))
+    same = SAME_NUMBER * max(high, -low)
+    least = float(steps.min(initial=np.inf))
+    if least <= same:
+        least = float(np.where(steps > same, steps, np.inf).min(initial=np.inf))
     return least if high - low >= SWITCHED_VALUES * least else 0.0
 
 
@@ -424,8 +427,7 @@ def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int,
 def _ends(bends: Array, first: int, last: int, period: float) -> slice:
     """Where the swing that [first, last) is part of begins and ends."""
     clipped = _clipped(bends, CLIPPED * median(np.abs(bends[first:last])))
-    pieces = _pieces(clipped[first:last], period)
-    period = _best_period(pieces, np.ones_like(pieces), period)
+    period = _best_period(_pieces(clipped[first:last], period), None, period)
     begin = _begin(clipped, first, period)
     return slice(begin, len(bends) - _begin(clipped[::-1], len(bends) - last, period))
 
@@ -435,11 +437,13 @@ def _begin(bends: Array, inside: int, period: float) -> int:
     settled = inside + int(period / 2)
     part = slice(settled, settled + round(SETTLED * period))
     angles: Array = np.arange(min(part.stop, len(bends)), dtype=np.float64) * (2 * np.pi / period)
-    waves: Array = np.stack((np.cos(angles), np.sin(angles)))
+    waves = np.empty((2, len(angles)))
+    np.cos(angles, out=waves[0])
+    np.sin(angles, out=waves[1])
     end, rows = inside + int(period), len(bends[part])
     swing = (waves[:, part] @ bends[part]) @ waves[:, :end] * (2 / max(1, rows))
     gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
-    return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
+    return int(gains[::-1].cumsum()[::-1].argmax())
 
 
 @dataclass(frozen=True)
@@ -464,7 +468,7 @@ class Fit:
         middle = pieces.shape[1] // 2
         usual = np.partition(np.abs(pieces), middle, axis=1)[:, middle, None]
         clipped = _clipped(pieces, CLIPPED * usual)
-        period, _, model = _sines(clipped, np.ones_like(clipped), period)
+        period, _, model = _sines(clipped, None, period)
         left = float(np.square(clipped - model).sum())
         squares = float(np.square(clipped).sum())
         return cls(pieces, clipped, model, period, 1 - left / squares if squares else 0.0)
@@ -496,7 +500,7 @@ def _pieces(values: Array, period: float) -> Array:
     return np.reshape(values[: count * rows], (count, rows))
 
 
-def _best_period(pieces: Array, weights: Array, period: float) -> float:
+def _best_period(pieces: Array, weights: Array | None, period: float) -> float:
     """The period about the given one whose sines explain most."""
     _, _, gains = _fits(pieces, weights, period * np.array(TRIED))
     low, middle, high = gains.sum(axis=0).tolist()
@@ -506,7 +510,7 @@ def _best_period(pieces: Array, weights: Array, period: float) -> float:
     return period * (1 + most * max(-FARTHEST, min(FARTHEST, aside)))
 
 
-def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
+def _sines(pieces: Array, weights: Array | None, period: float) -> tuple[float, Array, Array]:
     """The best period about the given one, and the heights and values of its sines."""
     period = _best_period(pieces, weights, period)
     sines, cosines, _ = _fits(pieces, weights, np.array([period]))
@@ -516,13 +520,24 @@ def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, 
     return period, np.hypot(sines, cosines), np.asarray(model, np.float64)
 
 
-def _fits(pieces: Array, weights: Array, periods: Array) -> tuple[Array, Array, Array]:
-    """Coefficients of sine and cosine and the squares they explain: pieces by periods."""
+def _fits(pieces: Array, weights: Array | None, periods: Array) -> tuple[Array, Array, Array]:
+    """Coefficients of sine and cosine and the squares they explain: pieces by periods.
+
+    Without weights all values count alike.
+    """
     places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
     angles: Array = 2 * np.pi * places[:, None] / periods
     sine, cosine = np.sin(angles), np.cos(angles)
-    weighted = weights * pieces
-    ss, cc, sc = weights @ (sine * sine), weights @ (cosine * cosine), weights @ (sine * cosine)
+    if weights is None:
+        weighted = pieces
+        ss, cc, sc = (
+            np.einsum("ij,ij->j", *pair)
+            for pair in ((sine, sine), (cosine, cosine), (sine, cosine))
+        )
+    else:
+        weighted = weights * pieces
+        ss, cc = weights @ (sine * sine), weights @ (cosine * cosine)
+        sc = weights @ (sine * cosine)
     sy, cy = weighted @ sine, weighted @ cosine
     determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
     of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant

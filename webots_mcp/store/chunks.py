@@ -566,6 +566,28 @@ def statistics_by_signal(
     return {signal_id: Statistics(*figures) for signal_id, *figures in rows}
 
 
+def chunks_by_signal(
+    connection: sqlite3.Connection, run_id: int, group_id: int
+) -> dict[int, EncodedChunk]:
+    """Return the chunks of all signals, times and ids in one group of a run, by their ids."""
+    rows = connection.execute(
+        "SELECT signal_id, codec, numbers, codes, labels FROM chunk "
+        "WHERE +run_id = ? AND group_id = ?",
+        (run_id, group_id),
+    ).fetchall()
+    return {signal_id: EncodedChunk(*stored) for signal_id, *stored in rows}
+
+
+def decoded_or_why(
+    encoded: EncodedChunk, rows: int, into: Array | None
+) -> Decoded | DamagedChunkError:
+    """As `decode`; of a chunk that cannot be read return the error that says why."""
+    try:
+        return decode(encoded, rows, into)
+    except DamagedChunkError as error:
+        return error
+
+
 def values_in(
     connection: sqlite3.Connection,
     run_id: int,
@@ -599,10 +621,7 @@ def values_in(
         rows = wanted.get(group_id)
         if rows is None:
             continue
-        try:
-            yield group_id, decode(EncodedChunk(*stored), rows, into.get(group_id))
-        except DamagedChunkError as error:
-            yield group_id, error
+        yield group_id, decoded_or_why(EncodedChunk(*stored), rows, into.get(group_id))
 
 
 # Chunks of a recording that is not to be written: in a temporary file of this process, made once.

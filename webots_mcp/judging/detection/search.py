@@ -494,6 +494,7 @@ class Search:
     coverage: SearchCoverage = field(default_factory=SearchCoverage)
     asked: Segment | None = None
     shared: dict[type, Any] = field(default_factory=dict[type, Any])
+    _walls: dict[float, float] = field(default_factory=dict[float, float])
 
     def of(self, segment: Segment, **changes: Any) -> Search:
         """The same in another segment of the run, of which it is known what is known of this."""
@@ -620,10 +621,12 @@ class Search:
         if self._purged is not None and len(self._purged):
             place = int(np.searchsorted(self._purged.times, time_s, "right")) - 1
             return float(self._purged.wall_times[max(place, 0)])
-        run_id = self.segment.run_id
-        row = self.connection.execute(_LAST_ROW, (run_id, time_s)).fetchone()
-        row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
-        return float(row[0]) if row else 0.0
+        if (known := self._walls.get(time_s)) is None:
+            run_id = self.segment.run_id
+            row = self.connection.execute(_LAST_ROW, (run_id, time_s)).fetchone()
+            row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+            known = self._walls[time_s] = float(row[0]) if row else 0.0
+        return known
 
     def not_searched(self, kind: str, *reasons: str, cause: Cause | None = None) -> None:
         """Note why a kind was not looked for, or where it was not."""
@@ -713,7 +716,10 @@ class Search:
 
     def _is_large(self, signal: RegisteredSignal) -> bool:
         zones = self.frame.zone_map(signal.name)
-        spans = zones.spans(zones.value_count < zones.held_count)
+        may_be_large = zones.value_count < zones.held_count
+        if not may_be_large.any():
+            return False
+        spans = zones.spans(may_be_large)
         parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)
         return any((np.abs(part) > LARGEST).any() for part in parts)
 

@@ -96,6 +96,16 @@ def median(values: Array) -> float:
     return float(ordered[low] + ordered[high]) / 2
 
 
+def in_order(values: Array, place: int) -> float:
+    """Return the value at a place of the sorted ones.
+
+    numpy is many times slower where it is asked for one place of values that repeat.
+    """
+    ordered = values.copy()
+    ordered.partition((place, place))
+    return float(ordered[place])
+
+
 def sums_of(values: Array, rows: int) -> Array:
     """Of so many values that follow each other; put together of sums of half as many."""
     if rows == 1:

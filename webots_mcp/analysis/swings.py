@@ -23,6 +23,7 @@ from webots_mcp.analysis.arrays import (
     Flags,
     Indexes,
     gap_borders,
+    in_order,
     median,
     noise_of,
     np,
@@ -295,7 +296,7 @@ def _clipped(values: Array, limit: float | Array) -> Array:
 
 def _quartile(sizes: Array) -> float:
     """The lower one."""
-    return float(np.partition(sizes, len(sizes) // 4)[len(sizes) // 4])
+    return in_order(sizes, len(sizes) // 4)
 
 
 def _resolution(values: Array) -> float:

@@ -13,6 +13,7 @@ from webots_mcp.analysis.arrays import (
     Flags,
     Indexes,
     gap_borders,
+    in_order,
     median,
     np,
     usual_interval_s,
@@ -217,7 +218,7 @@ def find_jumps(
         staying = (_staying(*part, interval_s, turns) for part in parts)
         sizes = np.concatenate([np.zeros(0), *staying])
         is_known = len(sizes) >= LEAST_STEPS
-        middle = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2]) if is_known else 0.0
+        middle = in_order(sizes, len(sizes) // 2) if is_known else 0.0
         limit = middle + score * middle / 0.6745
         if is_known and largest.max() < CERTAINLY_LESS * limit:
             return [], float(largest.max()), limit

@@ -28,7 +28,7 @@ from webots_mcp.store.reading.behaviour import with_behaviour
 from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
-from webots_mcp.store.reading.segment import Deadline, Segment, just_after
+from webots_mcp.store.reading.segment import Deadline, Segment, just_after, read_so_far
 from webots_mcp.store.registered_signals import RegisteredSignal, roles_of, stored_roles
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
@@ -546,11 +546,19 @@ class Search:
     @cached_property
     def meanings(self) -> dict[str, Meaning]:
         """What each signal of the robot means, also by its values where they were read."""
+        memo = read_so_far(self.connection).setdefault(("meanings", self.segment.run_id), [])
+        for known, meanings in memo:
+            if known == self.known:
+                return meanings
         meanings = meanings_of(self.known)
         try:
-            return with_behaviour(meanings, self.known, self.whole)
+            whole = self.whole
         except NotSearchableError:
             return meanings
+        meanings = with_behaviour(meanings, self.known, whole)
+        if whole.cut_at_s is None:
+            memo.append((self.known, meanings))
+        return meanings
 
     @cached_property
     def signals(self) -> list[RegisteredSignal]:

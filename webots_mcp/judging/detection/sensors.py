@@ -17,6 +17,7 @@ from webots_mcp.analysis.arrays import (
     RowSpan,
     Runs,
     constant_runs,
+    median,
     no_runs,
     noise_of,
     np,
@@ -295,9 +296,10 @@ def is_noisy(values: Array) -> bool:
     A smooth course, such as the exact position of a simulated robot, rests when the robot does.
     """
     steps = np.abs(np.diff(values))
-    if len(steps) < 2 * FEWEST_ROWS or np.mean(steps == 0) > MOST_REPEATED:
+    repeated = len(steps) - int(np.count_nonzero(steps))
+    if len(steps) < 2 * FEWEST_ROWS or repeated / len(steps) > MOST_REPEATED:
         return False
-    return noise_of(values) >= LEAST_NOISE * float(np.median(steps))
+    return noise_of(values) >= LEAST_NOISE * median(steps)
 
 
 def is_lively(run: Frame, name: str) -> bool:

@@ -91,7 +91,7 @@ def median(values: Array) -> float:
         inside = values[(values >= least) & (values <= most)]
         if below <= low and high < below + len(inside):  # they are the ones in the middle
             values, low, high = inside, low - below, high - below
-    ordered = values.copy()
+    ordered: Array = np.array(values)
     ordered.partition((low, high))
     return float(ordered[low] + ordered[high]) / 2
 
@@ -101,7 +101,7 @@ def in_order(values: Array, place: int) -> float:
 
     numpy is many times slower where it is asked for one place of values that repeat.
     """
-    ordered = values.copy()
+    ordered: Array = np.array(values)
     ordered.partition((place, place))
     return float(ordered[place])
 

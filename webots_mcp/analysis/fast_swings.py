@@ -115,7 +115,7 @@ def _peaks_of(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Ar
     """
     windows: Array = np.lib.stride_tricks.sliding_window_view(values, _WINDOW)[starts]
     orthogonal = _slow_motion()
-    rest: Array = windows - (windows @ orthogonal) @ orthogonal.T
+    rest: Array = windows - (windows @ orthogonal) @ np.transpose(orthogonal)
     found = np.fft.rfft(rest, axis=1)
     band: Array = np.square(found.real[:, _FIRST_ORDINATE:])
     band += np.square(found.imag[:, _FIRST_ORDINATE:])

@@ -197,13 +197,14 @@ def _decode_coded(encoded: EncodedChunk, rows: int) -> Decoded:
     if len(short) != rows or short.max(initial=0) >= len(labels) + FIRST_LABEL:
         raise DamagedChunkError("damaged: its codes are not those of its rows")
     flags = [each if isinstance(each, bool) else math.nan for each in labels]
-    numbers: Array = np.array([math.nan, math.nan, *flags])[short]
+    of_codes: Array = np.array([math.nan, math.nan, *flags], np.float64)
+    codes: Indexes = short.astype(np.intp)
+    numbers: Array = of_codes[codes]
     held = short == IS_NUMBER
     if held.any():
         found = np.empty(int(np.count_nonzero(held)))
         _decompress(encoded, found)
         numbers[held] = found
-    codes: Indexes = short.astype(np.intp)
     return Decoded(numbers, codes, labels, encoded.codec == _INTEGERS)
 
 

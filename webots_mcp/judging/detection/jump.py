@@ -212,7 +212,7 @@ def find_jumps(
     changing = np.count_nonzero(changes)
     if not changing:
         return [], float(largest.max(initial=0.0)), math.inf
-    for most in (1, SAMPLED_CHUNKS) if changing > 1 else (1,):
+    for most in (1, SAMPLED_CHUNKS):
         parts = [frame.rows(*span).usable(name) for span in _sampled(zones, changes, most)]
         interval_s = _interval_s([times for times, _ in parts])
         staying = (_staying(*part, interval_s, turns) for part in parts)
@@ -222,6 +222,8 @@ def find_jumps(
         limit = middle + score * middle / 0.6745
         if is_known and largest.max() < CERTAINLY_LESS * limit:
             return [], float(largest.max()), limit
+        if changing == 1:
+            break
     wanted = zones.spans(largest > limit if is_known else changes > 0)
     found: dict[float, Jump] = {}
     for start, stop in wanted:

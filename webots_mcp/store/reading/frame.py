@@ -435,7 +435,7 @@ class Frame:
         for at in cut:
             rows = self.rows(int(edges[at]), int(edges[at + 1]))
             table[at] = statistics_of(rows._decoded(name))
-        figures: dict[str, Array] = dict(zip(Statistics._fields, table.T, strict=True))
+        figures: dict[str, Array] = dict(zip(Statistics._fields, np.transpose(table), strict=True))
         held: Indexes = figures.pop("row_count").astype(np.intp)
         present: Indexes = figures.pop("value_count").astype(np.intp)
         changed: Indexes = figures.pop("change_count").astype(np.intp)

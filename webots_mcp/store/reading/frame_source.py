@@ -267,7 +267,9 @@ class FrameSource:
             yield from values_in(self.connection, self.run_id, signal_id, wanted, targets)
             return
         chunk = self._chunks_of_one_group.get(signal_id)
-        for group_id, rows in wanted.items() if chunk is not None else ():
+        if chunk is None:
+            return
+        for group_id, rows in wanted.items():
             yield group_id, decoded_or_why(chunk, rows, targets.get(group_id))
 
     @cached_property

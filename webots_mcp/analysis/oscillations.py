@@ -23,6 +23,7 @@ from webots_mcp.analysis.arrays import (
     Flags,
     Indexes,
     gap_borders,
+    in_order,
     median,
     noise_of,
     np,
@@ -324,14 +325,17 @@ def _clipped(values: Array, limit: float | Array) -> Array:
 
 def _quartile(sizes: Array) -> float:
     """The lower one."""
-    return float(np.partition(sizes, len(sizes) // 4)[len(sizes) // 4])
+    return in_order(sizes, len(sizes) // 4)
 
 
 def _resolution(values: Array) -> float:
     """The smallest step of values; 0 of so few that something is switched."""
     steps: Array = np.abs(np.diff(values))
     low, high = float(values.min()), float(values.max())
-    least = float(steps.min(where=steps > DECIDE.same_number * max(high, -low), initial=np.inf))
+    same = DECIDE.same_number * max(high, -low)
+    least = float(steps.min(initial=np.inf))
+    if least <= same:
+        least = float(np.where(steps > same, steps, np.inf).min(initial=np.inf))
     return least if high - low >= DECIDE.switched_values * least else 0.0
 
 
@@ -471,8 +475,7 @@ def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int,
 def _ends(bends: Array, first: int, last: int, period: float) -> slice:
     """Where the swing that [first, last) is part of begins and ends."""
     clipped = _clipped(bends, FIT.clipped * median(np.abs(bends[first:last])))
-    pieces = _pieces(clipped[first:last], period)
-    period = _best_period(pieces, np.ones_like(pieces), period)
+    period = _best_period(_pieces(clipped[first:last], period), None, period)
     begin = _begin(clipped, first, period)
     return slice(begin, len(bends) - _begin(clipped[::-1], len(bends) - last, period))
 
@@ -482,11 +485,13 @@ def _begin(bends: Array, inside: int, period: float) -> int:
     settled = inside + int(period / 2)
     part = slice(settled, settled + round(FIT.settled * period))
     angles: Array = np.arange(min(part.stop, len(bends)), dtype=np.float64) * (2 * np.pi / period)
-    waves: Array = np.stack((np.cos(angles), np.sin(angles)))
+    waves = np.empty((2, len(angles)))
+    np.cos(angles, out=waves[0])
+    np.sin(angles, out=waves[1])
     end, rows = inside + int(period), len(bends[part])
     swing = (waves[:, part] @ bends[part]) @ waves[:, :end] * (2 / max(1, rows))
     gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
-    return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
+    return int(gains[::-1].cumsum()[::-1].argmax())
 
 
 @dataclass(frozen=True)
@@ -511,7 +516,7 @@ class Fit:
         middle = pieces.shape[1] // 2
         usual = np.partition(np.abs(pieces), middle, axis=1)[:, middle, None]
         clipped = _clipped(pieces, FIT.clipped * usual)
-        period, _, model = _sines(clipped, np.ones_like(clipped), period)
+        period, _, model = _sines(clipped, None, period)
         left = float(np.square(clipped - model).sum())
         squares = float(np.square(clipped).sum())
         return cls(pieces, clipped, model, period, 1 - left / squares if squares else 0.0)
@@ -543,7 +548,7 @@ def _pieces(values: Array, period: float) -> Array:
     return np.reshape(values[: count * rows], (count, rows))
 
 
-def _best_period(pieces: Array, weights: Array, period: float) -> float:
+def _best_period(pieces: Array, weights: Array | None, period: float) -> float:
     """The period about the given one whose sines explain most."""
     _, _, gains = _fits(pieces, weights, period * np.array(FIT.tried))
     low, middle, high = gains.sum(axis=0).tolist()
@@ -553,7 +558,7 @@ def _best_period(pieces: Array, weights: Array, period: float) -> float:
     return period * (1 + most * max(-FIT.farthest, min(FIT.farthest, aside)))
 
 
-def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
+def _sines(pieces: Array, weights: Array | None, period: float) -> tuple[float, Array, Array]:
     """The best period about the given one, and the heights and values of its sines."""
     period = _best_period(pieces, weights, period)
     sines, cosines, _ = _fits(pieces, weights, np.array([period]))
@@ -563,13 +568,24 @@ def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, 
     return period, np.hypot(sines, cosines), np.asarray(model, np.float64)
 
 
-def _fits(pieces: Array, weights: Array, periods: Array) -> tuple[Array, Array, Array]:
-    """Coefficients of sine and cosine and the squares they explain: pieces by periods."""
+def _fits(pieces: Array, weights: Array | None, periods: Array) -> tuple[Array, Array, Array]:
+    """Coefficients of sine and cosine and the squares they explain: pieces by periods.
+
+    Without weights all values count alike.
+    """
     places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
     angles: Array = 2 * np.pi * places[:, None] / periods
     sine, cosine = np.sin(angles), np.cos(angles)
-    weighted = weights * pieces
-    ss, cc, sc = weights @ (sine * sine), weights @ (cosine * cosine), weights @ (sine * cosine)
+    if weights is None:
+        weighted = pieces
+        ss, cc, sc = (
+            np.einsum("ij,ij->j", *pair)
+            for pair in ((sine, sine), (cosine, cosine), (sine, cosine))
+        )
+    else:
+        weighted = weights * pieces
+        ss, cc = weights @ (sine * sine), weights @ (cosine * cosine)
+        sc = weights @ (sine * cosine)
     sy, cy = weighted @ sine, weighted @ cosine
     determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
     of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant

@@ -302,7 +302,9 @@ class SearchCoverage:
 
     def of(self, kind: str) -> Coverage:
         """Return the coverage of a kind."""
-        return self.by_kind.setdefault(kind, Coverage())
+        if (found := self.by_kind.get(kind)) is None:
+            found = self.by_kind[kind] = Coverage()
+        return found
 
     def not_searched(self, kind: str, *reasons: str, cause: Cause | None = None) -> None:
         """Note why a kind was not searched, or where it was not."""

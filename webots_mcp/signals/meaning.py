@@ -49,6 +49,7 @@ LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is dec
 _LONGEST_UNIT: Final = 20  # characters
 _BAD_UNIT: Final = "signal {!r}: unit must be a text of up to {} characters, such as 'm/s', not {}"
 _REMEMBERED: Final = 4096  # names whose words are kept
+_ROBOTS_REMEMBERED: Final = 16  # lists of names whose meanings are kept
 
 # -- the words of names ------------------------------------------------------------------------
 
@@ -344,11 +345,14 @@ def meanings_by_name(
         kinds: The kind of each signal.
         register_roles: The roles of those that have one.
     """
-    names = frozenset(kinds)
-    return {
-        name: meaning_by_name(name, kind, register_roles.get(name), names)
-        for name, kind in kinds.items()
-    }
+    asked = tuple((name, kind, register_roles.get(name)) for name, kind in kinds.items())
+    return dict(_meanings_of_all(asked))
+
+
+@lru_cache(maxsize=_ROBOTS_REMEMBERED)  # a question about many runs asks of the same names
+def _meanings_of_all(asked: tuple[tuple[str, str, str | None], ...]) -> dict[str, Meaning]:
+    names = frozenset(name for name, _, _ in asked)
+    return {name: meaning_by_name(name, kind, role, names) for name, kind, role in asked}
 
 
 # -- meanings that only the values tell ----------------------------------------------------------

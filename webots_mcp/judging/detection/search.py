@@ -28,7 +28,7 @@ from webots_mcp.store.reading.behaviour import with_behaviour
 from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
-from webots_mcp.store.reading.segment import Deadline, Segment, just_after
+from webots_mcp.store.reading.segment import Deadline, Segment, just_after, read_so_far
 from webots_mcp.store.registered_signals import RegisteredSignal, roles_of, stored_roles
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
@@ -494,6 +494,7 @@ class Search:
     coverage: SearchCoverage = field(default_factory=SearchCoverage)
     asked: Segment | None = None
     shared: dict[type, Any] = field(default_factory=dict[type, Any])
+    _walls: dict[float, float] = field(default_factory=dict[float, float])
 
     def of(self, segment: Segment, **changes: Any) -> Search:
         """The same in another segment of the run, of which it is known what is known of this."""
@@ -545,11 +546,19 @@ class Search:
     @cached_property
     def meanings(self) -> dict[str, Meaning]:
         """What each signal of the robot means, also by its values where they were read."""
+        memo = read_so_far(self.connection).setdefault(("meanings", self.segment.run_id), [])
+        for known, meanings in memo:
+            if known == self.known:
+                return meanings
         meanings = meanings_of(self.known)
         try:
-            return with_behaviour(meanings, self.known, self.whole)
+            whole = self.whole
         except NotSearchableError:
             return meanings
+        meanings = with_behaviour(meanings, self.known, whole)
+        if whole.cut_at_s is None:
+            memo.append((self.known, meanings))
+        return meanings
 
     @cached_property
     def signals(self) -> list[RegisteredSignal]:
@@ -620,10 +629,12 @@ class Search:
         if self._purged is not None and len(self._purged):
             place = int(np.searchsorted(self._purged.times, time_s, "right")) - 1
             return float(self._purged.wall_times[max(place, 0)])
-        run_id = self.segment.run_id
-        row = self.connection.execute(_LAST_ROW, (run_id, time_s)).fetchone()
-        row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
-        return float(row[0]) if row else 0.0
+        if (known := self._walls.get(time_s)) is None:
+            run_id = self.segment.run_id
+            row = self.connection.execute(_LAST_ROW, (run_id, time_s)).fetchone()
+            row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+            known = self._walls[time_s] = float(row[0]) if row else 0.0
+        return known
 
     def not_searched(self, kind: str, *reasons: str, cause: Cause | None = None) -> None:
         """Note why a kind was not looked for, or where it was not."""
@@ -713,7 +724,10 @@ class Search:
 
     def _is_large(self, signal: RegisteredSignal) -> bool:
         zones = self.frame.zone_map(signal.name)
-        spans = zones.spans(zones.value_count < zones.held_count)
+        may_be_large = zones.value_count < zones.held_count
+        if not may_be_large.any():
+            return False
+        spans = zones.spans(may_be_large)
         parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)
         return any((np.abs(part) > LARGEST).any() for part in parts)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from webots_mcp.contract import PROJECT_FILE
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.errors import warn
+from webots_mcp.rerun import tape_notes
 
 if TYPE_CHECKING:
     from webots_mcp.rerun.tape_recorder import TapeRecorder
@@ -25,6 +26,8 @@ def find_tape(wanted: bool | Literal["images"] | None, database: Database) -> Ta
         wanted: As the controller says; None where the environment or the project decides.
         database: Next to which the tape will be.
     """
+    if tape_notes.replayed is not None:
+        return None
     begun = _RECORDER in sys.modules and sys.modules[_RECORDER].recorder() is not None
     if wanted is False or not (begun or wanted or _may_be_wanted()):
         return None

@@ -76,6 +76,7 @@ _OF_THE_CORE: Final = {
     "capture": CommandEntry(STEER, f"{_CLI}.steering", "capture"),
     "trials": CommandEntry(RUNS, f"{_CLI}.steering", "trials"),
     "repeatability": CommandEntry(RUNS, f"{_CLI}.judging", "repeatability"),
+    "rerun": CommandEntry(RUNS, f"{_CLI}.rerunning", "rerun"),
     "first-difference": CommandEntry(RUNS, f"{_CLI}.judging", "first_difference"),
     "export": CommandEntry(DATA, f"{_CLI}.data", "export"),
     "import": CommandEntry(DATA, f"{_CLI}.data", "import_"),

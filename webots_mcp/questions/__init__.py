@@ -15,8 +15,9 @@ from webots_mcp.questions.declaring import Question
 # In the order in which clients list them; those of plugins follow.
 MODULES: Final = (
     "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor", "history",
-    "describe_signals", "find_events", "compare_runs", "query_sql", "control_simulation",
-    "run_trials", "set_breakpoints", "send_command", "controller_parameters", "edit_scene",
+    "describe_signals", "find_events", "compare_runs", "rerun_controller", "query_sql",
+    "control_simulation", "run_trials", "set_breakpoints", "send_command",
+    "controller_parameters", "edit_scene",
 )  # fmt: skip
 
 

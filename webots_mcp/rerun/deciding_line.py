@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from difflib import SequenceMatcher
 from pathlib import Path
-from types import FrameType
+from types import FrameType, MemberDescriptorType
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.rerun.package_surface import caller_frame
@@ -25,7 +25,7 @@ _MOST_VALUES: Final = 12  # of a line
 _MOST_CHARACTERS: Final = 80  # of a value
 _MOST_ITEMS: Final = 8
 _PLAIN: Final = (int, float, bool, str, type(None))
-_WORD: Final = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)?")
+_WORD: Final = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*")
 
 
 class TracedLine(NamedTuple):
@@ -107,10 +107,10 @@ def values_on_line(frame: FrameType, text: str) -> dict[str, str]:
     """Return the values of the names on a line of code that are numbers, texts or lists of them."""
     values: dict[str, str] = {}
     for name in dict.fromkeys(_WORD.findall(text.partition("#")[0])):
-        first, _, attribute = name.partition(".")
+        first, *attributes = name.split(".")
         known, value = _value_of(frame, first)
-        if known and attribute:
-            known, value = _attribute(value, attribute)
+        for attribute in attributes:
+            known, value = _attribute(value, attribute) if known else (False, None)
         shown = _shown(value) if known else None
         if shown is not None and len(values) < _MOST_VALUES:
             values[name] = shown
@@ -129,10 +129,17 @@ def _attribute(value: Any, name: str) -> tuple[bool, Any]:
     try:
         own: Any = object.__getattribute__(value, "__dict__")
     except AttributeError:
-        return False, None
-    if type(own) is not dict or name not in own:
-        return False, None
-    return True, cast("dict[str, Any]", own)[name]
+        own = None
+    if type(own) is dict and name in own:
+        return True, cast("dict[str, Any]", own)[name]
+    for cls in type.__dict__["__mro__"].__get__(type(value)):
+        slot = type.__dict__["__dict__"].__get__(cls).get(name)
+        if type(slot) is MemberDescriptorType:
+            try:
+                return True, slot.__get__(value, cls)
+            except AttributeError:
+                return False, None
+    return False, None
 
 
 def _shown(value: Any) -> str | None:

@@ -31,6 +31,7 @@ from webots_mcp.rerun.tape_values import UnrecordedValueError
 
 _frames_of_threads: Final = sys._current_frames  # pyright: ignore[reportPrivateUsage]
 PACKAGES_FOLDER: Final = Path(__file__).parent / "lib"
+_NOT_DEBUGGED: Final = ("webots_mcp*", "controller*", "vehicle*", "bdb", "pdb")  # modules
 TIMED_OUT: Final = 3  # exit code
 
 
@@ -185,7 +186,10 @@ class _Replay:
             frame = frame.f_back
         shown = f"round {self.tape.rounds} of the old run, {self.tape.time_s:.3f} s"
         sys.stderr.write(f"webots-mcp: {shown}; 'c' goes on, 'q' ends it\n")
-        pdb.Pdb(nosigint=True).set_trace(frame)
+        if frame is not None:
+            debugger = pdb.Pdb(nosigint=True, skip=_NOT_DEBUGGED)
+            debugger.set_trace(frame)
+            debugger.set_next(frame)  # not in the bridge, which runs before the step returns
 
     def _is_users(self, frame: FrameType) -> bool:
         return relative_source(frame.f_code.co_filename, self._root) is not None

@@ -20,7 +20,8 @@ class ReplayedObject:
     def __init__(self, *arguments: Any, **_: Any) -> None:
         owner = _public_class(type(self)).__name__
         if arguments and isinstance(arguments[0], str) and owner in _device_classes():
-            self.__dict__["_path"] = f"device:{arguments[0]}"
+            path = self.__dict__["_path"] = f"device:{arguments[0]}"
+            active().named.add(path)  # which enables a sensor
             return
         unnamed = active().unnamed
         unnamed[owner] += 1

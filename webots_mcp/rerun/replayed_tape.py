@@ -5,13 +5,13 @@ Nothing is simulated. What happens after the first difference is unknown, so the
 
 from __future__ import annotations
 
+import builtins
 import json
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from webots_mcp.rerun.difference import CommandDifference, Commanded, GivenCommand, differences
 from webots_mcp.rerun.source_files import relative_source
@@ -67,6 +67,7 @@ class ReplayedTape:
         why_ended: Why no step follows; None before the end.
         root: The folder of the project that is replayed.
         classes: Of the replayed packages, by name.
+        named: Paths of the devices that were made by their names.
         unnamed: Number of objects without a name that were made, by class.
         threads: Names of other threads that called Webots' package in the old run.
         on_round: Called with the number of each round before it begins.
@@ -100,6 +101,7 @@ class ReplayedTape:
         self._calls_after_end = 0
         self.classes: dict[str, type[Any]] = {}
         self.unnamed: Counter[str] = Counter()
+        self.named: set[str] = set()
         self.rounds = 0
         self.time_s = 0.0
         self.run = 0
@@ -250,8 +252,9 @@ class ReplayedTape:
             raise ReplayEndedError
         (value,) = found
         if isinstance(value, dict) and "$raised" in value:
-            kind: Any = getattr(sys.modules["builtins"], str(value["$raised"]), RuntimeError)
-            raise kind(value["text"])
+            raised = cast("dict[str, str]", value)
+            kind: Any = getattr(builtins, raised["$raised"], RuntimeError)
+            raise kind(raised["text"])
         try:
             return decode_value(value, self.make)
         except UnrecordedValueError as error:
@@ -317,8 +320,8 @@ class ReplayedTape:
             return (command.arguments[0],)
         if setter == "enable":
             is_sensed = any(key[0] == path for key in self._latest)
-            step_ms = self.tape.head["facts"].get("robot", {}).get("getBasicTimeStep", 0)
-            return (int(step_ms) if self.tape.head["began_late"] and is_sensed else 0,)
+            is_enabled = path in self.named or (self.tape.head["began_late"] and is_sensed)
+            return (int(self._fact("robot", "getBasicTimeStep")) if is_enabled else 0,)
         defaults = {"setPosition": 0.0, "setVelocity": self._fact(path, "getMaxVelocity")}
         return (defaults[setter],) if setter in defaults else None
 

@@ -25,8 +25,13 @@ import struct
 import zlib
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Final, NamedTuple, cast
+
+try:
+    import orjson
+except ImportError:  # where it is not installed, as in Webots' own Python
+    orjson = None
 
 from webots_mcp.database.files import PRIVATE_FILE, make_folder
 from webots_mcp.errors import InvalidInputError
@@ -49,7 +54,24 @@ def tape_file(data_dir: Path, session_uuid: str) -> Path:
     return data_dir / TAPE_FOLDER / f"{name}{TAPE_ENDING}"
 
 
+def is_tape(path: PurePath) -> bool:
+    """Return whether a path from the data folder is that of a tape."""
+    return len(path.parts) == 2 and path.parts[0] == TAPE_FOLDER and path.suffix == TAPE_ENDING
+
+
 _ENCODER: Final = json.JSONEncoder(separators=(",", ":"), check_circular=False)
+
+
+def _encoded(line: list[Any]) -> bytes:
+    """Return a line as JSON. orjson writes NaN and infinity as null, and refuses some texts."""
+    if orjson is not None:
+        try:
+            text = orjson.dumps(line)
+        except (TypeError, ValueError):
+            return _ENCODER.encode(line).encode("ascii")
+        if b"null" not in text:
+            return text
+    return _ENCODER.encode(line).encode("ascii")
 
 
 class TapeWriter:
@@ -87,11 +109,11 @@ class TapeWriter:
         """
         if not self.is_open:
             return
-        texts: list[str] = []
+        texts: list[bytes] = []
         for line in lines:
-            texts.append(_ENCODER.encode([self._number + len(texts), *line]))
-        texts.append("")
-        content = "\n".join(texts).encode("ascii")
+            texts.append(_encoded([self._number + len(texts), *line]))
+        texts.append(b"")
+        content = b"\n".join(texts)
         if self._block_start + self._raw_bytes + len(content) > self._max_bytes:
             self.close("full")
             return
@@ -125,7 +147,7 @@ class TapeWriter:
             return
         self.is_open = False
         try:
-            self._append((_ENCODER.encode([self._number, "end", reason]) + "\n").encode("ascii"))
+            self._append(_encoded([self._number, "end", reason]) + b"\n")
             if self._raw:
                 self._pack()
         finally:

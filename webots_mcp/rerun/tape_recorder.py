@@ -50,9 +50,12 @@ MAX_WAITING_LINES: Final = 20_000  # in memory, until a bridge opens the file
 _OFF: Final = ("", "0", "false", "no", "off")
 _OWN: Final = frozenset({"webots_mcp", *PACKAGES})  # packages whose calls are not the user's
 _PATH: Final = "_webots_mcp_path"  # of an object of Webots' package
-_CALLS: Final = "_webots_mcp_calls"  # numbers of its calls without arguments, by name
 _SENSED: Final = frozenset({"getValue", "getValues", "getRollPitchYaw"})  # that the bridge asks too
 _MOST_CALLS: Final = 20_000  # different ones; a call beyond them is not recorded
+# What follows from the commands, and what only the bridge asks; both are asked many times a step.
+_NOT_RECORDED: Final = ("SamplingPeriod", "sampling_period", "simulationGetMode")
+_READS_DEVICES: Final = "webots_mcp.bridge.devices"
+_VARIABLE_ARGUMENTS: Final = inspect.CO_VARARGS | inspect.CO_VARKEYWORDS
 _NUMBERS: Final = frozenset({type(None), bool, int, float})
 _PLAIN: Final = _NUMBERS | {str}
 _TAPE_LINE: Final = re.compile(r"^\s*tape\s*=\s*(true|\"images\"|'images')", re.MULTILINE)
@@ -72,6 +75,11 @@ _FACTS: Final = {  # what a device is, asked once: new code may ask it although 
 }  # fmt: skip
 
 
+def _key(kind: str, name: str) -> str:
+    """Return the name under which an object holds the number of a call without arguments."""
+    return f"_webots_mcp_{kind}_{name}"
+
+
 class TapeRecorder:
     """Collects the calls of a process and writes them, a line for each step.
 
@@ -80,6 +88,8 @@ class TapeRecorder:
 
     Attributes:
         began_late: Whether the robot was already there when the recording began.
+        events: Of the round that is under way; always the same list.
+        own_modules: Modules of Webots' package and of this one that have called.
         file: The tape; None until a bridge has opened it.
         why_not: Why nothing is recorded any more; None while it is.
     """
@@ -89,7 +99,8 @@ class TapeRecorder:
         self.began_late = False
         self.file: Path | None = None
         self.why_not: str | None = None
-        self._events: list[Any] = []
+        self.events: list[Any] = []
+        self.own_modules: set[str] = set()
         self._definitions: list[list[Any]] = []
         self._waiting: list[list[Any]] = []
         self._writer: TapeWriter | None = None
@@ -100,7 +111,6 @@ class TapeRecorder:
         self._places: dict[tuple[str, int], int] = {}
         self._unnamed: dict[str, int] = {}
         self._user_modules: set[str] = set()
-        self._own_modules: set[str] = set()
         self._thread = get_ident()
         self._has_threads = False
         main = _main_file()
@@ -115,10 +125,10 @@ class TapeRecorder:
         module = frame.f_globals.get("__name__", "")
         if module in self._user_modules:
             return False
-        if module in self._own_modules:
+        if module in self.own_modules:
             return True
         is_own = isinstance(module, str) and module.partition(".")[0] in _OWN
-        (self._own_modules if is_own else self._user_modules).add(module)
+        (self.own_modules if is_own else self._user_modules).add(module)
         return is_own
 
     def answered(
@@ -131,17 +141,14 @@ class TapeRecorder:
             if arguments:
                 number = self._number(source, name, arguments, kind)
             else:
-                key = name if kind == "question" else f"{kind} {name}"
-                number = self._number_without_arguments(source, key, name, kind)
+                number = self.number_without_arguments(source, _key(kind, name), name, kind)
             if type(answer) not in _NUMBERS:
                 if type(answer) is _Raised:
                     answer = {"$raised": type(answer.error).__name__, "text": str(answer.error)}
                 else:
                     path = functools.partial(self._name_answer, source, name, arguments)
                     answer = self._encode(answer, name, path)
-            self._events.extend((number, answer))
-            if get_ident() != self._thread:
-                self._note_thread()
+            self.events.extend((number, answer))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._stop(f"{type(error).__name__}: {error}")
 
@@ -152,7 +159,7 @@ class TapeRecorder:
         if self.why_not is not None:
             return None
         try:
-            number = self._number_without_arguments(source, name, name, "command")
+            number = self.number_without_arguments(source, _key("command", name), name, "command")
             coded = [
                 each if type(each) in _PLAIN else self._encode(each, name, _known_name)
                 for each in arguments
@@ -162,7 +169,7 @@ class TapeRecorder:
             if place is None:
                 place = self._enter_place(where)
             event = [coded, place]
-            self._events.extend((number, event))
+            self.events.extend((number, event))
             if get_ident() != self._thread:
                 self._note_thread()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
@@ -182,13 +189,14 @@ class TapeRecorder:
     def note(self, kind: str, content: Any) -> None:
         """Append what the bridge did at this moment: a command that it served, a value it set."""
         if self.why_not is None:
-            self._events.extend((NOTES, [kind, content]))
+            self.events.extend((NOTES, [kind, content]))
 
     def _write_round(self, robot: Any, name: str, arguments: Sequence[Any], answer: Any) -> None:
         if self._get_time is None:
             self._get_time = _unwrapped(robot, "getTime")
             self._robot = robot
-        events, self._events = self._events, []
+        events = self.events[:]
+        del self.events[: len(events)]
         time_s = self._get_time(robot)
         end = ["round", self._rounds, time_s, name, list(arguments), answer, events]
         self._rounds += 1
@@ -223,14 +231,12 @@ class TapeRecorder:
     def _encode(self, value: Any, name: str, name_of: Callable[[Any], str | None]) -> Any:
         return encode_value(value, name, name_of, images=self.images)
 
-    def _number_without_arguments(self, source: Any, key: str, name: str, kind: str) -> int:
+    def number_without_arguments(self, source: Any, key: str, name: str, kind: str) -> int:
+        """Return the number of a call of an object, which is stored there under a key."""
         own: dict[str, Any] = source.__dict__
-        numbers: dict[str, int] | None = own.get(_CALLS)
-        if numbers is None:
-            numbers = own[_CALLS] = {}
-        number = numbers.get(key)
+        number: int | None = own.get(key)
         if number is None:
-            number = numbers[key] = self._number(source, name, (), kind)
+            number = own[key] = self._number(source, name, (), kind)
         return number
 
     def _number(self, source: Any, name: str, arguments: Sequence[Any], kind: str) -> int:
@@ -335,14 +341,15 @@ class TapeRecorder:
         """End the tape, with what was asked and commanded after the last step."""
         if self._writer is not None and self._writer.is_open:
             try:
-                if self.why_not is None and self._events:
-                    last = ["round", self._rounds, None, "", [], None, self._events]
+                if self.why_not is None and self.events:
+                    last = ["round", self._rounds, None, "", [], None, self.events]
                     self._writer.write([*self._definitions, last])
                 self._writer.close(reason)
             except (OSError, TypeError, ValueError) as error:
                 warn(f"the end of the tape {self.file} could not be written: {error}")
         self.why_not = self.why_not or reason
-        self._events, self._waiting, self._definitions = [], [], []
+        self.events.clear()
+        self._waiting, self._definitions = [], []
 
     def abandon(self) -> None:
         """Leave the tape to the parent of a forked child."""
@@ -498,7 +505,7 @@ def _replace_members(tape: TapeRecorder, package: str) -> None:
                 continue
             if name in STEPS and hasattr(cls, "getTime"):
                 setattr(cls, name, _replaced_step(tape, name, member))
-            elif name.startswith("_") or name == "simulationGetMode":
+            elif name.startswith("_") or name.endswith(_NOT_RECORDED):
                 continue
             elif inspect.isfunction(member):
                 setattr(cls, name, _replaced_method(tape, name, member))
@@ -533,15 +540,14 @@ def _replaced_method(tape: TapeRecorder, name: str, original: Any) -> Any:
 
 
 def _question(tape: TapeRecorder, name: str, original: Any) -> Any:
-    is_sensed = name in _SENSED
+    code = original.__code__
+    takes_none = code.co_argcount == 1 and not (code.co_flags & _VARIABLE_ARGUMENTS)
+    if takes_none and not code.co_kwonlyargcount:
+        return _plain_question(tape, name, original)
 
     def ask(source: Any, *args: Any, **kwargs: Any) -> Any:
-        frame = caller_frame(1)
-        if tape.is_own(frame):
-            answer = original(source, *args, **kwargs)
-            if is_sensed and frame.f_globals["__name__"] == "webots_mcp.bridge.devices":
-                tape.answered(source, name, args, answer, "seen")
-            return answer
+        if tape.is_own(caller_frame(1)):
+            return original(source, *args, **kwargs)
         try:
             answer = original(source, *args, **kwargs)
         except Exception as error:
@@ -550,6 +556,34 @@ def _question(tape: TapeRecorder, name: str, original: Any) -> Any:
         if kwargs:
             args = _flat(original, source, args, kwargs)
         tape.answered(source, name, args, answer)
+        return answer
+
+    return ask
+
+
+def _plain_question(tape: TapeRecorder, name: str, original: Any) -> Any:
+    """Return a question without arguments: most calls are one, in each step."""
+    is_sensed = name in _SENSED
+    own_modules, extend, key = tape.own_modules, tape.events.extend, _key("question", name)
+
+    def ask(source: Any) -> Any:
+        frame = caller_frame(1)
+        module = frame.f_globals.get("__name__")
+        if module in own_modules or tape.is_own(frame):
+            answer = original(source)
+            if is_sensed and module == _READS_DEVICES:
+                tape.answered(source, name, (), answer, "seen")
+            return answer
+        try:
+            answer = original(source)
+        except Exception as error:
+            tape.answered(source, name, (), _Raised(error))
+            raise
+        number = source.__dict__.get(key)
+        if number is not None and tape.why_not is None and type(answer) in _NUMBERS:
+            extend((number, answer))
+        else:
+            tape.answered(source, name, (), answer)
         return answer
 
     return ask

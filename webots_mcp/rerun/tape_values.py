@@ -75,6 +75,8 @@ def encode_value(value: Any, member: str, name_of: NameOf, *, images: bool) -> A
 
 
 def _encode_items(items: Any, member: str, name_of: NameOf, *, images: bool) -> Any:
+    if len(items) <= _PACKED_FROM and items.__class__ is list and all(map(_is_float, items)):
+        return items[:]
     count = _count_numbers(items)
     if count > MOST_NUMBERS and not images:
         return {"$large": f"{count:,} numbers"}
@@ -89,6 +91,10 @@ def _encode_items(items: Any, member: str, name_of: NameOf, *, images: bool) -> 
         for each in items
     ]
     return {"$tuple": coded} if isinstance(items, tuple) else coded
+
+
+def _is_float(value: object) -> bool:
+    return type(value) is float
 
 
 def _count_numbers(items: Any) -> int:

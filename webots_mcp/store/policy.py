@@ -41,6 +41,7 @@ from webots_mcp.store.project_file import load_toml
 
 ALLOW: Final = "allow"
 LAUNCH: Final = "launch"  # stands for an action where Webots is started
+RERUN: Final = "rerun"  # stands for an action where a controller's code is run on an old run
 # The tools and commands that do an action: a rule for one of them holds for it by every route. What
 # sends no such action (webots_breakpoint, webots_report, ...) is checked by its name alone.
 TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -54,6 +55,7 @@ TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "run": ("webots_run",),
     "cancel_run": (),  # by which nothing is done
     LAUNCH: ("webots_launch_world", "launch"),
+    RERUN: ("webots_rerun_controller", RERUN),
     "load_world": ("webots_launch_world", "webots_load_world"),
     "quit": ("webots_launch_world", "webots_quit"),
     "screenshot": ("webots_take_screenshot",),
@@ -305,6 +307,11 @@ def policies_of(database: Database, data_dir: Path, files: Iterable[str]) -> Ite
             yield policy
 
 
+def is_named(policies: Iterable[Policy], action: str) -> bool:
+    """Return whether a file allows an action by its name, and not by a pattern."""
+    return any(action in policy.allow.get("actions", ()) for policy in policies)
+
+
 def read_policy(file: Path) -> Policy | None:
     """What a project's file allows; None where it has no such table.
 
@@ -313,7 +320,7 @@ def read_policy(file: Path) -> Policy | None:
     """
     try:
         text, content = load_toml(file)
-        if unknown := sorted(set(content) - {ALLOW, "expect", "signals"}):
+        if unknown := sorted(set(content) - {ALLOW, "expect", "signals", "tape"}):
             raise InvalidInputError(
                 f"{file}: unknown table {unknown[0]!r}. Tables: allow, expect, signals"
             )

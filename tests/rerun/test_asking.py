@@ -159,3 +159,23 @@ def test_attach_with_a_tape_records_from_there_on(tmp_path: Path) -> None:
     assert rerun_of(tmp_path, controller).outcome == "differs"
     controller.write_text(code, "utf-8")
     assert rerun_of(tmp_path, controller).outcome == "equal"
+
+
+def test_init_writes_a_first_test_that_passes_until_the_controller_changes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller = recorded(tmp_path, duration_s=6.0)
+    assert main(["init", str(tmp_path), "--tests"]) in (0, None)
+    assert "test_same_commands.py" in capsys.readouterr().out
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
+
+    def test() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    assert "1 passed" in test().stdout
+    controller.write_text(EDITED, "utf-8")
+    failed = test().stdout
+    assert "1 failed" in failed
+    assert "instead of 5.0" in failed
+    main(["init", str(tmp_path), "--tests"])
+    assert "unchanged" in capsys.readouterr().out

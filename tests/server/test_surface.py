@@ -36,7 +36,7 @@ ALL = DEFAULT | {
     "webots_get_timeline", "webots_list_meanings", "webots_query_sql", "webots_annotate_run",
     "webots_load_world", "webots_quit", "webots_get_trials", "webots_list_breakpoints",
     "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
-    "webots_report",
+    "webots_report", "webots_rerun_controller",
 }  # fmt: skip
 READING = {
     "webots_list_robots", "webots_diagnose_setup", "webots_get_world_info",

@@ -11,7 +11,7 @@ from webots_mcp.answers.answer_models import RerunAnswer
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import NotAllowedError
 from webots_mcp.questions.arguments import MAX_WAIT_S, RunId, Seconds
-from webots_mcp.questions.declaring import CHANGES, Caller, question
+from webots_mcp.questions.declaring import DESTROYS, Caller, question
 from webots_mcp.rerun.running import (
     LIMIT_S,
     TapedRun,
@@ -32,7 +32,7 @@ _REPLAYS: Final = (
 
 @question(
     "Run new code on an old run",
-    CHANGES,
+    DESTROYS,  # a script may write and delete files
     command="rerun",
     positional=("run_id", "file"),
     options={"until_s": "--until"},

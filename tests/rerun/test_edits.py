@@ -170,7 +170,7 @@ def test_an_exception_of_the_new_code_is_the_answer(tmp_path: Path) -> None:
 def test_a_loop_without_a_step_is_ended_in_time(tmp_path: Path) -> None:
     controller = recorded(tmp_path)
     controller.write_text(AVOID.replace("turning = 20", "\n        while True: pass"), "utf-8")
-    answer = rerun_of(tmp_path, controller, limit_s=5.0)
+    answer = rerun_of(tmp_path, controller, stall_s=5.0)
     assert answer.outcome == "timed out"
     assert "rover.py:" in answer.text
 

@@ -11,6 +11,7 @@ from tests.rerun.taping import (
     AVOID,
     EXAMPLES,
     data_dir_of,
+    project,
     record,
     recorded,
     rerun_of,
@@ -121,3 +122,78 @@ def test_threads_that_command_are_named(tmp_path: Path) -> None:
     answer = rerun_of(tmp_path, controller)
     assert answer.outcome == "not repeatable"
     assert "another thread" in answer.text
+
+
+RESETS = """\
+from math import inf
+
+from controller import Supervisor
+
+from webots_mcp import MCPBridge
+
+robot = Supervisor()
+bridge = MCPBridge(robot)
+step_ms = int(robot.getBasicTimeStep())
+motors = [robot.getDevice(f"{side} wheel motor") for side in ("left", "right")]
+gps = robot.getDevice("gps")
+gps.enable(step_ms)
+resets = rounds = 0
+for motor in motors:
+    motor.setPosition(inf)
+while robot.step(step_ms) != -1:
+    rounds += 1
+    if bridge.detect_reload():
+        resets += 1
+        for motor in motors:
+            motor.setPosition(inf)
+    bridge.publish({"rounds": rounds, "resets": resets})
+    x_m = gps.getValues()[0]
+    for motor in motors:
+        motor.setVelocity(3.0 + resets + x_m % 1)
+    if robot.getTime() > 1.0 and resets < 2:
+        robot.simulationReset()
+"""
+
+
+def test_a_later_run_of_a_process_is_replayed_from_its_start(tmp_path: Path) -> None:
+    controller = recorded(tmp_path, RESETS, 6.0)
+    second, third = taped_run(tmp_path, 2), taped_run(tmp_path, 3)
+    assert (second.number, third.number) == (1, 2)
+    assert second.tape.file == third.tape.file
+    answer = rerun(second, controller, until_s=0.5)
+    assert (answer.outcome, answer.until_s) == ("equal", pytest.approx(0.5, abs=0.02))
+    assert rerun(third, controller).outcome == "equal"
+    controller.write_text(RESETS.replace("x_m % 1)", "x_m % 1 + (resets == 2))"), "utf-8")
+    assert rerun(second, controller).outcome == "equal"
+    answer = rerun(third, controller)
+    assert answer.outcome == "differs"
+    assert answer.until_s < 0.1
+    controller.write_text(RESETS.replace("3.0 +", "3.5 +"), "utf-8")
+    assert "of an earlier run of the same process" in rerun(third, controller).text
+
+
+def test_a_crash_is_replayed_up_to_its_line(tmp_path: Path) -> None:
+    code = AVOID.replace("        turning = 20", "        turning = 20 / 0")
+    controller = project(tmp_path, code)
+    with pytest.raises(AssertionError, match="ZeroDivisionError"):
+        record(tmp_path / "worlds" / "arena.wbt", data_dir_of(tmp_path), 8.0)
+    answer = rerun_of(tmp_path, controller)
+    assert answer.outcome == "equal"
+    assert "then it ended by ZeroDivisionError: division by zero at controllers/" in answer.text
+    controller.write_text(AVOID, "utf-8")
+    assert rerun_of(tmp_path, controller).outcome == "equal"
+
+
+def test_a_killed_controller_can_be_replayed(tmp_path: Path) -> None:
+    code = AVOID.replace("turning = 0\n", "import os, signal\nturning = 0\n", 1).replace(
+        "        turning = 20", "        os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    controller = project(tmp_path, code)
+    with pytest.raises(AssertionError):
+        record(tmp_path / "worlds" / "arena.wbt", data_dir_of(tmp_path), 8.0)
+    controller.write_text(AVOID, "utf-8")
+    taped = taped_run(tmp_path)
+    assert taped.tape.end is None
+    answer = rerun(taped, controller, until_s=2.0)
+    assert answer.outcome == "equal"
+    assert answer.rounds == 125

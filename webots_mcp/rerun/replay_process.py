@@ -48,7 +48,8 @@ class ReplayJob:
         result: The file to write the result to.
         run: The run of the session, from 0, to whose end it is replayed.
         until_s: Simulation time in that run at which it ends.
-        limit_s: Wall time after which it is ended by force.
+        stall_s: Wall time without a step after which it is ended by force.
+        limit_s: Wall time after which it is ended in any case.
         traced_round: The round whose lines are traced.
         break_round: The round at which a debugger begins.
         break_at_s: Simulation time at which a debugger begins.
@@ -62,7 +63,8 @@ class ReplayJob:
     result: str
     run: int = 0
     until_s: float | None = None
-    limit_s: float = 60.0
+    stall_s: float = 60.0
+    limit_s: float = 3600.0
     traced_round: int | None = None
     break_round: int | None = None
     break_at_s: float | None = None
@@ -128,8 +130,6 @@ class _Replay:
         try:
             self._begin_round(0)
             runpy.run_path(self._job.file, run_name="__main__")
-            if self.tape.why_ended is None:
-                self.tape.step_never_comes()
         except ReplayEndedError as error:
             result.place = self._place_of(error.__traceback__)
         except SystemExit as error:
@@ -143,6 +143,8 @@ class _Replay:
             result.exception = "".join(traceback.format_exception_only(error)).strip()
         finally:
             sys.settrace(None)
+        if self.tape.why_ended is None and self.tape.unrecorded is None:
+            self.tape.step_never_comes()
         self.tape.finish()
         self.write(result)
 
@@ -205,7 +207,11 @@ class _Replay:
 
     def _end_in_time(self) -> None:
         """End the process when its time is over: a controller may loop without a step."""
-        threading.Event().wait(self._job.limit_s)
+        pause, rounds = threading.Event(), -1
+        ends_s = time.monotonic() + self._job.limit_s
+        while self.tape.rounds > rounds and time.monotonic() < ends_s:
+            rounds = self.tape.rounds
+            pause.wait(min(self._job.stall_s, max(ends_s - time.monotonic(), 0.0)))
         result = ReplayResult(timed_out=True)
         main = _frames_of_threads().get(threading.main_thread().ident or 0)
         while main is not None and not self._is_users(main):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -85,6 +86,7 @@ def _device_classes() -> set[str]:
     return {name for name, cls in classes.items() if device and issubclass(cls, device)}
 
 
+@functools.cache
 def _public_class(cls: type) -> type:
     """Return the class of Webots' package that a user's class derives from."""
     classes = set(active().classes.values())

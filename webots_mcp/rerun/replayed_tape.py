@@ -83,7 +83,7 @@ class ReplayedTape:
         root: str = "",
     ) -> None:
         self.tape = tape
-        self.root = root
+        self.root = Path(root)
         self._last_run = run
         self._until_s = until_s
         self._goes_on = goes_on
@@ -145,7 +145,7 @@ class ReplayedTape:
             if reply:
                 self._replies.setdefault((call.path, call.name), []).append(reply[0])
             return
-        key = (call.path, call.name, json.dumps(call.arguments))
+        key = (call.path, call.name, json.dumps(call.arguments) if call.arguments else "[]")
         self._latest[key] = value
         if call.kind == "seen":
             self._seen[key] = value
@@ -212,11 +212,6 @@ class ReplayedTape:
             raise ReplayEndedError
         return -1
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether the old run has no further round that was asked for."""
-        return self.why_ended not in (None, "difference")
-
     # -- notes for the bridge --------------------------------------------------------------------
 
     def command_due(self) -> tuple[str, dict[str, Any]] | None:
@@ -240,7 +235,7 @@ class ReplayedTape:
             LookupError: The bridge asked, and the tape does not know.
         """
         coded = [self._encode(each) for each in arguments]
-        key = (path, name, json.dumps(coded))
+        key = (path, name, json.dumps(coded) if coded else "[]")
         found = self._recorded(key, is_own=is_own)
         if found is None:
             found = self._derived(key, owner, name, arguments, is_own=is_own)
@@ -335,7 +330,7 @@ class ReplayedTape:
         if self.why_ended == "unrecorded":
             raise ReplayEndedError
         file = frame.f_code.co_filename
-        place = TapedPlace(relative_source(file, Path(self.root)) or file, frame.f_lineno)
+        place = TapedPlace(relative_source(file, self.root) or file, frame.f_lineno)
         coded = [self._encode(each) for each in arguments]
         self._new.add(GivenCommand(path, owner, name, coded, place))
         replies = self._replies.get((path, name))

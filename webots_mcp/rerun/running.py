@@ -31,7 +31,8 @@ from webots_mcp.rerun.source_files import (
 from webots_mcp.rerun.tape import Tape, open_tape, tape_file
 from webots_mcp.rerun.tape_recorder import TAPE_VARIABLE
 
-LIMIT_S: Final = 60.0  # of wall time, for each replay
+STALL_S: Final = 60.0  # of wall time without a step, after which a replay is ended
+LIMIT_S: Final = 3600.0  # of wall time, for each replay
 _GRACE_S: Final = 5.0  # after which a replay that did not end itself is killed
 _MOST_OUTPUT_CHARACTERS: Final = 2000
 _PROCESS: Final = "webots_mcp.rerun.replay_process"
@@ -81,6 +82,7 @@ class Rerun:
         place: Where that was, or where the unrecorded question was asked.
         began_late: The tape began after the robot was made.
         is_unchanged: The new version is the old one.
+        in_earlier_run: The replay ended in an earlier run of the same process.
         rounds_per_s: Rounds replayed in a second of processor time.
     """
 
@@ -98,12 +100,15 @@ class Rerun:
     place: str | None = None
     began_late: bool = False
     is_unchanged: bool = False
+    in_earlier_run: bool = False
     rounds_per_s: float = 0.0
 
     @property
     def text(self) -> str:
         """The outcome in a sentence."""
         until = f"{self.until_s:.3f} s"
+        if self.in_earlier_run:
+            until += " of an earlier run of the same process"
         if self.outcome == "not repeatable":
             causes = "; ".join(self.likely_causes) or "not known"
             return (
@@ -123,7 +128,7 @@ class Rerun:
         if self.outcome == "not on the tape":
             return f"{equal}; then the replay ends{place}: {self.unrecorded}"
         if self.outcome == "timed out":
-            return f"{equal}; then it made no step until its time was over{place}"
+            return f"{equal}; then the time for the replay was over{place}"
         why = f" by {self.exception}" if self.exception else ""
         return f"{equal}; then the new code ended{why}{place}, while the old one went on"
 
@@ -207,9 +212,13 @@ class Replays:
         taped: The run.
         until_s: Simulation time at which each replay ends.
         limit_s: Wall time for each replay.
+        stall_s: Wall time without a step after which a replay is ended.
     """
 
-    def __init__(self, taped: TapedRun, until_s: float | None, limit_s: float) -> None:
+    def __init__(
+        self, taped: TapedRun, until_s: float | None, limit_s: float, stall_s: float
+    ) -> None:
+        self._stall_s = min(stall_s, limit_s)
         self._taped = taped
         self._until_s = until_s
         self._limit_s = limit_s
@@ -259,7 +268,7 @@ class Replays:
         job = ReplayJob(
             str(self._taped.tape.file), str(file), str(root), str(file.parent),
             str(folder / "data"), str(folder / "result.json"), self._taped.number, self._until_s,
-            self._limit_s, **asked,
+            self._stall_s, self._limit_s, **asked,
         )  # fmt: skip
         (folder / "job.json").write_text(json.dumps(asdict(job)), "utf-8")
         output = self._call(folder, shows=shows)
@@ -295,7 +304,8 @@ class Replays:
                 start_new_session=True,
             )
             try:
-                process.wait(self._limit_s + _GRACE_S)
+                with suppress(subprocess.TimeoutExpired):  # it has left no result
+                    process.wait(self._limit_s + _GRACE_S)
             finally:
                 _kill(process)
             output.seek(0)
@@ -341,7 +351,12 @@ def _environment(head: Mapping[str, Any], data_dir: Path) -> dict[str, str]:
 
 
 def rerun(
-    taped: TapedRun, file: Path, *, until_s: float | None = None, limit_s: float = LIMIT_S
+    taped: TapedRun,
+    file: Path,
+    *,
+    until_s: float | None = None,
+    limit_s: float = LIMIT_S,
+    stall_s: float = STALL_S,
 ) -> Rerun:
     """Run a version of a controller on the tape of a run, after the version that recorded it.
 
@@ -350,11 +365,12 @@ def rerun(
         file: The new version.
         until_s: Simulation time in the run at which the replay ends.
         limit_s: Wall time for each of up to four replays.
+        stall_s: Wall time without a step after which a replay is ended.
 
     Raises:
         WebotsMCPError: There is no tape, or it does not hold the old version.
     """
-    with Replays(taped, until_s, limit_s) as replays:
+    with Replays(taped, until_s, limit_s, stall_s) as replays:
         old = replays.run(replays.old_file, replays.old_root)
         if (failed := _not_repeated(taped, replays, old, file)) is not None:
             return failed
@@ -407,6 +423,7 @@ def _answer(taped: TapedRun, file: Path, result: ReplayResult, of_rounds: int) -
         exception=result.exception,
         place=result.place,
         began_late=bool(taped.tape.head.get("began_late")),
+        in_earlier_run=result.run < taped.number,
         rounds_per_s=result.rounds / max(result.processor_s, 1e-6),
     )
 
@@ -417,9 +434,10 @@ def _not_repeated(taped: TapedRun, replays: Replays, old: ReplayResult, file: Pa
     ended_early = old.why_ended in (None, "ended early") and not old.timed_out
     if answer.outcome == "equal" and not ended_early:
         return None
-    if answer.outcome in ("not on the tape", "timed out") and "not recorded" in (
-        old.unrecorded or ""
-    ):
+    if answer.outcome == "timed out":
+        answer.place = f"the recorded code, at {old.place}; give a time with until"
+        return answer
+    if "not recorded" in (old.unrecorded or ""):
         return answer  # a picture: that is no chance
     answer.outcome, answer.first_differences, answer.place = "not repeatable", [], None
     found = [Witness(*each) for each in old.witnesses]
@@ -471,7 +489,7 @@ def debug(
         break_at_s: Simulation time at which the debugger begins.
         break_round: The round at which it begins, where no time is given.
     """
-    with Replays(taped, until_s, LIMIT_S) as replays:
+    with Replays(taped, until_s, LIMIT_S, STALL_S) as replays:
         asked = {"break_at_s": break_at_s} if break_at_s is not None else {}
         if break_at_s is None:
             asked = {"break_round": max(break_round or 0, 1)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import sys
@@ -27,6 +28,11 @@ def root_of(controller: Path) -> Path:
 
 def relative_source(file: str | os.PathLike[str], root: Path) -> str | None:
     """Return the path of a source file from its project's folder; None if it is not of it."""
+    return _relative(os.fspath(file), str(root))
+
+
+@functools.lru_cache(maxsize=4096)
+def _relative(file: str, root: str) -> str | None:
     try:
         relative = Path(file).relative_to(root)
     except ValueError:

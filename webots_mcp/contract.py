@@ -33,6 +33,7 @@ THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
 KEEP_LAST_VARIABLE: Final = "WEBOTS_MCP_KEEP_LAST_S"
 HANG_VARIABLE: Final = "WEBOTS_MCP_HANG_AFTER_S"
 PARAMETERS_VARIABLE: Final = "WEBOTS_MCP_PARAMETERS"
+INSPECT_VARIABLE: Final = "WEBOTS_MCP_INSPECT"  # 0: a controller's variables are never read
 
 
 CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
@@ -55,6 +56,8 @@ OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the other
 CUSTOM_DATA: Final = "customData"  # the kind of a robot that the observer records from this field
 OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
 WORLD_EVENT: Final = "world"  # the event with the robots and solids that an observer sees
+INSPECTION_EVENT: Final = "inspection"  # the event with the variables of a controller
+WATCHED: Final = "watched"  # the key of a state under which watched variables are recorded
 MODE_EVENT: Final = "mode"  # the event with the simulation mode that an observer sees
 LOOK_AT: Final = "look_at"  # its action
 MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
@@ -123,6 +126,8 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "set_parameters": BuiltInAction(("values", "when", "by"), ("values",), needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),
     "keep": BuiltInAction(("reason",), ("reason",), needs_supervisor=False),
+    "inspect": BuiltInAction(("path",), needs_supervisor=False),
+    "watch": BuiltInAction(("path", "every", "stop"), ("path",), needs_supervisor=False),
     "get_scene": BuiltInAction(("path", "types", "names", "fields", "depth", "cursor")),
     "get_field": BuiltInAction(("path", "start"), ("path",)),
     "set_field": BuiltInAction(("path", "value", "stop"), ("path", "value")),

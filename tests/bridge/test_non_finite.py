@@ -72,3 +72,17 @@ def test_of_two_places_with_one_path_one_is_named_and_the_other_counted() -> Non
         encoded = encoding.encode(first | second)
         (path,) = first
         assert (encoded.replaced[path], encoded.unnamed) == ("nan", 1)
+
+
+def test_a_state_with_none_takes_the_fast_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("orjson")
+    monkeypatch.setattr(encoding, "_encode_with_json", pytest.fail)
+    state = {"seen": None, "arm": {"goal": [1.5, None], "pair": (None, "a")}}
+    text = encoding.encode(state).text
+    assert text == '{"seen":null,"arm":{"goal":[1.5,null],"pair":[null,"a"]}}'
+
+
+def test_nan_beside_none_is_named_and_never_becomes_a_silent_null() -> None:
+    encoded = encoding.encode({"seen": None, "deep": {"new_path": [None, math.nan]}})
+    assert encoded.replaced == {"deep.new_path.1": "nan"}
+    assert encoded.text == '{"seen":null,"deep":{"new_path":[null,null]}}'

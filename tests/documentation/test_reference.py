@@ -29,6 +29,7 @@ from webots_mcp.questions.compare_runs import (
 )
 from webots_mcp.questions.describe_signals import MEANING_COLUMNS
 from webots_mcp.questions.history import SIGNAL_COLUMNS
+from webots_mcp.questions.inspect_controller import INSPECTION_COLUMNS
 from webots_mcp.questions.list_robots import (
     BODY_COLUMNS,
     PLACE_COLUMNS,
@@ -122,6 +123,7 @@ def test_each_table_of_an_answer_has_its_columns_with_their_meaning() -> None:
         ("ParametersAnswer.parameters", COLUMNS_OF_PARAMETERS),
         ("CommandsAnswer.commands", COMMAND_COLUMNS),
         ("BreakpointsAnswer.breakpoints", BREAKPOINT_COLUMNS),
+        ("InspectionAnswer.inspections", INSPECTION_COLUMNS),
         ("SignalsAnswer.signals", SIGNAL_COLUMNS),
         ("SignalMeaningsAnswer.signals", MEANING_COLUMNS),
         ("RunTrendTables.numbers", TREND_COLUMNS),

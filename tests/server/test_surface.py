@@ -35,6 +35,7 @@ DEFAULT = CORE | {
 ALL = DEFAULT | {
     "webots_get_timeline", "webots_list_meanings", "webots_query_sql", "webots_annotate_run",
     "webots_load_world", "webots_quit", "webots_get_trials", "webots_list_breakpoints",
+    "webots_inspect_controller", "webots_watch",
     "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
     "webots_report", "webots_rerun_controller",
 }  # fmt: skip
@@ -237,10 +238,12 @@ async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
         "webots_set_field",
         "webots_set_parameters",
         "webots_take_screenshot",
+        "webots_watch",
     }
     assert {name for name, note in told.items() if note.idempotent_hint} == {
         "webots_annotate_run",
         "webots_set_parameters",
+        "webots_watch",
     }
 
 

@@ -226,6 +226,22 @@ class BreakpointsAnswer(Answer):
     breakpoints: AnswerTable | None = said("One row for each breakpoint.")
 
 
+class InspectionAnswer(Answer):
+    """The controller's own variables, at an event or now."""
+
+    event_id: int | None = said("Number of the event at which they were recorded.")
+    at_s: float | None = said("Simulated seconds at which they had these values.")
+    cause: str | None = said("What happened then: a breakpoint, a violation, an error or a hang.")
+    frames: list[dict[str, Any]] | None = said(
+        "The controller's functions that were being executed, the innermost first: `at` is file "
+        "and line."
+    )
+    path: str | None = said("The variable that was asked for.")
+    value: Any = said("Its value.")
+    line: str | None = said("File and line that was being executed.")
+    inspections: AnswerTable | None = said("Inspections of the run, newest first.")
+
+
 class NotedAnswer(Answer):
     """An answer about a range of time, with what there is to know about that range."""
 

@@ -118,6 +118,13 @@ COLUMNS: Final[Mapping[str, Columns]] = {
         "set_by": "Who set it.",
         "off_because": "Why it is switched off.",
     },
+    "InspectionAnswer.inspections": {
+        "event_id": "Number of the event: ask with it for the variables.",
+        "at_s": "Simulated seconds at which it happened.",
+        "cause": "breakpoint, violation, error or hang.",
+        "name": "Condition, expectation, log line or place.",
+        "line": "File, line and function that was being executed.",
+    },
     "SignalsAnswer.signals": {
         "signal": "Name of the signal.",
         "kind": "num (a number), angle, bool, text or null (it never had a value).",

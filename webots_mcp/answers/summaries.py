@@ -24,6 +24,7 @@ from webots_mcp.answers.answer_models import (
     EventsAnswer,
     FullStateAnswer,
     HistoryAnswer,
+    InspectionAnswer,
     KindVerdicts,
     LogsAnswer,
     MonitorAnswer,
@@ -198,6 +199,20 @@ def _(answer: BreakpointAnswer) -> str:
 @_summary.register
 def _(answer: BreakpointsAnswer) -> str:
     return f"{_count(len(list(_rows(answer.breakpoints))), 'breakpoint')} of {_subject(answer)}."
+
+
+@_summary.register
+def _(answer: InspectionAnswer) -> str:
+    if answer.path is not None:
+        value = answer.value if isinstance(answer.value, int | float | str) else "see value"
+        return f"{answer.path} is {value}, at {answer.line or 'an unknown line'}."
+    if not answer.frames:
+        return f"No variables of the controller of {_subject(answer)} are recorded here."
+    inner = answer.frames[0]
+    when = "Now" if answer.event_id is None else f"At {answer.at_s or 0:.12g} s ({answer.cause})"
+    rows = len(list(_rows(answer.inspections)))
+    more = f"; {rows} inspections listed" if rows else ""
+    return f"{when}: {inner.get('at')}, {inner.get('function')}(){more}."
 
 
 @_summary.register

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, Final
 
+from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.encoding import plain
 from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.full_rate import FullRateRecorder
@@ -103,6 +104,7 @@ class Breakpoints:
         journal: Journal,
         pause: Pause,
         full_rate: FullRateRecorder,
+        variables: ControllerVariables,
     ) -> None:
         self._simulation = simulation
         self._clock = clock
@@ -110,6 +112,7 @@ class Breakpoints:
         self._journal = journal
         self._pause = pause
         self._full_rate = full_rate
+        self._variables = variables
         # The run in which the stored breakpoints were read; None: they have to be read again.
         self.run: CurrentRun | None = None
         self.reaches = False  # the newest state meets an expectation that has a time limit
@@ -311,9 +314,11 @@ class Breakpoints:
             data["not_kept"] = self._full_rate.why_not
         if each.expectation is None:
             self._journal.event("breakpoint", data, each.condition.text)
+            self._variables.record("breakpoint", each.condition.text, each)
         else:
             data["condition"] = each.condition.text
             self._journal.event(VIOLATION, data, each.expectation.name)
+            self._variables.record(VIOLATION, each.expectation.name, each)
 
     # -- failures ------------------------------------------------------------------------------
 

@@ -35,6 +35,7 @@ except ImportError:
 MAX_ROW_BYTES: Final = 1_000_000
 # Numpy's type codes. Half and single floats are not here: orjson writes them with fewer digits.
 _ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")
+_WITH_ITEMS: Final = frozenset((dict, list, tuple))  # in which a plain value may hold a None
 _CONTAINERS: Final = (dict, list, tuple, set, frozenset, deque)
 
 
@@ -122,7 +123,7 @@ def _encode_with_orjson(state: object, null_count: int) -> str | None:
 
     Args:
         state: What to encode.
-        null_count: Number of nulls in its text if no NaN was turned into one.
+        null_count: Number of nulls that were put into it for numbers that are not finite.
 
     Returns:
         The text, or None if orjson cannot encode the state or may have met a NaN.
@@ -136,7 +137,24 @@ def _encode_with_orjson(state: object, null_count: int) -> str | None:
         text = orjson.dumps(state, _in_lists, options)
     except Exception:  # noqa: BLE001  (the user's objects may raise anything; `json` comes next)
         return None
-    return text.decode() if text.count(b"null") == null_count else None
+    nulls = text.count(b"null")
+    return text.decode() if nulls == null_count or nulls == _count_none(state) else None
+
+
+def _count_none(value: Any) -> int:
+    """Return how many None a plain value holds in its dicts, lists and tuples."""
+    kind: Any = value.__class__
+    if kind is dict:
+        value = value.values()
+    elif kind is not list and kind is not tuple:
+        return value is None
+    count = 0
+    for item in value:
+        if item is None:
+            count += 1
+        elif item.__class__ in _WITH_ITEMS:
+            count += _count_none(item)
+    return count
 
 
 def _in_lists(value: Any) -> object:

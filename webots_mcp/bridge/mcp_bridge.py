@@ -349,6 +349,7 @@ class MCPBridge:
             self._session.journal.log(known or "info", "controller", text, logger)
             if known in _KEEPING:
                 self._session.full_rate.ask(f"{known}: {text}")
+                self._session.variables.record("error", text, "log")
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
@@ -639,7 +640,8 @@ class MCPBridge:
         self._session.control.why_ended = why
         self.keep(why)
         if isinstance(error, Exception):
-            self.log(why, "error")
+            self._session.journal.log("error", "controller", why)
+            self._session.variables.record_uncaught(error, why)
 
     def _capture_output(self) -> Capture:
         from webots_mcp.bridge.capture import Capture  # only here: seldom needed

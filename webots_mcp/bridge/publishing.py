@@ -13,12 +13,13 @@ from typing import Any, Final, cast
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.claimed_commands import Reloads
 from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
+from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.recorder import Recorder, this_call
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.bridge.throttle import Throttle
@@ -52,6 +53,7 @@ class Publisher:
         full_rate: FullRateRecorder,
         devices: DeviceReader,
         reloads: Reloads,
+        variables: ControllerVariables,
         begin_run: Callable[[], None],
     ) -> None:
         self._clock = clock
@@ -63,6 +65,7 @@ class Publisher:
         self._watch = watch
         self._full_rate = full_rate
         self._reloads = reloads
+        self._variables = variables
         self._begin_run = begin_run
         self._changes = StateChanges()
         self._names = SignalNames()
@@ -78,6 +81,8 @@ class Publisher:
         if self._clock.update():
             self._begin_run()
         wanted, hit, full_rate, breakpoints = force, None, self._full_rate, self._breakpoints
+        if self._variables.watches is not None:
+            state = self._variables.watches.added_to(state, this_call())
         # Checked before the call, since even a call that does nothing slows down every `publish`.
         if breakpoints.armed or breakpoints.run is not self._clock.run:
             hit = breakpoints.evaluate(state)
@@ -118,7 +123,8 @@ class Publisher:
             return state
         if throttle.admits(force or self._heartbeat.loop is not None):
             state = self._read(extra, include_time)
-            self._record(state)
+            watches = self._variables.watches
+            self._record(state if watches is None else watches.added_to(state, this_call()))
         elif full_rate.fills:
             full_rate.leave_out(self.devices.why)
         if full_rate.frames.cameras:

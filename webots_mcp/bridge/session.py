@@ -12,9 +12,11 @@ from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.claimed_commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.controller_actions import ControllerActions
+from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.full_rate import FullRateRecorder
+from webots_mcp.bridge.inspection_actions import InspectionActions
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
@@ -66,6 +68,7 @@ class BridgeSession:
         self.recorder = recorder = Recorder(database, self.identity, clock, errors)
         self.journal = journal = Journal(recorder, clock)
         self.heartbeat = Heartbeat(recorder, clock)
+        self.variables = ControllerVariables(clock, journal, errors, data_dir)
         self.reloads = Reloads(errors.failed)
         self.picture_files = PictureFiles(recorder, clock, data_dir)
         self.full_rate = FullRateRecorder(
@@ -84,14 +87,16 @@ class BridgeSession:
         )
         self.meanings = SignalMeanings(recorder)
         self.breakpoints = Breakpoints(
-            simulation, clock, recorder, journal, self.pause, self.full_rate
+            simulation, clock, recorder, journal, self.pause, self.full_rate, self.variables
         )
         self.watch = Watch(clock, simulation.basic_time_step_s / 100)
         self.publisher = self._build_publisher()
         self.unseen = UnseenSteps(simulation, journal, errors)
         self._scene = SceneActions(simulation, clock, journal, errors)
         self.control = self._build_control()
-        self._watchdog = Watchdog(simulation, clock, recorder, journal, database, hang_after_s)
+        self._watchdog = Watchdog(
+            simulation, clock, recorder, journal, self.variables, database, hang_after_s
+        )
         self._began_s: float | None = time.monotonic()  # None once `_on_tick` has checked the loop
         self._maintainer = _start_maintainer(database, self._on_tick)
 
@@ -108,6 +113,7 @@ class BridgeSession:
             self.full_rate,
             devices,
             self.reloads,
+            self.variables,
             self.begin_run,
         )
 
@@ -132,6 +138,7 @@ class BridgeSession:
             world,
             PictureActions(simulation, clock, self.picture_files),
             self._scene,
+            InspectionActions(self.variables),
             ControllerActions(
                 clock, pause, self.reloads, self.parameters, self.breakpoints, self.full_rate
             ),

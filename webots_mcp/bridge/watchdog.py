@@ -22,6 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock, Simulation
@@ -48,12 +49,14 @@ class Watchdog:
         clock: Clock,
         recorder: Recorder,
         journal: Journal,
+        variables: ControllerVariables,
         database: Database,
         limit_s: float,
     ) -> None:
         self._clock = clock
         self._recorder = recorder
         self._journal = journal
+        self._variables = variables
         self._meter = simulation.meter
         self._limit_s = limit_s
         self._is_on = limit_s > 0 and isinstance(database, Path)
@@ -169,6 +172,7 @@ class Watchdog:
             self._logged += 1
             clock = self._clock
             self._recorder.record("stacks", clock.run, stacks.log_values(clock.sim_time_s))
+            self._variables.record_thread(stacks.place, self._meter.thread)
         return True
 
 

@@ -17,7 +17,7 @@ MODULES: Final = (
     "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor", "history",
     "describe_signals", "find_events", "compare_runs", "rerun_controller", "query_sql",
     "control_simulation", "run_trials", "set_breakpoints", "send_command",
-    "controller_parameters", "edit_scene",
+    "controller_parameters", "edit_scene", "inspect_controller",
 )  # fmt: skip
 
 

@@ -63,6 +63,8 @@ TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "set_parameters": ("webots_set_parameters",),
     "arm_breakpoints": (),
     "keep": (),
+    "inspect": ("webots_inspect_controller",),
+    "watch": ("webots_watch",),
     "get_scene": ("webots_get_scene",),
     "get_field": ("webots_get_scene", "webots_get_field"),
     "set_field": ("webots_edit_scene", "webots_set_field"),
@@ -75,6 +77,7 @@ ANY_ACTION: Final = (
 _PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
 ASKS: Final = "ask"
 _HOLDS_FOR: Final = ("everyone", "assistants")
+_OTHER_KEYS: Final = ("expect", "signals", "inspect", "tape")  # which others read
 _KEYS: Final = (*_PATTERNS, "parameters", LAUNCH, "holds_for")
 _ASK: Final = (
     "Do not look for another way to the same: the person whose project it is can change that line, "
@@ -320,9 +323,9 @@ def read_policy(file: Path) -> Policy | None:
     """
     try:
         text, content = load_toml(file)
-        if unknown := sorted(set(content) - {ALLOW, "expect", "signals", "tape"}):
+        if unknown := sorted(set(content) - {ALLOW, *_OTHER_KEYS}):
             raise InvalidInputError(
-                f"{file}: unknown table {unknown[0]!r}. Tables: allow, expect, signals"
+                f"{file}: unknown table {unknown[0]!r}. Tables: allow, expect, signals, inspect"
             )
         if ALLOW not in content:
             return None

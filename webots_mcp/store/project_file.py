@@ -33,6 +33,7 @@ from typing import Any, Final, NamedTuple, cast
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, recorded_name
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.location import find_project
+from webots_mcp.database.secret_names import TABLE, check_table
 from webots_mcp.database.stored_breakpoints import OF_PROJECT
 from webots_mcp.errors import InvalidInputError, warn
 from webots_mcp.signals.conditions.compiler import Expectation, parse_expectation
@@ -83,6 +84,7 @@ def read_project(file: Path) -> ProjectFile:
     """
     text, content = load_toml(file)
     content.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
+    check_table(file, content.pop(TABLE, {}))  # which bridges read themselves
     signals = content.pop("signals", {})
     if (tape := content.pop("tape", False)) not in (True, False, "images"):
         raise InvalidInputError(f'{file}: tape must be true, false or "images", not {tape!r:.80}')
@@ -93,7 +95,7 @@ def read_project(file: Path) -> ProjectFile:
             f"{next(iter(content))!r} is unknown" if content else "'expect' is no list of tables"
         )
         raise InvalidInputError(
-            f"{file}: {found}; it holds tables [[expect]], [signals] and [allow], "
+            f"{file}: {found}; it holds tables [[expect]], [signals], [inspect] and [allow], "
             "and a line tape = true"
         )
     tables = cast("list[dict[str, Any]]", entries)

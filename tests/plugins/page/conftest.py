@@ -104,6 +104,10 @@ def write_story(data_dir: Path) -> None:
             hostile.publish(step / 10, {"$$x$$": step, "mode": LINE, NAME: step % 2 == 0})
         logged = {"level": "info", "source": "controller", "message": LINE}
         hostile.insert("log", **hostile.at(5.0), **logged)
+        frame = {"at": "nav.py:7", "function": LINE, "source": [LINE], "variables": {NAME: LINE}}
+        inspected = json.dumps({"cause": "error", "frames": [frame, frame]})
+        event = {"kind": "inspection", "name": LINE, "data": inspected}
+        hostile.insert("event", **hostile.at(4.9), **event)
         still = start_run(connection, "still")
         (session_id, robot_id) = connection.execute(
             "SELECT session_id, robot_id FROM run WHERE id = ?", (still.run_id,)

@@ -254,6 +254,24 @@ def test_a_click_on_a_log_line_or_an_event_and_the_keys_move_the_cursor_everywhe
     assert tab.errors == []
 
 
+def test_the_controllers_variables_are_shown_near_the_cursor_and_as_text(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", NAME)
+    shown = tab.page.locator("#variables")
+    expect(shown).to_contain_text("Variables of the controller at 4.900 s (error: <script>")
+    expect(shown.locator("details[open]")).to_have_count(1)
+    expect(shown.locator("dt").first).to_have_text(NAME)
+    expect(shown.locator("dd").first).to_have_text(LINE)
+    tab.page.evaluate("showAt(1.0)")
+    expect(shown).to_be_hidden()
+    tab.page.evaluate("showAt(4.6)")
+    expect(shown).to_be_visible()
+    assert tab.page.evaluate("window.hacked") is None
+    assert tab.errors == []
+
+
 def cursor(tab: Tab) -> list[float | None]:
     """The times at which the two figures show their cursors."""
     places = "['signal-figure', 'way-figure']"

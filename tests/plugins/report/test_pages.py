@@ -174,6 +174,22 @@ def test_a_report_of_a_crash_shows_the_last_seconds(recorded: Recorded, tmp_path
     assert "elapsed_s" not in drawn, "a clock over time shows nothing"
 
 
+def test_a_moment_shows_what_the_controllers_variables_held(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    robot = recorded.robot()
+    for step in range(50):
+        robot.state(step * 0.1, {"pose": {"x": step * 0.1, "y": 0.0}})
+    robot.log(4.8, "ZeroDivisionError: division by zero", "error")
+    frame = {"at": "nav.py:7", "function": "turn", "source": ["left / by"], "variables": {"by": 0}}
+    robot.event(4.8, "inspection", "division by zero", {"cause": "error", "frames": [frame, 3, {}]})
+    robot.end_run("crashed")
+    text = Shown(make_report(recorded.connection, [robot.run_id], tmp_path).html).text
+    assert "Variables of the controller at 4.800 s (error: division by zero)" in text
+    assert "nav.py:7, turn()" in text and "left / by" in text
+    assert "Inspection at" not in text, "it belongs to its moment, and is none itself"
+
+
 def test_a_fall_is_shown_with_the_signals_it_is_judged_by(
     recorded: Recorded, tmp_path: Path
 ) -> None:

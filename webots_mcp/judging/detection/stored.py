@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import Any, Final
 
 from webots_mcp.analysis.arrays import np
-from webots_mcp.contract import LOG_LEVELS
+from webots_mcp.contract import INSPECTION_EVENT, LOG_LEVELS
 from webots_mcp.database.stored_breakpoints import VIOLATION
 from webots_mcp.judging.detection.kinds import (
     Alike,
@@ -20,6 +20,7 @@ from webots_mcp.judging.detection.kinds import (
     but_for_numbers,
 )
 from webots_mcp.judging.detection.search import EventKind, Search
+from webots_mcp.store.inspections import place_of
 from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,
     Point,
@@ -40,7 +41,7 @@ _IN_SEGMENT: Final = (
 _NEWEST: Final = "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 _LOGS: Final = f"SELECT sim_time_s, wall_time_s, level, source, message FROM log {_IN_SEGMENT}"
 _NOTICED: Final = (  # changes of signals are read from states, of all signals, without a limit
-    f"SELECT sim_time_s, wall_time_s, kind, name, data FROM event {_IN_SEGMENT} "
+    f"SELECT sim_time_s, wall_time_s, kind, name, data, id FROM event {_IN_SEGMENT} "
     "AND kind NOT IN ('change', 'start', 'reset', 'reload') "
 )
 _IMAGES: Final = f"SELECT sim_time_s, wall_time_s, kind, device, path, id FROM image {_IN_SEGMENT}"
@@ -174,11 +175,20 @@ def noticed_events(search: Search) -> Iterator[Event]:
     """What the bridge noticed and stored: pause, resume, dropped rows, trouble with storage."""
     wanted = search.options.kinds
     is_found = not wanted or VIOLATION in wanted  # in values, as an event of its own kind
-    for time_s, wall_s, kind, name, data in _newest(search, "bridge_event", _NOTICED):
+    for time_s, wall_s, kind, name, data, event_id in _newest(search, "bridge_event", _NOTICED):
         if kind == VIOLATION and is_found:
             continue
-        details: dict[str, Any] = {"what": kind} | ({"data": json.loads(data)} if data else {})
+        said = json.loads(data) if data else None
+        details: dict[str, Any] = {"what": kind} | ({"data": said} if said else {})
+        if kind == INSPECTION_EVENT:  # whose variables webots_inspect_controller shows
+            details = {"what": kind, "event_id": event_id, "line": place_of(said or {})}
         yield Event("bridge_event", search.segment.run_id, time_s, time_s, wall_s, name, details)
+
+
+def _newest_inspection(events: Sequence[Event]) -> dict[str, Any]:
+    """The id of the newest one of several inspections, by which its variables are shown."""
+    event_id = events[-1].details.get("event_id")
+    return {} if event_id is None else {"newest_event_id": event_id}
 
 
 def image_events(search: Search) -> Iterator[Event]:
@@ -325,7 +335,9 @@ NOTICED: Final = EventKind(
     stored=True,
     drawn=6,
     alike=Alike(
-        lambda events, unit: f"times {events[0].details['what']}", sort=lambda e: e.details["what"]
+        lambda events, unit: f"times {events[0].details['what']}",
+        sort=lambda e: e.details["what"],
+        adds=_newest_inspection,
     ),
 )
 KEPT: Final = EventKind(

@@ -32,10 +32,12 @@ from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
+from webots_mcp.plugins.report.controller_variables import shown_variables
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.signals.naming import flatten, spelled_out
 from webots_mcp.store.ages import age_in_words
 from webots_mcp.store.chunks import parse
+from webots_mcp.store.inspections import inspections_of
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
 from webots_mcp.store.meanings import meanings_of
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
@@ -194,6 +196,7 @@ def robot_status(
             "live": view.robot.live,
             "pace": _pace(header["status"]) if is_newest else "",
             "picture": image.id if image else None,
+            "inspected": _inspected(connection, run.id) if run else [],
         }
 
 
@@ -380,6 +383,31 @@ def picture(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
     except WebotsMCPError as error:
         return {"uri": None, "caption": f"{caption}: {spelled_out(str(error))}"}
     return {"uri": f"data:image/jpeg;base64,{data}", "caption": caption}
+
+
+def _inspected(connection: sqlite3.Connection, run_id: int) -> list[float]:
+    """Return the times at which the controller's variables were recorded, newest first."""
+    return [each.sim_time_s for each in inspections_of(connection, run_id)]
+
+
+def controller_variables(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
+    """Return the controller's own variables as they were recorded nearest to the cursor."""
+    with recording.reader() as connection:
+        run = _view(connection, request).run
+        found = inspections_of(connection, run.id) if run else []
+    if not found:
+        return {"title": "", "frames": []}
+    at_s = found[0].sim_time_s if request.at_s is None else request.at_s
+    shown = shown_variables(min(found, key=lambda each: abs(each.sim_time_s - at_s)))
+    frames = [
+        {
+            "place": spelled_out(each.place),
+            "source": [*map(spelled_out, each.source)],
+            "variables": [[*map(spelled_out, variable)] for variable in each.variables],
+        }
+        for each in shown.frames
+    ]
+    return {"title": spelled_out(shown.title), "frames": frames}
 
 
 def _as_jpeg(file: Path) -> bytes:

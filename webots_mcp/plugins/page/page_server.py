@@ -26,6 +26,7 @@ from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.page_data import (
+    controller_variables,
     describe_signals,
     draw,
     page_request,
@@ -401,6 +402,10 @@ def _answer_picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]
     return picture(server.recording, page_request(asked))
 
 
+def _answer_variables(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return controller_variables(server.recording, page_request(asked))
+
+
 def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
     robot = asked.get("robot", "")
     if body.get("order") in ORDERS:
@@ -419,4 +424,5 @@ _QUESTIONS: Final = {
     "draw": _answer_figures,
     "picture": _answer_picture,
     "signals": _answer_signals,
+    "variables": _answer_variables,
 }

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
+from webots_mcp.contract import INSPECTION_EVENT, MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.judging.checks import CheckedRun, check_run
 from webots_mcp.judging.comparison import compare_runs
@@ -19,6 +19,7 @@ from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.judging.verdicts import AS_STUCK, Verdicts
 from webots_mcp.plotting.intervals import at_resolution, lane_of
 from webots_mcp.plotting.plotted_runs import plotted_runs
+from webots_mcp.plugins.report.controller_variables import ShownVariables, shown_variables
 from webots_mcp.plugins.report.grid import Grid, GridRow
 from webots_mcp.plugins.report.opening import (
     CRASH,
@@ -45,6 +46,7 @@ from webots_mcp.plugins.report.words import (
     time_at,
 )
 from webots_mcp.signals.naming import find_mode
+from webots_mcp.store.inspections import Inspection, inspections_of
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
     LogFilter,
@@ -95,7 +97,7 @@ class _ChapterLimits:
 
 _LIMITS: Final = _ChapterLimits()
 
-_ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)
+_ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT, INSPECTION_EVENT)
 """Events of the bridge that need no context."""
 
 
@@ -115,6 +117,7 @@ class EventContext:
         signals: Signals that show it, the most telling first.
         values: Values of a few signals at its start.
         lines: Entries of the timeline around it.
+        variables: What the controller's own variables held then; None where none were recorded.
     """
 
     event: Event
@@ -123,6 +126,7 @@ class EventContext:
     values: str
     lines: Grid
     signals: Sequence[str] = ()
+    variables: ShownVariables | None = None
 
     @property
     def start_s(self) -> float:
@@ -241,7 +245,8 @@ def chapter_of(
     stored = _stored(connection, whole, deadline_s / 3)
     matter = [*_crash(info, run.last_sim_time_s), *_that_matter(each_alone)]
     outstanding = _outstanding(connection, each_alone, matter, checked)
-    moments = [_moment(each, stored, each_alone.verdicts) for each in outstanding]
+    inspections = inspections_of(connection, run_id)
+    moments = [_moment(each, stored, each_alone.verdicts, inspections) for each in outstanding]
     course = trends(connection, whole, limit=500, deadline_s=deadline_s / 3)
     (run_trends,) = course.runs
     mode = _mode(run_trends)
@@ -449,7 +454,9 @@ def _outstanding(
     return sorted(shown, key=lambda each: each.start_s)
 
 
-def _moment(event: Event, stored: Found, verdicts: Verdicts) -> EventContext:
+def _moment(
+    event: Event, stored: Found, verdicts: Verdicts, inspections: Sequence[Inspection]
+) -> EventContext:
     lasted = f", for {length(event.duration_s)}" if event.duration_s else ""
     kind = capitalised(event_name(event).replace("_", " "))
     title = f"{kind} at {time_at(event.start_s)} s{lasted}"
@@ -470,7 +477,13 @@ def _moment(event: Event, stored: Found, verdicts: Verdicts) -> EventContext:
         GridRow([time_at(each.start_s), each.kind, describe_event(each)], _mark(each))
         for each in shown
     ]
-    return replace(moment, lines=Grid(columns, rows, left_out=len(around) - len(shown)))
+    near = [each for each in inspections if moment.start_s <= each.sim_time_s <= moment.end_s]
+    inspection = min(near, key=lambda each: abs(each.sim_time_s - event.start_s), default=None)
+    return replace(
+        moment,
+        lines=Grid(columns, rows, left_out=len(around) - len(shown)),
+        variables=inspection and shown_variables(inspection),
+    )
 
 
 def _says(event: Event) -> str:

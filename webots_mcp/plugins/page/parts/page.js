@@ -6,6 +6,8 @@ const REST_MS = 250; // between two drawings, at least, and so that they take a 
 const TAB = Math.random().toString(36).slice(2);
 const by = (id) => document.getElementById(id);
 const DRAGGED = "application/x-webots-mcp-signal";
+const INSPECTED_NEAR_S = 0.5; // from the cursor: its variables are shown
+const INSPECTED_LATELY_S = 5; // before the newest row, where there is no cursor
 const SNAP_PX = 8; // a click so near to an event means the event
 const FEW_SIGNALS = 40; // so many are shown without a click on their branch
 const figures = { signals: by("signal-figure"), way: by("way-figure") };
@@ -100,6 +102,7 @@ function show(answer) {
   showValues(answer.values);
   showParameters(answer.parameters, answer.settable);
   showLog(answer.lines);
+  showVariables();
   if (answer.picture !== lastPicture) showPicture(answer.picture);
   showOrders(answer.orders, answer.pace, answer.why_off);
   showOutcome(answer.runs.find(({ id }) => id === answer.run)?.outcome ?? "");
@@ -164,6 +167,36 @@ function markLog() {
   before?.classList.remove("at-cursor");
   marked?.classList.add("at-cursor");
   if (marked) by("log").scrollTop = marked.offsetTop - by("log").offsetTop - by("log").clientHeight + marked.offsetHeight;
+}
+
+let variablesOf = ""; // the inspection that is shown: its robot, run and time
+let isReadingVariables = false;
+
+/** Show the controller's variables where an inspection is near the cursor, or, without one, near the newest row. */
+async function showVariables() {
+  if (isReadingVariables || !shown) return;
+  const at = wanted.at === null ? shown.until : Number(wanted.at);
+  const within = wanted.at === null ? INSPECTED_LATELY_S : INSPECTED_NEAR_S;
+  const time = shown.inspected.reduce((best, each) => (Math.abs(each - at) < Math.abs(best - at) ? each : best), Infinity);
+  const key = Math.abs(time - at) <= within ? JSON.stringify([shown.robot, shown.run, time]) : "";
+  if (key === variablesOf) return;
+  isReadingVariables = true;
+  try {
+    const { title, frames } = key ? await ask("variables", { robot: shown.robot, run: shown.run, at: time }) : { title: "", frames: [] };
+    variablesOf = key;
+    by("variables").hidden = frames.length === 0;
+    by("variables").replaceChildren(element("h2", { textContent: title }), ...frames.map((frame, place) => (
+      element("details", { open: place === 0 },
+        element("summary", { textContent: frame.place }),
+        ...(frame.source.length ? [element("pre", { textContent: frame.source.join("\n") })] : []),
+        element("dl", {}, ...frame.variables.flatMap(([name, value]) => [
+          element("dt", { textContent: name }), element("dd", { textContent: value }),
+        ])))
+    )));
+  } catch { // The next look reports why, and asks again.
+    variablesOf = "";
+  }
+  isReadingVariables = false;
 }
 
 async function showPicture(key) {
@@ -334,6 +367,7 @@ function showAt(time) {
   by("follow").hidden = time === null;
   markLog();
   showPictureAt();
+  showVariables();
 }
 
 /** Let all figures show the cursor, or none if there is none. */

@@ -1,0 +1,191 @@
+"""Records the controller's own variables at hits, violations, errors and hangs, and shows them.
+
+An inspection is an event of the kind `inspection`: for each of the controller's own frames its
+file, line, source and local variables. Only what is alive at that moment is seen. Before Python
+3.13 reading the variables of a frame may keep their objects alive until it is read again.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+from types import FrameType, ModuleType
+from typing import Any, Final
+
+from webots_mcp.bridge.error_report import ErrorReport, cut
+from webots_mcp.bridge.inspection.attribute_paths import (
+    PathEndsError,
+    find_root,
+    follow,
+    parse_path,
+)
+from webots_mcp.bridge.inspection.frames import (
+    OwnFrame,
+    SourceLines,
+    frames_of_error,
+    own_frames,
+)
+from webots_mcp.bridge.inspection.values import Renderer, has_base
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.simulation import Clock
+from webots_mcp.contract import INSPECTION_EVENT
+from webots_mcp.database.secret_names import SecretNames, read_secret_names
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+
+MOST_INSPECTIONS: Final = 20  # of one cause in a run
+_MOST_VARIABLES: Final = 40  # of one frame
+_LONGEST_CAUSE: Final = 200
+_DEPTH: Final = 2  # an object and its attributes; a list and its items
+_DEPTH_OF_PATH: Final = 3
+_ANSWER_CHARACTERS: Final = 5_000
+
+
+class Inspector:
+    """Reads the frames of a loop.
+
+    Args:
+        data_dir: The recording's folder, whose project may name more secrets.
+    """
+
+    def __init__(self, clock: Clock, journal: Journal, errors: ErrorReport, data_dir: Path) -> None:
+        self._clock = clock
+        self._journal = journal
+        self._errors = errors
+        self._data_dir = data_dir
+        self._run = clock.run
+        self._counts: Counter[tuple[str, object]] = Counter()
+        self._source = SourceLines()
+        self._secrets: SecretNames | None = None
+        self.off: str | None = None  # why nothing is inspected
+
+    # -- recording -----------------------------------------------------------------------------
+
+    def record(self, cause: str, name: str, key: object, frame: FrameType | None) -> None:
+        """Record the variables of a frame and its callers, the first 20 times of a cause in a run.
+
+        Args:
+            cause: `breakpoint`, `violation`, `error` or `hang`.
+            name: What happened.
+            key: What is counted: a breakpoint, for example.
+            frame: Where it happened; the controller's own frames are found from there.
+        """
+        if self._is_wanted(cause, key):
+            error = sys.exc_info()[1] if cause == "error" else None
+            raised = frames_of_error(error.__traceback__) if error is not None else []
+            known = {id(each.frame) for each in raised}
+            callers = [each for each in own_frames(frame) if id(each.frame) not in known]
+            self._record(cause, name, [*raised, *callers])
+
+    def record_error(self, error: BaseException, name: str) -> None:
+        """Record the variables where an exception was raised that ends the controller."""
+        if self._is_wanted("error", "uncaught"):
+            self._record("error", name, frames_of_error(error.__traceback__))
+
+    def _is_wanted(self, cause: str, key: object) -> bool:
+        if self._clock.run is not self._run:
+            self._run = self._clock.run
+            self._counts.clear()
+        self._counts[cause, key] += 1
+        return self._counts[cause, key] <= MOST_INSPECTIONS and self._read_secrets() is not None
+
+    def _record(self, cause: str, name: str, frames: list[OwnFrame]) -> None:
+        try:
+            shown = self._shown_frames(frames)
+        except RuntimeError:  # another thread changes a container: it would be incomplete
+            return
+        if shown:
+            data: dict[str, object] = {"cause": cause, "frames": shown}
+            self._journal.event(INSPECTION_EVENT, data, cut(name, _LONGEST_CAUSE))
+
+    # -- answering -----------------------------------------------------------------------------
+
+    def show(self, path: object, frame: FrameType | None) -> dict[str, object]:
+        """Return the frames of the loop, or the value at a path.
+
+        Raises:
+            InvalidInputError: The path is invalid, or inspection is switched off.
+            CommandRefusedError: The path ends before its end.
+        """
+        secrets = self.secrets()
+        frames = own_frames(frame)
+        try:
+            if path is None:
+                return {"frames": self._shown_frames(frames, _ANSWER_CHARACTERS)}
+            parsed = parse_path(path, secrets)
+            value = follow(parsed, find_root(parsed, frames))
+            renderer = Renderer(secrets, _ANSWER_CHARACTERS)
+            where = self._place(frames[0]) if frames else {}
+            return {
+                "path": parsed.text,
+                "value": renderer.render(value, _DEPTH_OF_PATH, parsed.text),
+                **where,
+            }
+        except PathEndsError as error:
+            raise CommandRefusedError(f"{path}: {error}") from error
+        except RuntimeError as error:
+            raise CommandRefusedError(f"another thread changed it meanwhile: {error}") from error
+
+    def secrets(self) -> SecretNames:
+        """Return the names whose values are left out.
+
+        Raises:
+            InvalidInputError: Inspection is switched off, and by what.
+        """
+        secrets = self._read_secrets()
+        if secrets is None:
+            raise InvalidInputError(self.off or "inspection is switched off")
+        return secrets
+
+    def _read_secrets(self) -> SecretNames | None:
+        """Read the names of secrets once; None where inspection is switched off."""
+        if self._secrets is None and self.off is None:
+            try:
+                self._secrets = read_secret_names(self._data_dir)
+            except (InvalidInputError, OSError, ValueError) as error:
+                self.off = str(error)
+                if not isinstance(error, InvalidInputError):
+                    self._errors.failed("inspection", error)
+        return self._secrets
+
+    # -- frames --------------------------------------------------------------------------------
+
+    def _shown_frames(
+        self, frames: list[OwnFrame], characters: int | None = None
+    ) -> list[dict[str, object]]:
+        secrets = self.secrets()
+        renderer = Renderer(secrets, characters) if characters else Renderer(secrets)
+        return [
+            {**self._place(each), "variables": self._variables(each, renderer)} for each in frames
+        ]
+
+    def _place(self, own: OwnFrame) -> dict[str, object]:
+        code = own.frame.f_code
+        place: dict[str, object] = {
+            "at": f"{Path(code.co_filename).name}:{own.line}",
+            "function": code.co_name,
+        }
+        source = self._source.around(own)
+        return {**place, "source": source} if source else place
+
+    def _variables(self, own: OwnFrame, renderer: Renderer) -> dict[str, Any]:
+        names = own.variables
+        is_module = own.frame.f_code.co_name == "<module>"
+        shown: dict[str, Any] = {}
+        for name, value in list(names.items()):
+            if is_module and (name.startswith("__") or _is_definition(value)):
+                continue
+            if len(shown) == _MOST_VARIABLES:
+                shown["..."] = f"{len(names)} in all"
+                break
+            shown[name] = renderer.named(name, value, _DEPTH)
+        return shown
+
+
+def _is_definition(value: object) -> bool:
+    """Return whether a name of a module is an import, a class or a function."""
+    kind = id(type(value))
+    return kind in _DEFINITIONS or has_base(type(value), type)
+
+
+_DEFINITIONS: Final = frozenset(map(id, (ModuleType, type(_is_definition), type(len))))

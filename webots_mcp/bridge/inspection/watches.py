@@ -1,0 +1,151 @@
+"""Watched variables: the value at an attribute path, recorded as a signal with each state.
+
+A path is followed at each call of `publish`, or at each step of an attached robot. Its signal is
+`watched.` and the path. A path that ends on the way is null, and is named once in the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import FrameType
+from typing import Any, Final, cast
+
+from webots_mcp.bridge.error_report import describe
+from webots_mcp.bridge.inspection.attribute_paths import (
+    AttributePath,
+    PathEndsError,
+    find_root,
+    follow,
+)
+from webots_mcp.bridge.inspection.frames import OwnFrame, own_frames
+from webots_mcp.bridge.inspection.values import signal_value
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.contract import WATCHED
+from webots_mcp.errors import CommandRefusedError
+
+MOST_WATCHED: Final = 20
+MOST_EVERY: Final = 1_000_000
+_WATCHING: Final = "watch {}: {}; null is recorded while that is so"
+
+
+class WatchedPath:
+    """One watched path.
+
+    Attributes:
+        every: Its value is recorded in one of so many states.
+        code: The function whose variable the path begins with, where it was found last.
+        failing: A state had no value for it, and the log says so.
+    """
+
+    def __init__(self, path: AttributePath, every: int) -> None:
+        self.path = path
+        self.every = every
+        self.code: object = None
+        self.failing = False
+
+
+class Watches:
+    """The watched paths of a controller, until it ends."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._paths: dict[str, WatchedPath] = {}
+        self._calls = 0
+
+    def add(self, path: AttributePath, every: int) -> None:
+        """Watch a path from now on; a path that is watched already gets the new interval.
+
+        Raises:
+            CommandRefusedError: Too many are watched.
+        """
+        if path.text not in self._paths and len(self._paths) >= MOST_WATCHED:
+            raise CommandRefusedError(f"{MOST_WATCHED} paths are watched already: stop one first")
+        self._paths[path.text] = WatchedPath(path, every)
+
+    def remove(self, text: str) -> None:
+        """Watch a path no longer.
+
+        Raises:
+            CommandRefusedError: It is not watched.
+        """
+        if self._paths.pop(text, None) is None:
+            known = ", ".join(self._paths) or "none"
+            raise CommandRefusedError(f"{text!r} is not watched; watched: {known}")
+
+    @property
+    def signals(self) -> list[str]:
+        """The names of their signals."""
+        return [f"{WATCHED}.{text}" for text in self._paths]
+
+    def added_to(self, state: Mapping[Any, Any], frame: FrameType | None) -> Mapping[Any, Any]:
+        """Return a state with the values of the watched paths; the state itself stays as it is.
+
+        Args:
+            state: A state that is published; one that is no dict is returned as it is.
+            frame: The call of the bridge, whose callers have the variables.
+        """
+        if not self._paths or state.__class__ is not dict:
+            return state
+        try:
+            values = self.read(frame)
+        except Exception as error:  # noqa: BLE001  (the row must not be lost)
+            self._paths.clear()
+            self._journal.log(
+                "warning", "bridge", f"nothing is watched any more: {describe(error)}"
+            )
+            return state
+        if not values:
+            return state
+        own = cast("dict[Any, Any]", state).get(WATCHED)
+        if own is not None and type(own) is not dict:
+            return state  # the controller publishes something else under this name
+        return {**state, WATCHED: {**(own or {}), **values}}
+
+    def read(self, frame: FrameType | None) -> dict[str, Any]:
+        """Return the value of each path that is due, from a frame and its callers."""
+        self._calls += 1
+        values: dict[str, Any] = {}
+        variables: dict[int, Mapping[str, Any]] = {}  # by the id of a function: each is read once
+        for text, watched in tuple(self._paths.items()):
+            if self._calls % watched.every == 0:
+                values[text] = self._value(watched, frame, variables)
+        return values
+
+    def _value(
+        self,
+        watched: WatchedPath,
+        frame: FrameType | None,
+        variables: dict[int, Mapping[str, Any]],
+    ) -> Any:
+        path = watched.path
+        try:
+            names = variables.get(id(watched.code))
+            if names is None and (names := _variables_of(watched.code, frame)) is not None:
+                variables[id(watched.code)] = names
+            if names is None or path.root not in names:
+                root, watched.code = _search_root(path, frame)
+            else:
+                root = names[path.root]
+            value = signal_value(follow(path, root))
+        except (PathEndsError, RuntimeError) as error:
+            if not watched.failing:
+                watched.failing = True
+                self._journal.log("warning", "bridge", _WATCHING.format(path.text, error))
+            return None
+        watched.failing = False
+        return value
+
+
+def _variables_of(code: object, frame: FrameType | None) -> Mapping[str, Any] | None:
+    """Return the variables of the function that had the root last; None if it is not running."""
+    while frame is not None and frame.f_code is not code:
+        frame = frame.f_back
+    return None if frame is None else OwnFrame(frame, 0).variables
+
+
+def _search_root(path: AttributePath, frame: FrameType | None) -> tuple[Any, object]:
+    """Return the variable that a path begins with, and the function that has it."""
+    frames = own_frames(frame)
+    found = find_root(path, frames)
+    own = (each.frame.f_code for each in frames if path.root in each.variables)
+    return found, next(own, None)

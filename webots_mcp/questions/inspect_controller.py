@@ -1,0 +1,199 @@
+"""The controller's own variables: at a recorded event, or now; and watching one of them.
+
+Nothing can be set: parameters are for that.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, cast
+
+from anyio import to_thread
+from pydantic import Field
+
+from webots_mcp.answers.answer_models import CommandAnswer, InspectionAnswer
+from webots_mcp.answers.budget import RESULT_BUDGET_TOKENS, fitting, header_of, seconds, table
+from webots_mcp.answers.shortening import cut_text, shorten
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.questions.arguments import Id, RobotName, RunId, TimeoutS
+from webots_mcp.questions.declaring import READS, SETS, Caller, question
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.store.inspections import Inspection, inspection_at, inspections_of
+from webots_mcp.store.recording import RecordingAccess, RobotView
+
+INSPECTION_COLUMNS: Final = ("event_id", "at_s", "cause", "name", "line")
+_WAIT_S: Final = 10.0
+_LIST_BUDGET_TOKENS: Final = 500
+_LONGEST_NAME: Final = 120
+_NOTHING: Final = (
+    "no inspection is recorded in this run: the variables are recorded at the hits of a breakpoint "
+    "(webots_breakpoint), violations of an expectation, logged errors and hangs"
+)
+_PATH: Final = Field(
+    max_length=200,
+    description="Variable of the controller, such as self.pid.integral or path[3].",
+)
+
+
+@question(
+    "Inspect the controller",
+    READS,
+    command="inspect",
+    positional=("path",),
+    options={"event_id": "--event"},
+    example="self.pid.integral",
+    tier="all",
+)
+async def webots_inspect_controller(
+    recording: RecordingAccess,
+    caller: Caller,
+    path: Annotated[str | None, _PATH] = None,
+    event_id: Annotated[
+        Id | None,
+        Field(description="Event of which to show them, from webots_find_events. Default: now."),
+    ] = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
+    timeout_wall_s: TimeoutS = _WAIT_S,
+) -> InspectionAnswer:
+    """Show the controller's own variables: which line it executed and what its variables held.
+
+    With `event_id` or `run_id` as recorded at breakpoint hits, violations, errors and hangs; else
+    as they are now, in the running or paused loop. It runs no code of the controller and changes
+    nothing. To record a variable as a signal use webots_watch.
+    """
+    if path is not None and (event_id is not None or run_id is not None):
+        raise InvalidInputError(
+            "path asks the running controller. For what was recorded leave path out: give "
+            "event_id or run_id alone"
+        )
+    if event_id is not None:
+        return await to_thread.run_sync(_recorded, recording, robot, event_id)
+    live = run_id is None and not recording.read_only
+    if live and await to_thread.run_sync(_is_live, recording, robot):
+        return await _now(recording, caller, path, robot, timeout_wall_s)
+    if path is not None:
+        raise CommandRefusedError(
+            "no controller runs that could be asked for a path. Leave path out for the variables "
+            "that were recorded at breakpoint hits, errors and hangs"
+        )
+    return await to_thread.run_sync(_newest, recording, robot, run_id)
+
+
+@question(
+    "Watch a variable", SETS, command="watch", positional=("path",),
+    example="self.pid.integral", tier="all",
+)  # fmt: skip
+async def webots_watch(
+    recording: RecordingAccess,
+    path: Annotated[str, _PATH],
+    caller: Caller,
+    every: Annotated[
+        int, Field(ge=1, le=1_000_000, description="Record it in every Nth state.")
+    ] = 1,
+    stop: Annotated[bool, Field(description="Watch it no longer.")] = False,
+    robot: RobotName = None,
+    timeout_wall_s: TimeoutS = _WAIT_S,
+) -> CommandAnswer:
+    """Record a variable of the running controller as a signal from now on: watched.PATH.
+
+    Plots, events, breakpoints and comparisons take it like any signal. It ends with the
+    controller. To see variables once use webots_inspect_controller.
+    """
+    params = {"path": path, "every": every} | ({"stop": True} if stop else {})
+    return await Dispatcher(recording, caller.report).ask(robot, "watch", timeout_wall_s, params)
+
+
+# -- as recorded -----------------------------------------------------------------------------------
+
+
+def _recorded(recording: RecordingAccess, robot: str | None, event_id: int) -> InspectionAnswer:
+    with recording.view(robot) as view:
+        found = inspection_at(view.connection, event_id)
+        if found is None:
+            listed = _listed(view, _run_of(view, None))
+            ids = [row[0] for row in listed]
+            there = f"event_id may be {', '.join(map(str, ids[:5]))}" if ids else _NOTHING
+            raise InvalidInputError(f"event {event_id} has no variables of the controller: {there}")
+        return _answer(view, found, [])
+
+
+def _newest(recording: RecordingAccess, robot: str | None, run_id: int | None) -> InspectionAnswer:
+    with recording.view(robot, run_id) as view:
+        run = _run_of(view, run_id)
+        found = inspections_of(view.connection, run, 1) if run is not None else []
+        if not found:
+            return InspectionAnswer(**view.header(), hint=_NOTHING)
+        return _answer(view, found[0], _listed(view, run))
+
+
+def _run_of(view: RobotView, run_id: int | None) -> int | None:
+    return run_id if run_id is not None else view.run.id if view.run else None
+
+
+def _listed(view: RobotView, run_id: int | None) -> list[list[Any]]:
+    if run_id is None:
+        return []
+    return [
+        [
+            each.event_id,
+            seconds(each.sim_time_s),
+            each.cause,
+            cut_text(each.name, _LONGEST_NAME),
+            each.place,
+        ]
+        for each in inspections_of(view.connection, run_id)
+    ]
+
+
+def _answer(view: RobotView, found: Inspection, others: list[list[Any]]) -> InspectionAnswer:
+    header: dict[str, Any] = {**view.header(), "run_id": found.run_id}
+    several = len(others) > 1
+    return InspectionAnswer(
+        **header,
+        event_id=found.event_id,
+        at_s=seconds(found.sim_time_s),
+        cause=f"{found.cause}: {cut_text(found.name, _LONGEST_NAME)}",
+        frames=_fitting(found.frames),
+        inspections=(
+            table(INSPECTION_COLUMNS, fitting(others, _LIST_BUDGET_TOKENS)) if several else None
+        ),
+    )
+
+
+def _fitting(frames: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
+    """Return the frames, shortened where they are long; the innermost ones keep their room."""
+    shown = shorten(frames, RESULT_BUDGET_TOKENS).value
+    return cast("list[dict[str, Any]]", shown) if isinstance(shown, list) else frames[:1]
+
+
+# -- now -------------------------------------------------------------------------------------------
+
+
+def _is_live(recording: RecordingAccess, robot: str | None) -> bool:
+    with recording.view(robot) as view:
+        return view.robot.live and view.session is not None and view.session.has_bridge
+
+
+async def _now(
+    recording: RecordingAccess,
+    caller: Caller,
+    path: str | None,
+    robot: str | None,
+    timeout_wall_s: float,
+) -> InspectionAnswer:
+    params = {} if path is None else {"path": path}
+    dispatcher = Dispatcher(recording, caller.report)
+    reply = await dispatcher.ask(robot, "inspect", timeout_wall_s, params)
+    result = cast("dict[str, Any] | None", reply.result)
+    if reply.outcome != "done" or result is None:
+        raise CommandRefusedError(reply.error or reply.hint or f"the command is {reply.outcome}")
+    header = await to_thread.run_sync(header_of, recording, reply.robot)
+    if path is None:
+        return InspectionAnswer(**header, at_s=header.get("sim_time_s"), frames=result["frames"])
+    return InspectionAnswer(
+        **header,
+        at_s=header.get("sim_time_s"),
+        path=result["path"],
+        value=result["value"],
+        line=result.get("at"),
+    )

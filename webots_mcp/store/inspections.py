@@ -1,0 +1,96 @@
+"""Inspections that were recorded: the controller's own variables at a hit, an error or a hang."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from typing import Any, Final, NamedTuple, cast
+
+from webots_mcp.contract import INSPECTION_EVENT
+
+_COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, name, data"
+_AT: Final = (  # of an event: it is written right after it
+    f"SELECT {_COLUMNS} FROM event WHERE kind = '{INSPECTION_EVENT}' AND id >= :id AND run_id = "
+    "(SELECT run_id FROM event WHERE id = :id) AND sim_time_s = "
+    "(SELECT sim_time_s FROM event WHERE id = :id) ORDER BY id LIMIT 1"
+)
+_OF_RUN: Final = (
+    f"SELECT {_COLUMNS} FROM event WHERE run_id = ? AND kind = '{INSPECTION_EVENT}' "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+MOST_LISTED: Final = 50
+
+
+class Inspection(NamedTuple):
+    """What the controller's code was doing at an event.
+
+    Attributes:
+        event_id: Its row in the table `event`.
+        cause: `breakpoint`, `violation`, `error` or `hang`.
+        name: What happened: a condition, an expectation, a log line or a place.
+        frames: The controller's own frames, the innermost first: `at`, `function`, `source` and
+            `variables` of each.
+    """
+
+    event_id: int
+    run_id: int
+    sim_time_s: float
+    wall_time_s: float
+    cause: str
+    name: str
+    frames: list[dict[str, Any]]
+
+    @property
+    def place(self) -> str | None:
+        """The innermost line, such as `nav.py:123, turn()`."""
+        if not self.frames:
+            return None
+        return f"{self.frames[0]['at']}, {self.frames[0]['function']}()"
+
+
+def inspection_at(connection: sqlite3.Connection, event_id: int) -> Inspection | None:
+    """Return an inspection by its id, or the one that belongs to another event."""
+    row = connection.execute(_AT, {"id": event_id}).fetchone()
+    return None if row is None else _inspection(row)
+
+
+def inspections_of(
+    connection: sqlite3.Connection, run_id: int, limit: int = MOST_LISTED
+) -> list[Inspection]:
+    """Return the inspections of a run, newest first."""
+    return [_inspection(row) for row in connection.execute(_OF_RUN, (run_id, limit))]
+
+
+def place_of(data: dict[str, Any]) -> str | None:
+    """Return the innermost line of the data of an inspection's event."""
+    return Inspection(0, 0, 0.0, 0.0, "", "", _frames_of(data)).place
+
+
+def _inspection(row: tuple[Any, ...]) -> Inspection:
+    event_id, run_id, sim_time_s, wall_time_s, name, text = row
+    try:
+        data = json.loads(text or "{}")
+    except (ValueError, RecursionError):  # another program's
+        data = {}
+    said = cast("dict[str, Any]", data if isinstance(data, dict) else {})
+    cause = str(said.get("cause", "unknown"))
+    return Inspection(
+        event_id, run_id, sim_time_s, wall_time_s, cause, str(name or ""), _frames_of(said)
+    )
+
+
+def _frames_of(data: dict[str, Any]) -> list[dict[str, Any]]:
+    frames = data.get("frames")
+    each = cast("list[Any]", frames) if isinstance(frames, list) else []
+    return [_frame(cast("dict[str, Any]", frame)) for frame in each if isinstance(frame, dict)]
+
+
+def _frame(found: dict[str, Any]) -> dict[str, Any]:
+    """Return a frame with all its members, whatever program has written it."""
+    source, variables = found.get("source"), found.get("variables")
+    return {
+        "at": str(found.get("at")),
+        "function": str(found.get("function")),
+        "source": list(map(str, cast("list[Any]", source))) if isinstance(source, list) else [],
+        "variables": variables if isinstance(variables, dict) else {},
+    }

@@ -18,9 +18,10 @@ from webots_mcp.answers.answer_models import Answer, AnswerPart
 from webots_mcp.answers.columns import COLUMNS
 from webots_mcp.cli import described
 from webots_mcp.cli.commands import COMMANDS, DATA, NOW, PAST, RUNS, SERVER, START, STEER
-from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.judging.checks import CHECKS
-from webots_mcp.judging.detection.events import KINDS
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
+from webots_mcp.judging.checks.check_run import CHECKS
+from webots_mcp.judging.detection.event_kinds import KINDS
 from webots_mcp.questions import all_questions
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.signals.meaning import QUANTITIES, ROLES, SIDES, short_forms, understood_words

@@ -8,8 +8,9 @@ from contextlib import closing, contextmanager
 from functools import cache
 
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
 from webots_mcp.database.location import MemoryDatabase
+from webots_mcp.database.schema import create_schema
 
 
 @contextmanager

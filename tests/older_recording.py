@@ -4,8 +4,9 @@ from contextlib import closing
 from pathlib import Path
 
 from webots_mcp.contract import PREVIOUS_SCHEMA_VERSION, new_uuid
-from webots_mcp.database.connection import connect, statements_of
-from webots_mcp.database.upgrade import PREVIOUS_SCHEMA_FILE
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import statements_of
+from webots_mcp.database.schema_migration import PREVIOUS_SCHEMA_FILE
 
 OLDER_SCHEMA = PREVIOUS_SCHEMA_VERSION
 

@@ -12,7 +12,7 @@ PACKAGE = Path(webots_mcp.__file__).parent
 # What a user imports, or Webots' own API, and the table of the same thing.
 SHARED = {
     "Parameter": {"bridge/parameters.py", "store/models.py"},
-    "Event": {"judging/detection/kinds.py", "store/models.py"},
+    "Event": {"judging/detection/event.py", "store/models.py"},
     "Robot": {"standin/lib/controller/robot.py", "store/models.py"},
 }
 ONCE = ("Place", "Run", "Kind", "Progress", "Report", "Frame")

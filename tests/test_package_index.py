@@ -57,6 +57,8 @@ def test_a_release_has_addresses_in_place_of_the_placeholders() -> None:
     if not (CHECKOUT / "CHANGELOG.md").read_text("utf-8").count("\n## Unreleased\n"):
         assert placeholders == {False}, "fill in [project.urls] of pyproject.toml"
         assert source_of(dict(urls)) is not None
+        readme = (CHECKOUT / "README.md").read_text("utf-8")
+        assert PLACEHOLDER not in readme, "fill in the address to clone"
 
 
 def test_the_readme_is_whole_but_for_its_links() -> None:

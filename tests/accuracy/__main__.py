@@ -21,7 +21,7 @@ from tests.benchmarks import recorders
 from tests.benchmarks.core import Bench
 
 PARTS: Final = (
-    Part("cases", "Public situations", "Does it hold for robots of others?", cases.cases),
+    Part("cases", "Public situations", "Does it work for other people's robots?", cases.cases),
     Part("events", "Events", "Are events found, and are they true?", events.events),
     Part("checks", "Checks", "Do checks find faults?", events.checks),
     Part("comparisons", "Comparisons of runs", "Are differences real?", comparing.comparisons),
@@ -54,14 +54,14 @@ what recording costs.
 `tests/cases` rebuilds situations from public reports as recordings, with the answer that an expert
 would give. The rules were made with the first two groups in view. The other groups were labelled
 before the first question about them was asked; then some rules were improved for whole classes of
-misses. In the third group, the right answer earns 2 points, a helpful one 1, none 0 and a false one
--1: {first} of {most} points at first, {now} now."""
+misses. In the third group, a right answer earns 2 points, a helpful one 1, none 0 and a false one
+-1. The first answers earned {first} of {most} points, and those of today {now}."""
 _SIMULATED: Final = """\
 ## All figures
 
-The other recordings are simulated by us, because only then the truth is known exactly. Their
-robots, noise and faults are our idea of real ones. The rules were made with other draws of the same
-kinds. Each figure links to its conditions and tables."""
+The other recordings are simulated, because only then is the truth known exactly. Their robots,
+noise and faults imitate real ones. The rules were made with other recordings of the same kinds.
+Each figure links to its conditions and tables."""
 _METHOD: Final = """\
 ## How it is measured
 
@@ -156,7 +156,7 @@ def situations(details: str) -> list[str]:
     texts += [f"Answered wrongly in the first two groups:\n\n{wrong[1]}"] if wrong else []
     missed = [f"- {name}: {now}" for name, (_, now) in points.items() if now < _RIGHT]
     if missed:
-        head = "Not answered rightly in the third group, with the points:"
+        head = "Not answered completely in the third group, with the points:"
         texts.append("\n".join([f"{head}\n", *missed]))
     return texts
 
@@ -183,12 +183,16 @@ def _in_words(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def figures(known: dict[str, str]) -> str:
-    """What the README shows: a question for each of four parts, and the figure that answers it."""
+    """What the README shows: four questions, each with the sentence that answers it."""
     return "\n".join(
-        f"- **{question}** {headline(known[name])}"
+        f"- **{question}** {_first_sentence(headline(known[name]))}"
         for name, question in SHOWN.items()
         if name in known
     )
+
+
+def _first_sentence(text: str) -> str:
+    return text.partition(". ")[0].removesuffix(".") + "."
 
 
 def _show(text: str) -> None:

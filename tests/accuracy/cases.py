@@ -34,14 +34,14 @@ a pass of the responsible check. The first answers earned {first} of {most} poin
 rules were improved for whole classes of misses. The labels are in
 `tests/cases/public_labels.toml`."""
 _UNFAMILIAR: Final = """\
-{robots} robots of kinds that are in no other list, from a gantry to an underwater glider, were
-simulated: healthy with a row each {rates}, and once with a fault each. The right answers were
-committed before the first question. An alarm about a healthy robot is false. A fault is answered
-*right* if the responsible check warns or fails, names it and gives its start. The answer is
-*helpful* if one of the three is missing, *not judged* if it says that it cannot tell, and
-*denied* if that check passes."""
+{robots} kinds of robots that are in no other list, from a gantry to an underwater glider, were
+simulated. Each was recorded healthy, with a row every {rates}, and once with a fault. The right
+answers were committed before the first question. An alarm about a healthy robot is false. A
+fault is answered *right* if the responsible check warns or fails, names it and gives its start.
+The answer is *helpful* if one of the three is missing, *not judged* if it says that it cannot
+decide, and *denied* if that check passes."""
 _ALSO_DRAWN: Final = """\
-The healthy kinds were also simulated with a row each {rates} and other noise. Of {runs} runs,
+The healthy kinds were also simulated with a row every {rates} and other noise. Of {runs} runs,
 {alarmed} raise an alarm{names}."""
 _OSCILLATIONS: Final = 30
 _GROWTH: Final = """\
@@ -84,7 +84,7 @@ def cases(bench: Bench) -> Iterator[str]:
     yield _growth()
     bench.say("cases: rates and noises")
     yield _RATES
-    yield table(("fault", "a row each", *(f"{100 * each:g} %" for each in NOISES)), _rates())
+    yield table(("fault", "a row every", *(f"{100 * each:g} %" for each in NOISES)), _rates())
 
 
 def _unfamiliar() -> str:

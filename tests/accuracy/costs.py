@@ -53,7 +53,7 @@ published is compared with the database. States that a lock kept out of the data
 file next to it, and the next process ingests them. The machine was not switched off: without
 `fsync` in the loop, a power cut may cost the newest states."""
 _INTERRUPTED: Final = """\
-Ctrl-C is sent at instructions of the bridge's writing code, of which these were drawn:"""
+Ctrl-C is sent at randomly chosen instructions of the code with which the bridge writes:"""
 
 
 def _number(text: str) -> int:
@@ -81,8 +81,8 @@ def answers(bench: Bench) -> Iterator[str]:
     core, whole, _ = (counts_of(anyio.run(server[tier].list_tools)) for tier in TIERS)
     memory.close()
     yield (
-        f"Half of {len(every)} answers have at most {median(every):,.0f} tokens, the longest "
-        f"{max(every):,}; the list of the {whole.tools} tools has {whole.tokens:,}."
+        f"Half of {len(every)} answers have at most {median(every):,.0f} tokens, the list of the "
+        f"{whole.tools} tools has {whole.tokens:,}. The longest answer has {max(every):,}."
     )
     yield _READ.format(
         budget=f"{ANSWER_TOKENS:,}",

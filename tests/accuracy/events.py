@@ -20,9 +20,9 @@ from tests.judging.detection.labelled import SETTING, Measure, Setting
 from tests.judging.detection.measuring import Report, measure
 from tests.judging.detection.sensing import READING_NOISES_M
 from tests.judging.detection.swinging import NOISE_SHARE_LEVELS
-from webots_mcp.judging.checks import CHECKS
+from webots_mcp.judging.checks.check_run import CHECKS
+from webots_mcp.judging.detection.event_kinds import KINDS
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import KINDS
 
 INTERVALS_S: Final = (0.016, 0.064, 0.16, 0.5)
 LEVELS: Final = ("no noise", "little", "much")
@@ -57,9 +57,9 @@ def events(bench: Bench) -> Iterator[str]:
     quiet = _sum(each for found in cells.values() for _, each in found if not each.incidents)
     yield (
         f"{percent(clear.recall)} % of {clear.incidents:,} events in simulated recordings are "
-        "found, "
-        f"{percent(clear.precision)} % of the reported ones are true; with much noise "
-        f"{percent(noisy.recall)} % of {noisy.incidents:,} and {percent(noisy.precision)} %."
+        f"found, and {percent(clear.precision)} % of the reported ones are true. With much noise, "
+        f"{percent(noisy.recall)} % of {noisy.incidents:,} are found, and "
+        f"{percent(noisy.precision)} % are true."
     )
     yield _EVENTS.format(
         cases=bench.count(4, least=0),
@@ -71,18 +71,18 @@ def events(bench: Bench) -> Iterator[str]:
         hours=f"{quiet.minutes / 60:.0f}",
     )
     for heading, cell in (("found / true", _truth), ("begin, end off", _errors)):
-        head = ("kind of event", "a row each", *(f"{each}: {heading}" for each in LEVELS))
+        head = ("kind of event", "a row every", *(f"{each}: {heading}" for each in LEVELS))
         yield table(head, _rows(cells, cell))
     poor = list(_poor(cells)) or ["- none"]
-    yield f"Below {100 * _POOR:.0f} %, and in which recordings most of it:"
+    yield f"Results below {100 * _POOR:.0f} %, with the recordings that cause most of them:"
     yield "\n".join(poor)
     score = EventOptions().jump_min_score
     yield _WHY.format(score=score, jump_m=(1 + score / 0.6745) * _USUAL_STEP * READING_NOISES_M[2])
     measured = {kind for kind, _ in MEASURES.values()}
     measured |= set(CHECKED)
     others = ", ".join(f"`{each.name}`" for each in KINDS if each.name not in measured)
-    yield f"Not measured, since they are what rows and tables say, without an estimate: {others}."
-    yield f"Measured by their checks: {', '.join(f'`{kind}`' for kind in CHECKED)}."
+    yield f"Not measured, because they are facts of the recording: {others}."
+    yield f"Measured by [their checks](checks.md): {', '.join(f'`{kind}`' for kind in CHECKED)}."
 
 
 CHECKED: Final = (
@@ -92,21 +92,21 @@ CHECKED: Final = (
     "degradation",
 )  # kinds that labelled runs of checks show
 _EVENTS: Final = """\
-For each row interval and noise level, {cases} recordings of each of {recordings} kinds are
-simulated: drives, stops, docking, slow drift, robots that are held, failing sensors,
-oscillations, healthy robots and so on. The noise (standard deviation) is {places} for a position
+Recordings of {recordings} kinds are simulated, {cases} of each kind for each row interval and
+noise level: drives, stops, docking, slow drift, robots that are held, failing sensors,
+oscillations, healthy robots and others. The noise (standard deviation) is {places} for a position
 coordinate, {readings} for a distance sensor, and {swings} of the amplitude for an oscillation.
-*Found* is the share of events that are reported (recall), and *true* the share of reports that
-are right (precision), both in per cent, followed by the number of events. *Off* is the median
+*Found* is the share of events that are reported (recall). *True* is the share of reports that are
+right (precision). Both are in per cent, followed by the number of events. *Off* is the median
 error of start and end, with the 90th percentile in parentheses. In {hours} hours of recordings
 without an event of a kind, {false} false events of that kind are reported per hour."""
 
 _WHY: Final = """\
-The two weak cases have these reasons. A dropout must be {score:g} times as large as the signal's
-usual steps (a modified z-score). With noise of 50 mm that is {jump_m:.1f} m, so a distance
-sensor that reads less drops out unnoticed. An answer without any jump names that size. With few
-rows and much noise, a short stop cannot be told from a slow drive; the answer then says that it
-may have missed some."""
+The weak cases have two reasons. A dropout must be {score:g} times as large as the signal's usual
+steps (a modified z-score). With noise of 50 mm that is {jump_m:.1f} m, so a dropout of a distance
+sensor that reads less is not noticed. An answer without any jump names that size. With few rows
+and much noise, a short stop looks like a slow drive; the answer then says that it may have missed
+some."""
 
 
 def _recordings() -> list[str]:
@@ -120,7 +120,7 @@ def _measured(bench: Bench) -> dict[Cell, list[tuple[str, Tally]]]:
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
         reports = pool.map(_report, settings, repeat(cases))
         for (interval_s, noise), report in zip(settings, reports, strict=True):
-            bench.say(f"events: a row each {duration(interval_s)}, {LEVELS[noise]}")
+            bench.say(f"events: a row every {duration(interval_s)}, {LEVELS[noise]}")
             for (recording, judged, _), tally in report.tallies.items():
                 found.setdefault((judged, interval_s, noise), []).append((recording, tally))
     return found
@@ -173,7 +173,7 @@ def _errors(tally: Tally, interval_s: float) -> str:
 def _poor(cells: dict[Cell, list[tuple[str, Tally]]]) -> Iterator[str]:
     for (judged, interval_s, noise), tallies in cells.items():
         whole = _sum(tally for _, tally in tallies)
-        where = f"- {MEASURES[judged][1]}, a row each {duration(interval_s)}, {LEVELS[noise]}"
+        where = f"- {MEASURES[judged][1]}, a row every {duration(interval_s)}, {LEVELS[noise]}"
         if (whole.recall if whole.recall is not None else 1.0) < _POOR:
             missed = ((each, tally.incidents - tally.found) for each, tally in tallies)
             found = share(whole.found, whole.incidents)

@@ -12,8 +12,8 @@ from tests.accuracy.__main__ import PARTS, SHOWN, figures, page_of, situations, 
 from tests.accuracy.page import DETAILS, FIGURES, PAGE, README, Part, share
 from tests.benchmarks.core import Bench
 from tests.judging.checks.labelled import FAULTS, WRITTEN
-from webots_mcp.judging.checks import CHECKS
-from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.judging.checks.check_run import CHECKS
+from webots_mcp.judging.detection.event_kinds import kind_names
 
 PAGE_TEXT = PAGE.read_text("utf-8")
 DETAILS_OF = stored()

@@ -27,7 +27,7 @@ from webots_mcp.answers.answer_models import (
 )
 from webots_mcp.answers.event_tables import verdicts_of
 from webots_mcp.answers.summaries import MOST_WORDS, summary_of, verdict_of_kinds
-from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.judging.detection.event_kinds import kind_names
 from webots_mcp.judging.verdicts import AS_STUCK, JudgedInterval, SearchCoverage
 from webots_mcp.questions import all_questions
 

@@ -27,8 +27,9 @@ from tests.benchmarks.core import (
 from tests.benchmarks.processes import Program, driving, our_server, running_server
 from tests.benchmarks.ways import STEP_S
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
 from webots_mcp.database.queue import CommandQueue, fetch_command
+from webots_mcp.database.schema import create_schema
 
 _LOOK_INTERVAL_S = 0.001
 _CLAIMERS = 8

@@ -19,7 +19,7 @@ from tests.benchmarks.core import Bench, Line, Target, benchmark, compared, proc
 from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.database.connection import connect
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events, timeline
 from webots_mcp.judging.divergence import compare_rows

@@ -50,7 +50,7 @@ class _Toll:
         return Line(
             f"rows lost, {self.robots} robots{server}, {loop}",
             f"{self.kills} kills",
-            f"{self.published:,} published, {self.waited:,} taken in after the kill",
+            f"{self.published:,} published, {self.waited:,} recovered after the kill",
             self.lost,
             "rows",
             Target(0),

@@ -11,7 +11,8 @@ from typing import Final
 
 from tests.benchmarks.core import Bench, Line, benchmark, compared
 from tests.recordings.rover import Recorder
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.store.chunk_making import make_chunks
 
 _RUNS: Final = (10, 100, 1000, 4000)

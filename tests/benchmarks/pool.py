@@ -32,7 +32,7 @@ from tests.plugins.pool.lab import short_runs
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.database.connection import connect as connect_recording
-from webots_mcp.database.connection import create_schema
+from webots_mcp.database.schema import create_schema
 from webots_mcp.plugins.pool.fetching import fetch
 from webots_mcp.plugins.pool.pool_contents import (
     RunFilter,

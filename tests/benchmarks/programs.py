@@ -45,8 +45,9 @@ def claimer(database: str) -> None:
     """Claims the commands of robot 1 until none is left, and says which it got."""
     from pathlib import Path
 
-    from webots_mcp.database.connection import connect, never_wait
+    from webots_mcp.database.connection import connect
     from webots_mcp.database.queue import CLAIM, PEEK
+    from webots_mcp.database.transactions import never_wait
 
     connection = connect(Path(database), "loop")
     never_wait(connection)

@@ -17,7 +17,8 @@ import webots_mcp
 from tests.benchmarks.ways import Rover
 from webots_mcp import MCPBridge
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.database.waiting_file import adopt
 
 PACKAGE = str(Path(webots_mcp.__file__).parent)

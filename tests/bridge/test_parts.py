@@ -14,6 +14,7 @@ from webots_mcp import MemoryDatabase
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.claimed_commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
+from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.full_rate import FullRateRecorder
@@ -57,6 +58,7 @@ class Base:
         self.recorder = Recorder(self.database, identity, self.clock, self.errors)
         self.journal = Journal(self.recorder, self.clock)
         self.heartbeat = Heartbeat(self.recorder, self.clock)
+        self.variables = ControllerVariables(self.clock, self.journal, self.errors, folder)
 
     def rows(self, sql: str) -> list[tuple[Any, ...]]:
         connection = self.recorder.connection
@@ -77,7 +79,7 @@ class Base:
 
     def breakpoints(self, pause: Pause, full_rate: FullRateRecorder) -> Breakpoints:
         parts = (self.simulation, self.clock, self.recorder, self.journal)
-        return Breakpoints(*parts, pause, full_rate)
+        return Breakpoints(*parts, pause, full_rate, self.variables)
 
 
 @pytest.fixture
@@ -145,6 +147,7 @@ def test_a_publisher_records_what_its_throttle_admits(base: Base) -> None:
         full_rate,
         DeviceReader(base.simulation, base.journal, base.errors, lambda: None),
         Reloads(base.errors.failed),
+        base.variables,
         begin_run=lambda: None,
     )
     for n in range(4):
@@ -212,7 +215,7 @@ def test_the_actions_on_the_scene_need_no_session(base: Base) -> None:
 
 def test_a_watchdog_writes_its_file_next_to_the_database(base: Base) -> None:
     file = base.folder / "webots.db"
-    parts = (base.simulation, base.clock, base.recorder, base.journal)
+    parts = (base.simulation, base.clock, base.recorder, base.journal, base.variables)
     watchdog = Watchdog(*parts, file, limit_s=5.0)
     watchdog.begin()
     assert [each.name for each in base.folder.iterdir() if base.recorder.uuid in each.name]

@@ -20,10 +20,10 @@ from tests.cases.columns import Array
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_PER_SIM, WALL_START_S, start_run
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.judging.checks import CheckedRun, check_run
+from webots_mcp.judging.checks.check_run import CheckedRun, check_run
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Columns = Mapping[str, Any]

@@ -12,14 +12,9 @@ from pathlib import Path
 import pytest
 
 from tests.memory import memory_connection
-from webots_mcp.database.connection import (
-    AtomicStatements,
-    connect,
-    create_schema,
-    is_busy,
-    is_damage,
-    transaction,
-)
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
+from webots_mcp.database.transactions import AtomicStatements, is_busy, is_damage, transaction
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (?, 'somebody', 0)"
 COUNT = "SELECT count(*) FROM lease"

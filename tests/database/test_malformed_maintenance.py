@@ -15,7 +15,7 @@ from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.database.waiting_file import FORMAT, adopt
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 BLOB = b"\x00\xff\x01"
 IN_CHUNKS = (

@@ -22,9 +22,10 @@ from webots_mcp.bridge.lidar_summary import SECTORS
 from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import described, names
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
-from webots_mcp.database.connection import OLDEST_SQLITE, SCHEMA_FILE
-from webots_mcp.judging.checks import CHECKS
-from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.database.connection import OLDEST_SQLITE
+from webots_mcp.database.schema import SCHEMA_FILE
+from webots_mcp.judging.checks.check_run import CHECKS
+from webots_mcp.judging.detection.event_kinds import kind_names
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.arguments import MAX_WAIT_S
 from webots_mcp.server.mcp_server import create_server
@@ -79,11 +80,11 @@ def test_the_page_of_the_bridge_names_every_action_that_is_built_in_and_no_other
     ("name", "said"),
     [
         ("bridge.md", f"up to {MAX_WAITING_ROWS:,} rows or {MAX_WAITING_BYTES / 1e6:g} MB"),
-        ("bridge.md", f"({MOST_LINES_PER_S} a second of each; what is above is counted)"),
+        ("bridge.md", f"(up to {MOST_LINES_PER_S} lines a second of each;"),
         ("bridge.md", f"No call waits longer than {MAX_WAIT_S} s"),
-        ("bridge.md", f"the nearest distance of {WORDS[SECTORS]} sectors"),
-        ("bridge.md", f"how many and the nearest {WORDS[MOST_OBJECTS]}"),
-        ("bridge.md", f"keeps the last seconds, and {WORDS[KEEP_AFTER_S]} more"),
+        ("bridge.md", f"the nearest distance in each of {WORDS[SECTORS]} sectors"),
+        ("bridge.md", f"their number and the nearest {WORDS[MOST_OBJECTS]}"),
+        ("bridge.md", f"keeps the last seconds, and the next {WORDS[KEEP_AFTER_S]}"),
         ("limits.md", f"No tool waits longer than {MAX_WAIT_S} s"),
         ("limits.md", f"under {ANSWER_TOKENS:,} tokens"),
         ("limits.md", f"up to {LARGE_ANSWER_TOKENS:,}"),

@@ -17,7 +17,8 @@ from tests.cases.situations import PROBLEMS, record
 from tests.documentation.test_tutorial import form
 from tests.judging.checks import labelled
 from webots_mcp.contract import DATABASE_NAME, PROJECT_DATA_FOLDER
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 
 assert problems.__doc__  # it registers the situations
 

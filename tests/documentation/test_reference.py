@@ -17,7 +17,7 @@ from webots_mcp.answers.event_tables import EVENT_COLUMNS
 from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.answers.trend_tables import STATE_COLUMNS, TREND_COLUMNS
 from webots_mcp.cli import described, names
-from webots_mcp.database.connection import SCHEMA_FILE
+from webots_mcp.database.schema import SCHEMA_FILE
 from webots_mcp.judging.divergence import PartedSignal
 from webots_mcp.questions.compare_runs import (
     CHECK_COLUMNS,

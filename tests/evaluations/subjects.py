@@ -18,7 +18,8 @@ from tests.judging.checks.labelled import FAULTS, WRITTEN, healthy, record
 from tests.recordings.drawn import DRAWN
 from tests.server.story import copy_of
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, bundled
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.standin import Simulation
 from webots_mcp.testing import RobotRecording
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
-from webots_mcp.judging.detection.events import kind_names
+from webots_mcp.judging.detection.event_kinds import kind_names
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CONVERSATIONS = sorted(path.parent.name for path in EXAMPLES.glob("*/conversation.toml"))

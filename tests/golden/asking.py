@@ -94,6 +94,7 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "plot": ("webots_plot", {}),
     "check": ("webots_check_run", {}),
     "check of an expectation": ("webots_check_run", {"expect": ["X > -100"]}),
+    "variables of the controller": ("webots_inspect_controller", {}),
     "outcome of a command": ("webots_wait_for_command", {"command_id": 1, "timeout_wall_s": 1}),
     "diagnosis": ("webots_diagnose_setup", {}),
     "scene": ("webots_get_scene", {}),
@@ -117,6 +118,7 @@ ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "remove a breakpoint": ("webots_remove_breakpoint", {"breakpoint_id": 1}),
     "send a command": ("webots_send_command", {"action": "blink", "timeout_wall_s": 1}),
     "set parameters": ("webots_set_parameters", {"values": {"speed": 0.3}, "timeout_wall_s": 1}),
+    "watch a variable": ("webots_watch", {"path": "self.speed", "timeout_wall_s": 1}),
     "run on": ("webots_run", {"for_s": 1.0, "timeout_wall_s": 1}),
     "run trials": (
         "webots_run_trials",

@@ -13,13 +13,15 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+from unittest.mock import patch
 
 from tests.bridge.conftest import eager, send
 from tests.recordings.drawn import draw_story, sum_up, sum_up_file
 from tests.recordings.rover import Recorder
 from webots_mcp import MCPBridge
-from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.contract import INSPECT_VARIABLE, new_uuid
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
@@ -68,6 +70,12 @@ class GoldenRecording:
 
 def draw_drive(folder: Path) -> None:
     """A rover that drives a circle and runs commands, recorded by the bridge."""
+    with patch.dict("os.environ", {INSPECT_VARIABLE: "0"}):  # lines of this file are no answers
+        _drive_circle(folder)
+    sum_up_file(folder)
+
+
+def _drive_circle(folder: Path) -> None:
     robot = InProcessSupervisor("rover")
     bridge = MCPBridge(robot, throttle_interval=2, database=folder / "webots.db")
     camera = robot.getDevice("camera")
@@ -93,7 +101,6 @@ def draw_drive(folder: Path) -> None:
         if step == 1000:
             bridge.keep("the far side of the circle")
     bridge.close()
-    sum_up_file(folder)
 
 
 def _drive_state(time_s: float) -> dict[str, Any]:
@@ -164,6 +171,9 @@ def _record_loss(recorder: Recorder, robot_id: int, session_id: int) -> None:
     """What the controller says of the part that it lost, and a command that it could not do."""
     at = recorder.at(DROPPED_S)
     recorder.insert("log", **at, level="error", source="controller", message="the part fell")
+    frame = {"at": "arm.py:12", "function": "lift", "variables": {"grip": "loose", "part": None}}
+    data = json.dumps({"cause": "error", "frames": [frame]})
+    recorder.insert("event", **at, kind="inspection", name="the part fell", data=data)
     recorder.insert(
         "command", robot_id=robot_id, action="grasp", params="{}", status="failed",
         created_wall_time_s=at["wall_time_s"], expires_wall_time_s=at["wall_time_s"] + 10,

@@ -21,10 +21,10 @@ from tests.judging.detection.publishing import WAYS, Publishing, moments
 from tests.judging.detection.writing import write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.judging.checks import CHECKS, check_run
+from webots_mcp.judging.checks.check_run import CHECKS, check_run
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.store.reading.ranges import Scope, find_range
 

@@ -23,7 +23,7 @@ from webots_mcp.judging.divergence import (
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 ROWS = 500

@@ -9,7 +9,7 @@ from random import Random
 from typing import Any
 
 from tests.recordings.rover import start_run
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
 from webots_mcp.signals.meaning import meanings_by_name, targets_in

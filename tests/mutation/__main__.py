@@ -43,11 +43,16 @@ _LEFT_OUT: Final = (
 
 @dataclass(frozen=True)
 class Module:
-    """What is mutated together, and the tests that have to notice."""
+    """What is mutated together, and the tests that have to notice.
+
+    Attributes:
+        without: Tests of these files that are left out.
+    """
 
     name: str
     files: tuple[str, ...]
     tests: tuple[str, ...]
+    without: tuple[str, ...] = ()
 
 
 def read_modules() -> dict[str, Module]:
@@ -55,7 +60,7 @@ def read_modules() -> dict[str, Module]:
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     tables: dict[str, dict[str, list[str]]] = toml.loads(MODULES.read_text("utf-8"))
     return {
-        name: Module(name, tuple(table["files"]), tuple(table["tests"]))
+        name: Module(name, **{key: tuple(values) for key, values in table.items()})
         for name, table in tables.items()
     }
 
@@ -119,7 +124,10 @@ def _settings(module: Module, folder: Path) -> str:
         "source_paths": ["webots_mcp"],
         "only_mutate": list(module.files),
         "also_copy": beside,
-        "pytest_add_cli_args": ["-p", "no:cacheprovider", "-p", "no:xdist"],
+        "pytest_add_cli_args": [
+            *("-p", "no:cacheprovider", "-p", "no:xdist"),
+            *(f"--deselect={test}" for test in module.without),
+        ],
         "pytest_add_cli_args_test_selection": list(module.tests),
     }
     lines = [f"{name} = {json.dumps(value)}" for name, value in settings.items()]

@@ -17,12 +17,13 @@ from tests.recordings.rounds import record_rounds
 from tests.recordings.rover import Recorder, record_rover
 from webots_mcp import MCPBridge
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 CHECKOUT: Final = Path(__file__).parents[2]

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.recordings.rover import WALL_START_S, start_run
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.store.chunk_making import make_chunks
 
 INTERVAL_S: Final = 0.032

@@ -8,7 +8,8 @@ from typing import Final
 
 from tests.recordings.rover import Recorder, rover_state, start_run
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.store.chunk_making import make_chunks
 
 ROWS: Final = 5200  # 1040 s: five groups of rows and some

@@ -10,8 +10,9 @@ import time
 from typing import Any
 
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
+from webots_mcp.database.schema import create_schema
 
 
 def insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> int:

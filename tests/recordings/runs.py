@@ -9,7 +9,7 @@ from typing import Any
 
 from tests.recordings.rover import Recorder
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 ROW_S = 0.5  # simulated and wall time between two rows of these recordings
 

@@ -24,7 +24,7 @@ from PIL import Image
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
-from webots_mcp.store.retention import Limit, set_limits
+from webots_mcp.store.retention_limits import Limit, set_limits
 
 ROWS: Final = 60
 JSON_COLUMNS: Final = {

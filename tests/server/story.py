@@ -13,7 +13,8 @@ from typing import Any, Literal
 from mcp import Client, StdioServerParameters
 
 from tests.recordings.rover import record_rover
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.server.mcp_server import create_server
 
 Way = Literal["memory", "memory-legacy", "stdio", "stdio-legacy"]

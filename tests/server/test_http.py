@@ -28,7 +28,8 @@ from tests.server.conftest import Driver, ask, fail
 from tests.waiting import until, wait_for
 from webots_mcp.cli import main
 from webots_mcp.server.access_token import access_token, new_token, token_file
-from webots_mcp.server.http_server import Endpoint, guarded_app
+from webots_mcp.server.endpoint import Endpoint
+from webots_mcp.server.http_server import guarded_app
 from webots_mcp.server.mcp_server import create_server
 
 pytestmark = pytest.mark.anyio

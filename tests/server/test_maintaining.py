@@ -12,7 +12,7 @@ from tests.server.conftest import Connect, ask
 from tests.waiting import until
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 pytestmark = pytest.mark.anyio
 

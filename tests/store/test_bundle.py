@@ -16,7 +16,8 @@ import pytest
 from tests.recordings.runs import Recorded
 from webots_mcp import MCPBridge
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import DatabaseError, InvalidInputError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import is_bundle, merge, settled, unpacked, write_bundle

@@ -13,8 +13,9 @@ from tests.judging.asking import ask
 from tests.older_recording import make_older
 from tests.recordings.rows import RecordedRobot, insert
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.database.upgrade import in_current_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
+from webots_mcp.database.schema_migration import in_current_schema
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import find_motion
 from webots_mcp.signals.meaning import Meaning

@@ -13,7 +13,8 @@ import pytest
 
 from tests.recordings.runs import Recorded
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge, settled

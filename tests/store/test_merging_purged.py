@@ -15,12 +15,13 @@ from tests.recordings.rounds import PART, ROWS, record_rounds
 from tests.recordings.rover import Recorder, rover_state, start_run
 from tests.store.retention.test_chunks import framed
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge, unpacked, write_bundle
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.runs import run_info
 
 SIGNALS = (

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import NoDatabaseError
 from webots_mcp.store.recording import OpenReaders, RecordingAccess
 

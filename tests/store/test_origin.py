@@ -13,7 +13,8 @@ from tests.recordings.rows import Recorded
 from webots_mcp import MCPBridge
 from webots_mcp.cli import main
 from webots_mcp.database import connection
-from webots_mcp.database.connection import Role, connect, keep_deadline, shipped_objects
+from webots_mcp.database.connection import Role, connect, keep_deadline
+from webots_mcp.database.schema import shipped_objects
 from webots_mcp.errors import DatabaseError, ForeignDatabaseError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge

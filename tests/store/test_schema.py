@@ -11,7 +11,7 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 from sqlmodel import SQLModel
 
 from migrations.generate import generated_statements
-from webots_mcp.database.connection import shipped_statements
+from webots_mcp.database.schema import shipped_statements
 from webots_mcp.store import models
 
 assert models.Robot  # importing the models filled the metadata

@@ -13,8 +13,9 @@ import pytest
 from tests.older_recording import make_older
 from tests.recordings.runs import Recorded, states
 from webots_mcp.contract import new_uuid
-from webots_mcp.database.connection import connect, create_schema
-from webots_mcp.database.upgrade import in_current_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
+from webots_mcp.database.schema_migration import in_current_schema
 from webots_mcp.database.waiting_file import STATEMENTS
 from webots_mcp.errors import ForeignDatabaseError
 from webots_mcp.store.chunk_making import chunk_whole_run

@@ -16,7 +16,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.testing import RobotRecording
 
 

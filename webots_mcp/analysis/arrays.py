@@ -35,6 +35,10 @@ _ORDER: Final = 4
 # standard deviation, and a normal variable has a median magnitude of 0.6745 of it.
 _GAIN: Final = 0.6745 * 70**0.5
 LEAST_ROWS: Final = 3 * _ORDER
+_AT_ONCE: Final = 16_384  # values, which stay in the cache of a processor
+_MANY: Final = 50_000  # values, of which a sample tells about where their median is
+_SAMPLED: Final = 4096
+_MARGIN: Final = 160  # of the sample: five standard deviations of the rank of its median
 GAP_INTERVALS: Final = 3.0  # a longer pause between two rows is a gap; in median intervals
 EVEN_STEPS: Final = 1e-3  # of the mean step: steps that differ by less are even
 LEAST_WEIGHT: Final = 1e-9  # of rows of the same moment, so that no sum of weights is 0
@@ -71,10 +75,22 @@ def inner(one: Array, other: Array) -> float:
 
 
 def median(values: Array) -> float:
-    """That of at least one finite value; for few of them in a fifth of the time of numpy's."""
-    below, above = (len(values) - 1) // 2, len(values) // 2
-    ordered = np.partition(values, (below, above))
-    return float(ordered[below] + ordered[above]) / 2
+    """That of at least one finite value, in a fifth of the time of numpy's.
+
+    Of many values only those are ordered that lie next to the middle of a sample of them.
+    """
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    if len(values) >= _MANY:
+        bounds: Array = np.sort(values[:: len(values) // _SAMPLED])
+        middle = len(bounds) // 2
+        least, most = bounds[[middle - _MARGIN, middle + _MARGIN]]
+        below = int(np.count_nonzero(values < least))
+        inside = values[(values >= least) & (values <= most)]
+        if below <= low and high < below + len(inside):  # they are the ones in the middle
+            values, low, high = inside, low - below, high - below
+    ordered = values.copy()
+    ordered.partition((low, high))
+    return float(ordered[low] + ordered[high]) / 2
 
 
 def sums_of(values: Array, rows: int) -> Array:
@@ -95,8 +111,13 @@ def noise_of(values: Array) -> float:
     Biometrika 73, 1986, of which this is the robust form with a higher order). 0 for fewer than
     12 values.
     """
-    sizes = np.abs(np.diff(values, _ORDER))
-    return median(sizes) / _GAIN if len(sizes) >= LEAST_ROWS - _ORDER else 0.0
+    if len(values) < LEAST_ROWS:
+        return 0.0
+    sizes = np.empty(len(values) - _ORDER)
+    for first in range(0, len(sizes), _AT_ONCE):
+        part = np.diff(values[first : first + _AT_ONCE + _ORDER], _ORDER)
+        np.abs(part, out=sizes[first : first + _AT_ONCE])
+    return median(sizes) / _GAIN
 
 
 class RowSpan(NamedTuple):
@@ -270,7 +291,7 @@ def longest_usual_s(times: Array) -> float | None:
 
 def _suspects(intervals: Array) -> Indexes:
     """The intervals that are far longer than one near them, which all gaps are."""
-    if len(intervals) < 3:
+    if len(intervals) < 3 or intervals.max() <= _GAPS.least_intervals * intervals.min():
         return np.zeros(0, np.intp)
     near = _GAPS.around // 2 + 1
     beyond = np.full(near, np.inf)

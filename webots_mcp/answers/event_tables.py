@@ -16,11 +16,8 @@ from webots_mcp.answers.budget import (
     without_empty,
 )
 from webots_mcp.answers.shortening import tokens_of
-from webots_mcp.judging.detection.events import (
-    Events,
-    Found,
-)
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.event import Event
+from webots_mcp.judging.detection.events import Events, Found
 from webots_mcp.judging.verdicts import Coverage, Verdicts
 from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.recording import RobotView

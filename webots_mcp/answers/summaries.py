@@ -415,7 +415,7 @@ def _kinds_in(texts: Iterable[str]) -> list[str]:
 
 @cache
 def _severities() -> dict[str, int]:
-    from webots_mcp.judging.detection.events import KINDS  # only here: answers need not load it
+    from webots_mcp.judging.detection.event_kinds import KINDS
 
     return {kind.name: kind.severity for kind in KINDS}
 

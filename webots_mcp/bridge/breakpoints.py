@@ -25,7 +25,7 @@ from webots_mcp.errors import (
 
 if TYPE_CHECKING:
     from webots_mcp.signals.conditions import Condition, Evaluator
-    from webots_mcp.signals.conditions.compiler import Expectation, Violated
+    from webots_mcp.signals.conditions.expectation import Expectation, Violated
 
 MOST_EVENTS: Final = 1000  # of one breakpoint in one run, lest a flickering condition fill the disk
 _UNPUBLISHED_S: Final = 1.0  # simulation time after which an unpublished signal is reported
@@ -177,7 +177,7 @@ class Breakpoints:
         self, number: int, text: bytes, action: bytes, after_hits: int, *expected: bytes | None
     ) -> ArmedBreakpoint | None:
         from webots_mcp.signals.conditions import parse_condition
-        from webots_mcp.signals.conditions.compiler import parse_expectation
+        from webots_mcp.signals.conditions.expectation import parse_expectation
 
         name, expects, during = (
             None if each is None else each.decode("utf-8", "replace") for each in expected
@@ -216,7 +216,7 @@ class Breakpoints:
         Raises:
             InvalidInputError: If a condition or the name is invalid, or too many are armed.
         """
-        from webots_mcp.signals.conditions.compiler import parse_expectation
+        from webots_mcp.signals.conditions.expectation import parse_expectation
 
         return self._arm(_expected(None, parse_expectation(text, during, name)))
 

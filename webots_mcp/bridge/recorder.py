@@ -39,23 +39,19 @@ from webots_mcp.bridge.registration import (
 )
 from webots_mcp.bridge.simulation import Clock, CurrentRun
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.database.connection import (
+from webots_mcp.database.connection import connect, identify_files, journal_mode
+from webots_mcp.database.heartbeat import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
+from webots_mcp.database.location import Database
+from webots_mcp.database.schema import create_schema, require_current, schema_version
+from webots_mcp.database.transactions import (
     FAILURES,
-    connect,
-    create_schema,
-    identify_files,
     in_transaction,
     is_busy,
     is_damage,
-    journal_mode,
     never_wait,
-    require_current,
     roll_back,
-    schema_version,
     text_of,
 )
-from webots_mcp.database.heartbeat import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
-from webots_mcp.database.location import Database
 from webots_mcp.database.waiting_file import (
     STATEMENTS,
     Kind,

@@ -20,9 +20,9 @@ from webots_mcp.contract import (
     recorded_name,
 )
 from webots_mcp.database import session_cleanup
-from webots_mcp.database.connection import transaction
 from webots_mcp.database.pauses import PAUSED, STEPPING_WORLD
 from webots_mcp.database.processes import process_identity
+from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import enter_robot, enter_session
 
 # A successor in the same Webots within seconds means a reload; so does one after an issued reload

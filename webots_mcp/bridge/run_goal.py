@@ -69,9 +69,7 @@ def read_goal(params: dict[str, Any]) -> Goal:
 
 
 def _condition(name: str, params: dict[str, Any]) -> Condition | None:
-    from webots_mcp.signals.conditions.compiler import (
-        parse_condition,  # only here: most controllers never need it
-    )
+    from webots_mcp.signals.conditions.compiler import parse_condition
 
     text = params.get(name)
     if text is not None and not isinstance(text, str):

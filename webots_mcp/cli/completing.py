@@ -86,7 +86,7 @@ def values_of(kind: ValueKind, recording: RecordingAccess) -> list[str]:
         NoDatabaseError: Nothing is recorded there.
     """
     if kind == "kinds":
-        from webots_mcp.judging.detection.events import kind_names
+        from webots_mcp.judging.detection.event_kinds import kind_names
 
         return kind_names()
     with recording.reader() as connection:

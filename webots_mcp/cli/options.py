@@ -19,7 +19,7 @@ from cyclopts import Token
 from cyclopts.validators import Number
 
 from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
-from webots_mcp.store.retention import (
+from webots_mcp.store.retention_limits import (
     DEFAULT,
     NO_LIMIT,
     Asked,

@@ -24,17 +24,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
-from webots_mcp.database.connection import (
-    CHECKPOINT_TIMEOUT_MS,
-    connect,
-    identify_files,
-    is_busy,
-    never_wait,
-    require_current,
-    text_of,
-)
-from webots_mcp.database.leases import JobLease, give_back, take
+from webots_mcp.database.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files
+from webots_mcp.database.job_leases import JobLease, give_back, take
 from webots_mcp.database.location import Database, MemoryDatabase
+from webots_mcp.database.schema import require_current
+from webots_mcp.database.transactions import is_busy, never_wait, text_of
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn
 

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES, new_uuid
-from webots_mcp.database.connection import is_busy
+from webots_mcp.database.transactions import is_busy
 from webots_mcp.errors import InvalidInputError
 
 MAX_PARAMS_BYTES: Final = 65_536

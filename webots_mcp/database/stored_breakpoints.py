@@ -10,7 +10,7 @@ import time
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, BreakpointAction
-from webots_mcp.database.connection import transaction
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError
 
 VIOLATION: Final = "violation"  # the kind of the event: what was expected did not hold

@@ -30,9 +30,9 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 
-from webots_mcp.database.connection import in_transaction
 from webots_mcp.database.queue import CONFIRM_RELOAD, FINISH, ISSUE
 from webots_mcp.database.stacks import LOGGER, read_stacks, stacks_path
+from webots_mcp.database.transactions import in_transaction
 from webots_mcp.errors import SessionGoneError, warn
 
 # The kinds of writes of a running controller; `STATEMENTS` has the statement of each.

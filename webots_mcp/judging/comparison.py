@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.analysis.summary import (
     MIN_EFFECT_SD,
@@ -38,7 +38,7 @@ from webots_mcp.judging.run_measures import (
     reasons_of,
 )
 from webots_mcp.judging.run_sampling import SampledRun, shared_interval_s
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import listed
 from webots_mcp.signals.parameter import Value
 from webots_mcp.store.reading import frame_summary
@@ -367,16 +367,7 @@ def compare_runs(
     """
     if not 0 < min_effect_sd < math.inf:
         raise InvalidInputError(f"min_effect_sd={min_effect_sd} must be a number above 0.")
-    notes: list[str] = []
-    if run_ids is not None:
-        groups = _repeats(connection, run_ids)
-    elif set_id is not None:
-        found = scored_runs(connection, set_id)
-        groups = {name: found[name][:MOST_OF_EDIT] for name in list(found)[:MOST_SETS]}
-        if len(found) > len(groups):
-            notes += [f"the best {len(groups)} of {len(found)} sets of parameters"]
-    else:
-        groups = _around_last_edit(connection, robot)
+    groups, notes = _asked_groups(connection, run_ids, set_id, robot)
     options = options or EventOptions()
     deadline = Deadline(deadline_s)
     compared = _groups(connection, groups)
@@ -386,21 +377,14 @@ def compare_runs(
     asked = resolve_signals(known, names)
     is_named = tuple(names) != ("*",)
     signals = [each for each in asked if each.is_number or (is_named and each.kind == "bool")]
-    unread: dict[str, None] = {}
-    summaries: list[list[dict[str, Summary] | None]] = []
-    outcomes: list[list[RunOutcome]] = []
-    for group in runs.parts(compared_s):
-        summaries.append([])
-        outcomes.append([])
-        for part in group:
-            if len(runs.durations_s) > 1:
-                summaries[-1].append(_summarise(connection, part, signals, deadline, unread))
-            outcomes[-1].append(outcome_of(connection, part, options, deadline))
-            part.rows.frame.forget()
+    figures = _figures(connection, runs, signals)
     compared_ids = [[run.run_id for run in group.runs] for group in compared]
     tests = 2 * len(signals)
     differences = [
-        replace(difference_of(each, summaries, compared_ids, tests, min_effect_sd), asked=is_named)
+        replace(
+            difference_of(each, figures.summaries, compared_ids, tests, min_effect_sd),
+            asked=is_named,
+        )
         for each in signals
         if len(runs.durations_s) > 1
     ]
@@ -408,13 +392,17 @@ def compare_runs(
     if is_named and len(runs.durations_s) > 1:
         shared += [_of_text(each, len(groups)) for each in asked if each not in signals]
     shared.sort(key=size_of, reverse=True)
-    found_outcomes = outcomes_of(outcomes, compared_s, min_effect_sd)
+    found_outcomes = outcomes_of(figures.outcomes, compared_s, min_effect_sd)
     return Comparison(
         groups=compared,
         compared_s=compared_s,
         measures=found_outcomes.measures,
         unknown=found_outcomes.unknown
-        | ({"means of signals": "; ".join(unread)} if unread and differences else {}),
+        | (
+            {"means of signals": "; ".join(figures.unread)}
+            if figures.unread and differences
+            else {}
+        ),
         differences=tuple(shared[:limit]),
         total=len(shared),
         only_in=only_in(differences, list(groups)),
@@ -425,6 +413,59 @@ def compare_runs(
             *_cut_notes(runs.durations_s, compared_s),
         ),
     )
+
+
+def _asked_groups(
+    connection: sqlite3.Connection,
+    run_ids: Sequence[int] | None,
+    set_id: int | None,
+    robot: str | None,
+) -> tuple[dict[str, list[int]], list[str]]:
+    """Return the runs to compare by the names of their groups, and a note on what is left out."""
+    if run_ids is not None:
+        return _repeats(connection, run_ids), []
+    if set_id is None:
+        return _around_last_edit(connection, robot), []
+    found = scored_runs(connection, set_id)
+    groups = {name: found[name][:MOST_OF_EDIT] for name in list(found)[:MOST_SETS]}
+    if len(found) == len(groups):
+        return groups, []
+    return groups, [f"the best {len(groups)} of {len(found)} sets of parameters"]
+
+
+class _Figures(NamedTuple):
+    """What was read of the runs, by group and run.
+
+    Attributes:
+        summaries: Of each signal; None of a run of which not all was read.
+        unread: Reasons why figures are missing.
+    """
+
+    summaries: list[list[dict[str, Summary] | None]]
+    outcomes: list[list[RunOutcome]]
+    unread: dict[str, None]
+
+    def missing_means(self) -> dict[str, str]:
+        """Return why means of signals are missing, as an entry of what is unknown."""
+        return {"means of signals": "; ".join(self.unread)} if self.unread else {}
+
+
+def _figures(
+    connection: sqlite3.Connection, runs: _Runs, signals: Sequence[RegisteredSignal]
+) -> _Figures:
+    """Read each run, for as long as the shortest one lasted; a single run has no summaries."""
+    figures = _Figures([], [], {})
+    for group in runs.parts(min(runs.durations_s.values())):
+        figures.summaries.append([])
+        figures.outcomes.append([])
+        for part in group:
+            if len(runs.durations_s) > 1:
+                summary = _summarise(connection, part, signals, runs.deadline, figures.unread)
+                figures.summaries[-1].append(summary)
+            outcome = outcome_of(connection, part, runs.options, runs.deadline)
+            figures.outcomes[-1].append(outcome)
+            part.rows.frame.forget()
+    return figures
 
 
 def _of_text(signal: RegisteredSignal, groups: int) -> Difference:
@@ -470,8 +511,8 @@ class _Runs:
     ) -> None:
         self._connection = connection
         self._groups = groups
-        self._options = options
-        self._deadline = deadline
+        self.options = options
+        self.deadline = deadline
         run_ids = [run.run_id for group in groups for run in group.runs]
         self._segments = {run_id: _whole_run(connection, run_id) for run_id in run_ids}
         self._robots = {run_id: fetch_run(connection, run_id).robot_id for run_id in run_ids}
@@ -496,7 +537,7 @@ class _Runs:
 
     def _frame(self, run_id: int) -> Frame:
         """All rows of a run, without those that only a full-rate segment has if it has others."""
-        segment, deadline = self._segments[run_id], self._deadline
+        segment, deadline = self._segments[run_id], self.deadline
         frame = read_frame(self._connection, segment, deadline, full_rate=False)
         if segment.full_rate and len(frame) < 2:
             return read_frame(self._connection, segment, deadline)
@@ -523,7 +564,7 @@ class _Runs:
             whole,
             segment,
             known,
-            motion_in(frame, known, self._options),
+            motion_in(frame, known, self.options),
             SampledRun(frame, self._interval_s, segment.end_s),
             self.goals.get(run.run_id),
             searched,

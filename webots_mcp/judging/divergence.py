@@ -18,7 +18,7 @@ from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
 from webots_mcp.judging.comparison import COMPARE_DEADLINE_S
 from webots_mcp.judging.run_measures import OUT_OF_TIME
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import METRES, Value, counted, listed
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, Decoded, Replaced
 from webots_mcp.store.reading.catalogue import held_by, resolve_signals, signals_of_frame

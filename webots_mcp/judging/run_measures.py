@@ -23,11 +23,12 @@ from webots_mcp.analysis.summary import (
 )
 from webots_mcp.analysis.track import PathLength, tracks_of, travelled
 from webots_mcp.judging.detection.condition import VIOLATION, expectations_of
+from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
+from webots_mcp.judging.detection.events import Found, search_events
 from webots_mcp.judging.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
 from webots_mcp.judging.run_sampling import SampledRun
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_summary import MOST_VALUES, change_points, spelled
@@ -465,6 +466,24 @@ def _reason_of_runs(reasons: dict[int, str], of: int) -> str:
     return f"run {', '.join(map(str, reasons))}: {first[1]}"
 
 
+def _path_figures(
+    part: RunPart, duration_s: float, deadline: Deadline
+) -> tuple[dict[str, float | None], str | None]:
+    """Return how far and how fast a robot went, and why these figures are not certain, if so."""
+    position = part.motion.position
+    if position is None:
+        return {}, NAME_POSITION
+    read = _way_in_even_rows(part.rows, position)
+    is_known = len(read.times) > 1 and not (deadline.passed or read.unread)
+    way = read.length if is_known else None
+    speed = None if way is None else way.length_m / duration_s
+    doubt = OUT_OF_TIME if deadline.passed else "; ".join(map(str, read.unread))
+    doubt = doubt or (NO_WAY if way is None else doubt_of_unit(position, speed or 0.0))
+    return {"distance_m": way and way.length_m, _SPEED: speed}, doubt or (
+        way and doubt_of_length(way)
+    )
+
+
 def outcome_of(
     connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
 ) -> RunOutcome:
@@ -478,19 +497,10 @@ def outcome_of(
     if part.run.own_ms is not None:
         figures[_OWN_MS] = part.run.own_ms
     unknown: dict[str, tuple[str, ...]] = {}
-    position = part.motion.position
-    if position is None:
-        unknown["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
-    else:
-        read = _way_in_even_rows(part.rows, position)
-        is_known = len(read.times) > 1 and not (deadline.passed or read.unread)
-        way = read.length if is_known else None
-        speed = None if way is None else way.length_m / duration_s
-        figures |= {"distance_m": way and way.length_m, _SPEED: speed}
-        doubt = OUT_OF_TIME if deadline.passed else "; ".join(map(str, read.unread))
-        doubt = doubt or (NO_WAY if way is None else doubt_of_unit(position, speed or 0.0))
-        if doubt := doubt or (way and doubt_of_length(way)):
-            unknown["distance_m, mean_speed_m_s"] = (doubt,)
+    of_path, doubt = _path_figures(part, duration_s, deadline)
+    figures |= of_path
+    if doubt:
+        unknown["distance_m, mean_speed_m_s"] = (doubt,)
     shares, unread = _mode_shares(connection, part, deadline)
     if deadline.passed or unread:
         shares = {}

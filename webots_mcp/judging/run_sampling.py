@@ -15,7 +15,7 @@ from typing import Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, np, usual_interval_s
 from webots_mcp.analysis.summary import Summary, summarise_numbers, usable_part
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.store.chunks import Statistics
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_summary import FULL_ROWS, summary_of

@@ -10,8 +10,9 @@ from typing import Final
 
 from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.condition import aggregated, position_in
+from webots_mcp.judging.detection.event_kinds import kind_names
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import kind_names, search_events
+from webots_mcp.judging.detection.events import search_events
 from webots_mcp.signals.conditions.scoring import Facts, Score, Scored, parse_score
 from webots_mcp.signals.naming import listed, nearest_first
 from webots_mcp.store.reading.catalogue import catalogue

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.event import Event
+from webots_mcp.judging.detection.event_kinds import drawn_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import Events, Found, drawn_kinds, find_events
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.events import Events, Found, find_events
 from webots_mcp.judging.detection.search import find_motion
 from webots_mcp.judging.verdicts import Verdicts, cause_of
 from webots_mcp.plotting.canvas import short

@@ -137,6 +137,19 @@ def paint_trials(plot: TrialAxes, width_px: int, height_px: int) -> Canvas:
     return canvas
 
 
+def _legend(*, has_best: bool, has_failures: bool) -> list[LegendEntry]:
+    """Return the entries of the legend of scores over one parameter."""
+    entries = [
+        LegendEntry("mean, and least to greatest", _mean_sample),
+        LegendEntry("one trial", mark_sample("circle", 2.2, **_DOT)),
+    ]
+    if has_best:
+        entries.append(LegendEntry("best", mark_sample("circle", 8.0, **_RING)))
+    if has_failures:
+        entries.append(LegendEntry("with failures", mark_sample("cross", 5.0, **_FAILED)))
+    return entries
+
+
 def _paint_scores(canvas: Canvas, plot: TrialAxes, top: float) -> None:
     """Over one parameter: each score, and the mean of each value with its range."""
     (name,) = plot.names
@@ -145,14 +158,7 @@ def _paint_scores(canvas: Canvas, plot: TrialAxes, top: float) -> None:
                   key=lambda pair: pair[0])  # fmt: skip
     scored = [(place, each, each.score) for place, each in told if each.score is not None]
     failed = [place for place, each in told if each.failures]
-    entries = [
-        LegendEntry("mean, and least to greatest", _mean_sample),
-        LegendEntry("one trial", mark_sample("circle", 2.2, **_DOT)),
-    ]
-    entries += [LegendEntry("best", mark_sample("circle", 8.0, **_RING))] if plot.best else []
-    entries += (
-        [LegendEntry("with failures", mark_sample("cross", 5.0, **_FAILED))] if failed else []
-    )
+    entries = _legend(has_best=bool(plot.best), has_failures=bool(failed))
     legend = rows_of(entries, canvas.width_px - 20, canvas.height_px)
     y = axis_range(min(s.low for *_, s in scored), max(s.high for *_, s in scored))
     x = axis_range(min(places.values()), max(places.values()), 0.05)

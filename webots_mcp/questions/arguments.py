@@ -6,7 +6,6 @@ Each is an annotated type: pydantic reads its bounds, and clients show its descr
 from __future__ import annotations
 
 from typing import (
-    TYPE_CHECKING,
     Annotated,
     Final,
 )
@@ -19,10 +18,6 @@ from pydantic import (
 )
 
 from webots_mcp import contract
-
-if TYPE_CHECKING:
-    pass
-
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90

@@ -31,8 +31,8 @@ from webots_mcp.answers.budget import (
 )
 from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.checks import CHECK_DEADLINE_S, check_run
-from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.checks.check import Finding
+from webots_mcp.judging.checks.check_run import CHECK_DEADLINE_S, check_run
 from webots_mcp.judging.comparison import (
     COMPARE_DEADLINE_S,
     Comparison,
@@ -57,7 +57,7 @@ from webots_mcp.questions.arguments import (
     Value,
 )
 from webots_mcp.questions.declaring import READS, SETS, question
-from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
+from webots_mcp.signals.conditions.expectation import Expectation, read_expectation
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.ages import utc
 from webots_mcp.store.project_file import Expected, file_of, read_project

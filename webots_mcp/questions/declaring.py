@@ -41,7 +41,7 @@ from webots_mcp.errors import (
     WebotsMCPError,
 )
 from webots_mcp.questions.arguments import SCOPE
-from webots_mcp.questions.former_calls import former_names
+from webots_mcp.questions.renamed_tools import former_names
 from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import RecordingAccess

@@ -13,14 +13,9 @@ from webots_mcp.answers.budget import answer_about, notes_of, range_in, room_tok
 from webots_mcp.answers.event_tables import events_table, fitting_events, not_shown_of, verdicts_of
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.event_kinds import KINDS, kind_names, stored_kinds
 from webots_mcp.judging.detection.event_options import EventOptions, both_of
-from webots_mcp.judging.detection.events import (
-    KINDS,
-    kind_names,
-    search_events,
-    stored_kinds,
-    timeline,
-)
+from webots_mcp.judging.detection.events import search_events, timeline
 from webots_mcp.questions.arguments import (
     AnyNames,
     LogLevel,

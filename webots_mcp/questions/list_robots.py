@@ -41,7 +41,7 @@ from webots_mcp.store.recording import (
     storage,
     view_of,
 )
-from webots_mcp.store.retention import described, unheeded
+from webots_mcp.store.retention_limits import described, unheeded
 from webots_mcp.store.retention_plan import file_sizes
 from webots_mcp.store.robots import (
     RobotRecord,

@@ -25,9 +25,10 @@ from webots_mcp.answers.event_tables import fitting_events, not_shown_of, verdic
 from webots_mcp.answers.movement import movement
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.event import Event
+from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import asked_kinds, search_events
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.events import search_events
 from webots_mcp.judging.trends import RunTrends, trends
 from webots_mcp.judging.verdicts import Verdicts
 from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName

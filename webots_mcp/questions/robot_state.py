@@ -34,19 +34,21 @@ from webots_mcp.answers.shortening import (
     tokens_in,
     tokens_of,
 )
-from webots_mcp.contract import CUSTOM_DATA
+from webots_mcp.contract import CUSTOM_DATA, INSPECTION_EVENT
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.list_robots import BY_OBSERVER
 from webots_mcp.questions.sensor_values import sensor_part, unnamed_devices
 from webots_mcp.signals.naming import OBSERVED
+from webots_mcp.store.inspections import reference_to
 from webots_mcp.store.loop_evidence import rows_waiting
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.observed_pose import pose_at
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, newest_kept
 from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.run_rows import (
+    EventRecord,
     StateRecord,
     count_dropped,
     newest_events,
@@ -318,11 +320,17 @@ def _events(view: RobotView) -> AnswerTable:
     """Return the newest events that fit, the oldest of them first."""
     events = newest_events(view.connection, view.require_run().id, _SIZES.events)
     rows = [
-        [round(event.sim_time_s, 3), event.kind, event.name, detailed(event.details())]
+        [round(event.sim_time_s, 3), event.kind, event.name, detailed(_details_of(event))]
         for event in reversed(events)
     ]
     shown = fitting(rows, _SIZES.events_tokens)[::-1]
     return AnswerTable(columns=["start_s", "kind", "name", "details"], rows=shown)
+
+
+def _details_of(event: EventRecord) -> Any:
+    """Return the details; of an inspection how to ask for its variables."""
+    details = event.details()
+    return reference_to(event.id, details) if event.kind == INSPECTION_EVENT else details
 
 
 def _health(view: RobotView) -> dict[str, Any] | None:

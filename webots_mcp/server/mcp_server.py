@@ -29,15 +29,16 @@ from mcp.types import (
 from pydantic import ValidationError
 
 from webots_mcp.contract import VERSION
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.schema import create_schema
 from webots_mcp.database.session_cleanup import reap_if_dead
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.questions import all_questions
+from webots_mcp.questions.argument_errors import faults_of, shown_value
 from webots_mcp.questions.declaring import TIERS, Tier
-from webots_mcp.questions.faults import faults_of, shown_value
-from webots_mcp.questions.former_calls import current_call
+from webots_mcp.questions.renamed_tools import current_call
 from webots_mcp.server.channel import CHANNEL_INSTRUCTIONS, Channel
 from webots_mcp.server.client_view import make_view, name_the_view
 from webots_mcp.server.connected_clients import ConnectedClients
@@ -55,7 +56,7 @@ from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, ingest_journals
 from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.recording import OpenReaders, RecordingAccess
-from webots_mcp.store.retention import Asked, ask
+from webots_mcp.store.retention_limits import Asked, ask
 from webots_mcp.store.sql import describe_schema
 
 INSTRUCTIONS: Final = (

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.contract import host_name
-from webots_mcp.database.leases import give_back, held_jobs, holder_of, lease_of, take
+from webots_mcp.database.job_leases import give_back, held_jobs, holder_of, lease_of, take
 from webots_mcp.errors import (
     CommandRefusedError,
     DatabaseError,

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import OBSERVER_NAME, WORLD_ENDING, host_name
-from webots_mcp.database.connection import transaction
 from webots_mcp.database.files import full_path
 from webots_mcp.database.location import find_project, require_world_of
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.simulator.console_lines import as_row
 from webots_mcp.simulator.orders import WebotsAddress, WebotsLine, address_of

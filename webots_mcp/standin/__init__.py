@@ -20,11 +20,11 @@ Only plugins and `webots_mcp.testing` import the stand-in.
 from __future__ import annotations
 
 from webots_mcp.standin.controller_path import LIBRARY  # first: the others import `controller`
-from webots_mcp.standin.errors import RequestAfterEndError as ControllerEndedError
-from webots_mcp.standin.errors import StandInError, WorldError, WouldBlockError
 from webots_mcp.standin.in_process import InProcessRobot, InProcessSimulation, InProcessSupervisor
 from webots_mcp.standin.simulator import Mode
 from webots_mcp.standin.stand_in_simulation import StandInSimulation as Simulation
+from webots_mcp.standin.standin_errors import RequestAfterEndError as ControllerEndedError
+from webots_mcp.standin.standin_errors import StandInError, WorldError, WouldBlockError
 
 __all__ = [
     "LIBRARY",

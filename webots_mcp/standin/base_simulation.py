@@ -13,8 +13,8 @@ from pathlib import Path
 from controller.simulator_link import Message
 
 from webots_mcp.standin.controller_answers import answer, step_over
-from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.simulator import Mode, SimulatedRobot, Simulator
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.world import load_world
 
 

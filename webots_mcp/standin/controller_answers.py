@@ -8,9 +8,9 @@ from typing import Any, Final, cast
 from controller.simulator_link import Message
 
 from webots_mcp.standin.arena import Body
-from webots_mcp.standin.devices import FetchedSensor
-from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.simulated_devices import FetchedSensor
 from webots_mcp.standin.simulator import Mode, SimulatedRobot, Simulator, TrackedKey
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.view_pictures import Label
 from webots_mcp.standin.vrml import NODE_TYPES, FieldDefinition, Parser, WorldNode, descendants_of
 from webots_mcp.standin.world import as_text

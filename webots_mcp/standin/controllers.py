@@ -17,8 +17,8 @@ from controller.simulator_link import Inbox, Message, pack
 
 from webots_mcp.standin.base_simulation import ControllerEndpoint
 from webots_mcp.standin.controller_path import LIBRARY
-from webots_mcp.standin.errors import StandInError
 from webots_mcp.standin.simulator import SimulatedRobot, Simulator
+from webots_mcp.standin.standin_errors import StandInError
 
 _TERMINATION_S: Final = 1.0
 """How long a process may take to end after SIGTERM."""

@@ -14,14 +14,14 @@ from controller.simulator_link import Message
 from webots_mcp.contract import bundled
 from webots_mcp.standin.base_simulation import BaseSimulation, ControllerEndpoint
 from webots_mcp.standin.controller_answers import description
-from webots_mcp.standin.errors import (
+from webots_mcp.standin.simulator import Mode
+from webots_mcp.standin.simulator import SimulatedRobot as SimulatedRobot
+from webots_mcp.standin.standin_errors import (
     RequestAfterEndError,
     StandInError,
     WorldError,
     WouldBlockError,
 )
-from webots_mcp.standin.simulator import Mode
-from webots_mcp.standin.simulator import SimulatedRobot as SimulatedRobot
 
 DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"
 """A 4 m x 4 m arena with a few obstacles and one two-wheeled robot, "rover"."""

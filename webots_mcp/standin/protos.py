@@ -18,7 +18,7 @@ from math import cos, pi, sin, tan
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.vrml import (
     DATA,
     NODE_TYPES,

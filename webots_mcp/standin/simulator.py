@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body
-from webots_mcp.standin.devices import (
+from webots_mcp.standin.simulated_devices import (
     SimulatedDevice,
     SimulatedEmitter,
     SimulatedReceiver,
     devices_in,
 )
-from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.vehicle import Vehicle, joints_in
 from webots_mcp.standin.view_pictures import Label, PictureRequest, save_picture
 from webots_mcp.standin.vrml import WorldNode

@@ -25,8 +25,8 @@ from controller.simulator_link import ADDRESS_FILE, Message
 from webots_mcp.standin.base_simulation import BaseSimulation, ControllerEndpoint
 from webots_mcp.standin.controller_answers import description
 from webots_mcp.standin.controllers import Controller, ControllerConnection, ControllerLaunch
-from webots_mcp.standin.errors import StandInError
 from webots_mcp.standin.simulator import Mode
+from webots_mcp.standin.standin_errors import StandInError
 
 _MODES: Final = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
 _NOTIFY_INTERVAL_S: Final = 0.002

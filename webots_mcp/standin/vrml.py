@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
-from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.standin_errors import WorldError
 
 DATA: Final = Path(__file__).with_name("data")
 """Folder of the node types and the built-in PROTO nodes."""

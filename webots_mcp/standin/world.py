@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.geometry import CoordinateFrame, frame_of
 from webots_mcp.standin.protos import Protos
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
     Parser,

@@ -19,11 +19,11 @@ from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.contract import HEARTBEAT_LATE_S
 from webots_mcp.database.queue import QueuedCommand
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.events import search_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.trends import trends
 from webots_mcp.signals.conditions import parse_condition
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import flatten
 from webots_mcp.steering.run_command import (
     ACTION,

@@ -20,14 +20,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.database.connection import (
-    FAILURES,
-    LONGEST_WRITE_S,
-    AtomicStatements,
-    FrozenConnection,
-)
-from webots_mcp.database.leases import holder_of
+from webots_mcp.database.connection import FrozenConnection
+from webots_mcp.database.job_leases import holder_of
 from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.transactions import FAILURES, LONGEST_WRITE_S, AtomicStatements
 from webots_mcp.errors import DatabaseError, warn
 from webots_mcp.signals.register import MAX_SIGNALS
 from webots_mcp.store.chunks import (

@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import functools
 import json
+import math
 import shutil
 import sqlite3
 import tempfile
@@ -23,7 +24,8 @@ from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.analysis.arrays import Array, Indexes, inner, np
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import DatabaseError, MalformedRowError
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
 
@@ -191,17 +193,18 @@ def _decode_coded(encoded: EncodedChunk, rows: int) -> Decoded:
     assert encoded.codes is not None
     raw = zlib.decompress(encoded.codes)
     width: Any = np.uint8 if len(raw) == rows else np.uint16
-    codes = np.frombuffer(raw, width).astype(np.intp)
+    short = np.frombuffer(raw, width)
     labels = _labels(encoded.labels)
-    if len(codes) != rows or codes.max(initial=0) >= len(labels) + FIRST_LABEL:
+    if len(short) != rows or short.max(initial=0) >= len(labels) + FIRST_LABEL:
         raise DamagedChunkError("damaged: its codes are not those of its rows")
-    numbers = np.full(rows, np.nan)
-    held = codes == IS_NUMBER
+    flags = [each if isinstance(each, bool) else math.nan for each in labels]
+    numbers: Array = np.array([math.nan, math.nan, *flags])[short]
+    held = short == IS_NUMBER
     if held.any():
-        found = np.empty(int(held.sum()))
+        found = np.empty(int(np.count_nonzero(held)))
         _decompress(encoded, found)
         numbers[held] = found
-    _fill_flags(numbers, codes, labels)
+    codes: Indexes = short.astype(np.intp)
     return Decoded(numbers, codes, labels, encoded.codec == _INTEGERS)
 
 
@@ -593,13 +596,12 @@ def values_in(
             f"{values_query} AND group_id IN (SELECT value FROM json_each(?))",
             [*asked, json.dumps([*wanted])],
         )
-    for group_id, codec, numbers, codes, labels in connection.execute(query, asked):
+    for group_id, *stored in connection.execute(query, asked):
         rows = wanted.get(group_id)
         if rows is None:
             continue
         try:
-            encoded = EncodedChunk(codec, numbers, codes, labels)
-            yield group_id, decode(encoded, rows, into.get(group_id))
+            yield group_id, decode(EncodedChunk(*stored), rows, into.get(group_id))
         except DamagedChunkError as error:
             yield group_id, error
 

@@ -61,9 +61,16 @@ def inspections_of(
     return [_inspection(row) for row in connection.execute(_OF_RUN, (run_id, limit))]
 
 
-def place_of(data: dict[str, Any]) -> str | None:
-    """Return the innermost line of the data of an inspection's event."""
-    return Inspection(0, 0, 0.0, 0.0, "", "", _frames_of(data)).place
+def reference_to(event_id: int, data: object) -> dict[str, Any]:
+    """Return what stands for the variables in a list of events: how to ask for them.
+
+    Args:
+        event_id: Of the inspection.
+        data: Of its event.
+    """
+    said = cast("dict[str, Any]", data if isinstance(data, dict) else {})
+    place = Inspection(0, 0, 0.0, 0.0, "", "", _frames_of(said)).place
+    return {"event_id": event_id, "line": place}
 
 
 def _inspection(row: tuple[Any, ...]) -> Inspection:

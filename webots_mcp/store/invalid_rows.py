@@ -18,7 +18,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
-from webots_mcp.database.connection import shipped_statements
+from webots_mcp.database.schema import shipped_statements
 
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
 _SHOWN: Final = 5

@@ -45,7 +45,8 @@ from webots_mcp.contract import (
     recorded_name,
 )
 from webots_mcp.database import processes, session_cleanup, waiting_file
-from webots_mcp.database.connection import identify_files, in_transaction
+from webots_mcp.database.connection import identify_files
+from webots_mcp.database.transactions import in_transaction
 from webots_mcp.database.waiting_file import (
     FORMAT,
     STATEMENTS,
@@ -430,6 +431,22 @@ class _Reading:
         self.begun += (entry.run,)
         return known | {name: value for name, value in lost.items() if value is not None}
 
+    def _note_times(
+        self,
+        session_id: int,
+        runs: Mapping[str, tuple[float, float, int]],
+        ends: Mapping[Kind, dict[str, Any]],
+    ) -> None:
+        """Write when runs were seen last and how many rows they have, and which runs ended."""
+        for run, (sim, wall, rows) in runs.items():
+            values = {"run": run, "sim": sim, "wall": wall, "rows": rows, "session": session_id}
+            self.connection.execute(_SEEN_RUN, values)
+            self.connection.execute(_SEEN_SESSION, values)
+        if begun := ends.get("run"):
+            session_cleanup.end_runs(self.connection, session_id, "reset", begun["uuid"])
+        if end := ends.get("session end"):
+            session_cleanup.end_runs(self.connection, session_id, end["reason"])
+
     def _finish(
         self,
         session_id: int,
@@ -475,14 +492,7 @@ class _Reading:
             for name, before, after in changed:
                 data = json.dumps({"from": before, "to": after}, ensure_ascii=False)
                 self._event(entry, "change", name[:200], data)
-        for run, (sim, wall, rows) in runs.items():
-            values = {"run": run, "sim": sim, "wall": wall, "rows": rows, "session": session_id}
-            self.connection.execute(_SEEN_RUN, values)
-            self.connection.execute(_SEEN_SESSION, values)
-        if begun := ends.get("run"):
-            session_cleanup.end_runs(self.connection, session_id, "reset", begun["uuid"])
-        if end := ends.get("session end"):
-            session_cleanup.end_runs(self.connection, session_id, end["reason"])
+        self._note_times(session_id, runs, ends)
         dropped = self.faults.and_those(faults)
         self.faults = _NO_FAULTS if last else dropped
         if last and dropped.lines:

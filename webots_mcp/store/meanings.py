@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.database.connection import transaction
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.meaning import (
     MEANING_FIELDS,

@@ -20,15 +20,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final, get_args
 
 from webots_mcp.contract import DATABASE_NAME, REMOTE_SILENCE_S, host_name
-from webots_mcp.database.connection import (
-    FrozenConnection,
-    connect,
-    create_schema,
-    require_shipped,
-    transaction,
-)
+from webots_mcp.database.connection import FrozenConnection, connect
 from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
+from webots_mcp.database.schema import create_schema, require_shipped
 from webots_mcp.database.session_cleanup import end_session, reap
+from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.rerun.tape import MAX_TAPE_BYTES, TAPE_ENDING, is_tape, tape_file
@@ -657,20 +653,11 @@ def ingest_chunks(connection: sqlite3.Connection, there: int, here: int, robot_i
         InvalidInputError: Its ids are spread as no bridge gives them.
     """
     shift = _reserve_ids(connection, there)
-    asked = {"run": there, "here": robot_id}
-    seen = {
-        name: Seen(path, reduction, kind, (role or "").startswith("mode"), first_s)
-        for name, path, reduction, kind, role, first_s in connection.execute(_SIGNALS, asked)
-    }
-    enter_signals(connection, robot_id, seen)
-    connection.execute(
-        "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
-    )
-    connection.execute("DELETE FROM temp.signal_here")
-    connection.execute(_FILL_MAP, asked)
-    for group, rows in connection.execute(
+    _ingest_signals(connection, there, robot_id)
+    groups = connection.execute(
         "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1", (there,)
-    ).fetchall():
+    ).fetchall()
+    for group, rows in groups:
         values: dict[str, Any] = {"run": here, "shift": shift, "group": group}
         values["here"] = connection.execute(
             f"INSERT INTO main.row_group (run_id, last_state_id, max_state_id, {_GROUP}) "
@@ -684,19 +671,40 @@ def ingest_chunks(connection: sqlite3.Connection, there: int, here: int, robot_i
             "JOIN temp.signal_here m ON m.there = c.signal_id WHERE c.group_id = :group",
             values,
         )
-        packed = connection.execute(
-            f"SELECT {_PACKED} FROM source.chunk WHERE group_id = ? AND signal_id = {STATE_IDS}",
-            (group,),
-        ).fetchone()
-        if packed is not None:
-            with suppress(DamagedChunkError):  # who reads them is told that they are missing
-                shifted = _shifted(packed, rows, shift)
-                connection.execute(
-                    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
-                    f"VALUES ({', '.join('?' * (3 + len(_VALUES.split(','))))})",
-                    (values["here"], here, STATE_IDS, *shifted),
-                )
+        _ingest_state_ids(connection, values, rows)
     return shift
+
+
+def _ingest_signals(connection: sqlite3.Connection, there: int, robot_id: int) -> None:
+    """Register the signals of a run, and map their ids there to those here."""
+    asked = {"run": there, "here": robot_id}
+    seen = {
+        name: Seen(path, reduction, kind, (role or "").startswith("mode"), first_s)
+        for name, path, reduction, kind, role, first_s in connection.execute(_SIGNALS, asked)
+    }
+    enter_signals(connection, robot_id, seen)
+    connection.execute(
+        "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
+    )
+    connection.execute("DELETE FROM temp.signal_here")
+    connection.execute(_FILL_MAP, asked)
+
+
+def _ingest_state_ids(connection: sqlite3.Connection, values: dict[str, Any], rows: int) -> None:
+    """Copy the chunk of the ids of a group's state rows, each id raised by the shift."""
+    packed = connection.execute(
+        f"SELECT {_PACKED} FROM source.chunk WHERE group_id = ? AND signal_id = {STATE_IDS}",
+        (values["group"],),
+    ).fetchone()
+    if packed is None:
+        return
+    with suppress(DamagedChunkError):  # readers of the group then report that it is missing
+        shifted = _shifted(packed, rows, values["shift"])
+        connection.execute(
+            f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
+            f"VALUES ({', '.join('?' * (3 + len(_VALUES.split(','))))})",
+            (values["here"], values["run"], STATE_IDS, *shifted),
+        )
 
 
 def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:

@@ -31,12 +31,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, recorded_name
-from webots_mcp.database.connection import transaction
 from webots_mcp.database.location import find_project
 from webots_mcp.database.secret_names import TABLE, check_table
 from webots_mcp.database.stored_breakpoints import OF_PROJECT
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError, warn
-from webots_mcp.signals.conditions.compiler import Expectation, parse_expectation
+from webots_mcp.signals.conditions.expectation import Expectation, parse_expectation
 from webots_mcp.signals.meaning import MEANING_FIELDS, DeclaredMeaning, declare_meaning
 
 ALL: Final = "*"

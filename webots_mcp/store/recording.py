@@ -19,25 +19,25 @@ from typing import Any, Final
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database import session_cleanup
 from webots_mcp.database.connection import (
-    FAILURES,
     LONGEST_READ_S,
     FrozenConnection,
     Role,
     connect,
-    create_schema,
     identify_files,
+)
+from webots_mcp.database.job_leases import JobLease, still_held
+from webots_mcp.database.location import Database, MemoryDatabase
+from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
+from webots_mcp.database.queue import any_unfinished
+from webots_mcp.database.schema import create_schema, require_current, schema_version
+from webots_mcp.database.transactions import (
+    FAILURES,
     is_about_a_value,
     is_busy,
     is_damage,
     is_unwritable,
-    require_current,
-    schema_version,
     text_of,
 )
-from webots_mcp.database.leases import JobLease, still_held
-from webots_mcp.database.location import Database, MemoryDatabase
-from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
-from webots_mcp.database.queue import any_unfinished
 from webots_mcp.database.waiting_file import adopt, count_rows, left_waiting, waiting_paths
 from webots_mcp.errors import (
     DatabaseError,
@@ -60,7 +60,7 @@ from webots_mcp.store.journal_intake import (
 from webots_mcp.store.loop_evidence import ask_stuck
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
-from webots_mcp.store.retention import Asked
+from webots_mcp.store.retention_limits import Asked
 from webots_mcp.store.robot_status import Status, decide_status, stopped_for
 from webots_mcp.store.robots import RobotRecord, console_trouble
 from webots_mcp.store.run_rows import RunRecord, StateRecord, current_run, newest_state

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME
 from webots_mcp.store.chunk_making import INDEX_BYTES, disk_bytes
 from webots_mcp.store.chunks import STATE_IDS, WALL_TIMES, Decoded, values_in
-from webots_mcp.store.retention import DEFAULT, KEPT, Limit, Retention
+from webots_mcp.store.retention_limits import DEFAULT, KEPT, Limit, Retention
 
 TABLES: Final = ("state", "chunk", "kept_state", "log", "event", "image")
 _BLOCK_IDS: Final = {

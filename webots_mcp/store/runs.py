@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.database.connection import transaction
 from webots_mcp.database.pauses import paused_s
 from webots_mcp.database.session_cleanup import find_dead_sessions
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.parameter import Value
 from webots_mcp.store.reading.segment import in_one_snapshot
@@ -237,7 +237,8 @@ def _info(
                 "SELECT 'log ' || level, count(*) FROM log WHERE run_id = :run "
                 "AND level IN ('warning', 'error', 'critical') GROUP BY level UNION ALL "
                 "SELECT kind, count(*) FROM event WHERE run_id = :run "
-                "AND kind NOT IN ('change', 'start', 'reset', 'reload') GROUP BY kind UNION ALL "
+                "AND kind NOT IN ('change', 'start', 'reset', 'reload', 'inspection') "
+                "GROUP BY kind UNION ALL "
                 "SELECT 'command ' || status, count(*) FROM command c JOIN run r ON r.id = :run "
                 "AND r.session_id = c.session_id WHERE c.status IN ('failed', 'lost') "
                 "AND c.claimed_wall_time_s BETWEEN r.started_wall_time_s AND r.last_wall_time_s "

@@ -26,8 +26,9 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database.connection import connect, shipped_objects
+from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
+from webots_mcp.database.schema import shipped_objects
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline

@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from webots_mcp.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.contract import host_name, new_uuid
-from webots_mcp.database.connection import transaction
-from webots_mcp.database.leases import JobLease, give_back, holder_of, lease_of, take
+from webots_mcp.database.job_leases import JobLease, give_back, holder_of, lease_of, take
 from webots_mcp.database.processes import process_alive, process_identity
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.run_rows import columns_of
 

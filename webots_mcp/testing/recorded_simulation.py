@@ -19,8 +19,9 @@ from webots_mcp.contract import (
     PARAMETERS_VARIABLE,
     THROTTLE_VARIABLE,
 )
-from webots_mcp.database.connection import connect, require_current
+from webots_mcp.database.connection import connect
 from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.schema import require_current
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.signals.parameter import Value as ParameterValue
 from webots_mcp.standin import (

@@ -11,16 +11,17 @@ from functools import partial
 from typing import Any, Final, Literal
 
 from webots_mcp.contract import LOG_LEVELS
-from webots_mcp.database.connection import Role, connect, require_current, schema_version
+from webots_mcp.database.connection import Role, connect
 from webots_mcp.database.location import Database
 from webots_mcp.database.queue import CommandQueue, list_commands
+from webots_mcp.database.schema import require_current, schema_version
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.checks import CHECKS, check_run
+from webots_mcp.judging.checks.check_run import CHECKS, check_run
+from webots_mcp.judging.detection.event import Event as FoundEvent
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event as FoundEvent
 from webots_mcp.judging.divergence import compare_repeats
-from webots_mcp.signals.conditions.compiler import read_expectation
+from webots_mcp.signals.conditions.expectation import read_expectation
 from webots_mcp.signals.parameter import Value as ParameterValue
 from webots_mcp.store.export import StateTable
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines

@@ -22,7 +22,8 @@ from tests.bridge.conftest import (
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog, recorder
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import DatabaseError
 from webots_mcp.standin import InProcessSupervisor
 

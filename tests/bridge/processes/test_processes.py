@@ -12,7 +12,8 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from tests.bridge.processes.conftest import Start, has_states, last_number
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.database.session_cleanup import reap
 from webots_mcp.database.waiting_file import adopt
 
@@ -234,7 +235,7 @@ CLAIMER = """
 import sqlite3, sys, time
 from webots_mcp.database.queue import CLAIM, PEEK
 from webots_mcp.database.connection import connect
-from webots_mcp.database.connection import never_wait
+from webots_mcp.database.transactions import never_wait
 from pathlib import Path
 
 connection = connect(Path(sys.argv[1]), "loop")

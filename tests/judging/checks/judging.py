@@ -11,8 +11,8 @@ import numpy as np
 from tests.judging.checks.labelled import FAULTS, WRITTEN, healthy, record
 from tests.judging.detection.writing import put_in_chunks
 from tests.memory import memory_connection
-from webots_mcp.judging.checks import CHECKS, check_run
-from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.checks.check import Finding
+from webots_mcp.judging.checks.check_run import CHECKS, check_run
 
 OF_EACH_FAULT: Final = 5
 HEALTHY: Final = "healthy"

@@ -10,8 +10,8 @@ import pytest
 
 from tests.recordings.rows import RecordedRobot
 from tests.store.test_meanings import state
-from webots_mcp.judging.checks import check_run
-from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.checks.check import Finding
+from webots_mcp.judging.checks.check_run import check_run
 
 
 @pytest.fixture

@@ -17,15 +17,16 @@ from mcp import Client
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp import MCPBridge
 from webots_mcp.cli import main
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.signals.conditions.compiler import read_expectation
+from webots_mcp.signals.conditions.expectation import read_expectation
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.project_file import ProjectWatch, read_project
 from webots_mcp.store.reading.ranges import Scope, find_range

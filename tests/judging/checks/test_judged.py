@@ -13,8 +13,8 @@ import pytest
 
 from tests.judging.checks.judging import HEALTHY, checked, judge, render
 from tests.recordings.rows import Recorded, RecordedRobot
-from webots_mcp.judging.checks import CHECKS, UNDERSTOOD, check_run
-from webots_mcp.signals.conditions.compiler import read_expectation
+from webots_mcp.judging.checks.check_run import CHECKS, UNDERSTOOD, check_run
+from webots_mcp.signals.conditions.expectation import read_expectation
 from webots_mcp.store.chunk_making import make_chunks
 
 

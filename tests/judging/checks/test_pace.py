@@ -10,7 +10,7 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 
 
 def record(recorder: Recorder, factors: list[float]) -> None:

@@ -9,9 +9,9 @@ import pytest
 
 from tests.recordings.rows import RecordedRobot
 from tests.store.test_meanings import state
-from webots_mcp.cli.judging import _as_typed  # pyright: ignore[reportPrivateUsage]
-from webots_mcp.judging.checks import UNDERSTOOD, check_run
-from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.cli.judging_commands import _as_typed  # pyright: ignore[reportPrivateUsage]
+from webots_mcp.judging.checks.check import Finding
+from webots_mcp.judging.checks.check_run import UNDERSTOOD, check_run
 from webots_mcp.signals.meaning import DECLARED_WORDS
 
 

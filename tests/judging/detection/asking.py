@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from tests.judging.detection.labelled import Measure
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 # Without a deadline that a busy machine would meet; how long it took is measured beside.

@@ -13,7 +13,7 @@ from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
-from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.reading.ranges import Scope, find_range

@@ -16,10 +16,11 @@ from tests.frames import frame_of
 from tests.judging.asking import ask, spans
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.judging.detection.event import Event, count_by_kind
+from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import asked_kinds, find_events
+from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.jump import find_jumps
-from webots_mcp.judging.detection.kinds import Event, count_by_kind
 from webots_mcp.judging.detection.search import Search, events_touching
 from webots_mcp.judging.verdicts import SearchCoverage
 from webots_mcp.store.reading.catalogue import known_signals

@@ -13,9 +13,9 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 

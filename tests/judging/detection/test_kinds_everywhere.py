@@ -14,10 +14,10 @@ import pytest
 from tests.judging.asking import ask
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp import MemoryDatabase
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.comparison import compare_runs
-from webots_mcp.judging.detection.events import KINDS, drawn_kinds
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.event import Event
+from webots_mcp.judging.detection.event_kinds import KINDS, drawn_kinds
 from webots_mcp.plotting.canvas import Sheet
 from webots_mcp.plotting.on_a_page import signals_figure
 from webots_mcp.plotting.signal_plot import compose_signals, plot_signals

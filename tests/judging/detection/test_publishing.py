@@ -10,7 +10,7 @@ import pytest
 from tests.judging.detection.publishing import WAYS, Publishing, moments
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.signals.meaning import declare_meaning

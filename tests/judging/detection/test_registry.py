@@ -12,10 +12,10 @@ import pytest
 import webots_mcp
 from tests.recordings.rover import Recorder
 from webots_mcp.judging.comparison import compare_runs
-from webots_mcp.judging.detection import events
+from webots_mcp.judging.detection import event_kinds
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events, timeline
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.plotting.plotted_runs import event_lanes, plotted_runs
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -32,7 +32,7 @@ def tilted(search: Search) -> Iterator[Event]:
 def tilting(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
     """Two runs in which the robot leant over twice, and a kind of event that tells so."""
     kind = EventKind("tilted", "it leant over", tilted, of_numbers=True, drawn=0, stored=True)
-    monkeypatch.setattr(events, "KINDS", [*events.KINDS, kind])
+    monkeypatch.setattr(event_kinds, "KINDS", [*event_kinds.KINDS, kind])
     recorder = Recorder(empty)
     robot_id = recorder.robot("rover")
     session_id = recorder.session(robot_id, "a" * 64)
@@ -78,6 +78,6 @@ def strings_in(path: Path) -> Iterator[str]:
 
 
 def test_options_name_kinds_of_the_registry() -> None:
-    names = [kind.name for kind in events.asked_kinds(EventOptions())]
+    names = [kind.name for kind in event_kinds.asked_kinds(EventOptions())]
     assert "image" not in names and "condition" not in names and "stuck" in names
-    assert len(set(events.kind_names())) == len(events.KINDS)
+    assert len(set(event_kinds.kind_names())) == len(event_kinds.KINDS)

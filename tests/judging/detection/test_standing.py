@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.recordings.rover import start_run
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
 from webots_mcp.store.chunk_making import make_chunks

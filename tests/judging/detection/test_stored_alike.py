@@ -14,13 +14,13 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 ROWS = 6000
 NOISE = np.random.default_rng(1).normal(0, 0.01, (ROWS, 3)).tolist()

@@ -11,9 +11,9 @@ import pytest
 
 from tests.judging.asking import ask, spans
 from tests.recordings.rover import start_run
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.search import ModeUses, RunNoise, Search
 from webots_mcp.judging.detection.standstill import judge_standstills
 from webots_mcp.store.reading.catalogue import known_signals

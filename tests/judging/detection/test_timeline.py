@@ -8,8 +8,8 @@ import pytest
 
 from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.events import timeline
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 

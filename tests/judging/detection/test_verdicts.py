@@ -9,7 +9,7 @@ import sqlite3
 import numpy as np
 
 from tests.recordings.rover import start_run
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.detection.fall import NO_ATTITUDE

@@ -12,7 +12,7 @@ from tests.recordings.rover import WALL_PER_SIM, Recorder
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 _INSERT: Final = (
     "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, replaced) VALUES (?, ?, ?, ?, ?)"

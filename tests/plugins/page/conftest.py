@@ -17,7 +17,8 @@ import pytest
 from tests.browsing import chromium
 from tests.recordings.rover import record_rover, start_run
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.chunk_making import make_chunks

@@ -17,7 +17,8 @@ from tests.plugins.pool.rows import pooled, recorded, uuid_of
 from tests.postgres import NoServerError, Server, running_server
 from tests.recordings.runs import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.chunk_making import make_chunks

@@ -13,7 +13,8 @@ import pytest
 
 from tests.recordings.runs import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.plugins.pool.fetching import FetchResult, fetch
 from webots_mcp.plugins.pool.pool_contents import RunFilter, open_pool, resolve_filter
 from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship

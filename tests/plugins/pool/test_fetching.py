@@ -30,7 +30,7 @@ from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.runs import run_info
 from webots_mcp.store.trial_sets import find_trial_set, trials_of
 

@@ -19,7 +19,8 @@ from tests.plugins.pool.parquet import bucket
 from tests.plugins.pool.rows import BeforeWrite, pooled, shipping
 from tests.recordings.runs import states
 from webots_mcp.contract import host_name, new_uuid
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import (
     DatabaseError,
     PoolBusyError,

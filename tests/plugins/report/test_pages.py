@@ -18,10 +18,10 @@ from tests.plugins.report.conftest import Shown
 from tests.recordings.rows import Recorded
 from webots_mcp.analysis.summary import Spread
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
-from webots_mcp.judging.checks import CheckedRun
-from webots_mcp.judging.checks.finding import Finding
+from webots_mcp.judging.checks.check import Finding
+from webots_mcp.judging.checks.check_run import CheckedRun
 from webots_mcp.judging.comparison import compare_runs
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.run_measures import Measure
 from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.plugins.report.making import Report, make_report

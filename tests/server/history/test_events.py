@@ -13,8 +13,8 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
 from tests.server.history.conftest import STORY, tell
 from tests.server.story import WAYS, Way, client_on, rows_of
+from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import asked_kinds
 
 pytestmark = pytest.mark.anyio
 

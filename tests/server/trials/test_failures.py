@@ -14,7 +14,7 @@ from tests.server.story import rows_of
 from tests.server.trials.conftest import HANGS_AT, TunableDriver, trials, value_of
 from webots_mcp.database.connection import connect as database
 from webots_mcp.steering import trial_worker
-from webots_mcp.store.retention import KEPT
+from webots_mcp.store.retention_limits import KEPT
 
 pytestmark = pytest.mark.anyio
 

@@ -23,7 +23,7 @@ from tests.recordings.rows import Recorded
 from tests.simulator.webots_server import WebotsServer
 from tests.waiting import wait_for
 from webots_mcp.contract import host_name
-from webots_mcp.database.leases import holder_of
+from webots_mcp.database.job_leases import holder_of
 from webots_mcp.simulator import console, console_lines
 from webots_mcp.simulator.console import follow_console, job_of
 from webots_mcp.simulator.instances import Instance

@@ -11,7 +11,7 @@ import pytest
 from tests.judging.asking import ask as ask_events
 from tests.simulator.observer.conftest import Watching
 from webots_mcp.database.connection import connect
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.simulator.observed_bodies import BodyPose, pose_of
 from webots_mcp.store.meanings import meanings_of
 from webots_mcp.store.reading.catalogue import catalogue

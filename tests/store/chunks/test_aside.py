@@ -22,7 +22,7 @@ from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.recording import OpenReaders, RecordingAccess
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 ROWS = 3 * MIN_ROWS_ON_DEMAND
 

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.signals.register import MAX_SIGNALS
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import GROUP_ROWS, chunk_whole_run, make_chunks

@@ -24,7 +24,7 @@ from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
 from webots_mcp.store.export import FOR_VIEWERS, export, export_for_viewers
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 NAMES = st.text('ab."\\[ é', min_size=1, max_size=3)
 VALUES = st.recursive(

@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 
 from webots_mcp import MCPBridge
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.database.waiting_file import journal_parts
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.journal_intake import ingest_journals

@@ -10,9 +10,9 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.judging.detection.event import Event, count_by_kind
+from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import asked_kinds
-from webots_mcp.judging.detection.kinds import Event, count_by_kind
 from webots_mcp.judging.detection.search import Search, events_touching
 from webots_mcp.judging.verdicts import SearchCoverage, Verdicts
 from webots_mcp.store.reading.catalogue import known_signals

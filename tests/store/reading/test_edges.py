@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import moment_of, shown_time

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.chunks import decoded_of, statistics_of

@@ -13,7 +13,7 @@ from tests.recordings.rover import WALL_START_S
 from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.series import RunHistory, query_history
 
 

@@ -15,7 +15,7 @@ from webots_mcp.judging.detection.events import find_events
 from webots_mcp.store import chunk_making
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range, recorded_bounds
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 
 def around_a_purge(

@@ -10,7 +10,8 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.runs import Recorded
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 
 TABLES = ("state", "chunk", "row_group", "log", "event", "image", "command", "run", "session")
 

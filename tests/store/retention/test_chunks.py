@@ -14,7 +14,8 @@ from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.test_size import bytes_by_name
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.signals import register as signal_register
 from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
 from webots_mcp.store.purge import prune, purge
@@ -22,7 +23,7 @@ from webots_mcp.store.reading.catalogue import list_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, whole_run
 from webots_mcp.store.reading.segment import Deadline
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 
 NO_STATES = Limit(rows=0, spared_rows=0)

@@ -15,7 +15,7 @@ from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import view_robot
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 from webots_mcp.store.run_rows import newest_state
 from webots_mcp.store.series import query_history

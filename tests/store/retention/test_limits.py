@@ -14,7 +14,7 @@ from tests.recordings.runs import Recorded
 from webots_mcp.cli import main
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.purge import Upkeep
-from webots_mcp.store.retention import (
+from webots_mcp.store.retention_limits import (
     DEFAULT,
     Limit,
     ask,

@@ -10,7 +10,7 @@ import pytest
 from tests.recordings.runs import Recorded
 from tests.store.retention.conftest import TABLES
 from webots_mcp.store import retention_plan
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 
 def test_logs_events_and_pictures_have_limits_of_their_own(

@@ -13,11 +13,12 @@ import pytest
 
 from tests.recordings.runs import ROW_S, Recorded, states
 from webots_mcp import MCPBridge
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.purge import Upkeep, prune, purge
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 
 

@@ -19,7 +19,7 @@ from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.purge import purge
-from webots_mcp.store.retention import Limit, Retention, mark_kept
+from webots_mcp.store.retention_limits import Limit, Retention, mark_kept
 from webots_mcp.store.retention_plan import plan
 
 

@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.runs import Recorded, states
-from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import Upkeep
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)

@@ -36,7 +36,7 @@ from webots_mcp.errors import (
     InvalidInputError,
     UnknownSignalError,
 )
-from webots_mcp.judging.detection.kinds import (
+from webots_mcp.judging.detection.event import (
     Alike,
     Event,
     NotAskedError,
@@ -44,15 +44,15 @@ from webots_mcp.judging.detection.kinds import (
 )
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.conditions import Condition, Evaluator, parse_condition
-from webots_mcp.signals.conditions.compiler import (
+from webots_mcp.signals.conditions.compiler import Compiler
+from webots_mcp.signals.conditions.expectation import Expectation, parse_expectation
+from webots_mcp.signals.conditions.functions import (
     ARITHMETIC,
     COMPARISONS,
-    Compiler,
-    Expectation,
-    parse_expectation,
+    PLACES_KEPT,
+    SAME_TIME_S,
 )
 from webots_mcp.signals.conditions.scoring import Aggregate
-from webots_mcp.signals.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
 from webots_mcp.signals.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
 from webots_mcp.signals.naming import (
     FARTHEST_M,

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, noise_of, np
-from webots_mcp.judging.detection.kinds import Event, NotSearchableError
+from webots_mcp.judging.detection.event import Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, places_in, were_not_searched
 from webots_mcp.signals.meaning import Quantity
 from webots_mcp.store.reading.frame import Frame

@@ -13,22 +13,10 @@ from typing import Any, Final
 
 from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.detection import (
-    condition,
-    degradation,
-    fall,
-    gap,
-    jump,
-    oscillation,
-    sensors,
-    slip,
-    standstill,
-    stored,
-    targets,
-)
+from webots_mcp.judging.detection.event import Event, count_by_kind
+from webots_mcp.judging.detection.event_kinds import asked_kinds, kind_named, stored_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.kinds import Event, count_by_kind
-from webots_mcp.judging.detection.search import EventKind, Search, events_touching, find_motion
+from webots_mcp.judging.detection.search import Search, events_touching, find_motion
 from webots_mcp.judging.verdicts import SearchCoverage, Verdicts
 from webots_mcp.signals.naming import flatten
 from webots_mcp.store.chunks import parse
@@ -62,28 +50,6 @@ _NO_CURSOR: Final = (
     "{!r} is not a cursor of this tool. Give the `cursor` of this tool's previous answer "
     "unchanged, or leave cursor out to begin at the start."
 )
-KINDS: Final[list[EventKind]] = [
-    stored.RUN,
-    gap.GAP,
-    stored.CHANGE,
-    standstill.STANDSTILL,
-    standstill.STUCK,
-    condition.CONDITION,
-    condition.VIOLATIONS,
-    sensors.MISSING,
-    sensors.FLAT,
-    jump.JUMP,
-    oscillation.OSCILLATION,
-    targets.OFF_TARGET,
-    fall.FALL,
-    slip.SLIP,
-    degradation.DEGRADATION,
-    stored.COMMAND,
-    stored.LOG,
-    stored.NOTICED,
-    stored.KEPT,
-    stored.IMAGE,
-]
 
 
 @dataclass(frozen=True)
@@ -437,49 +403,6 @@ def _read_page_cursor(text: str) -> Place:
         return read_place(json.loads(text))
     except (ValueError, TypeError) as error:
         raise InvalidInputError(_NO_CURSOR.format(text[:80])) from error
-
-
-# -- the registry of kinds: all that reports, counts or draws events reads it ----------------------
-#
-# A new kind is a file that holds an `EventKind`, and a line here.
-
-
-def kind_named(name: str) -> EventKind:
-    """The kind of that name.
-
-    Raises:
-        InvalidInputError: There is none.
-    """
-    found = next((kind for kind in KINDS if kind.name == name), None)
-    if found is None:
-        raise InvalidInputError(f"Unknown kind {name!r}. Kinds: {', '.join(kind_names())}.")
-    return found
-
-
-def kind_names() -> list[str]:
-    """The names of all kinds."""
-    return [kind.name for kind in KINDS]
-
-
-def asked_kinds(options: EventOptions) -> list[EventKind]:
-    """The kinds that the options name, in the order of the registry; else the usual ones.
-
-    Raises:
-        InvalidInputError: There is no kind of such a name.
-    """
-    wanted = {kind_named(name).name for name in options.kinds}
-    return [kind for kind in KINDS if (kind.name in wanted if wanted else kind.usual(options))]
-
-
-def stored_kinds() -> tuple[str, ...]:
-    """The names of the kinds that were stored when they happened."""
-    return tuple(kind.name for kind in KINDS if kind.stored)
-
-
-def drawn_kinds() -> list[EventKind]:
-    """Those that have a row below a plot: what a person would look for first comes first."""
-    drawn = [(kind.drawn, kind) for kind in KINDS if kind.drawn is not None]
-    return [kind for _, kind in sorted(drawn, key=lambda each: each[0])]
 
 
 # -- many similar events as one: "10 dropouts to 0 m, the first at 3.2 s, ..." ---------------------

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
-from webots_mcp.judging.detection.kinds import Event, NotSearchableError
+from webots_mcp.judging.detection.event import Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, in_metres
 from webots_mcp.signals.naming import SOLIDS, WORLD, words_of
 from webots_mcp.store.reading.frame import Frame

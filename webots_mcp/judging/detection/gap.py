@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Final
 
 from webots_mcp.analysis.arrays import longest_usual_s, usual_interval_s
-from webots_mcp.judging.detection.kinds import Alike, Event
+from webots_mcp.judging.detection.event import Alike, Event
 from webots_mcp.judging.detection.search import EventKind, Search
-from webots_mcp.judging.detection.stored import note_unread, recorded_segment
+from webots_mcp.judging.detection.stored_events import note_unread, recorded_segment
 from webots_mcp.store.reading.frame_summary import frame_around, rhythm_in, rows_around
 from webots_mcp.store.reading.unread import Unread
 

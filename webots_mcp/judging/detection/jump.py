@@ -22,7 +22,7 @@ from webots_mcp.analysis.swings import (
     Swing,
     find_swings,
 )
-from webots_mcp.judging.detection.kinds import (
+from webots_mcp.judging.detection.event import (
     Alike,
     Event,
 )

@@ -31,8 +31,8 @@ from webots_mcp.analysis.swings import (
     Swing,
     swings_in,
 )
+from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.kinds import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.meaning import Quantity, is_asked_for, words_in
 from webots_mcp.signals.naming import counted, in_snake_case

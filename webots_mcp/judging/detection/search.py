@@ -16,8 +16,8 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.analysis.track import PathLength, SmoothedTrack, tracks_of
+from webots_mcp.judging.detection.event import Alike, Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.kinds import Alike, Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.verdicts import Cause, JudgedInterval, SearchCoverage
 from webots_mcp.signals.meaning import INPUTS, Meaning, Quantity, words_in
 from webots_mcp.signals.naming import FARTHEST_M, listed, unit_in

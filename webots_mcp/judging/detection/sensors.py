@@ -21,8 +21,8 @@ from webots_mcp.analysis.arrays import (
     np,
     runs_of,
 )
-from webots_mcp.judging.detection.kinds import Alike, Event
-from webots_mcp.judging.detection.missing_items import missing_item_events
+from webots_mcp.judging.detection.event import Alike, Event
+from webots_mcp.judging.detection.missing_array_items import missing_item_events
 from webots_mcp.judging.detection.search import MOST_NAMED, EventKind, Search
 from webots_mcp.signals.naming import find_targets, listed
 from webots_mcp.store.reading.catalogue import other_form

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
-from webots_mcp.judging.detection.kinds import Alike, Event, NotSearchableError
+from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, in_metres, places_in
 from webots_mcp.judging.detection.standstill import ON_THE_SPOT
 from webots_mcp.signals.meaning import words_in

@@ -16,8 +16,8 @@ from webots_mcp.analysis.still_intervals import (
     shortest_seen_s,
 )
 from webots_mcp.analysis.track import SmoothedTrack, track_of
+from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.kinds import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.search import (
     LEAST_VISITS,
     NO_TIME,

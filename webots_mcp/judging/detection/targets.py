@@ -23,13 +23,13 @@ from webots_mcp.analysis.arrays import (
     runs_of,
 )
 from webots_mcp.analysis.summary import unwrap
-from webots_mcp.judging.detection.following import following_of
-from webots_mcp.judging.detection.holding import Grip, grips_in, lost_grips
-from webots_mcp.judging.detection.kinds import (
+from webots_mcp.judging.detection.event import (
     Alike,
     Event,
     NotSearchableError,
 )
+from webots_mcp.judging.detection.following import following_of
+from webots_mcp.judging.detection.holding import Grip, grips_in, lost_grips
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.meaning import HOLDING, Meaning, Quantity, targets_in, words_in
 from webots_mcp.signals.naming import METRES

@@ -23,7 +23,7 @@ from webots_mcp.cli.terminal import answer_lines, print_json
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, host_name
 from webots_mcp.database.connection import connect
 from webots_mcp.database.files import full_path, whole_file
-from webots_mcp.database.leases import give_back, holder_of, lease_of, take
+from webots_mcp.database.job_leases import give_back, holder_of, lease_of, take
 from webots_mcp.database.processes import process_alive
 from webots_mcp.errors import CommandRefusedError, NothingRecordedError, WebotsMCPError
 from webots_mcp.extras.requirements import quoted

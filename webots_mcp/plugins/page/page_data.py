@@ -27,7 +27,7 @@ from webots_mcp.errors import (
     WebotsMCPError,
 )
 from webots_mcp.extras.requirements import quoted
-from webots_mcp.judging.checks import check_run
+from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals

@@ -9,7 +9,7 @@ from cyclopts.validators import Number
 
 from webots_mcp.cli.ending import ending_in_time
 from webots_mcp.cli.options import HERE, Json, Parameter, Where, whole_number
-from webots_mcp.cli.serving import MAX_PORT
+from webots_mcp.cli.server_commands import MAX_PORT
 from webots_mcp.cli.terminal import print_json
 
 _PORT: Final = 5006

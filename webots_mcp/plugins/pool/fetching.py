@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.database.connection import transaction
 from webots_mcp.database.processes import process_alive
+from webots_mcp.database.transactions import transaction
 from webots_mcp.plugins.pool.pool_contents import ChosenRuns, PooledRun
 from webots_mcp.plugins.pool.pool_interface import Pool, is_whole, table
 from webots_mcp.rerun.tape import tape_file

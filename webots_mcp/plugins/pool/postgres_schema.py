@@ -21,7 +21,7 @@ from sqlalchemy.dialects import postgresql
 from sqlmodel import SQLModel
 
 from webots_mcp.contract import SCHEMA_VERSION
-from webots_mcp.database.connection import shipped_objects
+from webots_mcp.database.schema import shipped_objects
 from webots_mcp.errors import PoolError
 from webots_mcp.plugins.pool.pool_interface import (
     ShippedTable,

@@ -10,11 +10,12 @@ from typing import Final, NamedTuple
 
 from webots_mcp.contract import INSPECTION_EVENT, MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.judging.checks import CheckedRun, check_run
+from webots_mcp.judging.checks.check_run import CheckedRun, check_run
 from webots_mcp.judging.comparison import compare_runs
+from webots_mcp.judging.detection.event import Event
+from webots_mcp.judging.detection.event_kinds import KINDS, stored_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
-from webots_mcp.judging.detection.events import KINDS, Found, search_events, stored_kinds
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.events import Found, search_events
 from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.judging.verdicts import AS_STUCK, Verdicts
 from webots_mcp.plotting.intervals import at_resolution, lane_of
@@ -231,12 +232,17 @@ def chapter_of(
         whole = find_range(connection, Scope(run_id=run_id))
     except NothingRecordedError as error:  # The run has no state row.
         checked = check_run(connection, run_id, deadline_s=deadline_s / 2)
-        checks = budget.fit("checks", _checks(checked))
-        parameters = budget.fit("parameters", _parameters(connection, run_id))
-        log = budget.fit("log", _log(connection, run_id), newest=True)
-        opening = opening_of(info, checked, run.started_sim_time_s)
-        return Chapter(info, None, title, f"{_first_words(info)} {error}.", opening, checked, facts,
-                       checks=checks, parameters=parameters, log=log, notes=newer)  # fmt: skip
+        return Chapter(
+            info, None, title,
+            summary=f"{_first_words(info)} {error}.",
+            opening=opening_of(info, checked, run.started_sim_time_s),
+            checked=checked,
+            facts=facts,
+            checks=budget.fit("checks", _checks(checked)),
+            parameters=budget.fit("parameters", _parameters(connection, run_id)),
+            log=budget.fit("log", _log(connection, run_id), newest=True),
+            notes=newer,
+        )  # fmt: skip
     each_alone = _found(connection, whole, deadline_s)
     checked = check_run(connection, run_id, found=each_alone, deadline_s=deadline_s / 2)
     checks = budget.fit("checks", _checks(checked))
@@ -272,17 +278,20 @@ def chapter_of(
         timeline=budget.fit("timeline", _timeline(connection, stored), newest=True),
         log=budget.fit("log", _log(connection, run_id), newest=True),
         numbers=run_trends.total,
-        changed_most=[
-            each.name
-            for each in run_trends.numbers
-            if each.shape != "constant" and not _is_clock(each)
-        ],
+        changed_most=_changed(run_trends),
         found=each_alone,
         images=[each for each in stored.events if each.kind == "image"],
         notes=tuple(
             dict.fromkeys((*newer, *found.notes, *course.notes, *_unread(run_trends), *why_not))
         ),
     )  # fmt: skip
+
+
+def _changed(run_trends: RunTrends) -> list[str]:
+    """Return the signals that changed, the most first, without clocks."""
+    return [
+        each.name for each in run_trends.numbers if each.shape != "constant" and not _is_clock(each)
+    ]
 
 
 def _unread(course: RunTrends) -> list[str]:

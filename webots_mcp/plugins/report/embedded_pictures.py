@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.plugins.report.words import (
     time_at,
 )

@@ -54,7 +54,7 @@ def _of_file(run: RunRecord) -> tuple[Obstacle, ...]:
 @lru_cache(maxsize=8)
 def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
     from webots_mcp.standin.arena import Arena
-    from webots_mcp.standin.errors import WorldError
+    from webots_mcp.standin.standin_errors import WorldError
     from webots_mcp.standin.world import load_world
 
     try:

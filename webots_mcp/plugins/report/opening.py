@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from webots_mcp.judging.checks import CHECKS, UNDERSTOOD, CheckedRun
-from webots_mcp.judging.checks.finding import Finding, Outcome
-from webots_mcp.judging.detection.events import KINDS
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.checks.check import Finding, Outcome
+from webots_mcp.judging.checks.check_run import CHECKS, UNDERSTOOD, CheckedRun
+from webots_mcp.judging.detection.event import Event
+from webots_mcp.judging.detection.event_kinds import KINDS
 from webots_mcp.plugins.report.words import (
     capitalised,
     counted,

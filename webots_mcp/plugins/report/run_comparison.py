@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from webots_mcp.analysis.summary import Spread
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.judging.checks import CheckedRun
+from webots_mcp.judging.checks.check_run import CheckedRun
 from webots_mcp.judging.comparison import Comparison, Difference, compare_runs
 from webots_mcp.judging.run_measures import GOAL_REACHED, Measure
 from webots_mcp.judging.verdicts import WORST_FIRST

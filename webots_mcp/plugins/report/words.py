@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from typing import Any, Final, cast
 
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.jump import JUMP
-from webots_mcp.judging.detection.kinds import Event
 
 LONGEST_TEXT: Final = 1_000
 """Characters of a cell."""

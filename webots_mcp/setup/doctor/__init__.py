@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from webots_mcp.contract import PROJECT_DATA_FOLDER
-from webots_mcp.database.connection import is_damage, text_of
 from webots_mcp.database.files import full_path
+from webots_mcp.database.transactions import is_damage, text_of
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
 from webots_mcp.store.robots import list_robots

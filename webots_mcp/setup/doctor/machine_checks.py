@@ -16,9 +16,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import DATA_DIR_VARIABLE
-from webots_mcp.database.connection import (
-    OLDEST_SQLITE,
-)
+from webots_mcp.database.connection import OLDEST_SQLITE
 from webots_mcp.extras.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.doctor import (
     Diagnosis,

@@ -11,15 +11,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_LATE_S, SCHEMA_VERSION
-from webots_mcp.database.connection import (
-    FrozenConnection,
-    connect,
-    is_there,
-    journal_mode,
-    require_current,
-    schema_version,
-)
+from webots_mcp.database.connection import FrozenConnection, connect, is_there, journal_mode
 from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
+from webots_mcp.database.schema import require_current, schema_version
 from webots_mcp.database.waiting_file import count_rows, waiting_paths
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.setup.doctor import (

@@ -142,6 +142,11 @@ def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
         return wrong(f"{head} ({why})", reload)
     if others is None:
         return wrong(f"{head} ({why})", play)
+    return _paused_by_hand(head, others, play, reload)
+
+
+def _paused_by_hand(head: str, others: _Others, play: str, reload: str) -> Diagnosis:
+    """Say how likely it is that a person paused the simulation, since no controller computes."""
     if others.silent:
         named = _listed(others.silent)
         seen = (

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, TypeAlias
 
 from webots_mcp.errors import UnknownSignalError
-from webots_mcp.signals.conditions.compiler import ARITHMETIC, OF_NUMBERS, Compiler, Number
+from webots_mcp.signals.conditions.compiler import Compiler, Number
+from webots_mcp.signals.conditions.functions import ARITHMETIC, OF_NUMBERS
 from webots_mcp.signals.conditions.syntax import Nodes, Scanned, function_of, is_signal, parse, scan
 from webots_mcp.signals.naming import nearest_first
 

@@ -104,6 +104,8 @@ class ZoneMap:
 
     def spans(self, wanted: Flags) -> list[tuple[int, int]]:
         """Rows [start, stop) of the chunks that are wanted; those side by side are one span."""
+        if not wanted.any():
+            return []
         return _spans(np.append(self.first_row, self.first_row[-1:] + self.row_count[-1:]), wanted)
 
 
@@ -359,7 +361,10 @@ class Frame:
                 if known.setdefault((type(label), label), len(labels)) == len(labels):
                     labels.append(label)
             shared = [known[type(each), each] + FIRST_LABEL for each in values.labels]
-            coded.append((inside, np.array([IS_NUMBER, IS_ABSENT, *shared], np.intp)[values.codes]))
+            codes_there = values.codes
+            if shared != list(range(FIRST_LABEL, FIRST_LABEL + len(shared))):
+                codes_there = np.array([IS_NUMBER, IS_ABSENT, *shared], np.intp)[codes_there]
+            coded.append((inside, codes_there))
         codes: Indexes | None = None
         if coded or sum(each.stop - each.start for each in plain) < len(numbers):
             codes = np.full(len(numbers), IS_ABSENT, np.intp)
@@ -404,24 +409,33 @@ class Frame:
         edges = self._source.first_rows[parts.start : parts.stop + 1]
         return np.minimum(np.maximum(edges, self._start), self._stop) - self._start
 
-    def _make_zone_map(self, name: str) -> ZoneMap:
+    @cached_property
+    def _chunks(self) -> tuple[Indexes, Array, Array, list[int]]:
+        """The edges of its chunks, when they begin and end, and which of them it cuts."""
         source, edges = self._source, self._edges
-        if source.order is None:
-            parts = source.parts(self._start, self._stop)
-            table: Array = np.array(source.statistics(name)[parts])
-            starts_s: Array = np.array(source.starts_s[parts])
-            ends_s: Array = np.array(source.ends_s[parts])
-            whole = np.diff(source.first_rows[parts.start : parts.stop + 1])
-            cut = np.flatnonzero(np.diff(edges) < whole)
+        if source.order is not None:
+            starts_s, ends_s = self.times[edges[:-1]], self.times[edges[1:] - 1]
+            return edges, starts_s, ends_s, list(range(len(edges) - 1))
+        parts = source.parts(self._start, self._stop)
+        starts_s, ends_s = (np.array(each[parts]) for each in (source.starts_s, source.ends_s))
+        whole = np.diff(source.first_rows[parts.start : parts.stop + 1])
+        cut: list[int] = np.flatnonzero(np.diff(edges) < whole).tolist()
+        for at in cut:
+            rows = self.rows(int(edges[at]), int(edges[at + 1]))
+            starts_s[at], ends_s[at] = rows.times[0], rows.times[-1]
+        return edges, starts_s, ends_s, cut
+
+    def _make_zone_map(self, name: str) -> ZoneMap:
+        edges, starts_s, ends_s, cut = self._chunks
+        if self._source.order is None:
+            parts = self._source.parts(self._start, self._stop)
+            table: Array = np.array(self._source.statistics(name)[parts])
         else:
             table = no_statistics(len(edges) - 1)
-            starts_s, ends_s = self.times[edges[:-1]], self.times[edges[1:] - 1]
-            cut = np.arange(len(table))
-        for at in cut.tolist():
+        for at in cut:
             rows = self.rows(int(edges[at]), int(edges[at + 1]))
             table[at] = statistics_of(rows._decoded(name))
-            starts_s[at], ends_s[at] = rows.times[0], rows.times[-1]
-        figures: dict[str, Array] = dict(zip(Statistics._fields, np.transpose(table), strict=True))
+        figures: dict[str, Array] = dict(zip(Statistics._fields, table.T, strict=True))
         held: Indexes = figures.pop("row_count").astype(np.intp)
         present: Indexes = figures.pop("value_count").astype(np.intp)
         changed: Indexes = figures.pop("change_count").astype(np.intp)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import sqlite3
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
@@ -57,7 +58,8 @@ class FrameSource:
 
     Attributes:
         columns: The rows that are in no group.
-        first_rows: The first row of each part, followed by the number of all rows.
+        first_rows: The first row of each part, followed by the number of all rows; `edges` is the
+            same as a list.
         starts_s: Simulation time of the first row of each part; `ends_s` of the last one.
         order: The rows in order of time; None if they are.
         unread: What could not be read so far, each with its column: None for all of them.
@@ -87,10 +89,12 @@ class FrameSource:
         self._noting: list[dict[Unread, Column | None]] = []
         groups = self._sound(groups)
         self._group_ids: Indexes = groups[:, 0].astype(np.intp)
+        self._ids_of_groups: list[int] = self._group_ids.tolist()
         new = np.arange(0, len(columns), chunk_making.GROUP_ROWS)
         ends = np.minimum(new + chunk_making.GROUP_ROWS, len(columns))
         rows = np.concatenate(([0.0], groups[:, 3], ends - new))
         self.first_rows: Indexes = np.cumsum(rows.astype(np.intp))
+        self.edges: list[int] = self.first_rows.tolist()
         times: Array = np.array(columns.times, np.float64)
         self.starts_s: Array = np.append(groups[:, 1], times[new])
         self.ends_s: Array = np.append(groups[:, 2], times[ends - 1])
@@ -115,12 +119,12 @@ class FrameSource:
     @property
     def rows(self) -> int:
         """The number of rows."""
-        return int(self.first_rows[-1])
+        return self.edges[-1]
 
     def parts(self, start: int, stop: int) -> slice:
         """Return the parts that have rows in [start, stop)."""
-        first = int(np.searchsorted(self.first_rows, start, "right")) - 1
-        return slice(first, int(np.searchsorted(self.first_rows, stop)) if start < stop else first)
+        first = bisect_right(self.edges, start) - 1
+        return slice(first, bisect_left(self.edges, stop) if start < stop else first)
 
     def values(
         self,
@@ -142,7 +146,7 @@ class FrameSource:
         """
         parts = self.parts(start, stop)
         places = range(parts.start, parts.stop)
-        edges = self.first_rows.tolist()
+        edges = self.edges
         targets: dict[int, Array] = {}
         if into is not None:
             targets = {
@@ -228,10 +232,10 @@ class FrameSource:
         signal_id = self._signal_id(column)
         if signal_id is None or not places:
             return
-        at = np.array(places, np.intp)
-        ids = self._group_ids[at].tolist()
+        edges, every_id = self.edges, self._ids_of_groups
+        ids = [every_id[place] for place in places]
         of_group = dict(zip(ids, places, strict=True))
-        wanted = dict(zip(ids, np.diff(self.first_rows)[at].tolist(), strict=True))
+        wanted = {every_id[place]: edges[place + 1] - edges[place] for place in places}
         missing = dict(of_group) if signal_id <= SIM_TIMES else {}  # each group has times and ids
         targets: dict[int, Array] = {}
         if into:

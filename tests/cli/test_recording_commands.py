@@ -19,7 +19,7 @@ import pytest
 
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
-from webots_mcp.store.retention import Limit, parse_limit, size_text
+from webots_mcp.store.retention_limits import Limit, parse_limit, size_text
 from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 Say = Callable[..., str]

@@ -118,8 +118,7 @@ def init(
             "--http",
             metavar="URL",
             help="Register a running server instead, such as http://127.0.0.1:8000/mcp. Clients "
-            "read "
-            "its token from the environment variable WEBOTS_MCP_TOKEN.",
+            "read its token from the environment variable WEBOTS_MCP_TOKEN.",
         ),
     ] = None,
     skills: Annotated[
@@ -401,8 +400,9 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
         InvalidInputError: The file is invalid.
     """
     from webots_mcp.contract import DATABASE_NAME
-    from webots_mcp.database.connection import connect, create_schema, schema_version
+    from webots_mcp.database.connection import connect
     from webots_mcp.database.files import make_folder
+    from webots_mcp.database.schema import create_schema, schema_version
     from webots_mcp.store.project_file import compile_project, file_of, read_project
 
     if (file := file_of(data_dir)) is None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.database.connection import transaction
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.run_rows import fetch_run
 

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import MOSTLY, Array, Flags, np
-from webots_mcp.judging.checks.finding import RunUnderCheck
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.checks.check import RunUnderCheck
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.sensors import rows_without_value
 from webots_mcp.signals.meaning import INERT, understood_words, words_in
 from webots_mcp.store.chunks import shown

@@ -8,11 +8,11 @@ from typing import Any, Final, cast
 
 from webots_mcp.analysis.arrays import Array, Indexes, RowSpan, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
-from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times, total_s
+from webots_mcp.judging.checks.check import Examined, RunUnderCheck, times, total_s
+from webots_mcp.judging.detection.event import Event, NotSearchableError
 from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
 from webots_mcp.judging.detection.holding import grips_in
 from webots_mcp.judging.detection.jump import JUMP
-from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.oscillation import GROWS, OSCILLATION, growth_begins_s
 from webots_mcp.judging.detection.search import ROLLS_OUT_S, in_metres, places_in
 from webots_mcp.judging.detection.slip import SLIP, SLIPS, flies

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import Flags, np
-from webots_mcp.judging.detection.kinds import Event
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.store.chunks import parse
 

@@ -9,7 +9,7 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -34,10 +34,11 @@ from webots_mcp.extras.plugin_registry import stand_in_simulator
 
 if TYPE_CHECKING:
     from webots_mcp.database.location import Database
+    from webots_mcp.server.endpoint import Endpoint
     from webots_mcp.simulator.launch import SessionStart, WebotsLaunch
     from webots_mcp.simulator.orders import WebotsLine
     from webots_mcp.store.recording import RecordingAccess
-    from webots_mcp.store.retention import Asked
+    from webots_mcp.store.retention_limits import Asked
 
 _AS_BEFORE: Final = RetentionOptions()
 _URL: Final = "WEBOTS_CONTROLLER_URL"
@@ -55,8 +56,7 @@ def serve(
         Parameter(
             "--tools",
             help="Tools to list: core (20 tools), default (34) or all. Tools that are not listed "
-            "can "
-            "still be called by name.",
+            "can still be called by name.",
         ),
     ] = "default",
     output_schemas: Annotated[
@@ -81,8 +81,7 @@ def serve(
             "--allow-host",
             metavar="NAME",
             help="With --http: host name that clients may use for this computer. Required, with "
-            "the "
-            "TLS files, if HOST can be reached from the network.",
+            "the TLS files, if HOST can be reached from the network.",
         ),
     ] = (),
     tls_cert: Annotated[
@@ -134,18 +133,8 @@ def serve(
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     database, data_dir = resolve_database(recorded.database, recorded.data_dir)
     asked = limits.asked()
-    place = None
-    if http is not None:
-        from webots_mcp.server.http_server import endpoint_of
-
-        place = endpoint_of(http, allow_host, tls_cert, tls_key)
-    elif allow_host or tls_cert or tls_key:
-        raise InvalidInputError(
-            "--allow-host, --tls-cert and --tls-key apply only to --http. Add --http PORT, or "
-            "leave "
-            "them out."
-        )
-    elif sys.stdin.isatty():
+    place = _endpoint(http, allow_host, tls_cert, tls_key)
+    if place is None and sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
             "MCP clients start this command themselves; 'webots-mcp init' registers it.",
@@ -171,6 +160,26 @@ def serve(
         from webots_mcp.server.http_server import serve_http
 
         serve_http(server, place, partial(_say_address, database))
+
+
+def _endpoint(
+    http: str | None, allow_host: Sequence[str], tls_cert: Path | None, tls_key: Path | None
+) -> Endpoint | None:
+    """Return where to serve over HTTP; None for stdin and stdout.
+
+    Raises:
+        InvalidInputError: If the endpoint is not safe, or options of HTTP are given without it.
+    """
+    if http is not None:
+        from webots_mcp.server.endpoint import endpoint_of
+
+        return endpoint_of(http, allow_host, tls_cert, tls_key)
+    if allow_host or tls_cert or tls_key:
+        raise InvalidInputError(
+            "--allow-host, --tls-cert and --tls-key apply only to --http. Add --http PORT, or "
+            "leave them out."
+        )
+    return None
 
 
 def _say_address(database: Database, url: str) -> None:
@@ -234,7 +243,7 @@ def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
     """Set the limits where that is this server's to do; say which others hold."""
     from webots_mcp.errors import NoDatabaseError
     from webots_mcp.store.recording import RecordingAccess
-    from webots_mcp.store.retention import ask
+    from webots_mcp.store.retention_limits import ask
 
     try:
         with RecordingAccess(database, data_dir).writer() as connection:
@@ -343,8 +352,7 @@ def launch(
         Parameter(
             "--stream",
             help="Allow steering without a controller that records. Everyone who can reach the "
-            "port "
-            "can then read files of the project.",
+            "port can then read files of the project.",
         ),
     ] = False,
     port: Annotated[
@@ -361,8 +369,7 @@ def launch(
         Parameter(
             "--stand-in",
             help="Use the stand-in simulator of webots-mcp, which needs no Webots. It stops with "
-            "its "
-            "last controller, or with Ctrl-C.",
+            "its last controller, or with Ctrl-C.",
         ),
     ] = False,
     robot: Annotated[
@@ -416,8 +423,7 @@ def launch(
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
     from webots_mcp.rerun.tape_recorder import IMAGES, TAPE_VARIABLE
-    from webots_mcp.simulator.console import StandInConsole
-    from webots_mcp.simulator.launch import WebotsLaunch, newest_in, require_world
+    from webots_mcp.simulator.launch import WebotsLaunch, require_world
     from webots_mcp.simulator.starting import Start, free_port
     from webots_mcp.store.policy import LAUNCH
     from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest, permit
@@ -433,18 +439,8 @@ def launch(
             raise InvalidInputError(
                 "--stream and --port apply only to Webots, not to --stand-in. Leave them out."
             )
-        os.environ.update({DATA_DIR_VARIABLE: str(recording.data_dir), **taping})
-        watched = recording, newest_in(recording), file, patience_s
-        threading.Thread(target=_watch, args=watched, daemon=True).start()
-        named = _controllers(robot)
-        with StandInConsole(recording) as recorder:
-            status = stand_in_simulator()(file, mode or "realtime", None, named, recorder)
-        option = _data_dir_option(recording)
-        if _has_recorded(*watched[:2]):
-            _say(f"next: 'webots-mcp check{option}' judges what was recorded")
-        else:
-            _say(f"no controller has recorded; 'webots-mcp logs{option}' shows what they printed")
-        return status
+        os.environ.update(taping)
+        return _launch_stand_in(recording, file, mode or "realtime", robot, patience_s)
     if robot:
         raise InvalidInputError(
             "--robot applies only to --stand-in: Webots runs the controllers that the world names. "
@@ -463,7 +459,32 @@ def launch(
             launched.webots.end()
 
 
-def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
+def _launch_stand_in(
+    recording: RecordingAccess,
+    world: Path,
+    mode: Literal["fast", "realtime", "pause"],
+    robots: Sequence[str],
+    patience_s: float,
+) -> int:
+    """Run a world in the stand-in until it ends; return its exit code."""
+    from webots_mcp.contract import DATA_DIR_VARIABLE
+    from webots_mcp.simulator.console import StandInConsole
+    from webots_mcp.simulator.launch import newest_in
+
+    os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
+    watched = recording, newest_in(recording), world, patience_s
+    threading.Thread(target=_watch, args=watched, daemon=True).start()
+    with StandInConsole(recording) as recorder:
+        status = stand_in_simulator()(world, mode, None, _controllers(robots), recorder)
+    option = _data_dir_option(recording)
+    if _has_recorded(*watched[:2]):
+        _say(f"next: 'webots-mcp check{option}' judges what was recorded")
+    else:
+        _say(f"no controller has recorded; 'webots-mcp logs{option}' shows what they printed")
+    return status
+
+
+def _controllers(robots: Sequence[str]) -> dict[str, str]:
     """Controller files by robot name, of NAME=FILE."""
     named: dict[str, str] = {}
     for text in robots:

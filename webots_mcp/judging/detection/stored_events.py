@@ -13,14 +13,14 @@ from typing import Any, Final
 from webots_mcp.analysis.arrays import np
 from webots_mcp.contract import INSPECTION_EVENT, LOG_LEVELS
 from webots_mcp.database.stored_breakpoints import VIOLATION
-from webots_mcp.judging.detection.kinds import (
+from webots_mcp.judging.detection.event import (
     Alike,
     Event,
     NotSearchableError,
     but_for_numbers,
 )
 from webots_mcp.judging.detection.search import EventKind, Search
-from webots_mcp.store.inspections import place_of
+from webots_mcp.store.inspections import reference_to
 from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,
     Point,
@@ -181,7 +181,7 @@ def noticed_events(search: Search) -> Iterator[Event]:
         said = json.loads(data) if data else None
         details: dict[str, Any] = {"what": kind} | ({"data": said} if said else {})
         if kind == INSPECTION_EVENT:  # whose variables webots_inspect_controller shows
-            details = {"what": kind, "event_id": event_id, "line": place_of(said or {})}
+            details = {"what": kind, **reference_to(event_id, said)}
         yield Event("bridge_event", search.segment.run_id, time_s, time_s, wall_s, name, details)
 
 

@@ -9,11 +9,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 from webots_mcp.judging.detection.condition import every_call_of
+from webots_mcp.judging.detection.event import Event, NotSearchableError
 from webots_mcp.judging.detection.events import Found
-from webots_mcp.judging.detection.kinds import Event, NotSearchableError
 from webots_mcp.judging.detection.search import Motion, RunNoise, Search
 from webots_mcp.judging.verdicts import Coverage, Fault, JudgedInterval, Outcome, cause_of
-from webots_mcp.signals.conditions.compiler import Expectation
+from webots_mcp.signals.conditions.expectation import Expectation
 from webots_mcp.signals.meaning import SOURCES, Meaning
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.runs import RunInfo

@@ -15,14 +15,8 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.contract import DATABASE_NAME, PREVIOUS_SCHEMA_VERSION
-from webots_mcp.database.connection import (
-    FrozenConnection,
-    connect,
-    create_schema,
-    require_shipped,
-    schema_version,
-    statements_of,
-)
+from webots_mcp.database.connection import FrozenConnection, connect
+from webots_mcp.database.schema import create_schema, require_shipped, schema_version, statements_of
 
 PREVIOUS_SCHEMA_FILE: Final = Path(__file__).with_name(f"schema_{PREVIOUS_SCHEMA_VERSION}.sql")
 # They belong to SQLite. All other files whose names begin with that of the database hold rows.

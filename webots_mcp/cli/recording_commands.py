@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.logs import FollowedLine
     from webots_mcp.store.reading.ranges import TimeRange
     from webots_mcp.store.recording import RecordingAccess
-    from webots_mcp.store.retention import Retention
+    from webots_mcp.store.retention_limits import Retention
     from webots_mcp.store.retention_plan import Plan
 
     _Format = str
@@ -132,8 +132,7 @@ def export(
     if trial_set is not None and part.scope() != Scope():
         raise InvalidInputError(
             "--trials cannot be combined with a robot, run or range of states, because trials are "
-            "a "
-            "table of their own. Leave one of them out."
+            "a table of their own. Leave one of them out."
         )
     recording = recorded.recording()
     if file is None:
@@ -171,8 +170,7 @@ def _require_for_stdout(form: str, *, as_json: bool) -> None:
     if as_json:
         raise InvalidInputError(
             "--json describes an exported file, and none was named. Name one with -o, or write "
-            "states "
-            "as JSON with --format jsonl."
+            "states as JSON with --format jsonl."
         )
 
 
@@ -298,7 +296,7 @@ def import_(
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
     """Return what the import has brought, of the runs that are in both recordings now."""
-    from webots_mcp.database.upgrade import in_current_schema
+    from webots_mcp.database.schema_migration import in_current_schema
     from webots_mcp.store.merging import settled
 
     with in_current_schema(source) as current:
@@ -360,7 +358,7 @@ def prune(
     by 'webots-mcp retention', are never pruned and do not count; labels of trials do not protect a
     run. Robots may record meanwhile. The MCP server prunes in the same way every few seconds.
     """
-    from webots_mcp.store.retention import in_force, set_limits
+    from webots_mcp.store.retention_limits import in_force, set_limits
     from webots_mcp.store.retention_plan import file_sizes, plan
 
     asked = limits.asked()
@@ -405,7 +403,7 @@ def retention(
     by commas, 'all' (no limit) or 'default'. Limits are stored in the database and apply at once.
     'webots-mcp status --storage' shows them.
     """
-    from webots_mcp.store.retention import described, mark_kept, set_limits
+    from webots_mcp.store.retention_limits import described, mark_kept, set_limits
 
     asked = limits.asked()
     if not run_ids and not asked:
@@ -468,7 +466,7 @@ def _as_data(wanted: Plan) -> dict[str, Any]:
 
 def _print_plan(wanted: Plan, done: str, *, freed_bytes: int = 0) -> None:
     """Print what was or would be deleted: first in a sentence, then by kind of row."""
-    from webots_mcp.store.retention import size_text
+    from webots_mcp.store.retention_limits import size_text
 
     rows = wanted.rows_by_table()
     total, size = sum(rows.values()), size_text(sum(map(wanted.size_of, rows)))
@@ -508,7 +506,7 @@ def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
 
 
 def _print_disk(disk: dict[str, Any]) -> None:
-    from webots_mcp.store.retention import size_text
+    from webots_mcp.store.retention_limits import size_text
 
     def sized(sizes: dict[str, int]) -> str:
         return ", ".join(f"{name} {size_text(size)}" for name, size in sizes.items())

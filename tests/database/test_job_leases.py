@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.database.connection import connect
-from webots_mcp.database.leases import (
+from webots_mcp.database.job_leases import (
     LEASE_S,
     JobLease,
     give_back,

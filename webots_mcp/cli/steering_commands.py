@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from webots_mcp.cli.data import write_picture
 from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.options import (
     HERE,
@@ -30,6 +29,7 @@ from webots_mcp.cli.options import (
     Where,
     whole_number,
 )
+from webots_mcp.cli.recording_commands import write_picture
 from webots_mcp.cli.terminal import clock_text, print_json, print_notes, print_table, text_of
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.contract import BreakpointAction
@@ -148,8 +148,7 @@ def parameters(
     if run_id is not None:
         raise InvalidInputError(
             "--run shows the parameters of an earlier run, which cannot be changed. Leave --run "
-            "out to "
-            "set them in the current run."
+            "out to set them in the current run."
         )
     when = "reset" if from_reset else "now"
     _show(webots_set_parameters, asked, as_json=json, values=settings, when=when)

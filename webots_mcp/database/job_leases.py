@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import host_name
-from webots_mcp.database.connection import transaction
+from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import LeaseLostError
 
 LEASE_S: Final = 30.0

@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import Any, Final, Literal
 
 from webots_mcp.analysis.arrays import MOSTLY, Array, Runs, median, np, runs_of
-from webots_mcp.judging.checks.finding import Examined, RunUnderCheck, times
-from webots_mcp.judging.checks.silence import explained
+from webots_mcp.judging.checks.check import Examined, RunUnderCheck, times
+from webots_mcp.judging.checks.silent_sensors import explained
 from webots_mcp.judging.detection.degradation import DEGRADATION, TIMES
+from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.jump import JUMP
-from webots_mcp.judging.detection.kinds import Event
 from webots_mcp.judging.detection.sensors import FLAT, MOST_REPEATED, OTHER_ROWS, is_noisy
 from webots_mcp.judging.verdicts import Fault
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT, Meaning

@@ -9,7 +9,6 @@ import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import (
-    TYPE_CHECKING,
     Final,
 )
 
@@ -19,10 +18,6 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from webots_mcp.signals.naming import perhaps_meant
-
-if TYPE_CHECKING:
-    pass
-
 
 _LONGEST_VALUE: Final = 80
 _AS_DECLARED: Final[Mapping[str, str]] = MappingProxyType({})

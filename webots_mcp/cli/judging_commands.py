@@ -317,7 +317,7 @@ def _in_processes(
     world: Path | None, asked: Waiting, for_s: float, number: int, *, stand_in: bool
 ) -> list[int]:
     """Run a world in simulators of their own, as trials without parameters."""
-    from webots_mcp.cli.steering import TrialOptions, run_plan
+    from webots_mcp.cli.steering_commands import TrialOptions, run_plan
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.store.trial_sets import trials_of
 

@@ -25,12 +25,13 @@ FLOORS = """
     answers      plotting     setup        testing
     judging      simulator
     store        bridge
+    rerun
     database     standin
     signals
     analysis     contract     errors       extras
 """
 LEVEL = {part: -number for number, floor in enumerate(FLOORS.split("\n")) for part in floor.split()}
-IN_A_CONTROLLER = ("bridge", "database", "signals", "contract", "errors")
+IN_A_CONTROLLER = ("bridge", "rerun", "database", "signals", "contract", "errors")
 OPTIONAL_THERE = {"orjson", "numpy", "controller"}  # where they are installed, or loaded already
 
 

@@ -112,6 +112,7 @@ ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
         "webots_describe_signals",
         {"signals": ["X"], "quantity": "x"},
     ),
+    "run new code on an old run": ("webots_rerun_controller", {}),
     "set a breakpoint": ("webots_breakpoint", {"condition": "X > 1e6"}),
     "breakpoints": ("webots_list_breakpoints", {}),
     "remove a breakpoint": ("webots_remove_breakpoint", {"breakpoint_id": 1}),

@@ -529,6 +529,27 @@ class RunsAnswer(Answer):
     cursor: int | None = said("Cursor to ask with for older runs.")
 
 
+class RerunAnswer(Answer):
+    """What new code commands on an old run, up to the first difference."""
+
+    verdict: str | None = said("The outcome in one sentence.")
+    comparison: str | None = said(
+        "equal, differs, not repeatable, not on the tape, ended early, or timed out."
+    )
+    equal_rounds: int | None = said("Rounds of the loop in which all commands are equal.")
+    equal_until_s: float | None = said("Simulation time up to which they are.")
+    of_rounds: int | None = said("Rounds of the run that were replayed.")
+    differences: list[str] | None = said("What differs in the first round that differs.")
+    deciding_line: dict[str, Any] | None = said(
+        "Line that decided, with the values on it in both versions."
+    )
+    not_recorded: str | None = said("What was asked and is not on the tape.")
+    likely_causes: list[str] | None = said("Why the recorded code does not repeat itself.")
+    exception: str | None = said("Exception that ended the new code.")
+    place: str | None = said("File and line at which the replay ended.")
+    file: str | None = said("Controller that was run.")
+
+
 class ComparisonAnswer(NotedAnswer):
     """Runs beside each other; the first group is the reference."""
 

@@ -29,6 +29,7 @@ from webots_mcp.answers.answer_models import (
     LogsAnswer,
     MonitorAnswer,
     ParametersAnswer,
+    RerunAnswer,
     RobotsAnswer,
     RunAnswer,
     RunsAnswer,
@@ -543,6 +544,11 @@ def _ended_badly(run: Mapping[str, Any]) -> str:
         return ""
     said = f"run {run.get('run_id')} {_end_of(run)}"
     return f"{said} ({', '.join(bad)})" if bad else said
+
+
+@_summary.register
+def _(answer: RerunAnswer) -> str | None:
+    return answer.verdict
 
 
 @_summary.register

@@ -78,6 +78,7 @@ _OF_THE_CORE: Final = {
     "capture": CommandEntry(STEER, f"{_CLI}.steering_commands", "capture"),
     "trials": CommandEntry(RUNS, f"{_CLI}.steering_commands", "trials"),
     "repeatability": CommandEntry(RUNS, f"{_CLI}.judging_commands", "repeatability"),
+    "rerun": CommandEntry(RUNS, f"{_CLI}.rerun_command", "rerun"),
     "first-difference": CommandEntry(RUNS, f"{_CLI}.judging_commands", "first_difference"),
     "export": CommandEntry(DATA, f"{_CLI}.recording_commands", "export"),
     "import": CommandEntry(DATA, f"{_CLI}.recording_commands", "import_"),

@@ -15,9 +15,9 @@ from webots_mcp.questions.declaration import Question
 # In the order in which clients list them; those of plugins follow.
 MODULES: Final = (
     "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor",
-    "query_history", "describe_signals", "find_events", "list_and_compare_runs", "query_sql",
-    "control_simulation", "run_trials", "set_breakpoints", "send_command", "controller_parameters",
-    "edit_scene", "inspect_controller",
+    "query_history", "describe_signals", "find_events", "list_and_compare_runs",
+    "rerun_controller", "query_sql", "control_simulation", "run_trials", "set_breakpoints",
+    "send_command", "controller_parameters", "edit_scene", "inspect_controller",
 )  # fmt: skip
 
 

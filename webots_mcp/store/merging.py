@@ -27,6 +27,7 @@ from webots_mcp.database.session_cleanup import end_session, reap
 from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.rerun.tape import MAX_TAPE_BYTES, TAPE_ENDING, is_tape, tape_file
 from webots_mcp.signals.meaning import MEANING_FIELDS
 from webots_mcp.signals.register import Kind, Seen
 from webots_mcp.store.chunks import (
@@ -132,6 +133,7 @@ def merge(
                 continue
             for run, run_uuid in runs:
                 _copy_pictures(connection, data_dir, pictures or source.parent, run, run_uuid)
+            _copy_tape(data_dir, pictures or source.parent, str(uuid))
             with transaction(connection):
                 _ingest_run_rows(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
@@ -446,6 +448,16 @@ def _copy_pictures(
             shutil.copyfile(file, aside)
 
 
+def _copy_tape(data_dir: Path, source_dir: Path, session_uuid: str) -> None:
+    """Copy the tape of a session, which has all its runs; one that is there is the same."""
+    file, target = tape_file(source_dir, session_uuid), tape_file(data_dir, session_uuid)
+    if not file.is_file() or file.is_symlink() or target.exists():
+        return
+    make_folder(target.parent)
+    with whole_file(target) as aside:
+        shutil.copyfile(file, aside)
+
+
 def _copy_image_rows(connection: sqlite3.Connection, run_id: int, run: int, run_uuid: str) -> None:
     for image_id, path, _ in _images(connection, "r.id = ?", run_id):
         own = {"run_id": run, "path": _path_here(path, run_uuid)}
@@ -511,8 +523,8 @@ def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         for each in found:
             entry = zipfile.ZipInfo.from_file(each, each.relative_to(folder).as_posix())
-            is_picture = each.suffix.lower() in PICTURES  # is compressed already
-            entry.compress_type = zipfile.ZIP_STORED if is_picture else zipfile.ZIP_DEFLATED
+            is_compressed = each.suffix.lower() in (*PICTURES, TAPE_ENDING)
+            entry.compress_type = zipfile.ZIP_STORED if is_compressed else zipfile.ZIP_DEFLATED
             with each.open("rb") as source, archive.open(entry, "w") as target:
                 while piece := source.read(_PIECE_BYTES):
                     target.write(piece)
@@ -522,7 +534,8 @@ def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
 
 
 def _is_packed(path: Path) -> bool:
-    return str(path) == DATABASE_NAME or (len(path.parts) > 1 and path.suffix.lower() in PICTURES)
+    is_picture = len(path.parts) > 1 and path.suffix.lower() in PICTURES
+    return str(path) == DATABASE_NAME or is_picture or is_tape(path)
 
 
 def is_bundle(file: Path) -> bool:
@@ -596,7 +609,8 @@ def _is_ours(entry: zipfile.ZipInfo) -> bool:
         return not _is_link(entry)
     plain = not path.is_absolute() and ".." not in path.parts and len(path.parts) > 1
     named = plain and not any(sign in entry.filename for sign in "\\:\0")
-    fits = path.suffix.lower() in PICTURES and entry.file_size <= MAX_FILE_BYTES
+    is_picture = path.suffix.lower() in PICTURES and entry.file_size <= MAX_FILE_BYTES
+    fits = is_picture or (is_tape(path) and entry.file_size <= MAX_TAPE_BYTES)
     return named and fits and not _is_link(entry)
 
 

@@ -6,7 +6,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 
 from tests.rerun.taping import WORLD, data_dir_of, record, recorded, rerun_of, tapes
 from tests.rerun.taping import project as make_project

@@ -9,11 +9,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from webots_mcp.analysis.arrays import Array, np
-from webots_mcp.analysis.levels import level_changes
 from webots_mcp.errors import ConditionFailedError, UnknownSignalError
 from webots_mcp.judging.checks import of_motion, of_sensors
 from webots_mcp.judging.checks.finding import (
@@ -29,6 +26,7 @@ from webots_mcp.judging.detection import (
     fall,
     jump,
     oscillation,
+    pace,
     sensors,
     slip,
     targets,
@@ -42,6 +40,7 @@ from webots_mcp.judging.detection.condition import (
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found, asked_kinds, search_events
 from webots_mcp.judging.detection.kinds import NotSearchableError
+from webots_mcp.judging.detection.pace import SLOW, PacePart, pace_of, together
 from webots_mcp.judging.detection.search import Search
 from webots_mcp.judging.verdicts import WORST_FIRST, Coverage, Fault, Outcome, outcome_of
 from webots_mcp.signals.conditions.compiler import Expectation
@@ -62,11 +61,7 @@ _OF_EVENTS: Final = 0.7  # of the time
 
 # -- of a run as a whole: its pace, its log, its end, and whether it reached its goal --------------
 
-SLOW: Final = 0.9  # of real time
-_CELL_S: Final = 1.0  # of simulation time, over which the pace is measured, or longer
-_MOST_CELLS: Final = 500
 _MOST_PARTS: Final = 3  # slow ones that are named
-_FALSE_ALARMS: Final = 1e-3  # that a run of one pace is divided
 _LONGEST_MESSAGE: Final = 120
 _MUCH: Final = 0.05  # of the run, or of its rows
 _HABIT: Final = 3  # so many times: its code does it
@@ -97,75 +92,34 @@ _JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
 _OFF, _FALL = (targets.OFF_TARGET.name,), (fall.FALL.name,)
 _SWINGS: Final = (oscillation.OSCILLATION.name,)
 _SLIP: Final = (slip.SLIP.name,)
+_SLOW: Final = (pace.SLOW_SIMULATION.name,)
 _NOISE: Final = (degradation.DEGRADATION.name,)
 
 
 def keeps_pace(run: RunUnderCheck) -> Examined:
     """Warns where a part of it was slower than 0.9 of real time; waits do not count.
 
-    Parts are divided where the pace changes for good, by a rank test with a false-alarm rate of
-    1 in 1,000 for a run. A wait is over a second long and over 20 times as long as its step.
+    Parts are divided where the pace changes, also for a while, by a test of ranks with a
+    false-alarm rate of 1 in 1,000 for a run. A wait is over a second long and over 20 times as long
+    as its step.
     """
-    frame = run.frame
-    steps, waits = np.diff(frame.times), np.diff(frame.wall_times)
-    moved = (steps > 0) & (waits >= 0)
-    usual_s = float(np.median(waits[moved])) if moved.any() else 0.0  # of who is slow all the time
-    goes_on = moved & (waits <= np.maximum(max(1.0, 3 * usual_s), 20 * steps))
-    if float(waits[goes_on].sum()) < 1.0:
-        raise NotSearchableError("it lasted less than a second of wall time")
-    longest = float(waits[moved].max())
-    waited = f"; longest wait between two rows {longest:.3g} s" if longest > 1.0 else ""
-    parts = _paces(frame.times[1:][goes_on], steps[goes_on], waits[goes_on])
-    slow = [part for part in parts if part.factor < SLOW]
-    said = [f"{part.factor:.3g} times real time" for part in slow or [_in_all(parts)]]
-    if len(parts) > 1 and slow:
-        others = [part for part in parts if part.factor >= SLOW]
-        said = [f"{e.factor:.3g} times real time {_span(e, parts)}" for e in slow[:_MOST_PARTS]]
-        said += [f"else {_in_all(others).factor:.3g}"] if others else []
+    found = pace_of(run.search)
+    waited = f"; longest wait between two rows {found.longest_wait_s:.3g} s"
+    waited = waited if found.longest_wait_s > 1.0 else ""
+    slow = [part for part in found.slow if part.factor < SLOW]
+    said = [f"{part.factor:.3g} times real time" for part in slow or [together(found.parts)]]
+    if len(found.parts) > 1 and slow:
+        others = [part for part in found.parts if part not in slow]
+        said = [
+            f"{e.factor:.3g} times real time {_span(e, found.parts)}" for e in slow[:_MOST_PARTS]
+        ]
+        said += [f"else {together(others).factor:.3g}"] if others else []
     evidence = ", ".join(said) + waited
     if not slow:
-        judged = counted(len(frame), "row")
+        judged = counted(len(run.frame), "row")
         return run.covered(evidence, judged=judged, limit=f"limit {SLOW:g} times real time")
-    since_s = slow[0].start_s if slow[0] is not parts[0] else float(frame.times[0])
-    more = f"webots_list_runs(cursor={run.info.run_id + 1})"
-    return Fault("warn", evidence, since_s, None, more)
-
-
-class PacePart(NamedTuple):
-    """A part of a run of one pace: simulated and wall seconds without waits."""
-
-    start_s: float
-    end_s: float
-    sim_s: float
-    wall_s: float
-
-    @property
-    def factor(self) -> float:
-        """The real-time factor."""
-        return self.sim_s / max(self.wall_s, 1e-9)
-
-
-def _paces(times: Array, steps: Array, waits: Array) -> list[PacePart]:
-    """The parts of a run between changes of its pace."""
-    cell_s = max(_CELL_S, float(times[-1] - times[0]) / _MOST_CELLS)
-    cells = ((times - times[0]) // cell_s).astype(np.intp)
-    firsts = np.flatnonzero(np.diff(cells, prepend=-1))
-    sim_s, wall_s = np.add.reduceat(steps, firsts), np.add.reduceat(waits, firsts)
-    edges = [0, *level_changes(sim_s / np.maximum(wall_s, 1e-9), _FALSE_ALARMS), len(firsts)]
-    ends_s = np.append(times[firsts[1:]] - steps[firsts[1:]], times[-1])
-    begins_s = times[firsts] - steps[firsts]
-    return [
-        PacePart(
-            float(begins_s[a]), float(ends_s[b - 1]), float(sim_s[a:b].sum()),
-            float(wall_s[a:b].sum()),
-        )
-        for a, b in pairwise(edges)
-    ]  # fmt: skip
-
-
-def _in_all(parts: Sequence[PacePart]) -> PacePart:
-    sim_s, wall_s = sum(each.sim_s for each in parts), sum(each.wall_s for each in parts)
-    return PacePart(parts[0].start_s, parts[-1].end_s, sim_s, wall_s)
+    since_s = slow[0].start_s if slow[0] is not found.parts[0] else float(run.frame.times[0])
+    return Fault("warn", evidence, since_s, len(slow), run.more(_SLOW[0]))
 
 
 def _span(part: PacePart, parts: Sequence[PacePart]) -> str:
@@ -387,7 +341,7 @@ CHECKS: Final[list[Check]] = [
     Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
     Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", _JUMP),
     Check("sensors keep their noise", of_sensors.sensors_keep_noise, "numbers", _NOISE),
-    Check("keeps pace", keeps_pace, "rows", of_values=True),
+    Check("keeps pace", keeps_pace, "rows", _SLOW, of_values=True),
     Check("misses no steps", misses_no_steps, "rows", ("gap",), of_values=True),
     Check("logs no errors", logs_no_errors, "", ("log",)),
     Check("ends well", ends_well, ""),

@@ -273,7 +273,9 @@ def stays_upright(run: RunUnderCheck) -> Examined:
     got_up = first.details.get("got_up")
     after = f"and got up {first.duration_s:.3g} s later" if got_up else "and stayed down"
     who = f"{first.name} " if first.name else ""
-    evidence = f"{who}fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
+    to = f" ({first.details['direction']})" if "direction" in first.details else ""
+    tilted = f"tilted by {first.details['tilt_deg']:.3g}°{to} {after}"
+    evidence = f"{who}fell {times(len(falls))}: {tilted}"
     return Fault("fail", evidence, first.start_s, len(falls), run.more(FALL.name))
 
 

@@ -68,7 +68,7 @@ def slip_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError(
             "its motors lift it"
             if wheels and flies(search)
-            else "no position, or no speeds of its wheels, are recorded: publish them"
+            else "publish the position and the speeds of its wheels"
         )
     if _Slip not in search.shared:
         search.shared[_Slip] = _slips_of(search, search.motion.position, wheels)

@@ -357,11 +357,19 @@ def _never_reached(search: Search, pursuit: Pursuit) -> Iterator[Event]:
         nearest = max(OFF_SHARE * size, margin)
         nearer = max(_ON_ITS_WAY * size, 2 * margin)
         crosses = np.any(np.sign(error) != np.sign(error[0]))
-        if crosses or away.min() <= nearest or away[half:].max() - away[-1] > nearer:
+        if crosses or away.min() <= nearest or _drop_of(away[half:]) > nearer:
             continue
-        first = int(np.flatnonzero(np.append(True, away[:-1] > away[-1] + nearer))[-1])
+        # Gusts move it to and fro while it stays away; before, it was on its way.
+        farthest = float(away[half:].max()) + nearer
+        first = int(np.flatnonzero(np.append(True, away[:half] > farthest))[-1])
         start_s, end_s = float(cells.starts_s[cells.is_full][first]), stay.end_s
         yield _off_target(search, pursuit, start_s, end_s, error[first:], size)
+
+
+def _drop_of(values: Array) -> float:
+    """By how much the straight line through some values falls from the first to the last."""
+    at = np.arange(len(values)) - (len(values) - 1) / 2
+    return -float((at * values).sum() / max(float((at * at).sum()), 1.0)) * (len(values) - 1)
 
 
 def _off_target(

@@ -86,7 +86,8 @@ def _wheels(t: Array, random: Random) -> Columns:
     on_spot = (random.random(16) < 0.25)[parts]
     mean = np.where(on_spot, 0.0, mean)
     left, right = mean - apart, mean + apart
-    radius_m, track_m = random.uniform(0.02, 0.2), random.uniform(0.1, 0.8)
+    radius_m = random.uniform(0.02, 0.2)
+    track_m = radius_m * random.uniform(4, 10)  # so that it turns by 2 rad/s at most
     unlike = random.uniform(0.9, 1.1)  # radii of both sides
     skids = random.uniform(0.5, 1.0)  # of a turn that wheels without slip would make
     step = np.diff(t, prepend=0.0)

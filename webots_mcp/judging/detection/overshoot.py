@@ -2,7 +2,9 @@
 
 A well damped follower passes its target by little: one of second order passes it by a quarter of
 the step where its damping ratio is 0.4, and by more with less damping. Compared is the median of
-three rows, which noise takes beyond four of its standard deviations in 1 of 300 million places.
+three rows, which noise takes beyond four of its standard deviations in 1 of 300 million places. Of
+660 steps of healthy joints with ratios of 0.5 or more (`tests.cases.false_alarms`) none was taken
+for one.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class PacePart(NamedTuple):
         return self.sim_s / max(self.wall_s, 1e-9)
 
 
-class Pace(NamedTuple):
+class RunPace(NamedTuple):
     """The pace of a run.
 
     Attributes:
@@ -61,7 +61,7 @@ class Pace(NamedTuple):
         return [part for part in self.parts if self.is_slow(part)]
 
 
-def pace_of(search: Search) -> Pace:
+def pace_of(search: Search) -> RunPace:
     """Return the pace of the whole run of a search.
 
     A wait is over a second long and over 20 times as long as its step.
@@ -69,8 +69,8 @@ def pace_of(search: Search) -> Pace:
     Raises:
         NotSearchableError: It was too short.
     """
-    if Pace in search.shared:
-        known: Pace = search.shared[Pace]
+    if RunPace in search.shared:
+        known: RunPace = search.shared[RunPace]
         return known
     frame = search.whole
     steps, waits = np.diff(frame.times), np.diff(frame.wall_times)
@@ -81,14 +81,14 @@ def pace_of(search: Search) -> Pace:
         raise NotSearchableError("it lasted less than a second of wall time")
     parts = _parts_of(frame.times[1:][goes_on], steps[goes_on], waits[goes_on])
     usual = max(parts, key=lambda part: part.sim_s).factor
-    pace = Pace(parts, usual, float(waits[moved].max()))
+    pace = RunPace(parts, usual, float(waits[moved].max()))
     merged: list[PacePart] = []
     for part in parts:
         if merged and pace.is_slow(part) and pace.is_slow(merged[-1]):
             merged[-1] = together([merged[-1], part])
         else:
             merged.append(part)
-    search.shared[Pace] = pace._replace(parts=merged)
+    search.shared[RunPace] = pace._replace(parts=merged)
     return pace._replace(parts=merged)
 
 

@@ -131,15 +131,15 @@ def _slips_of(
     rolls = f"rolls {usual:.3g} m/s{unit}"
     runs = runs_of(ratios < SLIPS * usual, starts_s)
     no_side = list[str]()
-    slips = list(_turns_though_straight(search, wheels))
+    of_sides, factor = list[SideSlip](), 0.0
     try:
-        of_sides = side_slips(search, wheels, usual)
-        slips = [each for each in slips if not _is_within(each, of_sides)]
-        slips += [_Slip(e.start_s, e.end_s, e.side, _says(e)) for e in of_sides]
+        of_sides, factor = side_slips(search, wheels, usual)
     except NotSearchableError as error:
-        of_sides = list[SideSlip]()
         if all(wheels_by_side(search, wheels)):
             no_side.append(f"not by side: {error}")
+    turns = _turns_though_straight(search, wheels, factor)
+    slips = [each for each in turns if not _is_within(each, of_sides)]
+    slips += [_Slip(e.start_s, e.end_s, e.side, _says(e)) for e in of_sides]
     for run in runs.only(runs.durations_s + 2 * lasts_s >= SLIP_S).spans():
         least = float(np.nanmin(ratios[run.start : run.stop]))
         end_s = min(run.end_s + 2 * lasts_s, search.ended_s)
@@ -165,10 +165,17 @@ def _is_within(slip: _Slip, others: Sequence[SideSlip]) -> bool:
     return any(2 * each > slip.end_s - slip.start_s for each in shared_s)
 
 
-def _turns_though_straight(search: Search, wheels: list[RegisteredSignal]) -> Iterator[_Slip]:
+def _turns_though_straight(
+    search: Search, wheels: list[RegisteredSignal], factor: float
+) -> Iterator[_Slip]:
     """A robot that turned for long while the wheels of both sides turned alike: one side slips.
 
     Where none of its wheels has a side nothing is said.
+
+    Args:
+        search: In which run.
+        wheels: Of both sides.
+        factor: How fast it turns per difference of its wheels; 0 where that is not known.
     """
     heading, sides = search.motion.heading, wheels_by_side(search, wheels)
     if heading is None or not all(sides):
@@ -189,7 +196,9 @@ def _turns_though_straight(search: Search, wheels: list[RegisteredSignal]) -> It
     alike = alike[1:] & alike[:-1] & (mean[1:] * mean[:-1] > 0) & (np.diff(cells[firsts]) == 1)
     if not alike.any():
         return
-    turned, driven = np.diff(course), (mean[1:] + mean[:-1]) / 2 * np.diff(t)
+    steps_s, apart = np.diff(t), right - left
+    turned, driven = np.diff(course), (mean[1:] + mean[:-1]) / 2 * steps_s
+    turned = turned - factor * (apart[1:] + apart[:-1]) / 2 * steps_s  # what wheels explain
     # Wheels of unlike radius make it turn all the time: what it does in a tenth of it is usual.
     ratios = turned[alike] / driven[alike]
     usual = float(ratios[np.argsort(np.abs(ratios))[len(ratios) // 10]])

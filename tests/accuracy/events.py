@@ -90,6 +90,7 @@ CHECKED: Final = (
     "fall",
     "slip",
     "degradation",
+    "slow_simulation",
 )  # kinds that labelled runs of checks show
 _EVENTS: Final = """\
 For each row interval and noise level, {cases} recordings of each of {recordings} kinds are

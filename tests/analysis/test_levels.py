@@ -32,7 +32,7 @@ def test_a_level_that_comes_back_is_found_in_the_middle_and_at_the_ends(
     start: int, length: int
 ) -> None:
     draws = np.random.default_rng([start, length])
-    values = draws.normal(1.0, 0.02, 120)
+    values = np.asarray(draws.normal(1.0, 0.02, 120), np.float64)
     stop = min(start + length, 120)
     values[start:stop] *= 0.4
     places = level_changes(values, 1e-3)

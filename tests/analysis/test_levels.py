@@ -32,9 +32,9 @@ def test_a_level_that_comes_back_is_found_in_the_middle_and_at_the_ends(
     start: int, length: int
 ) -> None:
     draws = np.random.default_rng([start, length])
-    values = np.asarray(draws.normal(1.0, 0.02, 120), np.float64)
+    values = draws.normal(1.0, 0.02, 120)
     stop = min(start + length, 120)
-    values[start:stop] *= 0.4
+    values[start:stop] = draws.normal(0.4, 0.01, stop - start)
     places = level_changes(values, 1e-3)
     wanted = [each for each in (start, stop) if 0 < each < 120]
     assert len(places) == len(wanted)

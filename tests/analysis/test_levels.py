@@ -44,5 +44,6 @@ def test_a_level_that_comes_back_is_found_in_the_middle_and_at_the_ends(
 @pytest.mark.parametrize("count", [20, 60, 150])
 def test_values_of_few_kinds_are_hardly_ever_divided(count: int) -> None:
     draws = np.random.default_rng(count)
-    divided = sum(bool(level_changes(draws.integers(0, 3, count) * 1.0, 1e-3)) for _ in range(1000))
+    drawn = (draws.integers(0, 3, count).astype(np.float64) for _ in range(1000))
+    divided = sum(bool(level_changes(each, 1e-3)) for each in drawn)
     assert divided <= 4

@@ -6,7 +6,6 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.retention_limits import Limit, Retention
 
 from tests.rerun.taping import WORLD, data_dir_of, record, recorded, rerun_of, tapes
 from tests.rerun.taping import project as make_project
@@ -14,6 +13,7 @@ from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
 from webots_mcp.store.purge import prune
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.testing import RecordedSimulation
 
 

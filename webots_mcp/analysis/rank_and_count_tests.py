@@ -1,21 +1,18 @@
-"""Statistical tests of ranks and counts: changes of a level, and rare events of groups of runs.
+"""Statistical tests of counts: whether rare events differ between groups of runs.
 
-The first finds where the level of values changes for good. The others compare how many runs of two
-groups have an event, by Fisher's exact test and by intervals of differences.
+How many runs of two groups have an event is compared by Fisher's exact test and by intervals of
+differences.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
 
-from webots_mcp.analysis.arrays import Array, np
 from webots_mcp.analysis.summary import MOST_CHANCE, MOST_REPEATED, Verdict
 
 _NORMAL_90: float = 1.6448536  # a normal figure lies within that many deviations nine times of ten
 _SAME_CHANCE: float = 1 + 1e-7  # two tables are as likely if they differ by rounding only
-FEWEST_VALUES: Final = 5  # on each side of a change
 
 
 def is_rare(groups: Sequence[Sequence[float | None]]) -> bool:
@@ -145,48 +142,3 @@ def _wanted(first: tuple[int, int], other: tuple[int, int], limit: float) -> int
         if chance_of_shares(having[0], runs, having[1], runs) < limit:
             return runs
     return None
-
-
-def level_changes(values: Array, false_alarms: float) -> list[int]:
-    """Return the places at which the level of values changes, in order.
-
-    At the place where the rank sums of both sides differ most (A. N. Pettitt, A non-parametric
-    approach to the change-point problem, Applied Statistics 28, 1979) they are divided, then each
-    side again. Single values that stand out, and a skewed distribution, divide nothing.
-
-    Args:
-        values: In order of time. They may have any distribution, and should be independent.
-        false_alarms: How often at most values of one level are divided.
-    """
-    found: list[int] = []
-    waiting = [(0, len(values))]
-    while waiting:
-        start, stop = waiting.pop()
-        place = _change_in(values[start:stop], false_alarms)
-        if place:
-            found.append(start + place)
-            waiting += [(start, start + place), (start + place, stop)]
-    return sorted(found)
-
-
-def _change_in(values: Array, false_alarms: float) -> int:
-    """The place of the one change that shows most; 0 where none is significant."""
-    count = len(values)
-    if count < 2 * FEWEST_VALUES:
-        return 0
-    ranks = _ranks(values)
-    before = np.arange(1, count)
-    sums = np.cumsum(ranks)[:-1] - before * (count + 1) / 2
-    variance = float(np.var(ranks)) * before * (count - before) / max(1, count - 1)
-    scores = np.abs(sums) / np.sqrt(np.maximum(variance, 1e-12))
-    scores[: FEWEST_VALUES - 1] = scores[count - FEWEST_VALUES :] = 0.0
-    place = int(scores.argmax())
-    chance = math.erfc(float(scores[place]) / math.sqrt(2)) * count  # of any place
-    return place + 1 if chance < false_alarms else 0
-
-
-def _ranks(values: Array) -> Array:
-    """Ranks from 1; equal values share the mean of theirs."""
-    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
-    ends = np.cumsum(counts)
-    return np.asarray((ends - (counts - 1) / 2)[places], np.float64)

@@ -203,7 +203,7 @@ def test_a_fall_is_shown_with_the_signals_it_is_judged_by(
     html = make_report(recorded.connection, [robot.run_id], tmp_path).html
     text = Shown(html).text
     assert re.search(r"Failed rover ran for 30 s and its controller finished\. Fell once", text)
-    assert "Fell: tilted by 90°, stayed down" in text
+    assert "Fell: tilted by 90° (right), stayed down" in text
     figure = html.decode().split("Fall at ")[1].split("</script>")[0]
     assert '"name":"roll"' in figure
     assert '"name":"pose.x"' not in figure

@@ -42,7 +42,7 @@ AWAY_S: Final = 20.0
 LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
 USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
 LEAST_VISITS: Final = 3
-_OF_MOTION: Final = ("speed", "turn rate", "wheel speed")
+_OF_MOTION: Final = ("speed", "turn rate", "wheel speed", "heading")
 EARLIER_RUNS: Final = 3
 MOST_ROWS: Final = 2_000_000  # of a run: its first ones
 _STANDS_SHARE: Final = 0.8  # of a visit
@@ -179,12 +179,17 @@ def find_motion(
         commanded,
         None if commanded else speed,
         (declared.get("mode") if options.mode is None else None) or first("mode", options.mode),
-        heading=declared.get("heading") or first("yaw"),
+        heading=declared.get("heading") or first("yaw") or _heading_among(meant),
         wheels=tuple(each for each in wheels if each != commanded),
         height=declared.get("height") or signals.get(f"z{place}"),
         wheel_commands=tuple(each for each in wheel_commands if each != commanded),
         turn_command=next(iter(meant("turn rate", sets=True)), None),
     )
+
+
+def _heading_among(meant: Callable[..., list[RegisteredSignal]]) -> RegisteredSignal | None:
+    """The first measured heading of which it is known what a whole turn is."""
+    return next((each for each in meant("heading", sets=False) if each.turn), None)
 
 
 _OF_ROLES: Final = {"x": "x", "y": "y", "z": "height", "yaw": "heading", "mode": "mode"}

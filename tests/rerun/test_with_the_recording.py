@@ -13,7 +13,7 @@ from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
 from webots_mcp.store.purge import prune
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.testing import RecordedSimulation
 
 
@@ -41,6 +41,17 @@ def test_an_import_takes_the_tape_along_once(project: Path, tmp_path: Path) -> N
         source = data_dir_of(project) / DATABASE_NAME
         main(["import", str(source), "--data-dir", str(tmp_path)])
     assert tape_files(tmp_path) == tape_files(data_dir_of(project))
+
+
+def test_a_pool_takes_the_tape_along_with_pictures(project: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    pool, other = str(tmp_path / "pool"), tmp_path / "other"
+    assert main(["ship", "--to", pool, "--pictures", "--data-dir", str(data_dir_of(project))]) == 0
+    assert main(["fetch", "--from", pool, "--robot", "rover", "--data-dir", str(other)]) in (
+        0,
+        None,
+    )
+    assert tape_files(other) == tape_files(data_dir_of(project))
 
 
 def test_a_tape_is_deleted_with_the_last_run_of_its_session(tmp_path: Path) -> None:

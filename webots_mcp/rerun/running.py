@@ -34,7 +34,7 @@ from webots_mcp.rerun.source_files import (
     unpack_sources,
 )
 from webots_mcp.rerun.tape import Tape, open_tape, tape_files
-from webots_mcp.rerun.tape_recorder import TAPE_VARIABLE
+from webots_mcp.rerun.tape_wanted import TAPE_VARIABLE
 
 STALL_S: Final = 60.0  # of wall time without a step, after which a replay is ended
 LIMIT_S: Final = 3600.0  # of wall time, for each replay

@@ -30,7 +30,7 @@ from webots_mcp.extras.plugin_registry import export_formats
 from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
-from webots_mcp.plugins.report.making import make_report
+from webots_mcp.plugins.report.make_report import make_report
 from webots_mcp.questions import all_questions
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers

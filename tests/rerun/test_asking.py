@@ -23,7 +23,7 @@ from tests.rerun.taping import (
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import NotAllowedError
-from webots_mcp.questions.declaring import Caller
+from webots_mcp.questions.declaration import Caller
 from webots_mcp.questions.rerun_controller import require_rerun
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.recording import RecordingAccess

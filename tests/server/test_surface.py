@@ -14,7 +14,7 @@ from mcp import Client, StdioServerParameters
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
 from tests.tool_list import counts_of
-from webots_mcp.questions.declaring import Tier
+from webots_mcp.questions.declaration import Tier
 
 pytestmark = pytest.mark.anyio
 

@@ -130,7 +130,7 @@ class WorldAnswer(Answer):
         "What the observer sees: robots, and solids with a DEF name."
     )
     real_time_factor: float | None = said(
-        "Simulated seconds per wall-clock second, over the last seconds recorded."
+        "Simulated seconds per wall-clock second over the last 5 s recorded (not the whole run)."
     )
     supervisor: bool | None = said("Whether the robot may control the simulation.")
     run: dict[str, Any] | None = said("The run: how it began and ended, its duration and its rows.")

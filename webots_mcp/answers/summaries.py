@@ -44,7 +44,7 @@ from webots_mcp.answers.answer_models import (
     WorldAnswer,
 )
 from webots_mcp.judging.verdicts import AS_STUCK
-from webots_mcp.store.ages import age_in_words
+from webots_mcp.store.relative_times import age_in_words
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4

@@ -64,7 +64,7 @@ def rerun(
 
         webots-mcp rerun 12 --pdb --break-at 12.4
     """
-    from webots_mcp.cli.asking import ask_and_show
+    from webots_mcp.cli.question_commands import ask_and_show
     from webots_mcp.questions.rerun_controller import webots_rerun_controller
 
     if break_at_s is not None and not pdb:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from cyclopts.validators import Number
 
-from webots_mcp.cli.ending import ending_in_time
+from webots_mcp.cli.interrupts import ending_in_time
 from webots_mcp.cli.options import (
     HERE,
     DataDir,

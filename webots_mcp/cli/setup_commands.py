@@ -756,7 +756,7 @@ def completion(
     from cyclopts.completion.detect import ShellDetectionError
 
     from webots_mcp.cli import app_for
-    from webots_mcp.cli.completing import values_of, with_values
+    from webots_mcp.cli.shell_completion import values_of, with_values
 
     if values is not None:
         names = values_of(values, recorded.recording())

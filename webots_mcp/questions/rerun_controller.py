@@ -12,7 +12,7 @@ from webots_mcp.answers.answer_models import RerunAnswer
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import NotAllowedError
 from webots_mcp.questions.arguments import MAX_WAIT_S, RunId, Seconds
-from webots_mcp.questions.declaring import DESTROYS, Caller, question
+from webots_mcp.questions.declaration import DESTROYS, Caller, question
 from webots_mcp.rerun.running import (
     LIMIT_S,
     TapedRun,

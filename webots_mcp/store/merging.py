@@ -78,18 +78,6 @@ _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError
 _MOST_IDS: Final = 2**40
 _NEWEST_HERE: Final = "SELECT coalesce(max(id), 0) FROM main.state"
 _RESERVED_HERE: Final = "SELECT coalesce(max(reserved_state_id), 0) FROM main.recording"
-_SIGNALS: Final = (
-    "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
-    "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} "
-    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id"
-)
-_FILL_MAP: Final = (
-    "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
-    "ON n.robot_id = :here AND n.name = s.name "
-    "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})"
-)
 _GROUP: Final = (
     "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, lost_value_count, "
     "stored_row_bytes, chunk_bytes, "
@@ -687,14 +675,26 @@ def _ingest_signals(connection: sqlite3.Connection, there: int, robot_id: int) -
     asked = {"run": there, "here": robot_id}
     seen = {
         name: Seen(path, reduction, kind, (role or "").startswith("mode"), first_s)
-        for name, path, reduction, kind, role, first_s in connection.execute(_SIGNALS, asked)
+        for name, path, reduction, kind, role, first_s in connection.execute(
+            "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
+            "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+            f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} AND EXISTS (SELECT 1 "
+            "FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id",
+            asked,
+        )
     }
     enter_signals(connection, robot_id, seen)
     connection.execute(
         "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
     )
     connection.execute("DELETE FROM temp.signal_here")
-    connection.execute(_FILL_MAP, asked)
+    connection.execute(
+        "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
+        "ON n.robot_id = :here AND n.name = s.name "
+        "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+        f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})",
+        asked,
+    )
 
 
 def _ingest_state_ids(connection: sqlite3.Connection, values: dict[str, Any], rows: int) -> None:

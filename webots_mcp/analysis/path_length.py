@@ -10,30 +10,46 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from math import log, sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np, rhythm_of
 
-FALSE_LEGS: Final = 0.003  # so many may noise alone make of a robot at rest, on average
-GAP_NOISE: Final = 7.0  # deviations of the position: so far it went at least during a gap
-FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
-SHARPEST_ARC_RAD: Final = 2.7  # from leg to leg; who turns farther went back
-LONGEST_SMOOTHING_S: Final = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
 _PLACES: Final = ("x", "y", "raw_x", "raw_y")
-_PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
-FEWEST_SMOOTHED: Final = 5  # rows: through fewer a parabola leaves the noise
-_BLOCK_S: Final = 0.5  # positions are averaged over this long
-_FAR: Final = 3  # blocks between the places of a long step
-_BRAKING_BLOCKS: Final = 2  # at the end of a leg, in which a robot that stood may have left
-_FEWEST_BLOCKS: Final = _FAR + _BRAKING_BLOCKS + 1
-# A turn of 1.5 rad/s, which steps of 0.5 to 1.5 s cut by about so much.
-_CUT: Final = 1.1
-# Standard errors of the mean square speed. It is positive without motion in one of 15 cases where
-# 1.5 are taken off; 1 of them makes up for a speed that varies, whose root mean square is more
-# than its mean. Beyond 2 it is in one of 44.
-_SHOWN: Final = 1.5
-_TAKEN_OFF: Final = 1.0
-_MOST: Final = 2.0
+
+
+class _SmoothingSettings(NamedTuple):
+    """How positions are smoothed, and when a leg of the path is one."""
+
+    false_legs: float = 0.003  # so many may noise alone make of a robot at rest, on average
+    gap_noise: float = 7.0  # deviations of the position: so far it went at least during a gap
+    finest_leg_m: float = 0.02  # smoothing that makes legs so short is enough
+    sharpest_arc_rad: float = 2.7  # from leg to leg; who turns farther went back
+    longest_smoothing_s: float = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
+    parabola_gain: float = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
+    fewest_smoothed: int = 5  # rows: through fewer a parabola leaves the noise
+
+
+SMOOTHING: Final = _SmoothingSettings()
+
+
+class _LongStepSettings(NamedTuple):
+    """How long steps show what narrow bends hide."""
+
+    block_s: float = 0.5  # positions are averaged over this long
+    far: int = 3  # blocks between the places of a long step
+    braking_blocks: int = 2  # at the end of a leg, in which a robot that stood may have left
+    fewest_blocks: int = far + braking_blocks + 1
+    # A turn of 1.5 rad/s, which steps of 0.5 to 1.5 s cut by about so much.
+    cut: float = 1.1
+    # Standard errors of the mean square speed. It is positive without motion in one of 15 cases
+    # where 1.5 are taken off; 1 of them makes up for a speed that varies, whose root mean square
+    # is more than its mean. Beyond 2 it is in one of 44.
+    shown: float = 1.5
+    taken_off: float = 1.0
+    most: float = 2.0
+
+
+LONG_STEPS: Final = _LongStepSettings()
 
 
 @dataclass(frozen=True)
@@ -114,8 +130,10 @@ def _smoothing_rows(times: Array, noise_m: float, of_rows: int) -> int:
     interval_s = median(np.diff(times)) if len(times) > 1 else 0.0
     if noise_m == 0 or interval_s <= 0:
         return 1
-    wanted = _PARABOLA_GAIN * (_leg_noise(of_rows, 1) * noise_m / FINEST_LEG_M) ** 2
-    most = max(FEWEST_SMOOTHED, LONGEST_SMOOTHING_S / interval_s)
+    wanted = (
+        SMOOTHING.parabola_gain * (_leg_noise(of_rows, 1) * noise_m / SMOOTHING.finest_leg_m) ** 2
+    )
+    most = max(SMOOTHING.fewest_smoothed, SMOOTHING.longest_smoothing_s / interval_s)
     return 2 * int(min(wanted, most) / 2) + 1
 
 
@@ -125,8 +143,8 @@ def _leg_noise(rows: int, smoothed_rows: int) -> float:
     Of two places that differ by noise alone the distance is above d deviations with a probability
     of exp(-d**2 / 4) (Rayleigh); the more independent places there are, the more pairs are.
     """
-    places = rows * min(1.0, _PARABOLA_GAIN / smoothed_rows)
-    return sqrt(4 * log(max(places, 2.0) / FALSE_LEGS))
+    places = rows * min(1.0, SMOOTHING.parabola_gain / smoothed_rows)
+    return sqrt(4 * log(max(places, 2.0) / SMOOTHING.false_legs))
 
 
 @dataclass(frozen=True)
@@ -181,7 +199,7 @@ def _leg_lengths(track: SmoothedTrack, corners: Indexes) -> Array:
     if len(legs_m) < 2:
         return legs_m
     turns = np.pad(np.angle(np.exp(1j * np.diff(np.arctan2(across, along)))), 1)
-    turns[np.abs(turns) > SHARPEST_ARC_RAD] = 0.0
+    turns[np.abs(turns) > SMOOTHING.sharpest_arc_rad] = 0.0
     arcs = (turns[:-1] + turns[1:]) / 2
     return legs_m / np.sinc(arcs / (2 * np.pi))
 
@@ -215,7 +233,7 @@ def travelled(tracks: list[SmoothedTrack]) -> PathLength:
     ]
     noise_m = max((track.noise_m for track in tracks), default=0.0)
     parts = [path_length(track) for track in tracks]
-    between_m = sum(way_m for way_m in across_m if way_m > GAP_NOISE * noise_m)
+    between_m = sum(way_m for way_m in across_m if way_m > SMOOTHING.gap_noise * noise_m)
     length_m = between_m + sum(part.length_m for part in parts)
     return PathLength(length_m, sum(part.longer_m for part in parts), noise_m)
 
@@ -241,17 +259,20 @@ def hidden_motion(
     interval_s = median(np.diff(times)) or float(times[-1] - times[0]) / (len(times) - 1)
     if interval_s <= 0:  # no time passed in which it could have moved
         return [], 0.0, 0.0
-    rows = max(1, round(_BLOCK_S / interval_s))
+    rows = max(1, round(LONG_STEPS.block_s / interval_s))
     blocks = np.diff(ends) // rows
-    slow: list[int] = np.flatnonzero(blocks >= _FEWEST_BLOCKS).tolist()
+    slow: list[int] = np.flatnonzero(blocks >= LONG_STEPS.fewest_blocks).tolist()
     if not slow:
         return [], 0.0, 0.0
-    cuts = [slice(ends[leg], ends[leg] + (blocks[leg] - _BRAKING_BLOCKS) * rows) for leg in slow]
+    cuts = [
+        slice(ends[leg], ends[leg] + (blocks[leg] - LONG_STEPS.braking_blocks) * rows)
+        for leg in slow
+    ]
     square, error = _mean_square_step([_means(x[cut], y[cut], rows) for cut in cuts])
     took_s = sum(ends[leg + 1] - ends[leg] for leg in slow) * interval_s
-    per_step = _CUT * took_s / (rows * interval_s)
-    least = square - _TAKEN_OFF * error if square > _SHOWN * error else 0.0
-    most = max(0.0, square + _MOST * error)
+    per_step = LONG_STEPS.cut * took_s / (rows * interval_s)
+    least = square - LONG_STEPS.taken_off * error if square > LONG_STEPS.shown * error else 0.0
+    most = max(0.0, square + LONG_STEPS.most * error)
     return slow, per_step * sqrt(least), per_step * sqrt(most)
 
 
@@ -267,10 +288,12 @@ def _mean_square_step(legs: Sequence[Array]) -> tuple[float, float]:
     """
     near, far = (
         np.concatenate([np.sum((leg[:, k:] - leg[:, :-k]) ** 2, axis=0) for leg in legs])
-        for k in (1, _FAR)
+        for k in (1, LONG_STEPS.far)
     )
-    square = float(far.mean() - near.mean()) / (_FAR**2 - 1)
-    error = sqrt(_FAR * far.var() / len(far) + 2 * near.var() / len(near)) / (_FAR**2 - 1)
+    square = float(far.mean() - near.mean()) / (LONG_STEPS.far**2 - 1)
+    error = sqrt(LONG_STEPS.far * far.var() / len(far) + 2 * near.var() / len(near)) / (
+        LONG_STEPS.far**2 - 1
+    )
     return square, error
 
 
@@ -283,7 +306,7 @@ def smooth(values: Array, rows: int) -> tuple[Array, float]:
     parabola through the first or last window is taken.
     """
     rows = min(rows, len(values) - 1 + len(values) % 2)
-    if rows < FEWEST_SMOOTHED:
+    if rows < SMOOTHING.fewest_smoothed:
         return values, 1.0
     fit, half = _parabola(rows), rows // 2
     smoothed = np.asarray(np.convolve(values, fit[half, ::-1], "same"), np.float64)
@@ -298,7 +321,7 @@ def variance_along(count: int, rows: int) -> Array:
     The parabola is less certain at the ends: there it is up to four times as much.
     """
     variance, rows = np.ones(count), min(rows, count - 1 + count % 2)
-    if rows >= FEWEST_SMOOTHED:
+    if rows >= SMOOTHING.fewest_smoothed:
         fit, half = _parabola(rows), rows // 2
         ratios = np.einsum("ij,ij->i", fit, fit) / (fit[half] @ fit[half])
         variance[:half], variance[-half:] = ratios[:half], ratios[-half:]
@@ -310,7 +333,7 @@ def kept_alike(rows: int) -> Array:
 
     The last one, 0, holds for all that lie farther apart.
     """
-    if rows < FEWEST_SMOOTHED:
+    if rows < SMOOTHING.fewest_smoothed:
         return np.array([1.0, 0.0])
     middle = _parabola(rows)[rows // 2]
     alike = np.correlate(middle, middle, "full")[rows - 1 :]

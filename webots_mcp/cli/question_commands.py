@@ -36,7 +36,7 @@ from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.argument_errors import faults_of
 from webots_mcp.questions.arguments import FOR_A_PERSON, SCOPE
-from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.declaration import Caller, Question, Reply
 from webots_mcp.store.recording import RecordingAccess
 
 # How options are called whose argument has another name in all questions.

@@ -36,7 +36,6 @@ INSTALLED: Final = (
     r"[/\\](?:site|dist)-packages[/\\]|[/\\]lib[/\\]controller[/\\]python[/\\]|^<frozen "
 )
 _DEBUGGER: Final = r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)"
-_BY_PERSON: Final = "waitForUserInputEvent"  # of Webots' Robot: it waits for a key or a click
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
 _UNTOUCHED_S: Final = 3.0  # the maintainer's thread normally touches the file once a second
 _MOST_BYTES: Final = 200_000
@@ -132,7 +131,11 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     own = [call for call in calls if call not in waits and not is_library(call.file, libraries)]
     inner = calls[: calls.index(own[0])] if own else calls
     is_in_step = any(call in waits for call in inner)
-    is_held = any(re.search(_DEBUGGER, call.file) or call.function == _BY_PERSON for call in calls)
+    # of Webots' Robot: it waits for a key or a click
+    is_held = any(
+        re.search(_DEBUGGER, call.file) or call.function == "waitForUserInputEvent"
+        for call in calls
+    )
     hangs = not (is_in_step or is_held)
     written_s = os.fstat(file.fileno()).st_mtime
     return Stacks(written_s, run, limit_s, calls, own, hangs, is_in_step, text)

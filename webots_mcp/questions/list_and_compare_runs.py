@@ -56,12 +56,12 @@ from webots_mcp.questions.arguments import (
     TrialSetId,
     Value,
 )
-from webots_mcp.questions.declaring import READS, SETS, question
+from webots_mcp.questions.declaration import READS, SETS, question
 from webots_mcp.signals.conditions.expectation import Expectation, read_expectation
 from webots_mcp.signals.naming import listed
-from webots_mcp.store.ages import utc
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
+from webots_mcp.store.relative_times import utc
 from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
 from webots_mcp.store.trial_sets import scored_runs
 

@@ -20,7 +20,7 @@ from tests.browsing import chromium
 from tests.recordings.rows import Recorded
 from tests.server.conftest import pictures_of, text_of
 from tests.tool_list import counts_of
-from webots_mcp.server.client_view import SHOWN_TOOLS, VIEW_URI, view_html
+from webots_mcp.server.mcp_app_view import SHOWN_TOOLS, VIEW_URI, view_html
 from webots_mcp.server.mcp_server import create_server
 
 __all__ = ["chromium"]

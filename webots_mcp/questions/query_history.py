@@ -48,11 +48,11 @@ from webots_mcp.questions.arguments import (
     RunId,
     ShownLimit,
 )
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaration import READS, question
 from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import RecordingAccess, RobotView
-from webots_mcp.store.series import (
+from webots_mcp.store.signal_history import (
     DEFAULT_POINTS,
     ChangeColumns,
     NumberColumns,

@@ -23,9 +23,15 @@ from tests.server.test_http import Http
 from tests.server.test_http import home as home
 from tests.waiting import until
 from webots_mcp.contract import ENDED_BY, new_uuid
-from webots_mcp.server.channel import CAPABILITY, METHOD, MOST_AT_ONCE, SECONDS_EACH, MessageBudget
+from webots_mcp.server.channel_notifications import (
+    CAPABILITY,
+    METHOD,
+    MOST_AT_ONCE,
+    SECONDS_EACH,
+    MessageBudget,
+)
 from webots_mcp.server.mcp_server import create_server
-from webots_mcp.server.occurrences import MAX_AGE_S, News, Occurrence, quoted
+from webots_mcp.server.notable_events import MAX_AGE_S, News, Occurrence, quoted
 
 pytestmark = pytest.mark.anyio
 Way = Literal["memory-legacy", "stdio", "stdio-legacy", "http"]

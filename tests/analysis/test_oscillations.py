@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from webots_mcp.analysis.arrays import Array
-from webots_mcp.analysis.swings import Swing, find_swings
+from webots_mcp.analysis.oscillations import Swing, find_swings
 
 START_S, PERIODS, HEIGHT = 60.0, 8, 0.2
 COURSES: dict[str, Callable[[Array], Array]] = {

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
-from webots_mcp.analysis.swings import EvenRows, Swing
+from webots_mcp.analysis.oscillations import EvenRows, Swing
 
 LONGEST_FAST_ROWS: Final = 7.0  # of a period; longer ones are found by their bends
 FALSE_ALARMS: Final = 1e-6  # of a window without an oscillation
@@ -117,16 +117,17 @@ def _peaks_of(values: Array, starts: Indexes) -> tuple[Flags, Indexes, Array, Ar
     orthogonal = _slow_motion()
     rest: Array = windows - (windows @ orthogonal) @ np.transpose(orthogonal)
     found = np.fft.rfft(rest, axis=1)
-    power: Array = found.real**2 + found.imag**2
-    power[:, -1] /= 2  # the last ordinate has one degree of freedom, the others two
-    band = power[:, _FIRST_ORDINATE:]
+    band: Array = np.square(found.real[:, _FIRST_ORDINATE:])
+    band += np.square(found.imag[:, _FIRST_ORDINATE:])
+    band[:, -1] /= 2  # the last ordinate has one degree of freedom, the others two
     count = band.shape[1]
-    total = band.sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.nan_to_num(band.max(axis=1) / total)
-    chance = count * (1 - share) ** (count - 1)
+    total: Array = band.sum(axis=1)
+    share = band.max(axis=1) / np.where(total > 0, total, 1.0)
+    swings: Flags = count * (1 - share) ** (count - 1) < FALSE_ALARMS
     # What remains of a step or a bend is spread over the band; rounding is no oscillation.
-    swings = (chance < FALSE_ALARMS) & (total > 1e-12 * np.maximum(power.sum(axis=1), 1e-300))
+    some = np.flatnonzero(swings)
+    slow = np.square(np.abs(found[some, :_FIRST_ORDINATE])).sum(axis=1)
+    swings[some] = total[some] > 1e-12 * np.maximum(slow + total[some], 1e-300)
     amplitude = np.sqrt(2 * total * share) / (_WINDOW / math.sqrt(2))
     return swings, band.argmax(axis=1), share, amplitude
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp.store.ages import LONG_AGO_S, age_in_words, ago
 from webots_mcp.store.recording import view_robot
+from webots_mcp.store.relative_times import LONG_AGO_S, age_in_words, ago
 
 
 @pytest.mark.parametrize(

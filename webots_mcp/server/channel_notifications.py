@@ -14,7 +14,7 @@ from typing import Any, Final
 from mcp.server.context import CallNext, HandlerResult, ServerRequestContext
 
 from webots_mcp.server.connected_clients import ConnectedClients
-from webots_mcp.server.occurrences import News, Occurrence
+from webots_mcp.server.notable_events import News, Occurrence
 
 CAPABILITY: Final = "claude/channel"
 METHOD: Final = "notifications/claude/channel"

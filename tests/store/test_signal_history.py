@@ -12,7 +12,7 @@ from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.series import NumberColumns, query_history, query_rows
+from webots_mcp.store.signal_history import NumberColumns, query_history, query_rows
 
 
 def ask(connection: sqlite3.Connection, *names: str, max_points: int = 50, **bounds: Any):

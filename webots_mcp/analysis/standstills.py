@@ -10,29 +10,39 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, np
-from webots_mcp.analysis.track import SmoothedTrack
+from webots_mcp.analysis.path_length import SmoothedTrack
 
-WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide
-SETTLED_SHARE: Final = 0.2  # of the radius: within it of the place is where a standstill begins
 NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
-UNSEEN_SLOPE: Final = 3.0  # deviations: a speed that is less may be noise alone
-_SAMPLES: Final = 12  # of the shortest standstill: so finely places are compared at first
-_NEAR_SHARE: Final = 0.9  # of the shortest standstill that it has to stay within the radius
-_ROUNDING_M: Final = 1e-6
-_MOST_AT_ONCE: Final = 2**20  # positions
-LONGEST_CREEP: Final = 100.0  # shortest standstills: who takes longer to leave a place drifts
-DRIFT_SHARE: Final = 0.15  # of the radius: who came farther between its first and last third moves
-CERTAIN: Final = 4.0  # standard errors
-SAME_COURSE: Final = 1.25  # times the noise: the residual of a motion that explains all rows
-REST_SHARE: Final = 0.5  # of the speed next to it: a part that is certainly slower is a rest
-CERTAINLY_SLOWER: Final = 3.0  # standard errors: the ramps next to it are certain already
-# So many times its own length before and after a stretch is looked for the same motion.
-_AROUND: Final = ((1, 1), (0, 2), (2, 0), (0, 5), (5, 0))
 MOST_AROUND: Final = 5
-_MEANS: Final = 30  # of neighbouring rows, that a line is laid through
-_FINE_MEANS: Final = 120  # in which a rest is looked for
-_BORDERS: Final = 25  # at which a rest between two ramps may begin and end
-_MOST_TWITCHES: Final = 12
+
+
+class _StandstillSettings(NamedTuple):
+    """When a robot counts as standing still, and how closely positions are compared."""
+
+    widened_by: float = 5.0  # a place is at least so many deviations of the smoothed position wide
+    settled_share: float = 0.2  # of the radius: within it of the place is where a standstill begins
+    unseen_slope: float = 3.0  # deviations: a speed that is less may be noise alone
+    samples: int = 12  # of the shortest standstill: so finely places are compared at first
+    near_share: float = 0.9  # of the shortest standstill that it has to stay within the radius
+    rounding_m: float = 1e-6
+    most_at_once: int = 2**20  # positions
+    longest_creep: float = 100.0  # shortest standstills: who takes longer to leave a place drifts
+    drift_share: float = (
+        0.15  # of the radius: who came farther between its first and last third moves
+    )
+    certain: float = 4.0  # standard errors
+    same_course: float = 1.25  # times the noise: the residual of a motion that explains all rows
+    rest_share: float = 0.5  # of the speed next to it: a part that is certainly slower is a rest
+    certainly_slower: float = 3.0  # standard errors: the ramps next to it are certain already
+    # So many times its own length before and after a stretch is looked for the same motion.
+    around: tuple[tuple[int, int], ...] = ((1, 1), (0, 2), (2, 0), (0, 5), (5, 0))
+    means: int = 30  # of neighbouring rows, that a line is laid through
+    fine_means: int = 120  # in which a rest is looked for
+    borders: int = 25  # at which a rest between two ramps may begin and end
+    most_twitches: int = 12
+
+
+STANDSTILL: Final = _StandstillSettings()
 
 
 @dataclass(frozen=True)
@@ -93,7 +103,7 @@ def find_standstills(
     """
     if len(track.times) < 2:
         return []
-    radius_m = max(radius_m, WIDENED_BY * track.left_m)
+    radius_m = max(radius_m, STANDSTILL.widened_by * track.left_m)
     grid = _grid_of(track, least_s)
     stays = _pairs(list(_stays(grid, radius_m)))
     if not len(stays):
@@ -105,7 +115,7 @@ def find_standstills(
     ends = newest - _begins_of_rest(track.reversed, newest - lasts, newest - firsts, grid.rows)
     ends = _near_coarse(track, lasts, ends, least_s)
     long = track.times[ends] - track.times[starts] >= NEARLY * least_s
-    near_m = SETTLED_SHARE * radius_m + 3 * track.left_m
+    near_m = STANDSTILL.settled_share * radius_m + 3 * track.left_m
     return _joined(track, rows, starts[long], ends[long], grid.rows, near_m)
 
 
@@ -125,7 +135,7 @@ def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s:
     The slope of a line through n positions within t seconds has a deviation of noise * sqrt(12 / n)
     / t. Three of them are not more than the speed of who just leaves the radius in `least_s`.
     """
-    noise = UNSEEN_SLOPE * noise_m * (12 * interval_s) ** 0.5
+    noise = STANDSTILL.unseen_slope * noise_m * (12 * interval_s) ** 0.5
     return max(least_s, (noise * least_s / radius_m) ** (2 / 3))
 
 
@@ -147,12 +157,12 @@ class _Grid(NamedTuple):
 
 def _grid_of(track: SmoothedTrack, least_s: float) -> _Grid:
     interval_s = median(np.diff(track.times))
-    step_s = max(least_s / _SAMPLES, interval_s)
+    step_s = max(least_s / STANDSTILL.samples, interval_s)
     first, last = track.times[[0, -1]] / step_s
     steps = np.arange(math.ceil(first * (1 - 1e-9)), int(last * (1 + 1e-9)) + 1, dtype=np.float64)
     times: Array = step_s * steps
     x, y = (np.interp(times, track.times, each) for each in (track.x, track.y))
-    window = max(2, math.ceil(_NEAR_SHARE * least_s / step_s))
+    window = max(2, math.ceil(STANDSTILL.near_share * least_s / step_s))
     return _Grid(times, x, y, window, math.ceil(step_s / interval_s) if interval_s else 1, least_s)
 
 
@@ -195,7 +205,7 @@ def _resting(
     It begins near the place of the first seconds and ends near that of the last: a robot that
     twitched in between stands elsewhere.
     """
-    limit_m = max(SETTLED_SHARE * radius_m, 3 * track.left_m)
+    limit_m = max(STANDSTILL.settled_share * radius_m, 3 * track.left_m)
     first = stays[:, 0] + _settled(grid, stays[:, :1] + np.arange(grid.window), limit_m)
     last = stays[:, 1] - 1 - _settled(grid, stays[:, 1:] - 1 - np.arange(grid.window), limit_m)
     firsts = np.searchsorted(track.times, grid.times[first])
@@ -206,7 +216,7 @@ def _resting(
     newest, slack = len(track.times) - 1, track.smoothed_rows // 2 + grid.rows
     firsts[(stays[:, 0] == 0) & (firsts <= slack)] = 0
     lasts[(stays[:, 1] == len(grid.times)) & (lasts >= newest - slack)] = newest
-    slowest_m_s = radius_m / (LONGEST_CREEP * grid.least_s)
+    slowest_m_s = radius_m / (STANDSTILL.longest_creep * grid.least_s)
     creeps = is_creep(rows, firsts, lasts + 1, radius_m, slowest_m_s, is_over)
     edges = np.searchsorted(track.times, np.append(grid.times, np.inf)[stays])
     touching = np.append(edges[1:, 0] == edges[:-1, 1], False)
@@ -285,14 +295,14 @@ def _begins_of_rest(
         left = left[(centre[left] > 0) & (stop[left] > start[left])]
         if not len(left):
             return begins
-        some = left[: max(1, _MOST_AT_ONCE // int(2 * reach[left].max()))]
+        some = left[: max(1, STANDSTILL.most_at_once // int(2 * reach[left].max()))]
         start, stop = start[some], stop[some]
         rest_until = np.maximum(
             stop, np.minimum(rested[some], stop + _RAMP.rest_share * reach[some])
         )
         ramp = _ends_of_ramps(track, start, stop, rest_until)
         widest = (start == 0) | (reach[some] >= _RAMP.most_rows)
-        certain = ramp.explained_m2 > _RAMP.certain * max(track.noise_m, _ROUNDING_M) ** 2
+        certain = ramp.explained_m2 > _RAMP.certain * max(track.noise_m, STANDSTILL.rounding_m) ** 2
         new = ~known[some]
         unseen = new & ~certain & ~widest
         moves_on = new & ~unseen & (ramp.end == stop - 1) & (stop < latest[some])
@@ -429,7 +439,7 @@ def is_creep(
     """
     own, lengths = _lines_through(rows, starts, ends), ends - starts
     creeps = np.zeros(len(starts), np.bool_)
-    for before, after in ((0, 0), *_AROUND):
+    for before, after in ((0, 0), *STANDSTILL.around):
         from_row = np.maximum(0, starts - before * lengths)
         to_row = np.minimum(rows.count, ends + after * lengths)
         line, moves = own, _drifts(rows, starts, ends, radius_m)
@@ -451,23 +461,26 @@ def _drifts(rows: Rows, starts: Indexes, ends: Indexes, radius_m: float) -> Flag
     third = np.maximum(1, (ends - starts) // 3)
     error_m = rows.noise_m * np.sqrt(2 / third)
     way_m = np.hypot(x[:, 2] - x[:, 0], y[:, 2] - y[:, 0])
-    return way_m > np.maximum(DRIFT_SHARE * radius_m, CERTAIN * error_m)
+    return way_m > np.maximum(STANDSTILL.drift_share * radius_m, STANDSTILL.certain * error_m)
 
 
 def _is_one_motion(rows: Rows, line: _Lines, radius_m: float) -> Flags:
     """A straight line in time explains all but the noise, and leads out of the place."""
-    explained = line.left_m < max(SAME_COURSE * rows.noise_m, 0.02 * radius_m)
-    certain = line.speed_m_s > CERTAIN * line.error_m_s
+    explained = line.left_m < max(STANDSTILL.same_course * rows.noise_m, 0.02 * radius_m)
+    certain = line.speed_m_s > STANDSTILL.certain * line.error_m_s
     return explained & certain & (line.speed_m_s * line.lasts_s > 0.5 * radius_m)
 
 
 def _is_slower(rest: _Lines, neighbours: _Lines) -> Flags:
-    error_m_s = np.hypot(rest.error_m_s, REST_SHARE * neighbours.error_m_s)
-    return REST_SHARE * neighbours.speed_m_s - rest.speed_m_s > CERTAINLY_SLOWER * error_m_s
+    error_m_s = np.hypot(rest.error_m_s, STANDSTILL.rest_share * neighbours.error_m_s)
+    return (
+        STANDSTILL.rest_share * neighbours.speed_m_s - rest.speed_m_s
+        > STANDSTILL.certainly_slower * error_m_s
+    )
 
 
 def _lines_through(rows: Rows, starts: Indexes, ends: Indexes) -> _Lines:
-    counts, times, x, y = rows.means(starts, ends, _MEANS)
+    counts, times, x, y = rows.means(starts, ends, STANDSTILL.means)
     total = np.maximum(counts.sum(axis=1), 1)
     times, x, y = (each - ((counts * each).sum(axis=1) / total)[:, None] for each in (times, x, y))
     squares = (counts * times**2).sum(axis=1)
@@ -494,7 +507,7 @@ def rest_within(rows: Rows, start: int, end: int) -> tuple[int, int] | None:
     """
     if end - start < 2:
         return None
-    parts = min(_FINE_MEANS, end - start)
+    parts = min(STANDSTILL.fine_means, end - start)
     first, last, _ = _best_rest(*_fine_places(rows, start, end, parts))
     rest = (start + (end - start) * first // parts, start + (end - start) * last // parts)
     edges = [(start, rest[0]), rest, (rest[1], end)]
@@ -510,7 +523,7 @@ def _fine_places(rows: Rows, start: int, end: int, parts: int) -> tuple[Array, f
     counts, _, x, y = rows.means(*edges, parts)
     places = np.stack((x[0] - x.mean(), y[0] - y.mean()), axis=1)
     apart_m = float(np.hypot(*np.ptp(places, axis=0))) / parts  # motion may end within a part
-    return places, CERTAIN**2 * (rows.noise_m**2 / float(counts.mean()) + apart_m**2)
+    return places, STANDSTILL.certain**2 * (rows.noise_m**2 / float(counts.mean()) + apart_m**2)
 
 
 def _best_rest(places: Array, least_m2: float) -> tuple[int, int, float]:
@@ -529,7 +542,7 @@ def _rests_among(count: int) -> tuple[Indexes, Indexes, Array]:
     A rest with one ramp may end at every place. The bases are orthonormal, as many rows for each.
     """
     inner = np.arange(1, count)
-    borders = np.unique(np.linspace(0, count, _BORDERS).astype(np.intp))
+    borders = np.unique(np.linspace(0, count, STANDSTILL.borders).astype(np.intp))
     firsts, lasts = (borders[each] for each in np.triu_indices(len(borders), 1))
     nothing, all_of_it = np.zeros_like(inner), np.full_like(inner, count)
     firsts = np.concatenate((firsts, inner, nothing))
@@ -548,10 +561,10 @@ def _only_twitches(rows: Rows, start: int, end: int) -> bool:
 
     The steps are found one by one, each where it explains most.
     """
-    parts = min(_FINE_MEANS, end - start)
+    parts = min(STANDSTILL.fine_means, end - start)
     places, least_m2 = _fine_places(rows, start, end, parts)
     steps_m2, edges = 0.0, [0, parts]
-    for _ in range(_MOST_TWITCHES):
+    for _ in range(STANDSTILL.most_twitches):
         gain_m2, at = max(_best_step(places, *pair) for pair in pairwise(edges))
         if gain_m2 <= least_m2:
             break

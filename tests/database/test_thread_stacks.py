@@ -22,7 +22,7 @@ from tests.recordings.rows import Recorded
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import mcp_bridge
 from webots_mcp.database import session_cleanup
-from webots_mcp.database.stacks import (
+from webots_mcp.database.thread_stacks import (
     FORMAT,
     SIGNAL,
     VERSION,

@@ -12,7 +12,7 @@ import anyio
 from anyio import CapacityLimiter, to_thread
 
 from webots_mcp.errors import WebotsMCPError, warn
-from webots_mcp.server.occurrences import News, OccurrenceReader
+from webots_mcp.server.notable_events import News, OccurrenceReader
 
 READ_EVERY_S: Final = 0.5
 Receiver = Callable[[News], Awaitable[None]]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.analysis.driving import noisy_track
 from webots_mcp.analysis.arrays import noise_of
-from webots_mcp.analysis.track import path_length, smooth, track_of
+from webots_mcp.analysis.path_length import path_length, smooth, track_of
 
 
 @given(st.integers(0, 1000), st.floats(0.001, 10), st.floats(-5, 5))

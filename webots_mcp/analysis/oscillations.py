@@ -16,13 +16,14 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, cast
+from typing import Final, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import (
     Array,
     Flags,
     Indexes,
     gap_borders,
+    in_order,
     median,
     noise_of,
     np,
@@ -30,61 +31,87 @@ from webots_mcp.analysis.arrays import (
 )
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
-SLOW_PERIOD_S: Final = 5.0  # beyond, bends of a way come as regularly by chance ...
-SLOW_HALF_SWINGS: Final = 12  # ... but hardly ever so many
+# Of a period above `SEARCH.slow_period_s`.
+SLOW_HALF_SWINGS: Final = 12
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 
-# Of a level, in means. What the first or the last one explains best is seen by another level.
-PERIODS: Final = (7.1, 8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.2, 18.4)
-SHIFT: Final = 3  # means: about a quarter of these periods
-BLOCK: Final = 8  # means from one window to the next
-WINDOW: Final = 4  # blocks: two to four periods
-SIGN_CHANGES: Final = (3, 12)  # in a window: a sine has 4 to 8, noise of the rows 16
-LIKELY: Final = 0.58  # of the signs a sine explains 0.83, and of white noise 0.58 once in 500
-LINKED: Final = 0.45  # of windows beside such a one
-SIGNS_OF_SINE: Final = 0.83
-AT_ONCE: Final = 16_384  # means, which stay in the cache of a processor
-UNTHREADED: Final = 400  # windows in a product that BLAS does not share between threads
-SURROUNDING: Final = 16  # blocks of which the lower quartile is taken
-SAME_PERIOD: Final = 1.25  # ratio of the periods of windows of one swing ...
-AS_LOUD: Final = 3.0  # ... and of their sizes
-HIDDEN: Final = 2.0  # periods, for which bends may hide a swing that goes on
-PROMISING: Final = 90.0  # as `ENOUGH`, by what the signs tell
 
-FITTED_ROWS: Final = 16  # means a period where ends and shape are measured
-LAG: Final = 0.25  # of the period
-CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
-RESTS: Final = 0.75  # of a period, in which the value ...
-QUIET: Final = 0.3  # ... bends by less than that share of what is usual
-SETTLED: Final = 2  # periods, from which the sine is continued to find its ends
-EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earlier
-AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
-PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
-TRIED: Final = (0.94, 1.0, 1.06)  # of the period
-FARTHEST: Final = 1.4  # times as far from the middle one the best may be
-UNSURE: Final = 1.1  # times as short the period may be as it seems before it is fitted
-ROUNDS: Final = 2  # after which what is farther off ...
-OUTLYING: Final = 2.5  # ... than so many median residuals, a bend, does not count
-MOST_NOISE: Final = 0.12  # of the squares of second differences, that is taken for noise
-REACH: Final = 30.0  # periods before and after are the surroundings
-FEW_PERIODS: Final = 1.5  # of surroundings say nothing
-LOUDEST: Final = 6.0  # times its surroundings: more is not more certain
-UNKNOWN_LOUDNESS: Final = 3.5  # where nothing surrounds it
-# Median magnitude of a normal variable, and that over its lower quartile.
-MEDIAN: Final = 0.6745
-MEDIAN_TO_QUARTILE: Final = MEDIAN / 0.3186
-ENOUGH: Final = 850.0  # of `evidence`: random courses reach it less than once an hour
-TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
-MANY_PERIODS: Final = 12  # of which some may be those of a swing within a staircase
-STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it ...
-DOUBT: Final = 4.7  # ... beside so many variances that noise makes of them
-NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
-MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
-SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
-SWITCHED_VALUES: Final = 3
-MOST_OVERLAP: Final = 0.2  # of the shorter one ...
-MUCH_SLOWER: Final = 4.0  # ... and ratio of periods, where two show one swing
-ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes on both sides of a gap
+class _SearchSettings(NamedTuple):
+    """How windows are searched for the signs of a sine, in means of rows."""
+
+    # Beyond, bends of a path come as regularly by chance, but hardly ever `SLOW_HALF_SWINGS` times.
+    slow_period_s: float = 5.0
+    # Of a level, in means. What the first or the last one explains best is seen by another level.
+    periods: tuple[float, ...] = (7.1, 8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.2, 18.4)
+    shift: int = 3  # means: about a quarter of these periods
+    block: int = 8  # means from one window to the next
+    window: int = 4  # blocks: two to four periods
+    sign_changes: tuple[int, int] = (3, 12)  # in a window: a sine has 4 to 8, noise of the rows 16
+    likely: float = 0.58  # of the signs a sine explains 0.83, and of white noise 0.58 once in 500
+    linked: float = 0.45  # of windows beside such a one
+    signs_of_sine: float = 0.83
+    at_once: int = 16_384  # means, which stay in the cache of a processor
+    unthreaded: int = 400  # windows in a product that BLAS does not share between threads
+    surrounding: int = 16  # blocks of which the lower quartile is taken
+    same_period: float = 1.25  # ratio of the periods of windows of one swing ...
+    as_loud: float = 3.0  # ... and of their sizes
+    hidden: float = 2.0  # periods, for which bends may hide a swing that goes on
+    promising: float = 90.0  # as `DECIDE.enough`, by what the signs tell
+
+
+SEARCH: Final = _SearchSettings()
+
+
+class _FitSettings(NamedTuple):
+    """How the period and the ends of an oscillation are fitted."""
+
+    fitted_rows: int = 16  # means a period where ends and shape are measured
+    lag: float = 0.25  # of the period
+    clipped: float = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
+    rests: float = 0.75  # of a period, in which the value ...
+    quiet: float = 0.3  # ... bends by less than that share of what is usual
+    settled: int = 2  # periods, from which the sine is continued to find its ends
+    edge: float = 0.13  # of the period: a sine that begins at 0 shows so much earlier
+    # Of the period: so near the end of what was recorded it reaches up to there.
+    at_end: float = 0.5
+    piece: float = 5.0  # periods of one phase: over more, a swing may change a little
+    tried: tuple[float, float, float] = (0.94, 1.0, 1.06)  # of the period
+    farthest: float = 1.4  # times as far from the middle one the best may be
+    unsure: float = 1.1  # times as short the period may be as it seems before it is fitted
+    rounds: int = 2  # after which what is farther off ...
+    outlying: float = 2.5  # ... than so many median residuals, a bend, does not count
+    most_noise: float = 0.12  # of the squares of second differences, that is taken for noise
+
+
+FIT: Final = _FitSettings()
+
+
+class _DecisionSettings(NamedTuple):
+    """When what was fitted counts as an oscillation."""
+
+    reach: float = 30.0  # periods before and after are the surroundings
+    few_periods: float = 1.5  # of surroundings say nothing
+    loudest: float = 6.0  # times its surroundings: more is not more certain
+    unknown_loudness: float = 3.5  # where nothing surrounds it
+    # Median magnitude of a normal variable, and that over its lower quartile.
+    median: float = 0.6745
+    median_to_quartile: float = median / 0.3186
+    enough: float = 850.0  # of `evidence`: random courses reach it less than once an hour
+    turns_back: float = 0.08  # of the way there a value comes back that does not only go one way
+    many_periods: int = 12  # of which some may be those of a swing within a staircase
+    straight: float = 0.085  # of the sine its harmonics reach where straight pieces make it ...
+    doubt: float = 4.7  # ... beside so many variances that noise makes of them
+    noise_amplitudes: float = 3.0  # a swing is at least so many deviations of the noise high ...
+    mean_amplitudes: float = 12.0  # ... or so many of their means over half the swing
+    same_number: float = 1e-9  # of the value: what adding up floating-point numbers makes of one
+    switched_values: int = 3
+    most_overlap: float = 0.2  # of the shorter one ...
+    much_slower: float = 4.0  # ... and ratio of periods, where two show one swing
+    # Ratios of periods and of amplitudes on both sides of a gap.
+    alike: tuple[float, float] = (1.15, 1.5)
+
+
+DECIDE: Final = _DecisionSettings()
 
 
 @dataclass(frozen=True)
@@ -174,25 +201,25 @@ class _Stretch:
             and len(means) > 3 * SHORTEST_PERIOD_ROWS
         ):
             for start, stop, period in _likely(means, resolution):
-                most = (stop - start) / period + HIDDEN
-                if self._is_enough(2 * most, period * rows / SAME_PERIOD):
+                most = (stop - start) / period + SEARCH.hidden
+                if self._is_enough(2 * most, period * rows / SEARCH.same_period):
                     yield from self._measured(start * rows, stop * rows, period * rows)
             means, rows = _means(means, 2), 2 * rows
 
     def _is_enough(self, half_swings: float, period: float) -> bool:
-        is_slow = period * self.interval_s > SLOW_PERIOD_S
+        is_slow = period * self.interval_s > SEARCH.slow_period_s
         return half_swings >= max(self.least, SLOW_HALF_SWINGS * is_slow)
 
     def _measured(self, start: int, stop: int, period: float) -> Iterator[Swing]:
         """The swings of about these rows and that period: the value may rest between them."""
-        margin = math.ceil(HIDDEN * period)
+        margin = math.ceil(SEARCH.hidden * period)
         low = max(0, start - margin)
-        step = max(1, int(period / FITTED_ROWS))
+        step = max(1, int(period / FIT.fitted_rows))
         period /= step
-        lag = math.ceil(LAG * period)
+        lag = math.ceil(FIT.lag * period)
         bends = _bends(_means(self.values[low : stop + margin], step), lag)
         first, last = (start - low) // step, (stop - low) // step - 2 * lag
-        for begin, end in _busy(np.abs(bends), first, last, round(RESTS * period)):
+        for begin, end in _busy(np.abs(bends), first, last, round(FIT.rests * period)):
             part, inside = bends[begin:end], (max(first, begin) - begin, min(last, end) - begin)
             if inside[1] - inside[0] >= 1.5 * period:
                 ends = _ends(part, *inside, period)
@@ -211,18 +238,18 @@ class _Stretch:
             scale: Rows of the means of which they are made; lag and period, in means.
         """
         step, lag, period = scale
-        edge = EDGE * period
+        edge = FIT.edge * period
         start, stop = (round(offset + at * step) for at in (ends.start + edge, ends.stop - edge))
         last = len(self.values) - 1
-        start = 0 if start < AT_END * period * step else start
-        stop = last if stop > last - AT_END * period * step else stop
-        most = 2 * (stop - start) / (period * step) * UNSURE
-        if not self._is_enough(most, period * step / UNSURE):
+        start = 0 if start < FIT.at_end * period * step else start
+        stop = last if stop > last - FIT.at_end * period * step else stop
+        most = 2 * (stop - start) / (period * step) * FIT.unsure
+        if not self._is_enough(most, period * step / FIT.unsure):
             return
         rows = slice(start, stop + 1)
         loudness = self._loudness(rows, period * step)
         fit = Fit.of(bends, period)
-        if evidence(loudness, 1.0, fit.explained, most) < ENOUGH:
+        if evidence(loudness, 1.0, fit.explained, most) < DECIDE.enough:
             return
         values = self.values[rows]
         noise = noise_of(values)
@@ -232,28 +259,31 @@ class _Stretch:
         count = round(2 * (stop - start) / period)
         if not self._is_enough(count, period) or period * self.interval_s > self.longest_s:
             return
-        if evidence(loudness, robustly, fit.explained, count) < ENOUGH:
+        if evidence(loudness, robustly, fit.explained, count) < DECIDE.enough:
             return
         amplitude = min(amplitude / gain / float(np.sinc(step / period)), _highest(values, period))
-        least = min(NOISE_AMPLITUDES, MEAN_AMPLITUDES / (period * count / 2) ** 0.5) * noise
+        least = (
+            min(DECIDE.noise_amplitudes, DECIDE.mean_amplitudes / (period * count / 2) ** 0.5)
+            * noise
+        )
         if amplitude < max(least, _resolution(values)):
             return
-        if _turns_back(values, period) < TURNS_BACK and _is_straight(values, period, noise):
+        if _turns_back(values, period) < DECIDE.turns_back and _is_straight(values, period, noise):
             return
         ends_s = float(self.times[start]), float(self.times[stop])
         yield Swing(*ends_s, count, period * self.interval_s, amplitude, fit.explained)
 
     def _loudness(self, rows: slice, period: float) -> float:
         """How much larger its second differences are than the lower quartile around it."""
-        step = max(1, int(period / FITTED_ROWS))
-        lag, far = math.ceil(LAG * period / step), int(REACH * period)
+        step = max(1, int(period / FIT.fitted_rows))
+        lag, far = math.ceil(FIT.lag * period / step), int(DECIDE.reach * period)
         parts = rows, slice(max(0, rows.start - far), rows.start), slice(rows.stop, rows.stop + far)
         sizes = [np.abs(_bends(_means(self.values[part], step), lag)) for part in parts]
         around = np.concatenate(sizes[1:])
-        if len(around) < FEW_PERIODS * period / step:
-            return UNKNOWN_LOUDNESS
-        inside, usual = median(sizes[0]), _quartile(around) * MEDIAN_TO_QUARTILE
-        return inside / usual if usual * LOUDEST > inside else LOUDEST
+        if len(around) < DECIDE.few_periods * period / step:
+            return DECIDE.unknown_loudness
+        inside, usual = median(sizes[0]), _quartile(around) * DECIDE.median_to_quartile
+        return inside / usual if usual * DECIDE.loudest > inside else DECIDE.loudest
 
 
 def evidence(loudness: float, robustly: float, explained: float, count: float) -> float:
@@ -295,60 +325,69 @@ def _clipped(values: Array, limit: float | Array) -> Array:
 
 def _quartile(sizes: Array) -> float:
     """The lower one."""
-    return float(np.partition(sizes, len(sizes) // 4)[len(sizes) // 4])
+    return in_order(sizes, len(sizes) // 4)
 
 
 def _resolution(values: Array) -> float:
     """The smallest step of values; 0 of so few that something is switched."""
     steps: Array = np.abs(np.diff(values))
     low, high = float(values.min()), float(values.max())
-    least = float(steps.min(where=steps > SAME_NUMBER * max(high, -low), initial=np.inf))
-    return least if high - low >= SWITCHED_VALUES * least else 0.0
+    same = DECIDE.same_number * max(high, -low)
+    least = float(steps.min(initial=np.inf))
+    if least <= same:
+        least = float(np.where(steps > same, steps, np.inf).min(initial=np.inf))
+    return least if high - low >= DECIDE.switched_values * least else 0.0
 
 
 def _likely(means: Array, resolution: float) -> Iterator[tuple[int, int, float]]:
     """Where means [start, stop) seem to swing, and with about which period."""
     share, which, sizes = _windows(means)
-    good = np.flatnonzero((share > LINKED) & (which > 0) & (which < len(PERIODS) - 1))
-    if not len(good) or share[good].max() < LIKELY:
+    good = np.flatnonzero((share > SEARCH.linked) & (which > 0) & (which < len(SEARCH.periods) - 1))
+    if not len(good) or share[good].max() < SEARCH.likely:
         return
-    blocks = sizes[good[:, None] + np.arange(WINDOW)]
-    loud = np.partition(blocks, WINDOW // 4, axis=1)[:, WINDOW // 4]
+    blocks = sizes[good[:, None] + np.arange(SEARCH.window)]
+    loud = np.partition(blocks, SEARCH.window // 4, axis=1)[:, SEARCH.window // 4]
     good, loud = good[loud > resolution / 2], loud[loud > resolution / 2]
     usual = _usual(sizes)
     for group in _groups(good, share[good], which[good], loud):
         at = good[group]
-        start, stop = int(at[0]) * BLOCK, (int(at[-1]) + WINDOW) * BLOCK + 2 * SHIFT
+        start, stop = (
+            int(at[0]) * SEARCH.block,
+            (int(at[-1]) + SEARCH.window) * SEARCH.block + 2 * SEARCH.shift,
+        )
         period = _period(which[at])
         loudness = median(loud[group]) / max(float(usual[at].min()), 1e-100)
-        unexplained = 1.05 - float(share[at].mean()) / SIGNS_OF_SINE
-        if min(loudness, 1e9) ** 1.5 * 2 * (stop - start) / period / unexplained > PROMISING:
+        unexplained = 1.05 - float(share[at].mean()) / SEARCH.signs_of_sine
+        if min(loudness, 1e9) ** 1.5 * 2 * (stop - start) / period / unexplained > SEARCH.promising:
             yield start, min(stop, len(means)), period
 
 
 def _period(which: Indexes) -> float:
     """The most frequent one."""
-    return PERIODS[int(np.argmax(np.bincount(which)))]
+    return SEARCH.periods[int(np.argmax(np.bincount(which)))]
 
 
 def _groups(good: Indexes, share: Array, which: Indexes, loud: Array) -> Iterator[Indexes]:
     """Places of windows that are alike, though for a while something may hide the swing."""
-    apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which)) > 1)
-    apart |= np.abs(np.diff(np.log(loud))) > math.log(AS_LOUD) / 2
+    apart = (np.diff(good) > SEARCH.window // 2) | (np.abs(np.diff(which)) > 1)
+    apart |= np.abs(np.diff(np.log(loud))) > math.log(SEARCH.as_loud) / 2
     waiting: list[tuple[float, float, Indexes]] = []
     edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(good)]
     likely: list[int] = []
     if len(good):
-        likely = np.flatnonzero(np.maximum.reduceat(share, edges[:-1]) >= LIKELY).tolist()
+        likely = np.flatnonzero(np.maximum.reduceat(share, edges[:-1]) >= SEARCH.likely).tolist()
     for at in likely:
         group: Indexes = np.arange(edges[at], edges[at + 1])
         period, size = _period(which[group]), median(loud[group])
         beside, waiting = waiting, []
         for other in beside:
-            between = (good[group[0]] - good[other[2][-1]] - WINDOW) * BLOCK
-            if between > HIDDEN * period:
+            between = (good[group[0]] - good[other[2][-1]] - SEARCH.window) * SEARCH.block
+            if between > SEARCH.hidden * period:
                 yield other[2]
-            elif _ratio(period, other[0]) < SAME_PERIOD and _ratio(size, other[1]) < AS_LOUD:
+            elif (
+                _ratio(period, other[0]) < SEARCH.same_period
+                and _ratio(size, other[1]) < SEARCH.as_loud
+            ):
                 group = np.concatenate((other[2], group))
             else:
                 waiting.append(other)
@@ -361,27 +400,36 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
 
     0 of those in which the sign changes much less or more often than a sine's.
     """
-    rows, beyond = WINDOW * BLOCK, (WINDOW - 1) * BLOCK + 2 * SHIFT
+    rows, beyond = (
+        SEARCH.window * SEARCH.block,
+        (SEARCH.window - 1) * SEARCH.block + 2 * SEARCH.shift,
+    )
     span = float(np.ptp(means)) or 1.0  # to which short floats are reduced, which reach 1e38
     found: list[tuple[Array, Indexes, Array]] = []
-    for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
-        part = means[begin : begin + AT_ONCE + beyond]
-        bends = _bends(((part - part[0]) / span).astype(np.float32), SHIFT)
+    for begin in range(0, max(1, len(means) - beyond), SEARCH.at_once):
+        part = means[begin : begin + SEARCH.at_once + beyond]
+        bends = _bends(((part - part[0]) / span).astype(np.float32), SEARCH.shift)
         if len(bends) < rows:
             bends = np.pad(bends, (0, rows - len(bends)))
-        blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
+        blocks: Array = np.reshape(
+            bends[: len(bends) // SEARCH.block * SEARCH.block], (-1, SEARCH.block)
+        )
         above = np.ravel(blocks) > 0
         changed = above != np.append(above[:1], above[:-1])
-        changes = sums_of(np.bitwise_count(changed.view(np.uint64)), WINDOW)
+        changes = sums_of(np.bitwise_count(changed.view(np.uint64)), SEARCH.window)
         share, which = np.zeros(len(changes)), np.zeros(len(changes), np.intp)
-        some = np.flatnonzero((changes >= SIGN_CHANGES[0]) & (changes <= SIGN_CHANGES[1]))
-        for at in range(0, len(some), UNTHREADED):
-            these = some[at : at + UNTHREADED]
-            signs = np.reshape(np.sign(blocks[these[:, None] + np.arange(WINDOW)]), (-1, rows))
+        some = np.flatnonzero(
+            (changes >= SEARCH.sign_changes[0]) & (changes <= SEARCH.sign_changes[1])
+        )
+        for at in range(0, len(some), SEARCH.unthreaded):
+            these = some[at : at + SEARCH.unthreaded]
+            signs = np.reshape(
+                np.sign(blocks[these[:, None] + np.arange(SEARCH.window)]), (-1, rows)
+            )
             squares = (_waves() @ np.transpose(signs)) ** 2
-            squares = squares[: len(PERIODS)] + squares[len(PERIODS) :]
+            squares = squares[: len(SEARCH.periods)] + squares[len(SEARCH.periods) :]
             share[these], which[these] = squares.max(axis=0) / rows, squares.argmax(axis=0)
-        found.append((share, which, np.einsum("ij->i", np.abs(blocks)) / BLOCK))
+        found.append((share, which, np.einsum("ij->i", np.abs(blocks)) / SEARCH.block))
     shares, periods, blocks_of = zip(*found, strict=True)
     sizes = [each[: len(share)] for share, _, each in found[:-1]]
     of_blocks = np.concatenate([*sizes, blocks_of[-1]]).astype(np.float64) * span
@@ -391,8 +439,11 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
 @lru_cache(1)  # the same for all
 def _waves() -> Array:
     """Cosines and sines of length 1 as rows."""
-    places: Array = np.arange(WINDOW * BLOCK, dtype=np.float64) - (WINDOW * BLOCK - 1) / 2
-    angles: Array = 2 * np.pi * places[:, None] / np.array(PERIODS)
+    places: Array = (
+        np.arange(SEARCH.window * SEARCH.block, dtype=np.float64)
+        - (SEARCH.window * SEARCH.block - 1) / 2
+    )
+    angles: Array = 2 * np.pi * places[:, None] / np.array(SEARCH.periods)
     waves = np.concatenate((np.cos(angles), np.sin(angles)), axis=1)
     waves /= np.sqrt(np.einsum("ij,ij->j", waves, waves))
     return cast("Array", np.ascontiguousarray(np.transpose(waves), np.float32))  # half as slow
@@ -400,14 +451,14 @@ def _waves() -> Array:
 
 def _usual(sizes: Array) -> Array:
     """The lower quartile about each size, the least of three such stretches."""
-    count, quarter = len(sizes) // SURROUNDING, SURROUNDING // 4
+    count, quarter = len(sizes) // SEARCH.surrounding, SEARCH.surrounding // 4
     if count < 2:
         return np.full(len(sizes), _quartile(sizes))
-    parts: Array = np.reshape(sizes[: count * SURROUNDING], (count, SURROUNDING))
+    parts: Array = np.reshape(sizes[: count * SEARCH.surrounding], (count, SEARCH.surrounding))
     usual = np.partition(parts, quarter, axis=1)[:, quarter]
     padded: Array = np.concatenate((usual[:1], usual, usual[-1:]))
     least = np.minimum(np.minimum(padded[:-2], usual), padded[2:])
-    return least[np.minimum(np.arange(len(sizes)) // SURROUNDING, count - 1)]
+    return least[np.minimum(np.arange(len(sizes)) // SEARCH.surrounding, count - 1)]
 
 
 def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int, int]]:
@@ -415,7 +466,7 @@ def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int,
     if last - first < rows:
         return
     sums = sums_of(sizes, rows)
-    loud = sums >= QUIET * median(sums[first : last - rows + 1])
+    loud = sums >= FIT.quiet * median(sums[first : last - rows + 1])
     edges = np.flatnonzero(np.diff(loud, prepend=False, append=False)).tolist()
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
         yield start, stop - 1 + rows
@@ -423,9 +474,8 @@ def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int,
 
 def _ends(bends: Array, first: int, last: int, period: float) -> slice:
     """Where the swing that [first, last) is part of begins and ends."""
-    clipped = _clipped(bends, CLIPPED * median(np.abs(bends[first:last])))
-    pieces = _pieces(clipped[first:last], period)
-    period = _best_period(pieces, np.ones_like(pieces), period)
+    clipped = _clipped(bends, FIT.clipped * median(np.abs(bends[first:last])))
+    period = _best_period(_pieces(clipped[first:last], period), None, period)
     begin = _begin(clipped, first, period)
     return slice(begin, len(bends) - _begin(clipped[::-1], len(bends) - last, period))
 
@@ -433,13 +483,15 @@ def _ends(bends: Array, first: int, last: int, period: float) -> slice:
 def _begin(bends: Array, inside: int, period: float) -> int:
     """Where the sine begins that swings from there on: before, it explains nothing."""
     settled = inside + int(period / 2)
-    part = slice(settled, settled + round(SETTLED * period))
+    part = slice(settled, settled + round(FIT.settled * period))
     angles: Array = np.arange(min(part.stop, len(bends)), dtype=np.float64) * (2 * np.pi / period)
-    waves: Array = np.stack((np.cos(angles), np.sin(angles)))
+    waves = np.empty((2, len(angles)))
+    np.cos(angles, out=waves[0])
+    np.sin(angles, out=waves[1])
     end, rows = inside + int(period), len(bends[part])
     swing = (waves[:, part] @ bends[part]) @ waves[:, :end] * (2 / max(1, rows))
     gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
-    return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
+    return int(gains[::-1].cumsum()[::-1].argmax())
 
 
 @dataclass(frozen=True)
@@ -463,8 +515,8 @@ class Fit:
         pieces = _pieces(bends, period)
         middle = pieces.shape[1] // 2
         usual = np.partition(np.abs(pieces), middle, axis=1)[:, middle, None]
-        clipped = _clipped(pieces, CLIPPED * usual)
-        period, _, model = _sines(clipped, np.ones_like(clipped), period)
+        clipped = _clipped(pieces, FIT.clipped * usual)
+        period, _, model = _sines(clipped, None, period)
         left = float(np.square(clipped - model).sum())
         squares = float(np.square(clipped).sum())
         return cls(pieces, clipped, model, period, 1 - left / squares if squares else 0.0)
@@ -479,34 +531,34 @@ class Fit:
         """
         usual = median(np.abs(self.clipped).ravel())
         period, model, amplitudes = self.period, self.model, self.pieces
-        for _ in range(ROUNDS):
+        for _ in range(FIT.rounds):
             sizes: Array = np.abs(self.pieces - model)
-            near = sizes <= OUTLYING * median(sizes.ravel()) + usual / 20
+            near = sizes <= FIT.outlying * median(sizes.ravel()) + usual / 20
             period, amplitudes, model = _sines(self.pieces, near.astype(np.float64), period)
         rest = median(np.abs(self.clipped - model).ravel()) ** 2
-        rest -= min(MOST_NOISE * usual**2, MEDIAN**2 * noise)
+        rest -= min(FIT.most_noise * usual**2, DECIDE.median**2 * noise)
         robustly = 1 - max(0.0, rest) / usual**2 if usual else 0.0
         return robustly, median(amplitudes[:, 0]), period
 
 
 def _pieces(values: Array, period: float) -> Array:
     """Parts of a few periods, one in each row."""
-    count = max(1, round(len(values) / period / PIECE))
+    count = max(1, round(len(values) / period / FIT.piece))
     rows = len(values) // count
     return np.reshape(values[: count * rows], (count, rows))
 
 
-def _best_period(pieces: Array, weights: Array, period: float) -> float:
+def _best_period(pieces: Array, weights: Array | None, period: float) -> float:
     """The period about the given one whose sines explain most."""
-    _, _, gains = _fits(pieces, weights, period * np.array(TRIED))
+    _, _, gains = _fits(pieces, weights, period * np.array(FIT.tried))
     low, middle, high = gains.sum(axis=0).tolist()
     bend = 2 * middle - low - high  # of the parabola through them: its vertex is the best
-    most = TRIED[2] - 1
+    most = FIT.tried[2] - 1
     aside = (high - low) / (2 * bend) if bend > 0 else math.copysign(1.0, high - low)
-    return period * (1 + most * max(-FARTHEST, min(FARTHEST, aside)))
+    return period * (1 + most * max(-FIT.farthest, min(FIT.farthest, aside)))
 
 
-def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
+def _sines(pieces: Array, weights: Array | None, period: float) -> tuple[float, Array, Array]:
     """The best period about the given one, and the heights and values of its sines."""
     period = _best_period(pieces, weights, period)
     sines, cosines, _ = _fits(pieces, weights, np.array([period]))
@@ -516,13 +568,24 @@ def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, 
     return period, np.hypot(sines, cosines), np.asarray(model, np.float64)
 
 
-def _fits(pieces: Array, weights: Array, periods: Array) -> tuple[Array, Array, Array]:
-    """Coefficients of sine and cosine and the squares they explain: pieces by periods."""
+def _fits(pieces: Array, weights: Array | None, periods: Array) -> tuple[Array, Array, Array]:
+    """Coefficients of sine and cosine and the squares they explain: pieces by periods.
+
+    Without weights all values count alike.
+    """
     places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
     angles: Array = 2 * np.pi * places[:, None] / periods
     sine, cosine = np.sin(angles), np.cos(angles)
-    weighted = weights * pieces
-    ss, cc, sc = weights @ (sine * sine), weights @ (cosine * cosine), weights @ (sine * cosine)
+    if weights is None:
+        weighted = pieces
+        ss, cc, sc = (
+            np.einsum("ij,ij->j", *pair)
+            for pair in ((sine, sine), (cosine, cosine), (sine, cosine))
+        )
+    else:
+        weighted = weights * pieces
+        ss, cc = weights @ (sine * sine), weights @ (cosine * cosine)
+        sc = weights @ (sine * cosine)
     sy, cy = weighted @ sine, weighted @ cosine
     determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
     of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
@@ -544,7 +607,7 @@ def _turns_back(values: Array, period: float) -> float:
     """The share of its way there that a value comes back; of many periods in most of them."""
     step = max(1, int(period / 8))
     steps = np.diff(_means(values, step))
-    rows = round(period / step) if len(values) > MANY_PERIODS * period else len(steps)
+    rows = round(period / step) if len(values) > DECIDE.many_periods * period else len(steps)
     parts: Array = np.reshape(steps[: len(steps) // rows * rows], (-1, rows))
     up, down = np.maximum(parts, 0).sum(axis=1), np.maximum(-parts, 0).sum(axis=1)
     return median(np.minimum(up, down) / np.maximum(np.maximum(up, down), 1e-300))
@@ -557,9 +620,9 @@ def _is_straight(values: Array, period: float, noise: float) -> bool:
     third harmonic reaches a ninth of the first; of all others the second one reaches more. The
     medians over all periods are taken, since bends of the course have harmonics too.
     """
-    step = max(1, int(period / FITTED_ROWS))
+    step = max(1, int(period / FIT.fitted_rows))
     period /= step
-    lag, rows = math.ceil(LAG * period), math.ceil(period)
+    lag, rows = math.ceil(FIT.lag * period), math.ceil(period)
     bends = _bends(_means(values, step), lag)
     parts = np.lib.stride_tricks.sliding_window_view(bends, rows)[:: max(1, rows // 4)]
     orders: Array = np.arange(1.0, 4.0)
@@ -575,7 +638,7 @@ def _is_straight(values: Array, period: float, noise: float) -> bool:
     squares = float(np.square(np.median(turned, axis=0)).sum())
     of_noise = np.square(inverse).sum(axis=1).reshape(2, 3).sum(axis=0)[1:] / gains[1:] ** 2
     of_one = 6 * noise**2 / step / median(heights[:, 0]) ** 2 * period / len(bends)
-    return squares - DOUBT * float(of_noise.sum()) * of_one > STRAIGHT**2
+    return squares - DECIDE.doubt * float(of_noise.sum()) * of_one > DECIDE.straight**2
 
 
 def _best(found: list[Swing]) -> list[Swing]:
@@ -595,8 +658,10 @@ def _is_same(one: Swing, other: Swing) -> bool:
     common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
     overlap = common_s / min(one.end_s - one.start_s, other.end_s - other.start_s)
     fast, slow = sorted((one, other), key=lambda each: each.period_s)
-    is_beneath = slow.period_s > MUCH_SLOWER * fast.period_s and slow.amplitude > fast.amplitude
-    return overlap > MOST_OVERLAP and not is_beneath
+    is_beneath = (
+        slow.period_s > DECIDE.much_slower * fast.period_s and slow.amplitude > fast.amplitude
+    )
+    return overlap > DECIDE.most_overlap and not is_beneath
 
 
 def _joined(found: Sequence[Swing], rows: EvenRows, values: Array) -> list[Swing]:
@@ -614,17 +679,17 @@ def _joined(found: Sequence[Swing], rows: EvenRows, values: Array) -> list[Swing
 
 def _goes_on(before: Swing, after: Swing, rows: EvenRows, values: Array) -> bool:
     ratios = _ratio(before.period_s, after.period_s), _ratio(before.amplitude, after.amplitude)
-    if ratios[0] > ALIKE[0] or ratios[1] > ALIKE[1]:
+    if ratios[0] > DECIDE.alike[0] or ratios[1] > DECIDE.alike[1]:
         return False
     ended, began = np.searchsorted(rows.times, [before.end_s, after.start_s]).tolist()
     period = before.period_s / rows.interval_s
     has_gap = bool(np.any((rows.borders > ended) & (rows.borders <= began)))
     if began - ended < period * (1 + has_gap):
         return True
-    lag = math.ceil(LAG * period)
+    lag = math.ceil(FIT.lag * period)
     bends = _bends(values[max(0, ended - lag) : began + lag], lag)
-    is_hidden = not has_gap and began - ended < HIDDEN * period
-    return is_hidden and median(np.abs(bends)) > QUIET * before.amplitude
+    is_hidden = not has_gap and began - ended < SEARCH.hidden * period
+    return is_hidden and median(np.abs(bends)) > FIT.quiet * before.amplitude
 
 
 def _ratio(one: float, other: float) -> float:

@@ -22,7 +22,7 @@ from webots_mcp.plotting.robot_path import thinned
 from webots_mcp.plotting.signal_plot import SignalAxes, paint_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, paint_trajectory
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.series import MOST_POINTS
+from webots_mcp.store.signal_history import MOST_POINTS
 
 ROOM: Final = Room(points=MOST_POINTS, panels=8, lanes=8, rows=16)
 WIDTH_PX: Final = 900

@@ -1,4 +1,8 @@
-"""Rare events compared as counts of runs: Fisher's exact test, and intervals of differences."""
+"""Statistical tests of counts: whether rare events differ between groups of runs.
+
+How many runs of two groups have an event is compared by Fisher's exact test and by intervals of
+differences.
+"""
 
 from __future__ import annotations
 

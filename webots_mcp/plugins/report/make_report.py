@@ -17,7 +17,7 @@ from webots_mcp.answers.budget import notes_of
 from webots_mcp.contract import VERSION
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plotting.on_a_page import figure_part
+from webots_mcp.plotting.interactive_svg import figure_part
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
 from webots_mcp.plugins.report.embedded_pictures import (
     EmbeddedPicture,
@@ -29,7 +29,7 @@ from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
 from webots_mcp.plugins.report.run_comparison import RunComparison, compare_two_runs
 from webots_mcp.plugins.report.words import clock, counted, size
 from webots_mcp.questions.arguments import AnyNames, RobotName, RunIds
-from webots_mcp.questions.declaring import DESTROYS, question
+from webots_mcp.questions.declaration import DESTROYS, question
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.segment import in_one_snapshot

@@ -179,3 +179,16 @@ def test_init_writes_a_first_test_that_passes_until_the_controller_changes(
     assert "instead of 5.0" in failed
     main(["init", str(tmp_path), "--tests"])
     assert "unchanged" in capsys.readouterr().out
+
+
+def test_launching_with_a_tape_records_one(tmp_path: Path) -> None:
+    ends = "while robot.getTime() < 1.0:\n    robot.step(step_ms)"
+    code = AVOID.replace("while robot.step(step_ms) != -1:", ends)
+    project(tmp_path, code)
+    world = str(tmp_path / "worlds" / WORLD.name)
+    command = [sys.executable, "-m", "webots_mcp", "launch", world, "--stand-in", "--mode", "fast"]
+    subprocess.run([*command, "--tape"], cwd=tmp_path, capture_output=True, check=True)
+    taped = taped_run(tmp_path)
+    assert not taped.tape.head["images"]
+    subprocess.run([*command, "--tape-images"], cwd=tmp_path, capture_output=True, check=True)
+    assert taped_run(tmp_path).tape.head["images"]

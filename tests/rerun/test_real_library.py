@@ -116,7 +116,8 @@ def record(folder: Path, parts: dict[str, str], *, attach: bool = True) -> Path:
     controller.write_text(LOOP.format(**filled), "utf-8")
     package = Path(os.environ["WEBOTS_HOME"]) / "lib" / "controller" / "python"
     with fake(mode="fast", supervisor=True) as simulation:
-        environment: dict[str, str] = simulation.environment() | {
+        environment: dict[str, str] = {
+            **simulation.environment(),
             "WEBOTS_MCP_TAPE": "images",
             "WEBOTS_MCP_DATA_DIR": str(data_dir_of(folder)),
             "PYTHONPATH": os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")]),

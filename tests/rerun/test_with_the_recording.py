@@ -14,7 +14,7 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention_limits import Limit, Retention
-from webots_mcp.testing import RecordedSimulation
+from webots_mcp.testing import RecordedSimulation, assert_same_commands
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tape_files(data_dir: Path) -> list[bytes]:
-    return [file.read_bytes() for file in (data_dir / "tapes").glob("*.tape")]
+    return [file.read_bytes() for file in (data_dir / "tapes").rglob("*.tape")]
 
 
 def test_a_bundle_takes_the_tape_along(project: Path, tmp_path: Path) -> None:
@@ -41,6 +41,33 @@ def test_an_import_takes_the_tape_along_once(project: Path, tmp_path: Path) -> N
         source = data_dir_of(project) / DATABASE_NAME
         main(["import", str(source), "--data-dir", str(tmp_path)])
     assert tape_files(tmp_path) == tape_files(data_dir_of(project))
+
+
+def test_code_that_came_with_an_import_runs_only_for_a_person_who_trusts_it(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle, other = tmp_path / "run.zip", tmp_path / "other"
+    main(["export", "--run", "1", "-o", str(bundle), "--data-dir", str(data_dir_of(project))])
+    main(["import", str(bundle), "--data-dir", str(other)])
+    assert main(["rerun", "1", "--data-dir", str(other)]) != 0
+    assert "was imported" in capsys.readouterr().err
+    assert main(["rerun", "1", "--trust", "--data-dir", str(other)]) in (0, None)
+    assert "unchanged code commands the same" in " ".join(capsys.readouterr().out.split())
+    again = tmp_path / "again.zip"
+    main(["export", "--run", "1", "-o", str(again), "--data-dir", str(other)])
+    controller = project / "controllers" / "rover" / "rover.py"
+    assert assert_same_commands(again, controller).rounds == 126
+
+
+def test_a_pool_takes_the_tape_along_with_pictures(project: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    pool, other = str(tmp_path / "pool"), tmp_path / "other"
+    assert main(["ship", "--to", pool, "--pictures", "--data-dir", str(data_dir_of(project))]) == 0
+    assert main(["fetch", "--from", pool, "--robot", "rover", "--data-dir", str(other)]) in (
+        0,
+        None,
+    )
+    assert tape_files(other) == tape_files(data_dir_of(project))
 
 
 def test_a_tape_is_deleted_with_the_last_run_of_its_session(tmp_path: Path) -> None:

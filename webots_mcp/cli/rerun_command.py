@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from webots_mcp.cli.options import HERE, Id, Json, Parameter, Where
 from webots_mcp.errors import InvalidInputError
@@ -41,6 +41,14 @@ def rerun(
             help="With --pdb: begin to debug at this simulation time instead.",
         ),
     ] = None,
+    trust: Annotated[
+        bool,
+        Parameter(
+            "--trust",
+            negative=(),
+            help="Run the code of an imported run, which came from elsewhere.",
+        ),
+    ] = False,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
@@ -64,8 +72,9 @@ def rerun(
     if pdb and json:
         raise InvalidInputError("--pdb talks with a person and cannot answer as JSON.")
     if pdb:
-        return _debug(run_id, file, until_s, break_at_s, recorded)
-    asked = {"run_id": run_id, "file": str(file) if file else None, "until_s": until_s}
+        return _debug(run_id, file, until_s, break_at_s, recorded, trust=trust)
+    asked: dict[str, Any] = {"run_id": run_id, "file": str(file) if file else None}
+    asked |= {"until_s": until_s, "trust": trust or None}
     ask_and_show(webots_rerun_controller, asked, recorded, as_json=json)
 
 
@@ -75,6 +84,8 @@ def _debug(
     until_s: float | None,
     break_at_s: float | None,
     recorded: Where,
+    *,
+    trust: bool,
 ) -> None:
     from webots_mcp.questions import rerun_controller
     from webots_mcp.rerun import running
@@ -88,6 +99,7 @@ def _debug(
     with OpenRequest(recording, BY_COMMAND_LINE, names, asked):
         permit(recording, RERUN, asked)
         taped = rerun_controller.taped_run(recording, run_id)
+        running.require_own_tape(taped, trusted=trust)
         own = rerun_controller.file_of(taped, named, recording)
         first = None
         if break_at_s is None:

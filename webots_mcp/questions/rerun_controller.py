@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.answers.answer_models import RerunAnswer
 from webots_mcp.database.location import find_project
@@ -19,6 +20,7 @@ from webots_mcp.rerun.running import (
     find_taped_run,
     newest_taped_run,
     require_own,
+    require_own_tape,
     rerun,
 )
 from webots_mcp.store.policy import RERUN, is_named, policies_of
@@ -56,6 +58,7 @@ def webots_rerun_controller(
         Seconds | None,
         Field(description="Simulation time of the run at which to stop. Default: its end."),
     ] = None,
+    trust: SkipJsonSchema[bool] = False,
 ) -> RerunAnswer:
     """Find out what an edited Python controller would have commanded in a recorded run.
 
@@ -66,6 +69,7 @@ def webots_rerun_controller(
     """
     require_rerun(recording, caller, file)
     taped = taped_run(recording, run_id)
+    require_own_tape(taped, trusted=trust and caller.client == "cli")
     limit_s = LIMIT_S if caller.client == "cli" else MAX_WAIT_S / _REPLAYS
     found = rerun(taped, file_of(taped, file, recording), until_s=until_s, limit_s=limit_s)
     line = found.deciding_line or {}

@@ -17,7 +17,12 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.contract import DATA_DIR_VARIABLE, PARAMETERS_VARIABLE
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
-from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
+from webots_mcp.errors import (
+    CommandRefusedError,
+    InvalidInputError,
+    NothingRecordedError,
+    UnknownRunError,
+)
 from webots_mcp.rerun import likely_cause
 from webots_mcp.rerun.deciding_line import TracedLine, find_deciding_line
 from webots_mcp.rerun.likely_cause import Witness, dated_lines
@@ -28,8 +33,8 @@ from webots_mcp.rerun.source_files import (
     root_of,
     unpack_sources,
 )
-from webots_mcp.rerun.tape import Tape, open_tape, tape_file
-from webots_mcp.rerun.tape_recorder import TAPE_VARIABLE
+from webots_mcp.rerun.tape import Tape, open_tape, tape_files
+from webots_mcp.rerun.tape_wanted import TAPE_VARIABLE
 
 STALL_S: Final = 60.0  # of wall time without a step, after which a replay is ended
 LIMIT_S: Final = 3600.0  # of wall time, for each replay
@@ -54,11 +59,13 @@ class TapedRun(NamedTuple):
         run_id: Its id.
         tape: The tape of its session.
         number: The run's number in the session, from 0.
+        is_imported: The tape, and so the recorded code, came from elsewhere.
     """
 
     run_id: int
     tape: Tape
     number: int
+    is_imported: bool = False
 
 
 @dataclass
@@ -145,13 +152,28 @@ def find_taped_run(database: Database, data_dir: Path, run_id: int) -> TapedRun:
         row = connection.execute(_OF_RUN, (run_id,)).fetchone()
     if row is None:
         raise UnknownRunError(f"There is no run {run_id}. 'webots-mcp runs' lists them.")
-    file = tape_file(data_dir, str(row[0]))
+    own, imported = tape_files(data_dir, str(row[0]))
+    file = own if own.is_file() else imported
     if not file.is_file():
         raise NothingRecordedError(
             f"Run {run_id} has no tape, so no code can be run on it: its rows lack what was asked "
             f"between them. {HOW_TO_RECORD}."
         )
-    return TapedRun(run_id, open_tape(file), int(row[1]))
+    return TapedRun(run_id, open_tape(file), int(row[1]), is_imported=file != own)
+
+
+def require_own_tape(taped: TapedRun, *, trusted: bool) -> None:
+    """Refuse to run code that came with an import, unless the person trusts it.
+
+    Raises:
+        CommandRefusedError: The tape was imported.
+    """
+    if taped.is_imported and not trusted:
+        raise CommandRefusedError(
+            f"The tape of run {taped.run_id} was imported, and its recorded code would run on this "
+            "machine. If you trust where it came from, a person can run it with "
+            f"'webots-mcp rerun {taped.run_id} FILE --trust'."
+        )
 
 
 def newest_taped_run(database: Database, data_dir: Path) -> int:
@@ -166,7 +188,7 @@ def newest_taped_run(database: Database, data_dir: Path) -> int:
             "ORDER BY run.id DESC"
         )
         for run_id, uuid in rows:
-            if tape_file(data_dir, str(uuid)).is_file():
+            if any(each.is_file() for each in tape_files(data_dir, str(uuid))):
                 return int(run_id)
     raise NothingRecordedError(f"No run has a tape. {HOW_TO_RECORD}.")
 
@@ -311,11 +333,11 @@ class Replays:
             output.seek(0)
             return output.read().decode("utf-8", "replace")
 
-    @staticmethod
-    def _interpreter(head: Mapping[str, Any]) -> str:
+    def _interpreter(self, head: Mapping[str, Any]) -> str:
         """Return the Python that the controller ran with, which has what it imports."""
         used = str(head.get("executable") or "")
-        return used if used and os.access(used, os.X_OK) else sys.executable
+        is_usable = not self._taped.is_imported and Path(used).name.lower().startswith("py")
+        return used if is_usable and os.access(used, os.X_OK) else sys.executable
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
@@ -339,6 +361,7 @@ def _environment(head: Mapping[str, Any], data_dir: Path) -> dict[str, str]:
         "WEBOTS_MCP_KEEP_LAST_S": "0",
         "WEBOTS_MCP_HANG_AFTER_S": "0",
         "WEBOTS_MCP_THROTTLE_INTERVAL": "1000",
+        "WEBOTS_MCP_INSPECT": "0",
     }
     if head.get("parameters"):
         environment[PARAMETERS_VARIABLE] = str(head["parameters"])

@@ -38,6 +38,7 @@ from webots_mcp.errors import InvalidInputError
 
 TAPE_FOLDER: Final = "tapes"  # in the data folder
 TAPE_ENDING: Final = ".tape"
+IMPORTED: Final = "imported"  # in that folder
 MAX_TAPE_BYTES: Final = 256_000_000
 NOTES: Final = 0  # the call whose answers are notes of the bridge, not of Webots' package
 MAGIC: Final = b"webots-mcp tape 1\n"
@@ -48,10 +49,25 @@ _LEVEL: Final = 1  # three times as fast as 6, for a tenth more bytes
 _MOST_BLOCK_BYTES: Final = 512_000_000  # of lines in one block, against files that lie
 
 
-def tape_file(data_dir: Path, session_uuid: str) -> Path:
-    """Return the file of a session's tape, next to its database."""
+def tape_file(data_dir: Path, session_uuid: str, *, imported: bool = False) -> Path:
+    """Return the file of a session's tape, next to its database.
+
+    Args:
+        data_dir: The folder of the database.
+        session_uuid: Of the session.
+        imported: Whether it came from elsewhere: its code is not run without being asked for.
+    """
     name = "".join(each for each in session_uuid if each.isalnum() or each in "-_")
-    return data_dir / TAPE_FOLDER / f"{name}{TAPE_ENDING}"
+    folder = data_dir / TAPE_FOLDER
+    return (folder / IMPORTED if imported else folder) / f"{name}{TAPE_ENDING}"
+
+
+def tape_files(data_dir: Path, session_uuid: str) -> tuple[Path, Path]:
+    """Return where the tape of a session may be: recorded here, or imported."""
+    return (
+        tape_file(data_dir, session_uuid),
+        tape_file(data_dir, session_uuid, imported=True),
+    )
 
 
 def is_tape(path: PurePath) -> bool:

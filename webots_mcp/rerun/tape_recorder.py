@@ -15,7 +15,6 @@ import atexit
 import functools
 import inspect
 import os
-import re
 import sys
 import threading
 import time
@@ -28,8 +27,7 @@ from threading import get_ident
 from types import FrameType, ModuleType
 from typing import Any, Final, cast
 
-from webots_mcp.contract import PARAMETERS_VARIABLE, PROJECT_FILE, VERSION
-from webots_mcp.database.location import find_project
+from webots_mcp.contract import PARAMETERS_VARIABLE, VERSION
 from webots_mcp.errors import warn
 from webots_mcp.rerun import tape_notes
 from webots_mcp.rerun.package_surface import (
@@ -44,10 +42,7 @@ from webots_mcp.rerun.source_files import read_sources, relative_source, root_of
 from webots_mcp.rerun.tape import MAX_TAPE_BYTES, NOTES, TapeWriter, tape_file
 from webots_mcp.rerun.tape_values import encode_value
 
-TAPE_VARIABLE: Final = "WEBOTS_MCP_TAPE"  # 1 or true; "images" with the pictures of sensors as well
-IMAGES: Final = "images"
 MAX_WAITING_LINES: Final = 20_000  # in memory, until a bridge opens the file
-_OFF: Final = ("", "0", "false", "no", "off")
 _OWN: Final = frozenset({"webots_mcp", *PACKAGES})  # packages whose calls are not the user's
 _PATH: Final = "_webots_mcp_path"  # of an object of Webots' package
 _SENSED: Final = frozenset({"getValue", "getValues", "getRollPitchYaw"})  # that the bridge asks too
@@ -58,7 +53,6 @@ _READS_DEVICES: Final = "webots_mcp.bridge.devices"
 _VARIABLE_ARGUMENTS: Final = inspect.CO_VARARGS | inspect.CO_VARKEYWORDS
 _NUMBERS: Final = frozenset({type(None), bool, int, float})
 _PLAIN: Final = _NUMBERS | {str}
-_TAPE_LINE: Final = re.compile(r"^\s*tape\s*=\s*(true|\"images\"|'images')", re.MULTILINE)
 _FACTS: Final = {  # what a device is, asked once: new code may ask it although the old one did not
     "Robot": ("getName", "getModel", "getBasicTimeStep", "getProjectPath", "getWorldPath",
               "getNumberOfDevices", "getCustomData", "getMode", "getSynchronization",
@@ -417,34 +411,6 @@ _recorder: TapeRecorder | None = None
 def recorder() -> TapeRecorder | None:
     """Return the recorder of this process; None where no tape is recorded."""
     return _recorder
-
-
-def wanted(environment: str | None, folder: Path | None = None) -> str | None:
-    """Return `on` or `images` where a tape is asked for; None where it is not.
-
-    Args:
-        environment: The value of `WEBOTS_MCP_TAPE`, which holds if it is set.
-        folder: A folder of the project, whose `webots-mcp.toml` may have the line `tape = true`.
-    """
-    if environment is not None:
-        text = environment.strip().lower()
-        return None if text in _OFF else IMAGES if text == IMAGES else "on"
-    project = find_project(folder) if folder else None
-    if project is None:
-        return None
-    try:
-        text = (project / PROJECT_FILE).read_text("utf-8-sig").partition("\n[")[0]
-    except (OSError, ValueError):
-        return None
-    found = None if text.lstrip().startswith("[") else _TAPE_LINE.search(text)
-    return None if found is None else "on" if found[1] == "true" else IMAGES
-
-
-def begin_if_wanted() -> None:
-    """Record the calls of this process if the environment or the project's file asks for it."""
-    how = wanted(os.environ.get(TAPE_VARIABLE), Path.cwd())
-    if how is not None:
-        begin(images=how == IMAGES)
 
 
 def begin(*, images: bool = False) -> TapeRecorder:

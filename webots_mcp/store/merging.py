@@ -27,7 +27,7 @@ from webots_mcp.database.session_cleanup import end_session, reap
 from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.rerun.tape import MAX_TAPE_BYTES, TAPE_ENDING, is_tape, tape_file
+from webots_mcp.rerun.tape import MAX_TAPE_BYTES, TAPE_ENDING, is_tape, tape_file, tape_files
 from webots_mcp.signals.meaning import MEANING_FIELDS
 from webots_mcp.signals.register import Kind, Seen
 from webots_mcp.store.chunks import (
@@ -95,6 +95,7 @@ def merge(
     run_id: int | None = None,
     address: str | None = None,
     pictures: Path | None = None,
+    is_export: bool = False,
 ) -> dict[str, int]:
     """Take in all sessions of a recording that is over, and its trial sets; or one run of it.
 
@@ -105,6 +106,7 @@ def merge(
         run_id: Only this run, which has to be over, with its session, commands and trials.
         address: How SQLite is to open it, where its path is not enough.
         pictures: The folder of its pictures; None for the one that it lies in.
+        is_export: Whether a bundle is made of it, and nothing comes from elsewhere.
 
     Returns:
         By their UUIDs, the ids that its runs have here.
@@ -133,7 +135,7 @@ def merge(
                 continue
             for run, run_uuid in runs:
                 _copy_pictures(connection, data_dir, pictures or source.parent, run, run_uuid)
-            _copy_tape(data_dir, pictures or source.parent, str(uuid))
+            _copy_tape(data_dir, pictures or source.parent, str(uuid), imported=not is_export)
             with transaction(connection):
                 _ingest_run_rows(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
@@ -448,10 +450,12 @@ def _copy_pictures(
             shutil.copyfile(file, aside)
 
 
-def _copy_tape(data_dir: Path, source_dir: Path, session_uuid: str) -> None:
+def _copy_tape(data_dir: Path, source_dir: Path, session_uuid: str, *, imported: bool) -> None:
     """Copy the tape of a session, which has all its runs; one that is there is the same."""
-    file, target = tape_file(source_dir, session_uuid), tape_file(data_dir, session_uuid)
-    if not file.is_file() or file.is_symlink() or target.exists():
+    found = (each for each in tape_files(source_dir, session_uuid) if each.is_file())
+    file = next((each for each in found if not each.is_symlink()), None)
+    target = tape_file(data_dir, session_uuid, imported=imported)
+    if file is None or any(each.exists() for each in tape_files(data_dir, session_uuid)):
         return
     make_folder(target.parent)
     with whole_file(target) as aside:
@@ -495,7 +499,10 @@ def write_bundle(
         with small_recording(folder) as writer:
             frozen = "&immutable=1" if isinstance(connection, FrozenConnection) else ""
             address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
-            merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
+            merge(
+                writer, folder, database,
+                run_id=run_id, address=address, pictures=data_dir, is_export=True,
+            )  # fmt: skip
             writer.execute(END_SESSIONS)
         pack(folder, file, progress)
 

@@ -21,7 +21,7 @@ from typing import Any, Final
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.database.transactions import LONGEST_WRITE_S, AtomicStatements, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
-from webots_mcp.rerun.tape import tape_file
+from webots_mcp.rerun.tape import tape_files
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks, remake_if_damaged
 from webots_mcp.store.retention_limits import DEFAULT, KEPT, Retention, in_force
 from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, ids_of, plan
@@ -368,8 +368,9 @@ class _Purge:
             if not self._first("SELECT 1 FROM image WHERE path = ? LIMIT 1", path):
                 self._delete_file(path)
         for (uuid,) in taped:
-            file = tape_file(self._data_dir, str(uuid))
-            if file.exists() and not self._first("SELECT 1 FROM session WHERE uuid = ?", uuid):
+            if self._first("SELECT 1 FROM session WHERE uuid = ?", uuid):
+                continue
+            for file in filter(Path.exists, tape_files(self._data_dir, str(uuid))):
                 self._delete_file(file.relative_to(self._data_dir).as_posix())
         return len(some)
 

@@ -23,9 +23,8 @@ FLOORS = """
     questions
     steering
     answers      plotting     setup        testing
-    judging      simulator
+    judging      simulator    rerun
     store        bridge
-    rerun
     database     standin
     signals
     analysis     contract     errors       extras

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.tapes.tape import Tape, open_tape
 from webots_mcp.rerun.running import (
     Rerun,
     TapedRun,
@@ -14,7 +15,6 @@ from webots_mcp.rerun.running import (
     newest_taped_run,
     rerun,
 )
-from webots_mcp.rerun.tape import Tape, open_tape
 from webots_mcp.testing import RecordedSimulation
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

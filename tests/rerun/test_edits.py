@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.rerun.taping import AVOID, data_dir_of, record, recorded, rerun_of, tapes
+from webots_mcp.database.tapes.tape import Tape
 from webots_mcp.rerun.running import Rerun
-from webots_mcp.rerun.tape import Tape
 
 STATEFUL = AVOID.replace(
     "turning = 0\n",

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from webots_mcp.database.tapes.tape import MAGIC, TapeWriter, open_tape, tape_file
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.rerun.tape import MAGIC, TapeWriter, open_tape, tape_file
 
 WRITES_UNTIL_KILLED = """
 import os, signal, sys
 from pathlib import Path
-from webots_mcp.rerun.tape import TapeWriter
+from webots_mcp.database.tapes.tape import TapeWriter
 writer = TapeWriter(Path(sys.argv[1]))
 writer.write([["head", {}], ["call", 1, "robot", "Robot", "getTime", [], "question"]])
 for number in range(int(sys.argv[2])):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp.rerun.tape_wanted import wanted
+from webots_mcp.database.tapes.tape_wanted import wanted
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.database.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
+from webots_mcp.database.tapes import tape_notes
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.rerun import tape_notes
 from webots_mcp.signals.naming import harmless_first
 
 Progress = Generator[None, None, object]

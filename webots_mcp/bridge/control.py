@@ -25,13 +25,13 @@ from webots_mcp.bridge.pause import PUMP_INTERVAL_S, Pause
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import BUILT_IN_ACTIONS, ENDING, LOOPING
 from webots_mcp.database.session_cleanup import EXTERN
+from webots_mcp.database.tapes import tape_notes
 from webots_mcp.errors import (
     CommandRefusedError,
     ControllerEndedError,
     InterruptedCommandError,
     InvalidInputError,
 )
-from webots_mcp.rerun import tape_notes
 from webots_mcp.signals.naming import misfit_of_parameters
 
 POLL_INTERVAL_S: Final = 0.005

@@ -14,9 +14,9 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import PARAMETERS_VARIABLE, recorded_name
+from webots_mcp.database.tapes import tape_notes
 from webots_mcp.database.waiting_file import Kind, Values
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
-from webots_mcp.rerun import tape_notes
 from webots_mcp.signals.parameter import MOST_PARAMETERS, Declaration, Value, require_known
 
 MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database

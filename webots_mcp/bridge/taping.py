@@ -8,13 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from webots_mcp.database.location import Database, MemoryDatabase
+from webots_mcp.database.tapes import tape_notes, tape_wanted
 from webots_mcp.errors import warn
-from webots_mcp.rerun import tape_notes, tape_wanted
 
 if TYPE_CHECKING:
-    from webots_mcp.rerun.tape_recorder import TapeRecorder
+    from webots_mcp.bridge.tape_recorder import TapeRecorder
 
-_RECORDER: Final = "webots_mcp.rerun.tape_recorder"
+_RECORDER: Final = "webots_mcp.bridge.tape_recorder"
+
+
+def begin_if_wanted() -> None:
+    """Record the calls of this process if the environment or the project's file asks for it."""
+    how = tape_wanted.wanted(os.environ.get(tape_wanted.TAPE_VARIABLE), Path.cwd())
+    if how is not None:
+        from webots_mcp.bridge import tape_recorder  # only where a tape is wanted
+
+        tape_recorder.begin(images=how == tape_wanted.IMAGES)
 
 
 def find_tape(asked: bool | Literal["images"] | None, database: Database) -> TapeRecorder | None:
@@ -34,7 +43,7 @@ def find_tape(asked: bool | Literal["images"] | None, database: Database) -> Tap
     if isinstance(database, MemoryDatabase):
         warn("no tape is recorded: it lies next to a database file, and this one is in memory")
         return None
-    from webots_mcp.rerun import tape_recorder  # only where a tape is wanted
+    from webots_mcp.bridge import tape_recorder  # only where a tape is wanted
 
     return tape_recorder.begin(images=how == tape_wanted.IMAGES)
 

@@ -422,7 +422,7 @@ def launch(
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
-    from webots_mcp.rerun.tape_wanted import IMAGES, TAPE_VARIABLE
+    from webots_mcp.database.tapes.tape_wanted import IMAGES, TAPE_VARIABLE
     from webots_mcp.simulator.launch import WebotsLaunch, require_world
     from webots_mcp.simulator.starting import Start, free_port
     from webots_mcp.store.policy import LAUNCH

@@ -1,6 +1,5 @@
-"""The calls of a controller as a file, the tape, and the controller's new code run on it.
+"""The new code of a controller, run on the tape of an old run: replay, comparison, deciding line.
 
-The recording half (the modules whose names begin with `tape`, and `source_files`) runs inside a
-robot's controller. The rest replays a tape in a process of its own. It may import `database` and
-everything below; the bridge, the store and everything above may import it. Standard library only.
+A tape is replayed in a process of its own. What records a tape runs inside a robot's controller
+(`bridge.tape_recorder`), and its format is shared (`database.tape`). Standard library only.
 """

@@ -17,8 +17,8 @@ from pathlib import Path
 from types import FrameType, MemberDescriptorType
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.rerun.package_surface import caller_frame
-from webots_mcp.rerun.source_files import relative_source
+from webots_mcp.database.tapes.package_surface import caller_frame
+from webots_mcp.database.tapes.source_files import relative_source
 
 MOST_LINES: Final = 20_000  # that are traced in the round
 _MOST_VALUES: Final = 12  # of a line

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.rerun.tape import TapedPlace
+from webots_mcp.database.tapes.tape import TapedPlace
 
 MOST_SHOWN: Final = 8
 _HOLDING: Final = frozenset({"Motor", "LED", "Brake", "Pen", "VacuumGripper", "Connector", "Skin"})

@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.rerun.package_surface import caller_frame
-from webots_mcp.rerun.source_files import relative_source
+from webots_mcp.database.tapes.package_surface import caller_frame
+from webots_mcp.database.tapes.source_files import relative_source
 
 _CLOCKS: Final = (
     "time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns",

@@ -20,14 +20,14 @@ from types import FrameType
 from typing import Any, Final
 
 from webots_mcp.database import location
-from webots_mcp.rerun import tape_notes
+from webots_mcp.database.tapes import tape_notes
+from webots_mcp.database.tapes.package_surface import caller_frame
+from webots_mcp.database.tapes.source_files import relative_source
+from webots_mcp.database.tapes.tape import open_tape
+from webots_mcp.database.tapes.tape_values import UnrecordedValueError
 from webots_mcp.rerun.deciding_line import RoundTracer
 from webots_mcp.rerun.likely_cause import Witnesses
-from webots_mcp.rerun.package_surface import caller_frame
 from webots_mcp.rerun.replayed_tape import ReplayedTape, ReplayEndedError, activate
-from webots_mcp.rerun.source_files import relative_source
-from webots_mcp.rerun.tape import open_tape
-from webots_mcp.rerun.tape_values import UnrecordedValueError
 
 _frames_of_threads: Final = sys._current_frames  # pyright: ignore[reportPrivateUsage]
 PACKAGES_FOLDER: Final = Path(__file__).parent / "lib"

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, Final
 
-from webots_mcp.rerun.package_surface import STEPS, caller_frame, kind_of_member
+from webots_mcp.database.tapes.package_surface import STEPS, caller_frame, kind_of_member
 from webots_mcp.rerun.replayed_tape import ReplayedTape, active
 
 _OWN: Final = frozenset({"webots_mcp", "controller", "vehicle"})

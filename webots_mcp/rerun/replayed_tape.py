@@ -13,10 +13,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final, cast
 
+from webots_mcp.database.tapes.source_files import relative_source
+from webots_mcp.database.tapes.tape import NOTES, Tape, TapedCall, TapedPlace, TapedRound
+from webots_mcp.database.tapes.tape_values import UnrecordedValueError, decode_value, encode_value
 from webots_mcp.rerun.difference import CommandDifference, Commanded, GivenCommand, differences
-from webots_mcp.rerun.source_files import relative_source
-from webots_mcp.rerun.tape import NOTES, Tape, TapedCall, TapedPlace, TapedRound
-from webots_mcp.rerun.tape_values import UnrecordedValueError, decode_value, encode_value
 
 Key = tuple[str, str, str]
 

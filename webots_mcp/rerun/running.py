@@ -17,6 +17,14 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.contract import DATA_DIR_VARIABLE, PARAMETERS_VARIABLE
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
+from webots_mcp.database.tapes.source_files import (
+    read_sources,
+    relative_source,
+    root_of,
+    unpack_sources,
+)
+from webots_mcp.database.tapes.tape import Tape, open_tape, tape_files
+from webots_mcp.database.tapes.tape_wanted import TAPE_VARIABLE
 from webots_mcp.errors import (
     CommandRefusedError,
     InvalidInputError,
@@ -27,14 +35,6 @@ from webots_mcp.rerun import likely_cause
 from webots_mcp.rerun.deciding_line import TracedLine, find_deciding_line
 from webots_mcp.rerun.likely_cause import Witness, dated_lines
 from webots_mcp.rerun.replay_process import ReplayJob, ReplayResult
-from webots_mcp.rerun.source_files import (
-    read_sources,
-    relative_source,
-    root_of,
-    unpack_sources,
-)
-from webots_mcp.rerun.tape import Tape, open_tape, tape_files
-from webots_mcp.rerun.tape_wanted import TAPE_VARIABLE
 
 STALL_S: Final = 60.0  # of wall time without a step, after which a replay is ended
 LIMIT_S: Final = 3600.0  # of wall time, for each replay

@@ -24,10 +24,16 @@ from webots_mcp.database.connection import FrozenConnection, connect
 from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
 from webots_mcp.database.schema import create_schema, require_shipped
 from webots_mcp.database.session_cleanup import end_session, reap
+from webots_mcp.database.tapes.tape import (
+    MAX_TAPE_BYTES,
+    TAPE_ENDING,
+    is_tape,
+    tape_file,
+    tape_files,
+)
 from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.rerun.tape import MAX_TAPE_BYTES, TAPE_ENDING, is_tape, tape_file, tape_files
 from webots_mcp.signals.meaning import MEANING_FIELDS
 from webots_mcp.signals.register import Kind, Seen
 from webots_mcp.store.chunks import (

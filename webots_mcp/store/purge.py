@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import KEPT_FRAME
+from webots_mcp.database.tapes.tape import tape_files
 from webots_mcp.database.transactions import LONGEST_WRITE_S, AtomicStatements, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
-from webots_mcp.rerun.tape import tape_files
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks, remake_if_damaged
 from webots_mcp.store.retention_limits import DEFAULT, KEPT, Retention, in_force
 from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, ids_of, plan

@@ -22,10 +22,10 @@ from typing import Final
 
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.processes import process_alive
+from webots_mcp.database.tapes.tape import tape_file
 from webots_mcp.database.transactions import transaction
 from webots_mcp.plugins.pool.pool_contents import ChosenRuns, PooledRun
 from webots_mcp.plugins.pool.pool_interface import Pool, is_whole, table
-from webots_mcp.rerun.tape import tape_file
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.chunks import STATE_IDS
 from webots_mcp.store.merging import END_SESSIONS, merge, small_recording

@@ -22,6 +22,7 @@ from typing import Final, NoReturn
 
 from webots_mcp.database.connection import FrozenConnection
 from webots_mcp.database.session_cleanup import find_dead_sessions
+from webots_mcp.database.tapes.tape import tape_file
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
@@ -46,7 +47,6 @@ from webots_mcp.plugins.pool.pool_interface import (
     whole_runs,
 )
 from webots_mcp.plugins.pool.shipping_source import UNCHECKED, ShippingSource, digest_of_rows
-from webots_mcp.rerun.tape import tape_file
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.chunks import reached
 from webots_mcp.store.merging import settled

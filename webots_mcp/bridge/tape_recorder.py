@@ -28,9 +28,8 @@ from types import FrameType, ModuleType
 from typing import Any, Final, cast
 
 from webots_mcp.contract import PARAMETERS_VARIABLE, VERSION
-from webots_mcp.errors import warn
-from webots_mcp.rerun import tape_notes
-from webots_mcp.rerun.package_surface import (
+from webots_mcp.database.tapes import tape_notes
+from webots_mcp.database.tapes.package_surface import (
     PACKAGES,
     STEPS,
     caller_frame,
@@ -38,9 +37,10 @@ from webots_mcp.rerun.package_surface import (
     describe_package,
     kind_of_member,
 )
-from webots_mcp.rerun.source_files import read_sources, relative_source, root_of
-from webots_mcp.rerun.tape import MAX_TAPE_BYTES, NOTES, TapeWriter, tape_file
-from webots_mcp.rerun.tape_values import encode_value
+from webots_mcp.database.tapes.source_files import read_sources, relative_source, root_of
+from webots_mcp.database.tapes.tape import MAX_TAPE_BYTES, NOTES, TapeWriter, tape_file
+from webots_mcp.database.tapes.tape_values import encode_value
+from webots_mcp.errors import warn
 
 MAX_WAITING_LINES: Final = 20_000  # in memory, until a bridge opens the file
 _OWN: Final = frozenset({"webots_mcp", *PACKAGES})  # packages whose calls are not the user's

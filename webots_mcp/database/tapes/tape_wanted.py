@@ -1,11 +1,10 @@
 """Whether a controller's calls are recorded: by the environment, or a line of the project's file.
 
-Each controller imports this module, so it imports the recorder only where a tape is wanted.
+Each controller imports this module: it imports little.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Final
 
@@ -43,12 +42,3 @@ def wanted(environment: str | None, folder: Path) -> str | None:
             said = value.strip().strip("\"'")
             return IMAGES if said == IMAGES else "on" if said == "true" else None
     return None
-
-
-def begin_if_wanted() -> None:
-    """Record the calls of this process if the environment or the project's file asks for it."""
-    how = wanted(os.environ.get(TAPE_VARIABLE), Path.cwd())
-    if how is not None:
-        from webots_mcp.rerun.tape_recorder import begin  # only where a tape is wanted
-
-        begin(images=how == IMAGES)

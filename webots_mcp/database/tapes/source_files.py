@@ -92,9 +92,9 @@ def unpack_sources(sources: Mapping[str, str], folder: Path, original: Path) -> 
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(text.encode("utf-8", "surrogateescape"))
     for made in {(folder / name).parent for name in sources}:
-        beside = original / made.relative_to(folder)
-        if beside.is_dir():
-            _link_others(beside, made)
+        counterpart = original / made.relative_to(folder)
+        if counterpart.is_dir():
+            _link_others(counterpart, made)
 
 
 def _link_others(original: Path, made: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from webots_mcp.analysis.rank_and_count_tests import level_changes
+from webots_mcp.analysis.level_changes import level_changes
 
 
 def test_changes_are_found_where_they_are() -> None:

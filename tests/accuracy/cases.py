@@ -39,7 +39,8 @@ simulated. Each was recorded healthy, with a row every {rates}, and once with a 
 answers were committed before the first question. An alarm about a healthy robot is false. A
 fault is answered *right* if the responsible check warns or fails, names it and gives its start.
 The answer is *helpful* if one of the three is missing, *not judged* if it says that it cannot
-decide, and *denied* if that check passes."""
+decide, and *denied* if that check passes. The column *first* counts what was answered before a
+rule was changed; ten healthy recordings were asked only later."""
 _ALSO_DRAWN: Final = """\
 The healthy kinds were also simulated with a row every {rates} and other noise. Of {runs} runs,
 {alarmed} raise an alarm{names}."""

@@ -6,10 +6,11 @@ The modules that read them (`webots_mcp.bridge.inspection`) are imported when th
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
@@ -21,6 +22,9 @@ from webots_mcp.errors import InvalidInputError
 if TYPE_CHECKING:
     from webots_mcp.bridge.inspection.inspector import Inspector
     from webots_mcp.bridge.inspection.watches import Watches
+
+
+_STARTED_S: Final = time.time()  # the bridge is imported when the controller starts
 
 
 class ControllerVariables:
@@ -118,5 +122,7 @@ class ControllerVariables:
         if self._inspector is None:
             from webots_mcp.bridge.inspection.inspector import Inspector
 
-            self._inspector = Inspector(self._clock, self._journal, self._errors, self._data_dir)
+            self._inspector = Inspector(
+                self._clock, self._journal, self._errors, self._data_dir, _STARTED_S
+            )
         return self._inspector

@@ -24,7 +24,8 @@ TABLE: Final = "inspect"
 LEFT_OUT: Final = "(left out: its name looks secret)"
 # Parts of names, in either case: `api_key`, `accessToken`, `DB_PASSWORD`; not `author` or `passed`.
 _SECRET: Final = (
-    r"(?i)passw|passphrase|\bpwd\b|secret|token|api_?key|private_?key|credential|cookie|auth(?!or)"
+    r"(?i)passw|passphrase|passcode|pwd|secret|token|credential|cookie|auth(?!or)"
+    r"|(?:api|access|private|encryption|signing|ssh)[-_ ]?key"
 )
 _KEYS: Final = ("secret", "enabled")
 _OFF: Final = ("0", "false", "no", "off")

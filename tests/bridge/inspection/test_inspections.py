@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import logging
+import math
 import os
 import subprocess
 import sys
 import threading
+from collections import OrderedDict, UserDict, defaultdict, deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +22,7 @@ from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge
 from webots_mcp.bridge.inspection.inspector import MOST_INSPECTIONS
 from webots_mcp.bridge.inspection.watches import MOST_WATCHED
+from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.secret_names import LEFT_OUT
 from webots_mcp.standin import InProcessSupervisor
 
@@ -179,6 +184,97 @@ def test_source_that_was_changed_since_the_start_is_not_shown(
     assert "source" not in data["frames"][0]
 
 
+def test_source_lines_are_those_of_python_and_only_of_files(
+    bridge: MCPBridge, recording: Recording, tmp_path: Path
+) -> None:
+    text = "\ufeff# a\fb\ndef say(bridge):\n    bridge.log('bad', 'error')\n"
+    pipe, file = tmp_path / "pipe.py", tmp_path / "feed.py"
+    os.mkfifo(pipe)  # reading it would block for ever
+    file.write_text(text, "utf-8")
+    for each in (file, pipe):
+        os.utime(each, (1, 1))  # long before the controller started
+        code: dict[str, Any] = {}
+        exec(compile(text.removeprefix("\ufeff"), str(each), "exec"), code)
+        code["say"](bridge)
+    (_, of_file), (_, of_pipe) = inspections(recording)
+    assert of_file["frames"][0]["source"] == [
+        "def say(bridge):", "    bridge.log('bad', 'error')", ""
+    ]  # fmt: skip
+    assert "source" not in of_pipe["frames"][0]
+
+
+def test_a_line_of_source_that_holds_a_secret_is_left_out(
+    bridge: MCPBridge, recording: Recording, tmp_path: Path
+) -> None:
+    file = tmp_path / "door.py"
+    file.write_text(
+        "def say(bridge):\n"
+        "    token = 's3cr3t'\n"
+        "    bridge.log('bad', 'error')\n"
+        "    token = bridge.token\n",
+        "utf-8",
+    )
+    os.utime(file, (1, 1))  # long before the controller started
+    code: dict[str, Any] = {}
+    exec(compile(file.read_text("utf-8"), str(file), "exec"), code)
+    with pytest.raises(AttributeError):
+        code["say"](bridge)
+    ((_, data),) = inspections(recording)
+    assert "s3cr3t" not in json.dumps(data)
+    assert data["frames"][0]["source"][0].startswith("(left out: it names a secret")
+    assert data["frames"][0]["source"][2] == "    token = bridge.token"
+
+
+def test_an_error_whose_traceback_is_a_property_is_recorded(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    calls: list[str] = []
+
+    class StrangeError(Exception):
+        @property
+        def __traceback__(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+            calls.append("traceback")
+
+    def fail() -> None:
+        raise StrangeError
+
+    try:
+        fail()
+    except StrangeError:
+        bridge.log("bad", "error")
+    ((_, data),) = inspections(recording)
+    assert data["frames"][0]["function"] == "fail"
+    assert calls == []
+
+
+def test_a_hit_where_the_stack_is_almost_full_costs_no_row(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    recording.send("watch", path="depth")
+    bridge.breakpoint("spare >= 0", action="log")
+    robot.step(STEP_MS)
+    published: list[int] = []
+
+    def publish(depth: int, spare: int) -> None:
+        if depth:
+            publish(depth - 1, spare)
+        else:
+            bridge.publish({"spare": spare})
+            published.append(spare)
+
+    publish(0, 1000)
+    eager(bridge)
+    depth = 0
+    frame: Any = sys._getframe()  # pyright: ignore[reportPrivateUsage]
+    while frame is not None:
+        depth, frame = depth + 1, frame.f_back
+    for spare in range(200, 5, -3):
+        with contextlib.suppress(RecursionError):
+            publish(sys.getrecursionlimit() - depth - spare, spare)
+    assert len(published) > 50
+    assert [state["spare"] for state in recording.states()] == published
+
+
 # -- asked for -------------------------------------------------------------------------------------
 
 
@@ -336,6 +432,71 @@ def test_a_state_of_the_controller_under_that_name_stays_as_it_is(
         eager(bridge)
     assert recording.states()[-1] == {"watched": "by me"}
     assert state == {"watched": "by me"}
+
+
+def test_states_of_python_s_own_kinds_of_dict_have_them_and_others_are_named_once(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    speed = 2
+    recording.send("watch", path="speed")
+    eager(bridge)
+    states: list[Any] = [OrderedDict(a=speed), defaultdict(int, a=2), UserDict(a=3), UserDict(a=4)]
+    for state in states:
+        robot.step(STEP_MS)
+        bridge.publish(state)
+    assert [state.get("watched") for state in recording.states()] == [
+        {"speed": 2}, {"speed": 2}, None, None
+    ]  # fmt: skip
+    lines = recording.rows("SELECT message FROM log WHERE message LIKE 'watched%'")
+    assert lines == ["watched values are not recorded: a UserDict is published, not a dict"]
+
+
+@pytest.mark.parametrize("every", [2, 3, 5, 7])
+def test_an_interval_that_never_meets_a_recorded_state_is_recorded_with_the_next(
+    robot: InProcessSupervisor, tmp_path: Path, every: int
+) -> None:
+    with MCPBridge(robot, data_dir=tmp_path, throttle_interval=3) as bridge:
+        recording = Recording(tmp_path / DATABASE_NAME)
+        recording.send("watch", path="turn", every=every)
+        for turn in range(1, 60):
+            robot.step(STEP_MS)
+            bridge.publish({"turn": turn})
+            eager(bridge)
+    watched = [state["watched"]["turn"] for state in recording.states() if "watched" in state]
+    gaps = {after - before for before, after in itertools.pairwise(watched)}
+    assert gaps == {3 * math.ceil(every / 3)}
+
+
+def test_a_list_that_another_thread_shortens_ends_no_watch(
+    navigator: Navigator, recording: Recording
+) -> None:
+    ended, busy, table = threading.Event(), deque[int](), dict[str, int]()
+
+    def churn() -> None:
+        while not ended.is_set():
+            busy.append(1)
+            table["x"] = 1
+            busy.pop()
+            del table["x"]
+
+    setattr(navigator, "busy", busy)  # noqa: B010
+    setattr(navigator, "table", table)  # noqa: B010
+    busy.append(0)
+    table["x"] = 0
+    for path in ("self.busy[0]", "self.table['x']", "self.busy[-1]", "self.pid.integral"):
+        recording.send("watch", path=path)
+    navigator.rounds(4)
+    busy.clear()
+    thread = threading.Thread(target=churn)
+    thread.start()
+    try:
+        navigator.rounds(300)
+    finally:
+        ended.set()
+        thread.join()
+    watched = [state["watched"] for state in recording.states()[4:]]
+    assert len(watched) == 300
+    assert all(values["self.pid.integral"] is not None for values in watched)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import this_call
 from webots_mcp.bridge.simulation import Clock
-from webots_mcp.contract import WATCHED
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -57,6 +56,13 @@ class ControllerVariables:
         """
         try:
             self.inspector.record(cause, name, key, this_call(1))
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("inspection", error)
+
+    def prepare(self) -> None:
+        """Import what reads variables, so that the first hit of a breakpoint need not."""
+        try:
+            self.inspector.prepare()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("inspection", error)
 
@@ -109,12 +115,11 @@ class ControllerVariables:
             )
         watches = self.watches = self.watches or Watches(self._journal)
         if stop:
-            watches.remove(path.text)
-            return {"stopped": f"{WATCHED}.{path.text}", "watched": watches.signals}
+            watches.remove(path)
+            return {"stopped": path.signal, "watched": watches.signals}
         shown = self.inspector.show(path.text, frame)
         watches.add(path, every)
-        signal = f"{WATCHED}.{path.text}"
-        return {"signal": signal, "value": shown["value"], "watched": watches.signals}
+        return {"signal": path.signal, "value": shown["value"], "watched": watches.signals}
 
     @property
     def inspector(self) -> Inspector:

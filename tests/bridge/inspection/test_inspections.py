@@ -94,6 +94,13 @@ def test_a_violation_records_them_too(navigator: Navigator, recording: Recording
     assert (name, data["cause"]) == ("turns little", "violation")
 
 
+def test_arming_a_breakpoint_loads_what_its_first_hit_needs(bridge: MCPBridge) -> None:
+    variables = bridge._session.variables  # pyright: ignore[reportPrivateUsage]
+    assert variables._inspector is None  # pyright: ignore[reportPrivateUsage]
+    bridge.breakpoint("turn == 3", action="log")
+    assert variables._inspector is not None  # pyright: ignore[reportPrivateUsage]
+
+
 def test_of_a_breakpoint_that_flickers_the_first_hits_of_a_run_are_recorded(
     navigator: Navigator, recording: Recording
 ) -> None:
@@ -379,6 +386,26 @@ def test_conditions_see_watched_signals_and_intervals_hold(
     assert {name for name, _ in inspections(recording)} == {"watched.self.pid.integral > 2.4"}
 
 
+@pytest.mark.parametrize("path", ["self.table['x']", 'self . table["x"]', "self.rows[1]"])
+@pytest.mark.parametrize("spelling", ["as the path", "as the signal"])
+def test_conditions_name_items_and_keys_as_the_path_or_the_signal_does(
+    navigator: Navigator, recording: Recording, path: str, spelling: str
+) -> None:
+    setattr(navigator, "table", {"x": 2})  # noqa: B010
+    setattr(navigator, "rows", [1, 2])  # noqa: B010
+    watch = recording.send("watch", path=path)
+    navigator.rounds(1)
+    signal = recording.fate(watch)[1]["signal"]
+    name = signal if spelling == "as the signal" else f"watched.{path.replace(' ', '')}"
+    navigator.bridge.breakpoint(f"{name} == 2", action="log")
+    navigator.rounds(1)
+    assert len(inspections(recording)) == 1
+    stop = recording.send("watch", path=path, stop=True)
+    navigator.rounds(2)
+    assert recording.fate(stop)[1] == {"stopped": signal, "watched": []}
+    assert "watched" not in recording.states()[-1]
+
+
 def test_an_attached_robot_has_them_in_its_own_rows(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -390,7 +417,7 @@ def test_an_attached_robot_has_them_in_its_own_rows(
         bridge._session.control._next_poll_s = 0.0  # pyright: ignore[reportPrivateUsage]
         assert robot.step(STEP_MS) != -1
     watched = [state["watched"] for state in recording.states() if "watched" in state]
-    assert watched == [{"speed['left']": turn} for turn in range(4)]
+    assert watched == [{"speed.left": turn} for turn in range(4)]
 
 
 def test_a_path_that_vanishes_is_null_and_named_once(

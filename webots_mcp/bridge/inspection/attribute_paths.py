@@ -29,6 +29,7 @@ from webots_mcp.bridge.inspection.objects import (
     name_of,
     numpy_class,
 )
+from webots_mcp.contract import WATCHED
 from webots_mcp.database.secret_names import SecretNames
 from webots_mcp.errors import InvalidInputError
 
@@ -55,6 +56,11 @@ class AttributePath(NamedTuple):
     text: str
     root: str
     steps: tuple[tuple[bool, str | int], ...]
+
+    @property
+    def signal(self) -> str:
+        """Its name as a signal, where an item or a key follows a dot, as in all signals."""
+        return ".".join([WATCHED, self.root, *(str(step) for _, step in self.steps)])
 
 
 class PathEndsError(Exception):

@@ -89,6 +89,10 @@ class Inspector:
             callers = [each for each in own_frames(frame) if id(each.frame) not in known]
             self._record(cause, name, [*raised, *callers])
 
+    def prepare(self) -> None:
+        """Read what the project says of secrets."""
+        self._read_secrets()
+
     def record_error(self, error: BaseException, name: str) -> None:
         """Record the variables where an exception was raised that ends the controller."""
         if self._is_wanted("error", "uncaught"):

@@ -205,6 +205,8 @@ def signal_value(value: Any) -> Any:
         items = list(islice(c_items(value), _SIGNAL_ITEMS + 1))
         if len(items) <= _SIGNAL_ITEMS and all(id(class_of(each)) in _NUMBERS for each in items):
             return items
+    if id(cls) in _LISTS or id(cls) in _DICTS:
+        return f"<{cls.__name__}>"
     number = _number_or_array(value, cls)
     if number is None:
         number = _c_number_or_array(value, cls)

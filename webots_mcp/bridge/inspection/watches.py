@@ -1,7 +1,8 @@
 """Watched variables: the value at an attribute path, recorded as a signal with each state.
 
 A path is followed at each call of `publish`, or at each step of an attached robot. Its signal is
-`watched.` and the path. A path that ends on the way is null, and is named once in the log.
+`watched.` and the path, with dots in place of brackets. A path that ends on the way is null, and
+is named once in the log.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class WatchedPath:
     """One watched path.
 
     Attributes:
+        key: Its name among the watched values of a state.
         every: Its value is recorded in one of so many states.
         waited: States since the last recorded one that had its value, or since it is watched.
         code: The function whose variable the path begins with, where it was found last.
@@ -45,6 +47,7 @@ class WatchedPath:
 
     def __init__(self, path: AttributePath, every: int) -> None:
         self.path = path
+        self.key = path.signal.removeprefix(f"{WATCHED}.")
         self.every = every
         self.waited = 0
         self.code: object = None
@@ -56,7 +59,7 @@ class Watches:
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
-        self._paths: dict[str, WatchedPath] = {}
+        self._paths: dict[str, WatchedPath] = {}  # by their signals
         self._is_refused = False  # the log says that the states have no place for the values
 
     def add(self, path: AttributePath, every: int) -> None:
@@ -65,24 +68,24 @@ class Watches:
         Raises:
             CommandRefusedError: Too many are watched.
         """
-        if path.text not in self._paths and len(self._paths) >= MOST_WATCHED:
+        if path.signal not in self._paths and len(self._paths) >= MOST_WATCHED:
             raise CommandRefusedError(f"{MOST_WATCHED} paths are watched already: stop one first")
-        self._paths[path.text] = WatchedPath(path, every)
+        self._paths[path.signal] = WatchedPath(path, every)
 
-    def remove(self, text: str) -> None:
+    def remove(self, path: AttributePath) -> None:
         """Watch a path no longer.
 
         Raises:
             CommandRefusedError: It is not watched.
         """
-        if self._paths.pop(text, None) is None:
-            known = ", ".join(self._paths) or "none"
-            raise CommandRefusedError(f"{text!r} is not watched; watched: {known}")
+        if self._paths.pop(path.signal, None) is None:
+            known = ", ".join(each.path.text for each in self._paths.values()) or "none"
+            raise CommandRefusedError(f"{path.text!r} is not watched; watched: {known}")
 
     @property
     def signals(self) -> list[str]:
         """The names of their signals."""
-        return [f"{WATCHED}.{text}" for text in self._paths]
+        return list(self._paths)
 
     def added_to(self, state: Mapping[Any, Any], frame: FrameType | None) -> Mapping[Any, Any]:
         """Return a state with the values of the watched paths; the state itself stays as it is.
@@ -118,10 +121,10 @@ class Watches:
         """
         values: dict[str, Any] = {}
         variables: dict[int, Mapping[str, Any]] = {}  # by the id of a function: each is read once
-        for text, watched in tuple(self._paths.items()):
+        for watched in tuple(self._paths.values()):
             watched.waited += 1
             if watched.waited >= watched.every:
-                values[text] = self._value(watched, frame, variables)
+                values[watched.key] = self._value(watched, frame, variables)
         return values
 
     def _refuse(self, why: str) -> None:

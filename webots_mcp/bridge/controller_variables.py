@@ -117,9 +117,9 @@ class ControllerVariables:
         if stop:
             watches.remove(path)
             return {"stopped": path.signal, "watched": watches.signals}
-        shown = self.inspector.show(path.text, frame)
+        shown = self.inspector.signal(path, frame)
         watches.add(path, every)
-        return {"signal": path.signal, "value": shown["value"], "watched": watches.signals}
+        return {"signal": path.signal, **shown, "watched": watches.signals}
 
     @property
     def inspector(self) -> Inspector:

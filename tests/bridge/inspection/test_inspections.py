@@ -23,8 +23,10 @@ from webots_mcp import MCPBridge
 from webots_mcp.bridge.inspection.inspector import MOST_INSPECTIONS
 from webots_mcp.bridge.inspection.watches import MOST_WATCHED
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.connection import connect
 from webots_mcp.database.secret_names import LEFT_OUT
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.inspections import inspection_at
 
 HERE = Path(__file__).name
 
@@ -111,6 +113,24 @@ def test_of_a_breakpoint_that_flickers_the_first_hits_of_a_run_are_recorded(
     navigator.robot.simulationReset()
     navigator.rounds(3)
     assert len(inspections(recording)) == MOST_INSPECTIONS + 1
+
+
+def test_of_two_breakpoints_that_are_hit_at_once_each_has_its_own_inspection(
+    navigator: Navigator, recording: Recording
+) -> None:
+    navigator.bridge.breakpoint("turn == 0", action="log")
+    navigator.bridge.breakpoint("turn <= 0", action="log", after_hits=MOST_INSPECTIONS + 1)
+    for _ in range(MOST_INSPECTIONS + 1):
+        navigator.rounds(2)
+    rows = recording.rows("SELECT id, name FROM event WHERE kind = 'breakpoint' ORDER BY id")
+    with contextlib.closing(connect(recording.database, "reader")) as connection:
+        found = {number: inspection_at(connection, number) for number, _ in rows}
+    assert len(rows) == MOST_INSPECTIONS + 2
+    beyond = rows[-2][0]  # of the first breakpoint, at the time of the second one's only hit
+    assert found.pop(beyond) is None
+    assert [each and each.name for each in found.values()] == [
+        name for number, name in rows if number != beyond
+    ]
 
 
 def test_an_error_that_is_logged_records_where_it_was_raised(
@@ -476,6 +496,23 @@ def test_states_of_python_s_own_kinds_of_dict_have_them_and_others_are_named_onc
     ]  # fmt: skip
     lines = recording.rows("SELECT message FROM log WHERE message LIKE 'watched%'")
     assert lines == ["watched values are not recorded: a UserDict is published, not a dict"]
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("self.pid", "<Pid>"), ("self.history", [1.0, 2.0]), ("self.table", "<dict>")],
+)
+def test_the_answer_to_a_watch_has_what_is_recorded(
+    navigator: Navigator, recording: Recording, path: str, value: object
+) -> None:
+    setattr(navigator, "history", deque([1.0, 2.0]))  # noqa: B010
+    setattr(navigator, "table", {"x": 1})  # noqa: B010
+    watch = recording.send("watch", path=path)
+    navigator.rounds(2)
+    answer = recording.fate(watch)[1]
+    assert answer["value"] == value
+    assert ("note" in answer) == isinstance(value, str)
+    assert recording.states()[-1]["watched"] == {path: value}
 
 
 @pytest.mark.parametrize("every", [2, 3, 5, 7])

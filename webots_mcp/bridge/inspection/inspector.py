@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from webots_mcp.bridge.error_report import ErrorReport, cut
 from webots_mcp.bridge.inspection.attribute_paths import (
+    AttributePath,
     PathEndsError,
     find_root,
     follow,
@@ -26,8 +27,8 @@ from webots_mcp.bridge.inspection.frames import (
     frames_of_error,
     own_frames,
 )
-from webots_mcp.bridge.inspection.objects import has_base, own_text
-from webots_mcp.bridge.inspection.values import Renderer
+from webots_mcp.bridge.inspection.objects import class_of, has_base, own_text
+from webots_mcp.bridge.inspection.values import Renderer, signal_value
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import INSPECTION_EVENT
@@ -41,6 +42,10 @@ _LONGEST_NAME: Final = 120  # of a function or a file
 _DEPTH: Final = 2  # an object and its attributes; a list and its items
 _DEPTH_OF_PATH: Final = 3
 _ANSWER_CHARACTERS: Final = 5_000
+_CHANGED: Final = "another thread changed it meanwhile ({}): ask again"
+_NOT_RECORDED: Final = (
+    "only this text is recorded, not the contents: watch a number, text or short list in it"
+)
 _TRACEBACK: Final[Any] = vars(BaseException)["__traceback__"]
 
 
@@ -129,7 +134,7 @@ class Inspector:
             if path is None:
                 return {"frames": self._shown_frames(frames, _ANSWER_CHARACTERS)}
             parsed = parse_path(path, secrets)
-            value = follow(parsed, find_root(parsed, frames))
+            value = _value_at(parsed, frames)
             renderer = Renderer(secrets, _ANSWER_CHARACTERS)
             where = self._place(frames[0]) if frames else {}
             return {
@@ -137,12 +142,20 @@ class Inspector:
                 "value": renderer.render(value, _DEPTH_OF_PATH, parsed.text),
                 **where,
             }
-        except PathEndsError as error:
-            raise CommandRefusedError(f"{path}: {error}") from error
         except (RuntimeError, LookupError) as error:
-            raise CommandRefusedError(
-                f"another thread changed it meanwhile ({error}): ask again"
-            ) from error
+            raise CommandRefusedError(_CHANGED.format(error)) from error
+
+    def signal(self, path: AttributePath, frame: FrameType | None) -> dict[str, object]:
+        """Return the value at a path as it would be recorded.
+
+        Raises:
+            CommandRefusedError: The path ends before its end.
+        """
+        value = _value_at(path, own_frames(frame))
+        recorded = signal_value(value)
+        if class_of(recorded) is str and class_of(value) is not str and recorded[0] == "<":
+            return {"value": recorded, "note": _NOT_RECORDED}
+        return {"value": recorded}
 
     def secrets(self) -> SecretNames:
         """Return the names whose values are left out.
@@ -198,6 +211,15 @@ class Inspector:
             ]
         shown = renderer.members(names[:_MOST_VARIABLES], _DEPTH)
         return {**shown, "...": f"{len(names)} in all"} if len(names) > len(shown) else shown
+
+
+def _value_at(path: AttributePath, frames: list[OwnFrame]) -> Any:
+    try:
+        return follow(path, find_root(path, frames))
+    except PathEndsError as error:
+        raise CommandRefusedError(f"{path.text}: {error}") from error
+    except (RuntimeError, LookupError) as error:
+        raise CommandRefusedError(_CHANGED.format(error)) from error
 
 
 def _traceback_of(error: BaseException) -> TracebackType | None:

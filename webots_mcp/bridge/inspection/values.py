@@ -197,7 +197,7 @@ def signal_value(value: Any) -> Any:
         return value[:_LONGEST_TEXT]
     if cls is numpy_class("ndarray") and value.dtype.kind in "biuf" and value.size <= _SIGNAL_ITEMS:
         return value.tolist()
-    if (cls is list or cls is tuple) and len(value) <= _SIGNAL_ITEMS:
+    if (cls is list or cls is tuple or cls is deque) and len(value) <= _SIGNAL_ITEMS:
         items = list(value)
         if all(id(class_of(each)) in _NUMBERS for each in items):
             return items

@@ -96,6 +96,36 @@ def test_a_violation_records_them_too(navigator: Navigator, recording: Recording
     assert (name, data["cause"]) == ("turns little", "violation")
 
 
+def test_an_inspection_of_many_frames_stays_short(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    def descend(depth: int) -> None:
+        words = [f"word {number}" for number in range(40)]
+        if depth:
+            descend(depth - 1)
+        else:
+            bridge.log(f"bad: {words[0]}", "error")
+
+    descend(20)
+    ((_, data),) = inspections(recording)
+    assert len(data["frames"]) == 8
+    assert data["frames"][0]["variables"]["words"][0] == "word 0"
+    assert len(json.dumps(data)) < 3500
+
+
+def test_an_object_under_the_same_name_in_two_functions_is_shown_once(
+    navigator: Navigator, recording: Recording
+) -> None:
+    navigator.bridge.breakpoint("turn == 0", action="log")
+
+    def outer(self: Navigator) -> None:
+        self.rounds(1)
+
+    outer(navigator)
+    ((_, data),) = inspections(recording)
+    assert frame_of(data, "outer")["variables"]["self"] == "(the same as above)"
+
+
 def test_arming_a_breakpoint_loads_what_its_first_hit_needs(bridge: MCPBridge) -> None:
     variables = bridge._session.variables  # pyright: ignore[reportPrivateUsage]
     assert variables._inspector is None  # pyright: ignore[reportPrivateUsage]

@@ -186,16 +186,21 @@ class Inspector:
     ) -> list[dict[str, object]]:
         secrets = self.secrets()
         renderer = Renderer(secrets, characters) if characters else Renderer(secrets)
-        return [
-            {**self._place(each), "variables": self._variables(each, renderer)} for each in frames
-        ]
+        shown: list[dict[str, object]] = []
+        for own in frames:
+            place = self._place(own, with_source=not renderer.is_full)
+            renderer.spend(sum(map(len, map(str, place.values()))))
+            shown.append({**place, "variables": self._variables(own, renderer)})
+        return shown
 
-    def _place(self, own: OwnFrame) -> dict[str, object]:
+    def _place(self, own: OwnFrame, *, with_source: bool = True) -> dict[str, object]:
         code = own.frame.f_code
         place: dict[str, object] = {
             "at": f"{Path(code.co_filename).name[-_LONGEST_NAME:]}:{own.line}",
             "function": own_text(code.co_name)[:_LONGEST_NAME],
         }
+        if not with_source:
+            return place
         if self._source is None:
             self._source = SourceLines(self._started_s, self.secrets())
         source = self._source.around(own)

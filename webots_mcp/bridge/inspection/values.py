@@ -38,7 +38,7 @@ from webots_mcp.bridge.inspection.objects import (
 )
 from webots_mcp.database.secret_names import LEFT_OUT, SecretNames
 
-MOST_CHARACTERS: Final = 3_000  # of one inspection
+MOST_CHARACTERS: Final = 2_300  # of one inspection: about 3 kB with the marks of JSON
 _LONGEST_TEXT: Final = 120
 _LONGEST_NAME: Final = 60
 _MOST_ITEMS: Final = 8
@@ -85,6 +85,10 @@ class Renderer:
         """Whether the number of characters is used up."""
         return self._left < 0
 
+    def spend(self, characters: int) -> None:
+        """Leave less space, because of what is shown next to the values."""
+        self._left -= characters
+
     def members(
         self, found: Sequence[tuple[str, object]], depth: int, path: Callable[[str], str] = str
     ) -> dict[str, Any]:
@@ -125,7 +129,7 @@ class Renderer:
             return self._plain(value)
         if kind in _LISTS or kind in _DICTS or is_own_class(cls):
             if (known := self._seen.get(id(value))) is not None:
-                return f"(the same as {known[0]})"
+                return f"(the same as {'above' if known[0] == path else known[0]})"
             self._seen[id(value)] = path, value
         if kind in _LISTS or kind in _DICTS:
             return self._container(value, cls, depth, path)

@@ -203,11 +203,11 @@ def signal_value(value: Any) -> Any:
         return value.tolist()
     if (cls is list or cls is tuple or cls is deque) and len(value) <= _SIGNAL_ITEMS:
         items = list(value)
-        if all(id(class_of(each)) in _NUMBERS for each in items):
+        if _are_numbers(items):
             return items
     if c_array_class(cls) is not None:
         items = list(islice(c_items(value), _SIGNAL_ITEMS + 1))
-        if len(items) <= _SIGNAL_ITEMS and all(id(class_of(each)) in _NUMBERS for each in items):
+        if len(items) <= _SIGNAL_ITEMS and _are_numbers(items):
             return items
     if id(cls) in _LISTS or id(cls) in _DICTS:
         return f"<{cls.__name__}>"
@@ -255,6 +255,10 @@ def _atom_text(key: Any) -> str:
     return _text_of_enum(key, cls) or f"<{name_of(cls)}>"
 
 
+def _are_numbers(items: list[Any]) -> bool:
+    return _NUMBERS.issuperset(map(id, map(type, items)))
+
+
 def _number_or_array(value: Any, cls: type) -> Any:
     if cls is complex or id(cls) in _SIZED:
         return complex.__repr__(value) if cls is complex else f"<{cls.__name__} of {len(value)}>"
@@ -298,7 +302,7 @@ def _c_number_or_array(value: Any, cls: type) -> Any:
     if c_array_class(cls) is None:
         return None
     items = list(islice(c_items(value), _ARRAY_ITEMS + 1))
-    if not all(id(class_of(each)) in _NUMBERS for each in items):
+    if not _are_numbers(items):
         return f"<{name_of(cls)}>"
     first = ", ".join(f"{each:.6g}" for each in items[:_ARRAY_ITEMS])
     return f"<{name_of(cls)}: {first}{', ...' if len(items) > _ARRAY_ITEMS else ''}>"

@@ -25,8 +25,8 @@ _WAIT_S: Final = 10.0
 _LIST_BUDGET_TOKENS: Final = 500
 _LONGEST_NAME: Final = 120
 _NOTHING: Final = (
-    "no inspection is recorded in this run: the variables are recorded at the hits of a breakpoint "
-    "(webots_breakpoint), violations of an expectation, logged errors and hangs"
+    "no variables are recorded in this run. They are recorded at breakpoint hits "
+    "(webots_breakpoint), violated expectations, logged errors and hangs"
 )
 _PATH: Final = Field(
     max_length=200,
@@ -77,8 +77,8 @@ async def webots_inspect_controller(
         return await _now(recording, caller, path, robot, timeout_wall_s)
     if path is not None:
         raise CommandRefusedError(
-            f"path {path!r} needs a running controller, and no controller runs. To see the "
-            "variables recorded at breakpoint hits, errors and hangs, leave path out"
+            f"path {path!r} needs a running Python controller with a bridge, and none runs. To see "
+            "the variables recorded at breakpoint hits, errors and hangs, leave path out"
         )
     return await to_thread.run_sync(_newest, recording, robot, run_id)
 

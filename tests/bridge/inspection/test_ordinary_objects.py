@@ -5,6 +5,7 @@ No code of the user runs meanwhile, and one strange part does not hide the other
 
 from __future__ import annotations
 
+import array
 import ctypes
 import enum
 import types
@@ -138,6 +139,8 @@ borrowed_dict = type("Borrowed", (), {"__dict__": Borrower.__dict__["__dict__"]}
         (ValueError("too far"), "<ValueError: too far>"),
         (np.str_("a"), "a"),
         (np.complex128(1j), "1j"),
+        (np.zeros((0, 3)), "<array 0 x 3 of float64>"),
+        (array.array("d", [1.5, 2.5]), "<array: 1.5, 2.5>"),
         (np.ma.masked_array([1, 2], mask=[False, True]), "<MaskedArray 2 of int64>"),
         (np.array(3.5), "<array 1 value of float64: 3.5>"),
         (Fraction(1, 3), "1/3"),
@@ -228,6 +231,7 @@ def test_a_path_that_ends_early_says_what_is_there(path: str, why: str) -> None:
     [
         ((ctypes.c_float * 2)(1, 2), [1.0, 2.0]),
         (ctypes.c_int(3), 3),
+        (array.array("d", [1.5]), [1.5]),
         (np.arange(100), "<array 100 of int64: 0, 1, 2, 3, 4, 5, ...>"),
         (np.zeros(2, dtype=[("x", "f8")]), "<array 2 of [('x', '<f8')]>"),
         (Fault.LIDAR, "Fault.LIDAR"),

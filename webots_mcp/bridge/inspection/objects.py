@@ -19,6 +19,7 @@ from webots_mcp.bridge.inspection.frames import is_own
 
 _LONGEST_NAME: Final = 120
 _MOST_ATTRIBUTES: Final = 1_000  # of one object
+_C_ARRAYS: Final = (("_ctypes", "Array"), ("array", "array"))
 _MOST_CLASSES: Final = 10_000  # that are remembered
 _TUPLE_FIELD: Final = getattr(import_module("_collections"), "_tuplegetter", None)
 
@@ -163,15 +164,18 @@ def loaded_class(module: str, name: str) -> Any:
 
 
 def c_array_class(cls: type) -> Any:
-    """Return the base of all arrays of ctypes if a class is one of them; else None."""
-    array: Any = loaded_class("_ctypes", "Array")
-    return array if array is not None and has_base(cls, array) else None
+    """Return the array of ctypes or of the module `array` that a class is or inherits from."""
+    for module, name in _C_ARRAYS:
+        base: Any = loaded_class(module, name)
+        if base is not None and has_base(cls, base):
+            return base
+    return None
 
 
 def c_items(value: Any) -> Iterator[Any]:
-    """Return the items of an array of ctypes."""
-    array: Any = loaded_class("_ctypes", "Array")
-    return (array.__getitem__(value, index) for index in range(array.__len__(value)))
+    """Return the items of such an array."""
+    base = c_array_class(class_of(value))
+    return (base.__getitem__(value, index) for index in range(base.__len__(value)))
 
 
 def _c_field_class() -> Any:

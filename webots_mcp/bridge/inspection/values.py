@@ -286,7 +286,7 @@ def _array(array: Any, cls: type, base: Any) -> str:
     sizes, dtype = members["shape"].__get__(array), members["dtype"].__get__(array)
     shape = " x ".join(map(str, sizes)) or "1 value"
     about = f"{'array' if cls is base else name_of(cls)} {shape} of {dtype!s:.60}"
-    if cls is not base or dtype.kind not in "biuf":
+    if cls is not base or dtype.kind not in "biuf" or not array.size:
         return f"<{about}>"
     first = ", ".join(f"{each.item():.6g}" for each in islice(array.flat, _ARRAY_ITEMS))
     return f"<{about}: {first}{', ...' if array.size > _ARRAY_ITEMS else ''}>"

@@ -23,14 +23,14 @@ FLOORS = """
     questions
     steering
     answers      plotting     setup        testing
-    judging      simulator
+    judging      simulator    rerun
     store        bridge
     database     standin
     signals
     analysis     contract     errors       extras
 """
 LEVEL = {part: -number for number, floor in enumerate(FLOORS.split("\n")) for part in floor.split()}
-IN_A_CONTROLLER = ("bridge", "database", "signals", "contract", "errors")
+IN_A_CONTROLLER = ("bridge", "rerun", "database", "signals", "contract", "errors")
 OPTIONAL_THERE = {"orjson", "numpy", "controller"}  # where they are installed, or loaded already
 
 

@@ -20,7 +20,7 @@ from mcp.types import Tool
 
 from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.location import MemoryDatabase
-from webots_mcp.questions.declaring import TIERS
+from webots_mcp.questions.declaration import TIERS
 from webots_mcp.server.mcp_server import create_server
 
 

@@ -7,6 +7,7 @@ The names are imported when first asked for, and from the standard library only:
 inside a robot's controller, and its pytest plugin is loaded by every pytest run.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,10 @@ _HOMES = {  # the module of each name, and its name there
     "MemoryDatabase": ("webots_mcp.database.location", "MemoryDatabase"),
     "__version__": ("webots_mcp.contract", "VERSION"),
 }
+
+# A tape has to begin before `Robot()` is made, which is before any name is asked for here.
+if {"WEBOTS_MCP_TAPE", "WEBOTS_INSTANCE_PATH", "WEBOTS_CONTROLLER_URL"} & os.environ.keys():
+    import_module("webots_mcp.bridge.taping").begin_if_wanted()
 
 
 def __getattr__(name: str) -> Any:

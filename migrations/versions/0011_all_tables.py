@@ -15,7 +15,7 @@ from sqlmodel import SQLModel
 from webots_mcp.contract import APPLICATION_ID
 from webots_mcp.store import models
 
-assert models.Robot  # importing the models filled the metadata
+assert models.RobotTable  # importing the models filled the metadata
 
 revision = "0011"
 down_revision = None

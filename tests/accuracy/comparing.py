@@ -19,7 +19,7 @@ from tests.judging.detection.asking import UNHURRIED_S
 from tests.judging.detection.labelled import Array, LabelledRun
 from tests.judging.detection.writing import Writer
 from tests.memory import memory_connection
-from webots_mcp.analysis.rare import verdicts_on_shares
+from webots_mcp.analysis.rank_and_count_tests import verdicts_on_shares
 from webots_mcp.analysis.summary import MOST_CHANCE, Outcome, rank
 from webots_mcp.judging.comparison import Comparison, compare_runs
 

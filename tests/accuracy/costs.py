@@ -21,7 +21,7 @@ from tests.tool_list import counts_of
 from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.answers.shortening import tokens_in
 from webots_mcp.database.location import MemoryDatabase
-from webots_mcp.questions.declaring import TIERS
+from webots_mcp.questions.declaration import TIERS
 from webots_mcp.server.mcp_server import create_server
 
 _KILLS: Final = 200  # of each kind with a server

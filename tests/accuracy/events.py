@@ -90,6 +90,7 @@ CHECKED: Final = (
     "fall",
     "slip",
     "degradation",
+    "slow_simulation",
 )  # kinds that labelled runs of checks show
 _EVENTS: Final = """\
 Recordings of {recordings} kinds are simulated, {cases} of each kind for each row interval and

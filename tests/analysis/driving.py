@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from webots_mcp.analysis.track import SmoothedTrack, track_of
+from webots_mcp.analysis.path_length import SmoothedTrack, track_of
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from webots_mcp.analysis.rare import (
+from webots_mcp.analysis.rank_and_count_tests import (
     chance_of_shares,
     interval_of_shares,
     is_rare,

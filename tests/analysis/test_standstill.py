@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.analysis.driving import noisy_track
-from webots_mcp.analysis.still_intervals import find_standstills
-from webots_mcp.analysis.track import noise_of, track_of
+from webots_mcp.analysis.path_length import noise_of, track_of
+from webots_mcp.analysis.standstills import find_standstills
 
 RADIUS_M = 0.05
 LEAST_S = 3.0

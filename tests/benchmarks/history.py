@@ -31,7 +31,7 @@ from webots_mcp.store.logs import LogFilter, LogWindow, count_lines, newest_line
 from webots_mcp.store.reading.catalogue import list_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import RecordingAccess
-from webots_mcp.store.series import query_history
+from webots_mcp.store.signal_history import query_history
 
 _ROWS: Final = 1_000_000
 _OVERVIEW: Final = "pose.0"

@@ -1,4 +1,4 @@
-"""Fifteen robots of kinds that no rule was made with: healthy at three rates, and with one fault.
+"""Robots of kinds that no rule was made with: healthy at three rates, and with one fault.
 
 What each answer should be was written down before the first question was asked.
 """
@@ -27,8 +27,15 @@ RIGHT, HELPFUL, NOT_JUDGED, DENIED, FALSE = (
     "false alarm",
 )
 GOOD: Final = "quiet"
-# Of the first answers, before a rule was changed for what was missed.
-FIRST_ANSWERS: Final = {GOOD: 39, FALSE: 6, RIGHT: 10, HELPFUL: 3, NOT_JUDGED: 2, DENIED: 0}
+# Of the first answers, before a rule was changed for what was missed: of 15 robots, then of 10.
+FIRST_ANSWERS: Final = {
+    GOOD: 39 + 30,
+    FALSE: 6,
+    RIGHT: 10 + 8,
+    HELPFUL: 3 + 2,
+    NOT_JUDGED: 2,
+    DENIED: 0,
+}
 Draw = Callable[[Array, Random, bool], Columns]
 
 
@@ -59,7 +66,7 @@ class Robot:
 ROBOTS: Final[dict[str, Robot]] = {}
 
 
-def _robot(name: str, lasts_s: float, **label: Any) -> Callable[[Draw], Draw]:
+def robot(name: str, lasts_s: float, **label: Any) -> Callable[[Draw], Draw]:
     def register(draw: Draw) -> Draw:
         ROBOTS[name] = Robot(draw, lasts_s, **label)
         return draw
@@ -67,20 +74,20 @@ def _robot(name: str, lasts_s: float, **label: Any) -> Callable[[Draw], Draw]:
     return register
 
 
-def _ramped(t: Array, marks: Sequence[float], values: Sequence[float]) -> Array:
+def ramped(t: Array, marks: Sequence[float], values: Sequence[float]) -> Array:
     return np.interp(t, marks, values)
 
 
-@_robot(
+@robot(
     "gantry", 70, fault="its y axis stalls at 30 s while its target goes on",
     check="follows its targets", kind="off_target", names="y", at_s=31,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
     marks = [0, 5, 12, 18, 25, 30, 38, 45, 52, 60, 70]
     aims = {
-        "x": _ramped(t, marks, [0, 0, 1.2, 1.2, 0.4, 0.4, 1.5, 1.5, 0.2, 0.2, 0.9]),
-        "y": _ramped(t, marks, [0, 0.5, 0.5, 0.9, 0.9, 0.1, 0.8, 0.8, 0.3, 0.6, 0.6]),
-        "z": _ramped(t, marks, [0.3, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.3]),
+        "x": ramped(t, marks, [0, 0, 1.2, 1.2, 0.4, 0.4, 1.5, 1.5, 0.2, 0.2, 0.9]),
+        "y": ramped(t, marks, [0, 0.5, 0.5, 0.9, 0.9, 0.1, 0.8, 0.8, 0.3, 0.6, 0.6]),
+        "z": ramped(t, marks, [0.3, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.3]),
     }
     columns: dict[str, Any] = {}
     for axis, aim in aims.items():
@@ -96,12 +103,12 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     return columns
 
 
-@_robot(
+@robot(
     "rocker-bogie rover", 90, fault="the motor of its rear left wheel is dead from 40 s on",
     check="follows its targets", kind="off_target", names="rear_left|rl", at_s=40,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
-    speed = 0.05 * _ramped(t, [0, 3, 5, 60, 62, 66, 68, 90], [0, 0, 1, 1, 0, 0, 1, 1])
+    speed = 0.05 * ramped(t, [0, 3, 5, 60, 62, 66, 68, 90], [0, 0, 1, 1, 0, 0, 1, 1])
     heading = 0.4 * np.sin(TURN * t / 80)
     step = t[1] - t[0]
     columns: dict[str, Any] = {
@@ -123,7 +130,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     return columns
 
 
-@_robot(
+@robot(
     "sailing dinghy", 160, fault="its rudder jams at 80 s while the autopilot goes on",
     check="follows its targets", kind="off_target", names="rudder", at_s=80, within_s=4,
 )  # fmt: skip
@@ -147,7 +154,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-@_robot(
+@robot(
     "trotting quadruped", 50, fault="its rear right knee hangs limp from 25 s on",
     check="follows its targets", kind="off_target", names="rr", at_s=25,
 )  # fmt: skip
@@ -179,7 +186,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     return columns
 
 
-@_robot(
+@robot(
     "paint robot", 80, fault="its pressure reading is frozen from 30 to 48 s",
     check="sensors live", kind="flat", names="pressure", at_s=30,
 )  # fmt: skip
@@ -201,13 +208,13 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     return columns
 
 
-@_robot(
+@robot(
     "warehouse vehicle with a lift", 120, fault="its lift stops half way up at 44 s",
     check="follows its targets", kind="off_target", names="lift", at_s=46, within_s=4,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
     step = t[1] - t[0]
-    speed = _ramped(t, [0, 5, 7, 30, 32, 75, 77, 100, 102, 120], [0, 0, 1, 1, 0, 0, 1, 1, 0, 0])
+    speed = ramped(t, [0, 5, 7, 30, 32, 75, 77, 100, 102, 120], [0, 0, 1, 1, 0, 0, 1, 1, 0, 0])
     up = 0.6 * ((t >= 40) & (t < 70))
     lift = np.clip((t - 40) * 0.08, 0, 0.6) - np.clip((t - 70) * 0.08, 0, 0.6)
     lift = np.where(faulty & (t < 70), np.minimum(lift, 0.32), lift)
@@ -230,12 +237,12 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }  # fmt: skip
 
 
-@_robot(
+@robot(
     "drone that drops a payload", 90, fault="its rangefinder reads 0 for moments from 50 s on",
     check="sensors drop nothing", kind="jump", names="range", at_s=50, within_s=3,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
-    height = _ramped(t, [0, 4, 14, 70, 84, 90], [0, 0, 12, 12, 0, 0])
+    height = ramped(t, [0, 4, 14, 70, 84, 90], [0, 0, 12, 12, 0, 0])
     range_m = height + 0.1 + noise(random, t, 0.02)
     if faulty:
         for start_s in (50, 53, 55.5, 58, 61, 66):
@@ -257,7 +264,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-@_robot(
+@robot(
     "cable-driven camera", 80, fault="its length sensor 2 becomes five times as noisy at 35 s",
     check="sensors keep their noise", kind="degradation", names="cables?.*2|length.*2", at_s=35,
     within_s=3,
@@ -273,13 +280,13 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     return columns
 
 
-@_robot(
+@robot(
     "tracked excavator", 90, fault="its tracks slip from 30 to 50 s",
     check="wheels grip", kind="slip", names="roll|track|slip", at_s=30, within_s=3,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
     step = t[1] - t[0]
-    drives = _ramped(t, [0, 4, 6, 58, 60, 90], [0, 0, 1, 1, 0, 0])
+    drives = ramped(t, [0, 4, 6, 58, 60, 90], [0, 0, 1, 1, 0, 0])
     slips = np.where(faulty & (t >= 30) & (t < 50), 0.2, 1.0)
     digs = (t >= 60) * 0.4 * np.sin(TURN * (t - 60) / 15)
     return {
@@ -295,7 +302,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-@_robot(
+@robot(
     "snake robot", 60, fault="the encoder of its joint 5 gives no number from 30 s on",
     check="sensors speak", kind="missing", names="joint5|joint.*5", at_s=30,
 )  # fmt: skip
@@ -316,12 +323,12 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     return columns
 
 
-@_robot(
+@robot(
     "blimp", 200, fault="its heading oscillates more and more from 60 s on",
     check="stays stable", kind="oscillation", names="heading|yaw|rudder", at_s=60, within_s=25,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
-    aim = _ramped(t, [0, 5, 5.01, 110, 110.01, 200], [10, 10, 30, 30, 18, 18])
+    aim = ramped(t, [0, 5, 5.01, 110, 110.01, 200], [10, 10, 30, 30, 18, 18])
     tracked, value, step = list[float](), 10.0, float(t[1] - t[0])
     for wanted in aim.tolist():
         value += max(-0.5 * step, min(0.5 * step, (wanted - value) * 0.2 * step))
@@ -341,7 +348,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-@_robot(
+@robot(
     "soccer robot", 80, fault="it pushes against another robot from 40 to 52 s and goes nowhere",
     check="moves when commanded", kind="stuck", names="stuck", at_s=40,
 )  # fmt: skip
@@ -366,13 +373,13 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }  # fmt: skip
 
 
-@_robot(
+@robot(
     "self-balancing scooter", 60, fault="it falls over at 33 s",
     check="stays upright", kind="fall", names="fell|tilt", at_s=33,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
     step = t[1] - t[0]
-    drives = _ramped(t, [0, 5, 8, 50, 53, 60], [0, 0, 1, 1, 0, 0])
+    drives = ramped(t, [0, 5, 8, 50, 53, 60], [0, 0, 1, 1, 0, 0])
     falls = np.clip((t - 33) / 0.8, 0, 1) if faulty else 0 * t
     speed = 0.9 * drives * (falls < 0.5)
     pitch = 0.05 * np.gradient(drives, t) + 0.015 * np.sin(TURN * t / 1.7)
@@ -387,7 +394,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-@_robot(
+@robot(
     "planting robot", 100, fault="its position jumps by 3 m at 45 s",
     check="stays in place", kind="jump", names="position", at_s=45,
 )  # fmt: skip
@@ -409,12 +416,12 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
     }
 
 
-@_robot(
+@robot(
     "underwater glider", 300, fault="its compass is 1.2 rad off its gyro from 150 s on",
     check="estimates agree", kind="", names="heading", at_s=150, within_s=5,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
-    depth = _ramped(t, [0, 20, 80, 140, 170, 230, 280, 300], [0, 0, 25, 0, 0, 25, 0, 0])
+    depth = ramped(t, [0, 20, 80, 140, 170, 230, 280, 300], [0, 0, 25, 0, 0, 25, 0, 0])
     dives = np.sign(np.gradient(depth, t))
     heading = 1.1 + 0.2 * np.sin(TURN * t / 150)
     off = 1.2 * np.clip((t - 150) / 2, 0, 1) * faulty

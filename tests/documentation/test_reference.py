@@ -19,7 +19,9 @@ from webots_mcp.answers.trend_tables import STATE_COLUMNS, TREND_COLUMNS
 from webots_mcp.cli import described, names
 from webots_mcp.database.schema import SCHEMA_FILE
 from webots_mcp.judging.divergence import PartedSignal
-from webots_mcp.questions.compare_runs import (
+from webots_mcp.questions.describe_signals import MEANING_COLUMNS
+from webots_mcp.questions.inspect_controller import INSPECTION_COLUMNS
+from webots_mcp.questions.list_and_compare_runs import (
     CHECK_COLUMNS,
     DIFFERENCE_COLUMNS,
     GROUP_COLUMNS,
@@ -27,15 +29,13 @@ from webots_mcp.questions.compare_runs import (
     PARTED_COLUMNS,
     RUN_COLUMNS,
 )
-from webots_mcp.questions.describe_signals import MEANING_COLUMNS
-from webots_mcp.questions.history import SIGNAL_COLUMNS
-from webots_mcp.questions.inspect_controller import INSPECTION_COLUMNS
 from webots_mcp.questions.list_robots import (
     BODY_COLUMNS,
     PLACE_COLUMNS,
     RECORDER_COLUMNS,
     ROBOT_COLUMNS,
 )
+from webots_mcp.questions.query_history import SIGNAL_COLUMNS
 from webots_mcp.questions.send_command import COMMAND_COLUMNS
 from webots_mcp.questions.set_breakpoints import BREAKPOINT_COLUMNS
 from webots_mcp.server.mcp_server import create_server

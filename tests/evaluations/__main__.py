@@ -34,7 +34,7 @@ from tests.evaluations.scores import (
 )
 from tests.tool_list import counts_of
 from webots_mcp.database.location import MemoryDatabase
-from webots_mcp.questions.declaring import TIERS
+from webots_mcp.questions.declaration import TIERS
 from webots_mcp.server.mcp_server import create_server
 
 

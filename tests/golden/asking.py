@@ -30,7 +30,7 @@ from webots_mcp.extras.plugin_registry import export_formats
 from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
-from webots_mcp.plugins.report.making import make_report
+from webots_mcp.plugins.report.make_report import make_report
 from webots_mcp.questions import all_questions
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers
@@ -112,6 +112,7 @@ ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
         "webots_describe_signals",
         {"signals": ["X"], "quantity": "x"},
     ),
+    "run new code on an old run": ("webots_rerun_controller", {}),
     "set a breakpoint": ("webots_breakpoint", {"condition": "X > 1e6"}),
     "breakpoints": ("webots_list_breakpoints", {}),
     "remove a breakpoint": ("webots_remove_breakpoint", {"breakpoint_id": 1}),

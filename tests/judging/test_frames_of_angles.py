@@ -16,7 +16,7 @@ from webots_mcp.signals.meaning import declare_meaning
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.meanings import set_meanings
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.series import TURNS_COUNTED, query_history
+from webots_mcp.store.signal_history import TURNS_COUNTED, query_history
 
 Course = Callable[[float], float]
 

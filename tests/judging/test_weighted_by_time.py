@@ -18,7 +18,7 @@ from webots_mcp.judging.run_score import score_run
 from webots_mcp.judging.trends import trends
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.series import WEIGHTED, query_history
+from webots_mcp.store.signal_history import WEIGHTED, query_history
 
 LASTS_S = 100.0
 STEP_S = 0.1

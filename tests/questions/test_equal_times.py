@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 
 from tests.recordings.rows import Recorded
+from webots_mcp.analysis.path_length import hidden_motion
 from webots_mcp.analysis.summary import flat_since
-from webots_mcp.analysis.track import hidden_motion
 from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
-from webots_mcp.plugins.report.making import make_report
+from webots_mcp.plugins.report.make_report import make_report
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.declaring import Caller, Question
+from webots_mcp.questions.declaration import Caller, Question
 from webots_mcp.store.export import FOR_VIEWERS, FORMATS, export, export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import RecordingAccess

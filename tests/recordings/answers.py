@@ -11,7 +11,7 @@ from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.events import find_events, timeline
 from webots_mcp.judging.trends import Trend, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.series import query_history
+from webots_mcp.store.signal_history import query_history
 
 _LOCAL: Final = {
     "id", "ids", "run_id", "run_ids", "session_id", "robot_id", "cursor", "path",

@@ -11,7 +11,7 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
 from webots_mcp.answers.shortening import tokens_of
-from webots_mcp.questions.sensor_values import unnamed_devices
+from webots_mcp.questions.robot_state import unnamed_devices
 from webots_mcp.store.chunk_making import chunk_whole_run
 
 pytestmark = pytest.mark.anyio

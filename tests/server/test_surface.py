@@ -14,7 +14,7 @@ from mcp import Client, StdioServerParameters
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
 from tests.tool_list import counts_of
-from webots_mcp.questions.declaring import Tier
+from webots_mcp.questions.declaration import Tier
 
 pytestmark = pytest.mark.anyio
 
@@ -37,7 +37,7 @@ ALL = DEFAULT | {
     "webots_load_world", "webots_quit", "webots_get_trials", "webots_list_breakpoints",
     "webots_inspect_controller", "webots_watch",
     "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
-    "webots_report",
+    "webots_report", "webots_rerun_controller",
 }  # fmt: skip
 READING = {
     "webots_list_robots", "webots_diagnose_setup", "webots_get_world_info",

@@ -20,7 +20,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.database.connection import connect
 from webots_mcp.database.processes import has_lost_simulator, process_identity, signal_process
 from webots_mcp.database.schema import create_schema
-from webots_mcp.database.stacks import SIGNAL
+from webots_mcp.database.thread_stacks import SIGNAL
 from webots_mcp.standin import InProcessSupervisor
 
 

@@ -14,7 +14,7 @@ from migrations.generate import generated_statements
 from webots_mcp.database.schema import shipped_statements
 from webots_mcp.store import models
 
-assert models.Robot  # importing the models filled the metadata
+assert models.RobotTable  # importing the models filled the metadata
 TABLES = SQLModel.metadata.sorted_tables
 
 

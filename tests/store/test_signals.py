@@ -14,7 +14,7 @@ from webots_mcp.signals.register import MAX_SIGNALS, Place, places
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.reading.catalogue import catalogue, list_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, find_range, find_subject
-from webots_mcp.store.series import query_rows
+from webots_mcp.store.signal_history import query_rows
 
 
 def test_every_leaf_has_a_dotted_name() -> None:

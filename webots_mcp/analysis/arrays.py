@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
@@ -85,12 +86,24 @@ def median(values: Array) -> float:
         middle = len(bounds) // 2
         least, most = bounds[[middle - _MARGIN, middle + _MARGIN]]
         below = int(np.count_nonzero(values < least))
+        if least == most and below <= low and high < below + int(np.count_nonzero(values == least)):
+            return float(least)
         inside = values[(values >= least) & (values <= most)]
         if below <= low and high < below + len(inside):  # they are the ones in the middle
             values, low, high = inside, low - below, high - below
-    ordered = values.copy()
+    ordered: Array = np.array(values)
     ordered.partition((low, high))
     return float(ordered[low] + ordered[high]) / 2
+
+
+def in_order(values: Array, place: int) -> float:
+    """Return the value at a place of the sorted ones.
+
+    numpy is many times slower where it is asked for one place of values that repeat.
+    """
+    ordered: Array = np.array(values)
+    ordered.partition((place, place))
+    return float(ordered[place])
 
 
 def sums_of(values: Array, rows: int) -> Array:
@@ -165,6 +178,12 @@ class Runs:
 
     def __len__(self) -> int:
         return len(self.starts)
+
+
+@lru_cache(1)  # the same for all
+def no_runs() -> Runs:
+    """Return none at all."""
+    return _runs(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0))
 
 
 def runs_of(holds: Flags, times: Array) -> Runs:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from webots_mcp.analysis.arrays import Array, Indexes, inner, np, weighted_mean
+from webots_mcp.analysis.arrays import Array, Indexes, in_order, inner, np, weighted_mean
 
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 _GOES_ON: Final = 3.0  # times the steps around it: a step over the end of a scale is no longer
@@ -193,8 +193,10 @@ def with_extremes_of(
 
 def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:
     """The usable ones of numbers that may be NaN, with their times."""
+    if len(numbers) and numbers.min() >= -LARGEST and numbers.max() <= LARGEST:  # none is NaN
+        return times, numbers
     usable = np.abs(numbers) <= LARGEST
-    return (times, numbers) if usable.all() else (times[usable], numbers[usable])
+    return times[usable], numbers[usable]
 
 
 # -- what it does over time: slope, spikes, rest, slow change --------------------------------------
@@ -262,7 +264,7 @@ def find_spikes(times: Array, values: Array, turn: float | None = None) -> list[
     least = float(sizes.max()) * (0.6745 / SPIKE_SCORE) * (1 + 1e-9)
     if np.count_nonzero(sizes < least) <= len(sizes) // 2:
         return []
-    mad = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
+    mad = in_order(sizes, len(sizes) // 2)
     limit = SPIKE_SCORE * (mad / 0.6745 if mad > 0 else 1.2533 * float(sizes.mean()))
     rows = np.flatnonzero(sizes > limit) + 1
     rows = rows[_apart_around(values, rows) < sizes[rows - 1] / 2]

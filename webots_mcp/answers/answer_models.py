@@ -130,7 +130,7 @@ class WorldAnswer(Answer):
         "What the observer sees: robots, and solids with a DEF name."
     )
     real_time_factor: float | None = said(
-        "Simulated seconds per wall-clock second, over the last seconds recorded."
+        "Simulated seconds per wall-clock second over the last 5 s recorded (not the whole run)."
     )
     supervisor: bool | None = said("Whether the robot may control the simulation.")
     run: dict[str, Any] | None = said("The run: how it began and ended, its duration and its rows.")
@@ -527,6 +527,27 @@ class RunsAnswer(Answer):
     run: dict[str, Any] | None = said("The run that was annotated.")
     total: int | None = said("Number of matching runs.")
     cursor: int | None = said("Cursor to ask with for older runs.")
+
+
+class RerunAnswer(Answer):
+    """What new code commands on an old run, up to the first difference."""
+
+    verdict: str | None = said("The outcome in one sentence.")
+    comparison: str | None = said(
+        "equal, differs, not repeatable, not on the tape, ended early, or timed out."
+    )
+    equal_rounds: int | None = said("Rounds of the loop in which all commands are equal.")
+    equal_until_s: float | None = said("Simulation time up to which they are.")
+    of_rounds: int | None = said("Rounds of the run that were replayed.")
+    differences: list[str] | None = said("What differs in the first round that differs.")
+    deciding_line: dict[str, Any] | None = said(
+        "Line that decided, with the values on it in both versions."
+    )
+    not_recorded: str | None = said("What was asked and is not on the tape.")
+    likely_causes: list[str] | None = said("Why the recorded code does not repeat itself.")
+    exception: str | None = said("Exception that ended the new code.")
+    place: str | None = said("File and line at which the replay ended.")
+    file: str | None = said("Controller that was run.")
 
 
 class ComparisonAnswer(NotedAnswer):

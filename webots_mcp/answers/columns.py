@@ -199,7 +199,8 @@ COLUMNS: Final[Mapping[str, Columns]] = {
         "began_by": "start, reset or reload.",
         "ended_by": "finished, reset, reload, crashed or superseded; else going on.",
         "duration_s": "Its length in simulated seconds.",
-        "real_time_factor": "Simulated seconds per wall-clock second.",
+        "real_time_factor": "Simulated seconds per wall-clock second over the whole run, pauses "
+        "excluded.",
         "own_ms": "Wall-clock milliseconds per step in the controller's code.",
         "step_wait_ms": "Wall-clock milliseconds per step in step().",
         "row_count": "Number of rows.",
@@ -232,7 +233,7 @@ COLUMNS: Final[Mapping[str, Columns]] = {
         "sha256": "Beginning of the SHA-256 of the controller's file.",
         "ended_by": "How its runs ended.",
         "total_duration_s": "Simulated seconds of all its runs.",
-        "real_time_factor": "Simulated seconds per wall-clock second.",
+        "real_time_factor": "Simulated seconds per wall-clock second over all its runs.",
     },
     "ComparisonAnswer.measures": {
         "name": "Name of the figure.",

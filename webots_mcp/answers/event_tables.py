@@ -19,8 +19,8 @@ from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.events import Events, Found
 from webots_mcp.judging.verdicts import Coverage, Verdicts
-from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.recording import RobotView
+from webots_mcp.store.relative_times import wall_clock
 
 EVENT_COLUMNS: Final = (
     "kind", "count", "run_id", "start_s", "wall_time", "duration_s", "ongoing", "name", "details",

@@ -29,6 +29,7 @@ from webots_mcp.answers.answer_models import (
     LogsAnswer,
     MonitorAnswer,
     ParametersAnswer,
+    RerunAnswer,
     RobotsAnswer,
     RunAnswer,
     RunsAnswer,
@@ -43,7 +44,7 @@ from webots_mcp.answers.answer_models import (
     WorldAnswer,
 )
 from webots_mcp.judging.verdicts import AS_STUCK
-from webots_mcp.store.ages import age_in_words
+from webots_mcp.store.relative_times import age_in_words
 
 MOST_WORDS: Final = 40
 _MOST_NAMED: Final = 4
@@ -545,6 +546,11 @@ def _ended_badly(run: Mapping[str, Any]) -> str:
         return ""
     said = f"run {run.get('run_id')} {_end_of(run)}"
     return f"{said} ({', '.join(bad)})" if bad else said
+
+
+@_summary.register
+def _(answer: RerunAnswer) -> str | None:
+    return answer.verdict
 
 
 @_summary.register

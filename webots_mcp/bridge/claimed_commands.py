@@ -18,6 +18,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.database.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
+from webots_mcp.database.tapes import tape_notes
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.signals.naming import harmless_first
 
@@ -140,6 +141,9 @@ class ClaimedCommands:
             params = None
         if isinstance(params, dict):
             command.params = cast("dict[str, Any]", params)
+            built_in = BUILT_IN_ACTIONS.get(command.action)
+            if tape_notes.note is not None and (built_in is None or built_in.runs_user_code):
+                tape_notes.note("command", [command.action, command.params])
             return command
         got = (text or b"")[:100].decode("utf-8", "replace")
         self.fail(command, f"params must be a JSON object, got {got!r}", sim_time_s)

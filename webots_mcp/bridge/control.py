@@ -25,6 +25,7 @@ from webots_mcp.bridge.pause import PUMP_INTERVAL_S, Pause
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import BUILT_IN_ACTIONS, ENDING, LOOPING
 from webots_mcp.database.session_cleanup import EXTERN
+from webots_mcp.database.tapes import tape_notes
 from webots_mcp.errors import (
     CommandRefusedError,
     ControllerEndedError,
@@ -94,6 +95,8 @@ class Control:
         Returns:
             The command that was handled last in this call, if any.
         """
+        if tape_notes.replayed is not None:
+            return self._serve_replayed(tape_notes.replayed)
         now, handled = time.monotonic(), None
         due = now >= self._next_poll_s
         if not (due or self._running or self._pause.active):
@@ -104,6 +107,14 @@ class Control:
             # Commands often come in groups: after one, the next round polls at once.
             self._next_poll_s = now + POLL_INTERVAL_S if handled is None else now
         return self._serve_pause() or handled
+
+    def _serve_replayed(self, tape: tape_notes.ReplayedNotes) -> ClaimedCommand | None:
+        """Serve the commands that the old run got in this round, of which no database knows."""
+        handled = None
+        while (due := tape.command_due()) is not None:
+            handled = ClaimedCommand(0, *due, 0)
+            self._start(handled)
+        return handled
 
     def _serve_pause(self) -> ClaimedCommand | None:
         """Serve commands for as long as the pause lasts."""

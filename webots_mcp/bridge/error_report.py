@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.database.stacks import is_library
+from webots_mcp.database.thread_stacks import is_library
 from webots_mcp.errors import DatabaseError, WebotsMCPError, warn
 
 if TYPE_CHECKING:

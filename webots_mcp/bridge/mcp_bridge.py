@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from webots_mcp.bridge.attachment import Attachment
 from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handler
@@ -17,6 +17,7 @@ from webots_mcp.bridge.parameters import Parameter, V
 from webots_mcp.bridge.picture_files import MOST_FRAMES
 from webots_mcp.bridge.session import BridgeSession
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.taping import find_tape
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
     ENDED_BY,
@@ -85,6 +86,10 @@ class MCPBridge:
             is to outlive the controller needs a stdout of its own.
         database: A file, `":memory:"`, or a `MemoryDatabase` shared with a server; None for
             `webots.db` in the data folder.
+        tape: Whether to record each call of Webots' API on a tape next to the database, on which
+            'webots-mcp rerun' runs new code; "images" with the images of cameras and lidars. None
+            for `WEBOTS_MCP_TAPE`, else `tape = true` in webots-mcp.toml. Recorded from here on: set
+            one of these two instead to include what was asked and enabled before.
 
     Raises:
         TypeError: `robot` is not a robot, or `database` is of another type.
@@ -104,6 +109,7 @@ class MCPBridge:
         hang_after_s: float = HANG_AFTER_S,
         capture_output: bool = False,
         database: str | os.PathLike[str] | MemoryDatabase | None = None,
+        tape: bool | Literal["images"] | None = None,
     ) -> None:
         keep_last_s = _seconds("keep_last_s", KEEP_LAST_VARIABLE, keep_last_s)
         hang_after_s = _seconds("hang_after_s", HANG_VARIABLE, hang_after_s)
@@ -116,6 +122,7 @@ class MCPBridge:
         self._close_after_answer = False
         strict = os.environ.get(STRICT_VARIABLE, "").lower() not in _FALSE
         self._errors = ErrorReport(strict=strict)
+        taped = find_tape(tape, self.database)  # before the steps of the robot's class are replaced
         simulation = Simulation(robot)
         # After the check of the robot, before the new session: a refused construction leaves the
         # former bridge as it is, and two sessions of one robot never overlap.
@@ -127,6 +134,8 @@ class MCPBridge:
         self._meter = simulation.meter
         self._publisher = self._session.publisher
         self._session.begin()
+        if taped is not None:
+            taped.open(self.data_dir, self._session.recorder.uuid, robot)
         self._capture = self._capture_output() if capture_output else None
         self._attachment: Attachment | None = None
         _bridges[id(robot)] = self

@@ -14,6 +14,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import PARAMETERS_VARIABLE, recorded_name
+from webots_mcp.database.tapes import tape_notes
 from webots_mcp.database.waiting_file import Kind, Values
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.signals.parameter import MOST_PARAMETERS, Declaration, Value, require_known
@@ -100,6 +101,7 @@ class _Held:
 
 CODE: Final = Setter("code")
 _ENVIRONMENT: Final = Setter("environment")
+_REPLAYED: Final = Setter("command")
 
 
 class Parameters:
@@ -196,6 +198,14 @@ class Parameters:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("Parameter.set", error)
 
+    def take_replayed(self, values: Mapping[str, object]) -> None:
+        """Set what was set from outside in this round of the run that is replayed."""
+        known = {name: value for name, value in values.items() if name in self._held}
+        try:
+            self.set_now(known, _REPLAYED)
+        except WebotsMCPError as error:
+            self._errors.failed("a replayed parameter", error)
+
     def take_wanted(self) -> None:
         """Apply what the controller's code has set since the last `get_command()`."""
         if self._held:
@@ -264,6 +274,9 @@ class Parameters:
     def _record_values(self, held: list[_Held]) -> None:
         if held:
             self._recorder.record("parameter values", self._clock.run, self._values_of(held))
+            if tape_notes.note is not None:  # what the code itself sets, a replay sets again
+                given = {each.parameter.name: each.value for each in held if each.setter != CODE}
+                tape_notes.note("parameters", given)
 
     def _values_of(self, held: Iterable[_Held]) -> dict[str, Any]:
         rows = json.dumps([each.row() for each in held], ensure_ascii=False)

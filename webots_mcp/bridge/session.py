@@ -36,6 +36,7 @@ from webots_mcp.bridge.world_actions import WorldActions
 from webots_mcp.contract import UNMOVED, VERSION
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.tapes import tape_notes
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for this time is blocked or waiting
 _UNMOVED_S: Final = 10.0  # wall time after which a loop must have called the bridge
@@ -214,6 +215,8 @@ class BridgeSession:
         if simulation.over:
             return None
         self.parameters.take_wanted()
+        if tape_notes.replayed is not None:
+            self.parameters.take_replayed(tape_notes.replayed.parameters_due())
         if self.full_rate.busy:
             self.full_rate.go_on()
         command = self.control.serve()

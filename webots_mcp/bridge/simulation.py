@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
 from webots_mcp.database.heartbeat import LoopTimes
-from webots_mcp.database.stacks import STEPPING
+from webots_mcp.database.thread_stacks import STEPPING
 from webots_mcp.errors import CommandRefusedError
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")

@@ -28,7 +28,14 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.database.files import PRIVATE_FILE
 from webots_mcp.database.location import Database
-from webots_mcp.database.stacks import FORMAT, LIBRARIES, SIGNAL, VERSION, read_stacks, stacks_path
+from webots_mcp.database.thread_stacks import (
+    FORMAT,
+    LIBRARIES,
+    SIGNAL,
+    VERSION,
+    read_stacks,
+    stacks_path,
+)
 from webots_mcp.database.waiting_file import lock
 
 _MOST_LOGGED: Final = 20  # in a session: a loop that is slow by design would fill the log

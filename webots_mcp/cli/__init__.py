@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.cli.ending import ended_by, ending_by_signals
+from webots_mcp.cli.interrupts import ended_by, ending_by_signals
 from webots_mcp.cli.streams import spelling_out
 from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
 from webots_mcp.errors import InvalidInputError, NotAllowedError, WebotsMCPError
@@ -267,7 +267,7 @@ def _function_of(command: CommandEntry) -> Callable[..., Any]:
     found = command.declared()
     if inspect.isfunction(found):
         return found
-    from webots_mcp.cli.asking import command_of
+    from webots_mcp.cli.question_commands import command_of
 
     return command_of(found)
 

@@ -22,8 +22,6 @@ from webots_mcp.errors import InvalidInputError
 
 MAX_WIDTH: Final = 100
 MAX_SEE_ALSO: Final = 5
-# Someone who asks about a symptom wants to know what to do before what is recorded of it.
-_SYMPTOMS_FIRST: Final = ("my-robot", "troubleshooting", "events", "check")
 _INDEX: Final = "index"
 
 
@@ -175,7 +173,10 @@ def _sections(page: str) -> tuple[Section, ...]:
 def _ranked() -> list[str]:
     """Return the names of the pages, those about symptoms first, then as the index lists them."""
     listed = [name for _, names in _groups() for name in names]
-    first = [name for name in _SYMPTOMS_FIRST if name in page_files()]
+    # Someone who asks about a symptom wants to know what to do before what is recorded of it.
+    first = [
+        name for name in ("my-robot", "troubleshooting", "events", "check") if name in page_files()
+    ]
     return list(dict.fromkeys([*first, *listed, *page_files()]))
 
 

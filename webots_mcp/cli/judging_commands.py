@@ -33,7 +33,7 @@ from webots_mcp.cli.terminal import is_verbose, print_answer, print_json, print_
 from webots_mcp.contract import host_name
 from webots_mcp.database.files import placed
 from webots_mcp.database.location import find_project
-from webots_mcp.database.stacks import INSTALLED, STEPPING
+from webots_mcp.database.thread_stacks import INSTALLED, STEPPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.signals.naming import listed, spelled_out
@@ -84,8 +84,8 @@ def check(
     Exit code 0: no check failed. 1: a check failed. 2: the run could not be read, or not all of it
     was checked.
     """
-    from webots_mcp.cli.asking import ask, show
-    from webots_mcp.questions.compare_runs import webots_check_run
+    from webots_mcp.cli.question_commands import ask, show
+    from webots_mcp.questions.list_and_compare_runs import webots_check_run
 
     _compile(recorded)
     make_chunks_first(recorded.recording())
@@ -113,7 +113,7 @@ def _compile(recorded: Where) -> None:
 
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     """Return the answer with commands in the place of calls, and what passed in one line."""
-    from webots_mcp.cli.asking import OPTIONS
+    from webots_mcp.cli.question_commands import OPTIONS
     from webots_mcp.cli.wording import commands_by_tool
 
     def typed(cell: Any) -> Any:
@@ -233,8 +233,8 @@ def first_difference(
     Differing parameters, code, worlds and versions are listed first. Rows are compared at equal
     simulated times, to the last digit; rows without a counterpart are counted.
     """
-    from webots_mcp.cli.asking import ask_and_show
-    from webots_mcp.questions.compare_runs import webots_compare_runs
+    from webots_mcp.cli.question_commands import ask_and_show
+    from webots_mcp.questions.list_and_compare_runs import webots_compare_runs
 
     asked = {"run_ids": [first, other], "signals": signals, "first_difference": True}
     ask_and_show(webots_compare_runs, asked, recorded, as_json=json)
@@ -341,7 +341,7 @@ def _in_processes(
 
 def _live(way: str, asked: Waiting, for_s: float) -> int:
     """Let the live simulation begin anew and run; the run that was recorded."""
-    from webots_mcp.cli.asking import ask
+    from webots_mcp.cli.question_commands import ask
     from webots_mcp.questions.control_simulation import webots_run, webots_world_reload
 
     to: dict[str, Any] = {"robot": asked.robot, "timeout_wall_s": asked.timeout_wall_s}
@@ -379,7 +379,7 @@ def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
 
 def _answer(found: Sequence[Parting]) -> dict[str, Any]:
     from webots_mcp.judging.divergence import verdict_on
-    from webots_mcp.questions.compare_runs import parting_facts
+    from webots_mcp.questions.list_and_compare_runs import parting_facts
 
     facts = [{"run_id": each.run_ids[1], **parting_facts(each)} for each in found]
     shown = ("run_id", "verdict", "growth", "notes")

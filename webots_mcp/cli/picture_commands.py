@@ -20,7 +20,7 @@ from webots_mcp.database.files import placed
 from webots_mcp.errors import NothingRecordedError
 
 if TYPE_CHECKING:
-    from webots_mcp.questions.declaring import Question
+    from webots_mcp.questions.declaration import Question
 
 _WAITING: Final = Waiting()
 _ROBOT: Final = ToRobot()
@@ -99,7 +99,7 @@ def _save(
     Raises:
         NothingRecordedError: There is no picture; the text says why.
     """
-    from webots_mcp.cli.asking import ask
+    from webots_mcp.cli.question_commands import ask
 
     reply = ask(question, given, asked)
     texts = [each for each in reply.shown if isinstance(each, str)]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from cyclopts.validators import Number
 
-from webots_mcp.cli.ending import ending_in_time
+from webots_mcp.cli.interrupts import ending_in_time
 from webots_mcp.cli.options import (
     HERE,
     DataDir,
@@ -381,6 +381,22 @@ def launch(
             "`<extern>`.",
         ),
     ] = (),
+    tape: Annotated[
+        bool,
+        Parameter(
+            "--tape",
+            negative=(),
+            help="Record each call of Webots' API by Python controllers, for 'webots-mcp rerun'.",
+        ),
+    ] = False,
+    tape_images: Annotated[
+        bool,
+        Parameter(
+            "--tape-images",
+            negative=(),
+            help="The same, with the images of cameras and lidars, which need much space.",
+        ),
+    ] = False,
     data_dir: Annotated[
         Path | None,
         Parameter(
@@ -406,6 +422,7 @@ def launch(
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
+    from webots_mcp.database.tapes.tape_wanted import IMAGES, TAPE_VARIABLE
     from webots_mcp.simulator.launch import WebotsLaunch, require_world
     from webots_mcp.simulator.starting import Start, free_port
     from webots_mcp.store.policy import LAUNCH
@@ -416,11 +433,13 @@ def launch(
     names, asked = ["launch", "webots_launch_world"], {"world": str(file)}
     with OpenRequest(recording, BY_COMMAND_LINE, names, asked):
         permit(recording, LAUNCH, asked, create=True)
+    taping = {TAPE_VARIABLE: IMAGES if tape_images else "1"} if tape or tape_images else {}
     if stand_in:
         if stream or port is not None:
             raise InvalidInputError(
                 "--stream and --port apply only to Webots, not to --stand-in. Leave them out."
             )
+        os.environ.update(taping)
         return _launch_stand_in(recording, file, mode or "realtime", robot, patience_s)
     if robot:
         raise InvalidInputError(
@@ -428,7 +447,7 @@ def launch(
             "Leave it out."
         )
     start = Start(file, mode, headless, stream, port or free_port())
-    environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
+    environment = {DATA_DIR_VARIABLE: str(recording.data_dir), **taping}
     console = _Console()
     launched = WebotsLaunch(recording, start, environment, console.show)
     with _Recorder(launched, recording) as recorder:

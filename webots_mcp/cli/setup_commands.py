@@ -162,6 +162,15 @@ def init(
             help="Remove these lines from a controller, or the observer from a world.",
         ),
     ] = None,
+    tests: Annotated[
+        bool,
+        Parameter(
+            "--tests",
+            negative=(),
+            help="Only write a first test: the controller commands what it did in the newest run "
+            "with a tape.",
+        ),
+    ] = False,
     writing: Writing = _ASKING,
 ) -> None:
     """Set up a Webots project: register the MCP server and list what each controller needs.
@@ -187,16 +196,18 @@ def init(
     """
     from webots_mcp.setup import project_edits
 
-    if sum(each is not None for each in (patch, undo, observer)) > 1:
+    if sum(each is not None for each in (patch, undo, observer)) + tests > 1:
         raise InvalidInputError(
-            "--patch, --observer and --undo exclude each other. Give one of them."
+            "--patch, --observer, --undo and --tests exclude each other. Give one of them."
         )
     if (in_place or extern) and observer is None:
         raise InvalidInputError(
             "--in-place and --extern apply only to --observer. Add --observer WORLD, or leave them "
             "out."
         )
-    if observer is not None:
+    if tests:
+        _write_first_test(project, writing)
+    elif observer is not None:
         _add_observer(observer, writing, in_place=in_place, extern=extern)
     elif undo is not None and undo.suffix == ".wbt":
         _remove_observer(undo, writing)
@@ -206,6 +217,21 @@ def init(
         _change_controller(patch, project_edits.patch, writing)
     else:
         _make_ready(project, name, writing, http, claude_desktop=claude_desktop, skills=skills)
+
+
+def _write_first_test(folder: str | None, writing: Writing) -> None:
+    from webots_mcp.contract import PROJECT_DATA_FOLDER
+    from webots_mcp.setup.first_test import first_test
+    from webots_mcp.simulator.project import project_of
+
+    project = project_of(folder)
+    test, bundle = first_test(project, project / PROJECT_DATA_FOLDER)
+    if test.before is not None and test.is_needed:
+        writing.require_yes_to(test)
+    if not writing.dry_run:
+        bundle.file.parent.mkdir(parents=True, exist_ok=True)
+    files = [writing.apply(each) for each in (bundle, test)]
+    _print_files(files, writing, then=f"pytest {_shown(test.file)}")
 
 
 def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
@@ -730,7 +756,7 @@ def completion(
     from cyclopts.completion.detect import ShellDetectionError
 
     from webots_mcp.cli import app_for
-    from webots_mcp.cli.completing import values_of, with_values
+    from webots_mcp.cli.shell_completion import values_of, with_values
 
     if values is not None:
         names = values_of(values, recorded.recording())

@@ -35,7 +35,7 @@ def status(
     recorded: Where = HERE,
 ) -> None:
     """Show what each robot is doing, since when, and any warnings."""
-    from webots_mcp.cli.asking import ask, show
+    from webots_mcp.cli.question_commands import ask, show
     from webots_mcp.questions.list_robots import webots_list_robots
 
     reply = ask(webots_list_robots, {}, recorded)
@@ -71,9 +71,9 @@ def _rows_of(table: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 def _mode_of(robot: Mapping[str, Any], recorded: Where) -> dict[str, Any]:
     """Return the value of the robot's signal `mode` and since when, if it has such a signal."""
-    from webots_mcp.cli.asking import ask
+    from webots_mcp.cli.question_commands import ask
     from webots_mcp.errors import WebotsMCPError
-    from webots_mcp.questions.history import webots_get_trends
+    from webots_mcp.questions.query_history import webots_get_trends
 
     if robot.get("run_id") is None:
         return {}

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from webots_mcp.cli.ending import ending_by_event
+from webots_mcp.cli.interrupts import ending_by_event
 from webots_mcp.cli.options import (
     HERE,
     Count,
@@ -37,7 +37,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
 if TYPE_CHECKING:
     from webots_mcp.analysis.summary import Ranking
-    from webots_mcp.questions.declaring import Question
+    from webots_mcp.questions.declaration import Question
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.steering.trial_run import Simulators
     from webots_mcp.store.recording import RecordingAccess
@@ -204,7 +204,7 @@ def signals(
         webots-mcp signals --describe motors.left quantity='wheel speed'
     """
     from webots_mcp.questions.describe_signals import webots_describe_signals, webots_list_meanings
-    from webots_mcp.questions.history import webots_list_signals
+    from webots_mcp.questions.query_history import webots_list_signals
 
     if describe is not None and undo is not None:
         raise InvalidInputError("--describe and --undo exclude each other. Give one of them.")
@@ -329,7 +329,7 @@ def field(
 
 def _show(question: Question, asked: ToRobot, *, as_json: bool, **given: Any) -> None:
     """Ask a question, with those options that it has, and print the answer."""
-    from webots_mcp.cli.asking import ask_and_show
+    from webots_mcp.cli.question_commands import ask_and_show
 
     of_options = {name: value for name, value in vars(asked).items() if _has(question, name)}
     ask_and_show(question, of_options | given, asked, as_json=as_json)

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple, TextIO, cast
 from webots_mcp.cli.streams import write_styled
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.ages import age_in_words
+from webots_mcp.store.relative_times import age_in_words
 
 _HEAD: Final = {
     "robot": "{}",

@@ -15,20 +15,7 @@ _ALIVE: Final = (
     "CASE WHEN end_reason = 'crashed' AND NOT EXISTS (SELECT 1 FROM session n "
     "WHERE n.robot_id = {0}.robot_id AND n.id > {0}.{1}) THEN NULL ELSE {2} END"
 )
-_BEAT_SESSION: Final = (
-    "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
-    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, pause_state = ?, "
-    "mode_before_pause = ?, rows_waiting = ?, rows_dropped = ?, last_error = ?, "
-    f"ended_wall_time_s = {_ALIVE.format('session', 'id', 'ended_wall_time_s')}, "
-    f"end_reason = {_ALIVE.format('session', 'id', 'end_reason')} WHERE id = ?"
-)
 NO_TIMES: Final = (None, None, None)  # in place of `LoopTimes`: no round of the loop was seen
-_BEAT_RUN: Final = (
-    "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, row_count = ?, "
-    "own_wall_s = ?, step_wait_wall_s = ?, steps = ?, "
-    f"ended_wall_time_s = {_ALIVE.format('run', 'session_id', 'ended_wall_time_s')}, "
-    f"end_reason = {_ALIVE.format('run', 'session_id', 'end_reason')} WHERE id = ?"
-)
 
 
 class LoopTimes(NamedTuple):
@@ -79,5 +66,18 @@ def write_heartbeat(
     now = time.time()
     seen = (now, time.monotonic(), loop.last_poll_wall_time_s, loop.moved_wall_time_s)
     how = (loop.sim_time_s, loop.command, loop.mode_before)
-    connection.execute(_BEAT_SESSION, (*seen, *how, *recording, session_id))
-    connection.execute(_BEAT_RUN, (now, loop.sim_time_s, rows, *(loop.times or NO_TIMES), run_id))
+    connection.execute(
+        "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
+        "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, pause_state = ?, "
+        "mode_before_pause = ?, rows_waiting = ?, rows_dropped = ?, last_error = ?, "
+        f"ended_wall_time_s = {_ALIVE.format('session', 'id', 'ended_wall_time_s')}, "
+        f"end_reason = {_ALIVE.format('session', 'id', 'end_reason')} WHERE id = ?",
+        (*seen, *how, *recording, session_id),
+    )
+    connection.execute(
+        "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, row_count = ?, "
+        "own_wall_s = ?, step_wait_wall_s = ?, steps = ?, "
+        f"ended_wall_time_s = {_ALIVE.format('run', 'session_id', 'ended_wall_time_s')}, "
+        f"end_reason = {_ALIVE.format('run', 'session_id', 'end_reason')} WHERE id = ?",
+        (now, loop.sim_time_s, rows, *(loop.times or NO_TIMES), run_id),
+    )

@@ -24,7 +24,6 @@ LEASE_S: Final = 30.0
 # One that ends later was taken before the clock was set back. It is not one lease from now: the
 # holder may renew after the asker looked at the clock and before its statement reads the row.
 _TIMES: Final = 2
-_RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?"
 
 
 class JobLease(NamedTuple):
@@ -111,7 +110,12 @@ def still_held(connection: sqlite3.Connection, lease: JobLease) -> Generator[Non
     """
     with transaction(connection):
         values = (time.time() + lease.lasts_s, lease.name, lease.holder)
-        if connection.execute(_RENEW, values).rowcount == 0:
+        if (
+            connection.execute(
+                "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?", values
+            ).rowcount
+            == 0
+        ):
             holder = holder_of(connection, lease.name)  # None where that one is done by now
             by = f" ({holder})" if holder else ""
             raise LeaseLostError(

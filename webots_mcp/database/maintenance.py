@@ -53,13 +53,6 @@ FREE_THE_LOG: Final = (
     "'webots-mcp serve' (not --read-only) or a controller runs"
 )
 
-# Another program may have written anything there: an end that is no time has passed.
-_LEASE: Final = (
-    f"SELECT holder = :holder, holder LIKE '{_BRIDGES}', "
-    "iif(typeof(until_wall_time_s) IN ('real', 'integer'), until_wall_time_s, 0) "
-    f"FROM lease WHERE name = '{_JOB}'"
-)
-
 
 Kind = Literal["server", "bridge", "prune", "question"]
 
@@ -159,7 +152,13 @@ class Maintainer(threading.Thread):
     def _hold_lease(self, connection: sqlite3.Connection) -> bool:
         """Take or renew the lease; it is renewed at half time, so that most ticks write nothing."""
         now = time.time()
-        lease = connection.execute(_LEASE, {"holder": self._lease.holder}).fetchone()
+        # Another program may have written anything there: an end that is no time has passed.
+        lease = connection.execute(
+            f"SELECT holder = :holder, holder LIKE '{_BRIDGES}', "
+            "iif(typeof(until_wall_time_s) IN ('real', 'integer'), until_wall_time_s, 0) "
+            f"FROM lease WHERE name = '{_JOB}'",
+            {"holder": self._lease.holder},
+        ).fetchone()
         is_ours, is_bridges, until_s = lease or (False, False, 0.0)
         if is_ours and LEASE_S / 2 < until_s - now <= LEASE_S:
             return True

@@ -53,23 +53,6 @@ LEFT_PAUSED: Final = (
     "or start that controller again and resume it there"
 )
 
-# A pause is recorded as an event at once, but the heartbeat shows it only at its next beat. Events
-# after that beat have at least its simulation time, which limits the search to the index.
-_CHANGE_SINCE: Final = (
-    "SELECT e.kind FROM run r JOIN event e ON e.run_id = r.id AND e.sim_time_s >= :sim_time_s "
-    "WHERE r.session_id = :session_id AND e.wall_time_s > :wall_time_s "
-    f"AND e.kind IN ('{PAUSE}', '{RESUME}') ORDER BY e.id DESC LIMIT 1"
-)
-_CONDITION: Final = (
-    "SELECT CASE WHEN json_valid(data) THEN json_extract(data, '$.condition') END, sim_time_s "
-    "FROM event WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
-    f"AND kind = '{PAUSE}' ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_OF_RUN: Final = (
-    "SELECT kind, wall_time_s FROM event WHERE run_id = ? "
-    f"AND kind IN ('{PAUSE}', '{RESUME}') ORDER BY id"
-)
-
 
 class Cause(NamedTuple):
     """Why a pause began or ended; fields that do not apply are None.
@@ -112,13 +95,27 @@ def change_since(
         wall_time_s: The wall time of its heartbeat.
     """
     values = {"session_id": session_id, "sim_time_s": sim_time_s, "wall_time_s": wall_time_s}
-    row = connection.execute(_CHANGE_SINCE, values).fetchone()
+    # A pause is recorded as an event at once, but the heartbeat shows it only at its next beat.
+    # Events after that beat have at least its simulation time, which limits the search to the
+    # index.
+    row = connection.execute(
+        "SELECT e.kind FROM run r JOIN event e ON e.run_id = r.id "
+        "AND e.sim_time_s >= :sim_time_s WHERE r.session_id = :session_id "
+        f"AND e.wall_time_s > :wall_time_s AND e.kind IN ('{PAUSE}', '{RESUME}') "
+        "ORDER BY e.id DESC LIMIT 1",
+        values,
+    ).fetchone()
     return row[0] if row else None
 
 
 def breakpoint_at(connection: sqlite3.Connection, session_id: int) -> str | None:
     """Describe the breakpoint that began the newest pause of a session; None if a command did."""
-    found = connection.execute(_CONDITION, (session_id,)).fetchone()
+    found = connection.execute(
+        "SELECT CASE WHEN json_valid(data) THEN json_extract(data, '$.condition') END, "
+        "sim_time_s FROM event WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) AND "
+        f"kind = '{PAUSE}' ORDER BY sim_time_s DESC, id DESC LIMIT 1",
+        (session_id,),
+    ).fetchone()
     if found is None or found[0] is None:
         return None
     return f"breakpoint at {found[1]:.3f} s: {found[0]}"
@@ -127,7 +124,14 @@ def breakpoint_at(connection: sqlite3.Connection, session_id: int) -> str | None
 def paused_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> float:
     """Return for how many seconds of wall time its bridge kept a run paused, up to its end."""
     total_s, since_s = 0.0, math.inf
-    for kind, wall_s in (*connection.execute(_OF_RUN, (run_id,)), (RESUME, end_wall_s)):
+    for kind, wall_s in (
+        *connection.execute(
+            "SELECT kind, wall_time_s FROM event WHERE run_id = ? "
+            f"AND kind IN ('{PAUSE}', '{RESUME}') ORDER BY id",
+            (run_id,),
+        ),
+        (RESUME, end_wall_s),
+    ):
         if kind == PAUSE:
             since_s = min(since_s, wall_s)
         else:

@@ -24,17 +24,6 @@ from webots_mcp.errors import InvalidInputError
 MAX_PARAMS_BYTES: Final = 65_536
 # A writer connection waits 5 s for the lock by itself; then the statement is sent again.
 _ATTEMPTS: Final = 3
-# Two questions, so that each is answered by its partial index.
-_UNFINISHED: Final = (
-    "SELECT EXISTS (SELECT 1 FROM command WHERE status = 'pending') "
-    "OR EXISTS (SELECT 1 FROM command WHERE status = 'claimed')"
-)
-_ENQUEUE: Final = (
-    "INSERT INTO command (robot_id, action, params, status, requested_by, idempotency_key, "
-    "created_wall_time_s, expires_wall_time_s, request_id) VALUES "
-    "(:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires, :request) "
-    "ON CONFLICT (idempotency_key) DO NOTHING"
-)
 
 # -- the statements by which a controller claims and answers commands, and others settle them ------
 
@@ -127,12 +116,6 @@ class QueuedCommand(NamedTuple):
 
 _COLUMNS: Final = ", ".join(QueuedCommand._fields)
 _BY_KEY: Final = f"SELECT {_COLUMNS} FROM command WHERE idempotency_key = ?"
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM command WHERE id = ?"
-_NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM command WHERE robot_id = :robot_id "
-    "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
-    "ORDER BY id DESC LIMIT :limit"
-)
 
 
 class CommandQueue:
@@ -191,7 +174,15 @@ class CommandQueue:
             "expires": now_s + time_to_live_s,
             "request": request_id,
         }
-        _while_busy(lambda: self._connection.execute(_ENQUEUE, values))
+        _while_busy(
+            lambda: self._connection.execute(
+                "INSERT INTO command (robot_id, action, params, status, requested_by, "
+                "idempotency_key, created_wall_time_s, expires_wall_time_s, request_id) VALUES "
+                "(:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires, "
+                ":request) ON CONFLICT (idempotency_key) DO NOTHING",
+                values,
+            )
+        )
         command = QueuedCommand(*self._connection.execute(_BY_KEY, (key,)).fetchone())
         if any(getattr(command, name) != values[name] for name in ("robot_id", "action", "params")):
             raise InvalidInputError(
@@ -234,7 +225,9 @@ def fetch_command(connection: sqlite3.Connection, command_id: int) -> QueuedComm
     Raises:
         InvalidInputError: If there is none.
     """
-    row = connection.execute(_BY_ID, (command_id,)).fetchone()
+    row = connection.execute(
+        f"SELECT {_COLUMNS} FROM command WHERE id = ?", (command_id,)
+    ).fetchone()
     if row is None:
         raise InvalidInputError(
             f"There is no command {command_id}. webots_list_commands lists the commands."
@@ -255,12 +248,26 @@ def list_commands(
     `before_id` pages towards older ones.
     """
     values = {"robot_id": robot_id, "status": status, "limit": limit, "before_id": before_id}
-    return [QueuedCommand(*row) for row in connection.execute(_NEWEST, values).fetchall()]
+    return [
+        QueuedCommand(*row)
+        for row in connection.execute(
+            f"SELECT {_COLUMNS} FROM command WHERE robot_id = :robot_id "
+            "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
+            "ORDER BY id DESC LIMIT :limit",
+            values,
+        ).fetchall()
+    ]
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:
     """Return whether `session_cleanup.reap` could have anything to say about commands."""
-    return bool(connection.execute(_UNFINISHED).fetchone()[0])
+    # Two questions, so that each is answered by its partial index.
+    return bool(
+        connection.execute(
+            "SELECT EXISTS (SELECT 1 FROM command WHERE status = 'pending') "
+            "OR EXISTS (SELECT 1 FROM command WHERE status = 'claimed')"
+        ).fetchone()[0]
+    )
 
 
 def _encode_params(params: Mapping[str, Any]) -> str:

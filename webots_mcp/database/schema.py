@@ -45,8 +45,6 @@ _OF_COLUMNS: Final = (
 _INDEX: Final = r"CREATE (UNIQUE )?INDEX"
 # Names of SQLite's own functions: a table or view of such a name would be read in their place.
 _OF_SQLITE: Final = r"pragma_|json_(each|tree)$|sqlite_"
-_OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
-_NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
 
 
 def schema_version(connection: sqlite3.Connection) -> int:
@@ -111,7 +109,10 @@ def create_schema(connection: sqlite3.Connection) -> None:
         if schema_version(connection) == 0:
             for statement in shipped_statements():
                 connection.execute(statement)
-            connection.execute(_NEW_RECORDING, (new_uuid(), time.time()))
+            connection.execute(
+                "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)",
+                (new_uuid(), time.time()),
+            )
 
 
 @cache
@@ -197,7 +198,8 @@ def _why_refused(
             if _spelled(sql) == _spelled(ours)
             else "differs from the object of that name in recordings"
         )
-    if re.match(_OF_SQLITE, name.lower()) and not sql.startswith(_OF_SQLITE_MADE):
+    # for AUTOINCREMENT, and by ANALYZE
+    if re.match(_OF_SQLITE, name.lower()) and not sql.startswith("CREATE TABLE sqlite_"):
         return "has a name of SQLite's own"
     if kind == "trigger" and (table.lower() in shipped or table.lower() in referring):
         return f"runs when {table[:60]!r} is written to"

@@ -19,9 +19,6 @@ from webots_mcp.database.connection import FrozenConnection, connect
 from webots_mcp.database.schema import create_schema, require_shipped, schema_version, statements_of
 
 PREVIOUS_SCHEMA_FILE: Final = Path(__file__).with_name(f"schema_{PREVIOUS_SCHEMA_VERSION}.sql")
-# They belong to SQLite. All other files whose names begin with that of the database hold rows.
-_FILES_OF_SQLITE: Final = ("-wal", "-shm", "-journal")
-_NOT_COPIED: Final = ("alembic_version",)
 
 
 @contextmanager
@@ -47,7 +44,9 @@ def in_current_schema(database: Path) -> Generator[Path]:
         _copy_rows(database, copy, is_frozen=is_frozen)
         for file in database.parent.glob(f"{glob.escape(database.name)}-*"):
             suffix = file.name[len(database.name) :]
-            if suffix not in _FILES_OF_SQLITE:
+            # They belong to SQLite. All other files whose names begin with that of the database
+            # hold rows.
+            if suffix not in ("-wal", "-shm", "-journal"):
                 shutil.copyfile(file, f"{copy}{suffix}")
         yield copy
 
@@ -78,7 +77,7 @@ def _copy_rows(database: Path, copy: Path, *, is_frozen: bool) -> None:
 def _tables(connection: sqlite3.Connection) -> list[str]:
     """Return the tables of the current schema that the other database has too."""
     query = "SELECT name FROM main.sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
-    names = [name for (name,) in connection.execute(query) if name not in _NOT_COPIED]
+    names = [name for (name,) in connection.execute(query) if name not in ("alembic_version",)]
     statement = "SELECT name FROM old.sqlite_master WHERE type = 'table' AND name = ?"
     return [name for name in names if connection.execute(statement, (name,)).fetchone()]
 

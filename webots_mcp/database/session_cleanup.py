@@ -20,34 +20,13 @@ from webots_mcp.database.processes import is_living, process_alive
 from webots_mcp.database.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
 from webots_mcp.database.waiting_file import waiting_path
 
-END_SESSION: Final = (
-    "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, end_reason = :reason "
-    "WHERE id = :id AND ended_wall_time_s IS NULL"
-)
 # A dead process cannot report its rows, so they are counted; the last row may be younger than the
 # last heartbeat. Counting takes long, so it comes first, while no robot waits for the lock. The
 # count stays right, since no other process writes to these runs.
 _LAST_ROW: Final = (
     "coalesce((SELECT {0} FROM state WHERE run_id = run.id ORDER BY sim_time_s DESC LIMIT 1), {1})"
 )
-_FOUND: Final = (
-    f"SELECT id AS run, "
-    f"max(last_wall_time_s, {_LAST_ROW.format('wall_time_s', 'last_wall_time_s')}), "
-    f"max(last_sim_time_s, {_LAST_ROW.format('sim_time_s', 'last_sim_time_s')}), "
-    "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
-    "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL AND coalesce(uuid, '') <> ?"
-)
-END_RUN: Final = (
-    "UPDATE run SET ended_wall_time_s = :last_s, last_wall_time_s = :last_s, "
-    "last_sim_time_s = :last_sim_s, end_reason = :reason, row_count = :rows "
-    "WHERE id = :id AND ended_wall_time_s IS NULL"
-)
 EXTERN: Final = "Webots does not restart an extern controller: start it by hand"
-_OPEN_SESSIONS: Final = (
-    "SELECT id, pid, CAST(process AS BLOB), last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
-    "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
-    "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
-)
 
 
 class OpenSession(NamedTuple):
@@ -141,7 +120,13 @@ def find_dead_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:
     Returns:
         The id of each, and how it ended: `reload` or `crashed`.
     """
-    sessions = connection.execute(_OPEN_SESSIONS, (host_name(),)).fetchall()
+    sessions = connection.execute(
+        "SELECT id, pid, CAST(process AS BLOB), last_seen_wall_time_s, EXISTS (SELECT 1 "
+        "FROM command WHERE session_id = session.id AND action = 'reload' "
+        "AND issued_wall_time_s IS NOT NULL) FROM session WHERE ended_wall_time_s IS NULL "
+        "AND host = ?",
+        (host_name(),),
+    ).fetchall()
     return [
         (session_id, "reload" if reloading else "crashed")
         for session_id, pid, process, seen_s, reloading in sessions
@@ -153,7 +138,11 @@ def end_session(connection: sqlite3.Connection, session_id: int, reason: str) ->
     """End a session that another process left open, and its runs, as of their last sign of life."""
     end_runs(connection, session_id, reason)
     # Last: a process that is killed before this leaves a session that will be settled again.
-    connection.execute(END_SESSION, {"id": session_id, "reason": reason})
+    connection.execute(
+        "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, end_reason = :reason "
+        "WHERE id = :id AND ended_wall_time_s IS NULL",
+        {"id": session_id, "reason": reason},
+    )
 
 
 def end_runs(
@@ -161,6 +150,18 @@ def end_runs(
 ) -> None:
     """End the open runs of a session as of their last sign of life, except the run of a UUID."""
     values = (session_id, going_on)
-    for run_id, last_s, last_sim_s, rows in connection.execute(_FOUND, values).fetchall():
+    for run_id, last_s, last_sim_s, rows in connection.execute(
+        f"SELECT id AS run, "
+        f"max(last_wall_time_s, {_LAST_ROW.format('wall_time_s', 'last_wall_time_s')}), "
+        f"max(last_sim_time_s, {_LAST_ROW.format('sim_time_s', 'last_sim_time_s')}), "
+        "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
+        "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL AND coalesce(uuid, '') <> ?",
+        values,
+    ).fetchall():
         times = {"last_s": last_s, "last_sim_s": last_sim_s}
-        connection.execute(END_RUN, {"id": run_id, "reason": reason, "rows": rows, **times})
+        connection.execute(
+            "UPDATE run SET ended_wall_time_s = :last_s, last_wall_time_s = :last_s, "
+            "last_sim_time_s = :last_sim_s, end_reason = :reason, row_count = :rows "
+            "WHERE id = :id AND ended_wall_time_s IS NULL",
+            {"id": run_id, "reason": reason, "rows": rows, **times},
+        )

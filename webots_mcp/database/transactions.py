@@ -14,10 +14,8 @@ from typing import Final, TypeVar
 Result = TypeVar("Result")
 _UNINTERRUPTED_MS: Final = 100
 LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits this long
-_UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _CALLED_OFF: Final = "called off"
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
-_SAYS_NOTHING: Final = "malformed database, which SQLite names in bytes that are not text"
 _ABOUT_A_VALUE: Final = (
     "malformed JSON", "JSON cannot hold", "JSON path", "to UTF-8 column", "integer overflow",
     "user-defined function",
@@ -191,11 +189,15 @@ def text_of(error: Exception) -> str:
     if isinstance(error, UnicodeDecodeError):
         return error.object.decode("utf-8", "replace")
     # Python 3.10 leaves such a message out; of this class itself, it was about the file.
-    return str(error) or (_SAYS_NOTHING if type(error) is sqlite3.DatabaseError else "")
+    return str(error) or (
+        "malformed database, which SQLite names in bytes that are not text"
+        if type(error) is sqlite3.DatabaseError
+        else ""
+    )
 
 
 def is_unwritable(error: Exception) -> bool:
     """Return whether the file, or the folder that it needs for its log, cannot be written."""
     return isinstance(error, sqlite3.OperationalError) and any(
-        text in str(error) for text in _UNWRITABLE
+        text in str(error) for text in ("readonly database", "unable to open database file")
     )

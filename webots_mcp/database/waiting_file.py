@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 
 from webots_mcp.database.queue import CONFIRM_RELOAD, FINISH, ISSUE
-from webots_mcp.database.stacks import LOGGER, read_stacks, stacks_path
+from webots_mcp.database.thread_stacks import LOGGER, read_stacks, stacks_path
 from webots_mcp.database.transactions import in_transaction
 from webots_mcp.errors import SessionGoneError, warn
 
@@ -195,13 +195,7 @@ _NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
 _LOCKED_BYTE: Final = 1 << 40  # far beyond the end: Windows refuses to read what is locked
 _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 _SESSION_OF: Final = "SELECT id, last_adopted_entry FROM session WHERE uuid = ?"
-_SET_ADOPTED: Final = "UPDATE session SET last_adopted_entry = ? WHERE id = ?"
 _RUN_OF: Final = "SELECT id FROM run WHERE uuid = ? AND session_id = ?"
-_RUN_SEEN: Final = (
-    "SELECT r.id, r.last_wall_time_s FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.uuid = ? AND coalesce(s.last_poll_wall_time_s, s.moved_wall_time_s) IS NOT NULL"
-)
-_SET_ROWS: Final = "UPDATE run SET row_count = ? WHERE id = ?"
 SESSION_COLUMNS: Final = (
     "uuid",
     "pid",
@@ -219,11 +213,6 @@ SESSION_COLUMNS: Final = (
     "last_seen_wall_time_s",
     "last_seen_monotonic_s",
     "throttle_interval",
-)
-_NEW_SESSION: Final = (
-    f"INSERT INTO session (robot_id, {', '.join(SESSION_COLUMNS)}) "
-    f"VALUES (:robot_id, :{', :'.join(SESSION_COLUMNS)}) ON CONFLICT (uuid) "
-    "DO UPDATE SET ended_wall_time_s = NULL, end_reason = NULL"
 )
 # Errors that mean that a row's own content is refused, whatever state the database is in.
 _UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeEncodeError, OverflowError)
@@ -552,7 +541,9 @@ def ingest(
                 taken.unfit.append(why) if why else taken.written.append(entry)
                 if time.monotonic() > until_s:
                     break
-        connection.execute(_SET_ADOPTED, (taken.number, session_id))
+        connection.execute(
+            "UPDATE session SET last_adopted_entry = ? WHERE id = ?", (taken.number, session_id)
+        )
         if finish is not None:
             finish(taken)
         return taken
@@ -613,7 +604,15 @@ def _adopt_stacks(connection: sqlite3.Connection, path: Path) -> int:
             if not lock(file.fileno()):
                 return 0
             stacks = read_stacks(file)
-            run = stacks and connection.execute(_RUN_SEEN, (stacks.run,)).fetchone()
+            run = (
+                stacks
+                and connection.execute(
+                    "SELECT r.id, r.last_wall_time_s FROM run r "
+                    "JOIN session s ON s.id = r.session_id WHERE r.uuid = ? "
+                    "AND coalesce(s.last_poll_wall_time_s, s.moved_wall_time_s) IS NOT NULL",
+                    (stacks.run,),
+                ).fetchone()
+            )
             if stacks and run and stacks.is_hang and stacks.began_after(run[1]):
                 values = bind(run[0], None, stacks.log_values(None))
                 logged = connection.execute(STATEMENTS["stacks"], values).rowcount
@@ -676,7 +675,7 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO, until_s: float) 
         "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
     )
     for counted in connection.execute(statement, (session_id,)).fetchall():
-        connection.execute(_SET_ROWS, counted)
+        connection.execute("UPDATE run SET row_count = ? WHERE id = ?", counted)
     if unfit:
         warn(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
     return count, True
@@ -712,5 +711,10 @@ def enter_robot(connection: sqlite3.Connection, robot: dict[str, Any], now_s: fl
 def enter_session(connection: sqlite3.Connection, robot_id: int, session: dict[str, Any]) -> int:
     """Insert a session's row, or reopen the one of that UUID; return its id."""
     values = dict.fromkeys(SESSION_COLUMNS) | session
-    connection.execute(_NEW_SESSION, {**values, "robot_id": robot_id})
+    connection.execute(
+        f"INSERT INTO session (robot_id, {', '.join(SESSION_COLUMNS)}) "
+        f"VALUES (:robot_id, :{', :'.join(SESSION_COLUMNS)}) ON CONFLICT (uuid) "
+        "DO UPDATE SET ended_wall_time_s = NULL, end_reason = NULL",
+        {**values, "robot_id": robot_id},
+    )
     return int(connection.execute(_SESSION_OF, (session["uuid"],)).fetchone()[0])

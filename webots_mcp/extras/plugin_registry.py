@@ -59,7 +59,7 @@ class Plugin(NamedTuple):
 
     Attributes:
         commands: For the command line.
-        questions: Modules that declare questions (`questions.declaring`), which are MCP tools.
+        questions: Modules that declare questions (`questions.declaration`), which are MCP tools.
         formats: Of exports.
         cluster: Where else trials can run: a context manager that gives
             `steering.trial_run.Simulators`, of a scheduler.

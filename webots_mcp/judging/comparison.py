@@ -64,12 +64,6 @@ MOST_OF_EDIT: Final = 10  # newest runs before and after an edit, and of each se
 MOST_SETS: Final = 5  # of a trial set
 _MOST_NAMED: Final = 10  # runs in the name of a group
 _AS_LONG: Final = 1.01  # times the compared time: the ends of identical runs differ by a few rows
-_CODE_OF_RUNS: Final = (
-    "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.robot_id = ? "
-    "AND (r.row_count > 0 OR EXISTS (SELECT 1 FROM state WHERE run_id = r.id)) "
-    "ORDER BY r.id DESC"
-)
 
 
 @dataclass(frozen=True)
@@ -619,7 +613,13 @@ def _name_of(run_ids: Sequence[int]) -> str:
 
 def _around_last_edit(connection: sqlite3.Connection, robot: str | None) -> dict[str, list[int]]:
     robot_id = resolve_robot(connection, robot, time.time()).id
-    runs = connection.execute(_CODE_OF_RUNS, (robot_id,)).fetchall()
+    runs = connection.execute(
+        "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
+        "WHERE r.robot_id = ? "
+        "AND (r.row_count > 0 OR EXISTS (SELECT 1 FROM state WHERE run_id = r.id)) "
+        "ORDER BY r.id DESC",
+        (robot_id,),
+    ).fetchall()
     blocks = [[run_id for run_id, _ in each] for _, each in groupby(runs, lambda run: run[1])][:2]
     if len(blocks) < 2:
         raise NothingRecordedError(

@@ -35,12 +35,6 @@ _SHORT_ROWS: Final = 2  # between the last row and the time up to which rows are
 _SHOWN: Final = 5  # times at which it is said how far a signal is apart, and like trials
 _LONGEST_TEXT: Final = 60  # of a value that is shown
 _REDUCED: Final = "of arrays of more than 16 items count, min, max, mean and argmin are compared"
-_FACTS: Final = (
-    "SELECT b.name AS robot, substr(controller_sha256, 1, 10) AS controller_sha256, "
-    "substr(git_commit, 1, 10) AS git_commit, world, basic_time_step_ms, throttle_interval, "
-    "start_reason AS began_by, versions FROM run r JOIN session s ON s.id = r.session_id "
-    "JOIN robot b ON b.id = r.robot_id WHERE r.id = ?"
-)
 
 
 class PartedSignal(NamedTuple):
@@ -344,7 +338,13 @@ def _unlike(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str,
     """What was recorded of code and world, the parameters, and versions of programs."""
     found: list[dict[str, Any]] = []
     for run_id, had in parameters_of(connection, run_ids).items():
-        cursor = connection.execute(_FACTS, (run_id,))
+        cursor = connection.execute(
+            "SELECT b.name AS robot, substr(controller_sha256, 1, 10) AS controller_sha256, "
+            "substr(git_commit, 1, 10) AS git_commit, world, basic_time_step_ms, "
+            "throttle_interval, start_reason AS began_by, versions FROM run r JOIN session s ON "
+            "s.id = r.session_id JOIN robot b ON b.id = r.robot_id WHERE r.id = ?",
+            (run_id,),
+        )
         facts = dict(zip((each[0] for each in cursor.description), cursor.fetchone(), strict=True))
         versions = json.loads(facts.pop("versions") or "{}")
         found += [facts | {f"parameter {n}": each.described for n, each in had.items()}]

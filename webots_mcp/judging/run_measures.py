@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np
-from webots_mcp.analysis.rare import is_rare, may_shares_differ, verdicts_on_shares
+from webots_mcp.analysis.path_length import PathLength, tracks_of, travelled
+from webots_mcp.analysis.rank_and_count_tests import is_rare, may_shares_differ, verdicts_on_shares
 from webots_mcp.analysis.summary import (
     MIN_REPEATED,
     Spread,
@@ -21,7 +22,6 @@ from webots_mcp.analysis.summary import (
     spread_of,
     verdicts_on,
 )
-from webots_mcp.analysis.track import PathLength, tracks_of, travelled
 from webots_mcp.judging.detection.condition import VIOLATION, expectations_of
 from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
@@ -45,7 +45,6 @@ _AS_LONG: Final = 1.01  # times another duration: the ends of identical runs dif
 _CLOCK_MARGIN: Final = (
     0.25  # wall times of two sessions differ by less on a machine with other load
 )
-_OF_THIS_RUN: Final = re.compile(r"^run \d+ lasted only [^;,]*|(?<=a period is over )\S+")
 _RATE: Final = " per min"
 NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
@@ -60,13 +59,6 @@ _DURATION: Final = "duration_s"
 _OWN_MS: Final = "own_ms_per_step"
 WHOLE_RUNS: Final = "whole runs"
 _OF_WHOLE_RUNS: Final = (GOAL_REACHED, _GOAL_TIME, _DURATION, _OWN_MS)
-_GOALS: Final = (  # the last run command with a goal that finished in each run
-    "SELECT json_extract(result, '$.run_id'), json_extract(params, '$.until'), "
-    "json_extract(result, '$.ended'), json_extract(result, '$.advanced_s') FROM command "
-    "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
-    "AND json_extract(params, '$.until') IS NOT NULL ORDER BY id"
-)
-_REACHED: Final = "condition held"
 
 
 @dataclass(frozen=True)
@@ -122,9 +114,16 @@ def goals_of(
 ) -> dict[int, RunGoal]:
     """Return the goals of those runs of a robot that had one."""
     wanted = set(run_ids)
+    # the last run command with a goal that finished in each run
     return {
-        run_id: RunGoal(str(condition), took_s if ended == _REACHED else None)
-        for run_id, condition, ended, took_s in connection.execute(_GOALS, (robot_id,))
+        run_id: RunGoal(str(condition), took_s if ended == "condition held" else None)
+        for run_id, condition, ended, took_s in connection.execute(
+            "SELECT json_extract(result, '$.run_id'), json_extract(params, '$.until'), "
+            "json_extract(result, '$.ended'), json_extract(result, '$.advanced_s') FROM command "
+            "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
+            "AND json_extract(params, '$.until') IS NOT NULL ORDER BY id",
+            (robot_id,),
+        )
         if run_id in wanted
     }
 
@@ -445,7 +444,10 @@ def _not_known(runs: Sequence[RunOutcome]) -> dict[str, str]:
     for run in runs:
         for name, reasons in run.unknown.items():
             for why in reasons:
-                key = (name, _OF_THIS_RUN.sub("", why))
+                key = (
+                    name,
+                    re.sub(r"^run \d+ lasted only [^;,]*|(?<=a period is over )\S+", "", why),
+                )
                 alike.setdefault(key, {})[run.run_id] = why
     sharing: dict[str, list[str]] = {}
     for (name, _), reasons in alike.items():

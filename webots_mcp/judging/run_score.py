@@ -24,12 +24,6 @@ from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import run_info
 
 SCORE_DEADLINE_S: Final = 60.0
-_STORED: Final = (
-    "SELECT count(*) FROM event WHERE run_id = ? AND kind = ? AND sim_time_s >= ? "
-    "AND sim_time_s < ?"
-)
-_STORED_KINDS: Final = "SELECT DISTINCT kind FROM event WHERE run_id = ?"
-_BRIDGE_KINDS: Final = ("breakpoint", "pause", "resume", "dropped", "storage")
 
 
 @dataclass(frozen=True)
@@ -140,8 +134,13 @@ def require_kinds(connection: sqlite3.Connection, score: Score, run_id: int) -> 
     Raises:
         InvalidInputError: With the kinds that there are.
     """
-    stored = [kind for (kind,) in connection.execute(_STORED_KINDS, (run_id,)).fetchall()]
-    known = [*kind_names(), *stored, *_BRIDGE_KINDS]
+    stored = [
+        kind
+        for (kind,) in connection.execute(
+            "SELECT DISTINCT kind FROM event WHERE run_id = ?", (run_id,)
+        ).fetchall()
+    ]
+    known = [*kind_names(), *stored, *("breakpoint", "pause", "resume", "dropped", "storage")]
     for kind, column in score.kinds.items():
         if kind not in known:
             offer = ", ".join(nearest_first(kind, list(dict.fromkeys(known)))[:5])
@@ -157,7 +156,13 @@ def _count(
     if kind not in kind_names():
         (segment,) = time_range.segments
         bounds = (segment.run_id, kind, segment.holds_from_s, segment.holds_to_s)
-        return int(connection.execute(_STORED, bounds).fetchone()[0])
+        return int(
+            connection.execute(
+                "SELECT count(*) FROM event WHERE run_id = ? AND kind = ? AND sim_time_s >= ? "
+                "AND sim_time_s < ?",
+                bounds,
+            ).fetchone()[0]
+        )
     try:
         options = EventOptions(kinds=(kind,))
         found = search_events(

@@ -10,6 +10,12 @@ from functools import cached_property
 from typing import Any, Final, Literal
 
 from webots_mcp.analysis.arrays import Array, Indexes, np, weighted_mean
+from webots_mcp.analysis.oscillations import (
+    LEAST_HALF_SWINGS,
+    SHORTEST_PERIOD_ROWS,
+    Swing,
+    find_swings,
+)
 from webots_mcp.analysis.summary import (
     FLAT_BAND,
     LARGEST,
@@ -28,12 +34,6 @@ from webots_mcp.analysis.summary import (
     unwrap,
     with_extremes,
     with_extremes_of,
-)
-from webots_mcp.analysis.swings import (
-    LEAST_HALF_SWINGS,
-    SHORTEST_PERIOD_ROWS,
-    Swing,
-    find_swings,
 )
 from webots_mcp.signals.naming import words_of
 from webots_mcp.store import chunk_making
@@ -57,7 +57,7 @@ from webots_mcp.store.reading.segment import (
     shown_time,
 )
 from webots_mcp.store.registered_signals import RegisteredSignal
-from webots_mcp.store.series import STATES_SHARE, TURNS_COUNTED, WEIGHTED, signals_left
+from webots_mcp.store.signal_history import STATES_SHARE, TURNS_COUNTED, WEIGHTED, signals_left
 
 # -- one numeric signal: its trend, and what a person would notice ---------------------------------
 

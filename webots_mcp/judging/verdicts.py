@@ -21,7 +21,6 @@ WORST_FIRST: Final[tuple[Outcome, ...]] = (
     "fail", "not looked at", "warn", "pass", "not judged", "not applicable",
 )  # fmt: skip
 AS_STUCK: Final = "reported as stuck"  # of standstills, where both kinds are asked for
-_TIMED_OUT: Final = "time limit reached"
 _WITHOUT: Final[dict[Cause, Outcome]] = {
     "absent": "not applicable", "undecided": "not judged", "unread": "not looked at",
 }  # fmt: skip
@@ -157,7 +156,7 @@ class Fault(NamedTuple):
 
 def cause_of(reason: str) -> Cause:
     """Return the cause that a reason tells: there was no time to read, or something is absent."""
-    return "unread" if reason.startswith(NOT_READ) or _TIMED_OUT in reason else "absent"
+    return "unread" if reason.startswith(NOT_READ) or "time limit reached" in reason else "absent"
 
 
 # -- checks ------------------------------------------------------------------------------------
@@ -303,7 +302,9 @@ class SearchCoverage:
 
     def of(self, kind: str) -> Coverage:
         """Return the coverage of a kind."""
-        return self.by_kind.setdefault(kind, Coverage())
+        if (found := self.by_kind.get(kind)) is None:
+            found = self.by_kind[kind] = Coverage()
+        return found
 
     def not_searched(self, kind: str, *reasons: str, cause: Cause | None = None) -> None:
         """Note why a kind was not searched, or where it was not."""

@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, get_args
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plotting.colours import LINES, ON_PAPER, Theme
 from webots_mcp.signals.naming import spelled_out
-from webots_mcp.store.series import MOST_POINTS
+from webots_mcp.store.signal_history import MOST_POINTS
 
 MOST_PANELS: Final = 3
 WIDTH_PX: Final = 900

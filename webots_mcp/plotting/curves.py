@@ -13,7 +13,7 @@ from typing import Final
 
 from webots_mcp.analysis.arrays import rhythm_of
 from webots_mcp.plotting.axes import axis_range
-from webots_mcp.store.series import NumberColumns, RunHistory
+from webots_mcp.store.signal_history import NumberColumns, RunHistory
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum
 MOST_CURVES: Final = 5  # more bands on top of each other are mud

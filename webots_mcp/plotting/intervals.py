@@ -11,7 +11,7 @@ from webots_mcp.analysis.arrays import Gap
 from webots_mcp.plotting.colours import LINES, MOST_VALUES, OTHER_VALUES
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.reading.frame_summary import Point, spelled
-from webots_mcp.store.series import ChangeColumns, RunHistory
+from webots_mcp.store.signal_history import ChangeColumns, RunHistory
 
 
 @dataclass(frozen=True)

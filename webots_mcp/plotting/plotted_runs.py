@@ -26,7 +26,7 @@ from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.run_parameters import differing, parameters_of
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.series import MOST_POINTS, History, RunHistory, query_history
+from webots_mcp.store.signal_history import MOST_POINTS, History, RunHistory, query_history
 
 Known = dict[str, RegisteredSignal]
 MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze

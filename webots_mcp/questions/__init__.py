@@ -10,14 +10,14 @@ import importlib
 from typing import Final
 
 from webots_mcp.extras.plugin_registry import question_modules
-from webots_mcp.questions.declaring import Question
+from webots_mcp.questions.declaration import Question
 
 # In the order in which clients list them; those of plugins follow.
 MODULES: Final = (
-    "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor", "history",
-    "describe_signals", "find_events", "compare_runs", "query_sql", "control_simulation",
-    "run_trials", "set_breakpoints", "send_command", "controller_parameters", "edit_scene",
-    "inspect_controller",
+    "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor",
+    "query_history", "describe_signals", "find_events", "list_and_compare_runs",
+    "rerun_controller", "query_sql", "control_simulation", "run_trials", "set_breakpoints",
+    "send_command", "controller_parameters", "edit_scene", "inspect_controller",
 )  # fmt: skip
 
 

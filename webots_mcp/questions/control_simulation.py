@@ -15,7 +15,7 @@ from webots_mcp.answers.shortening import cut_text
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName, TimeoutS, Value, WaitS
-from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, question
+from webots_mcp.questions.declaration import CHANGES, DESTROYS, Caller, question
 from webots_mcp.questions.show_pictures import show_end
 from webots_mcp.simulator.launch import SessionStart, WebotsLaunch, require_world
 from webots_mcp.simulator.orders import Order

@@ -24,13 +24,13 @@ from webots_mcp.answers.budget import (
 )
 from webots_mcp.answers.shortening import WHOLE, shorten
 from webots_mcp.questions.arguments import RobotName, RunId, TimeoutS, Value
-from webots_mcp.questions.declaring import READS, SETS, Caller, question
+from webots_mcp.questions.declaration import READS, SETS, Caller, question
 from webots_mcp.questions.send_command import (
     NO_BRIDGE,
 )
 from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
 from webots_mcp.steering.dispatch import Dispatcher, ProgressReport
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import RecordingAccess, RobotView
 from webots_mcp.store.run_parameters import COLUMNS, Declared, declared_by, described
 

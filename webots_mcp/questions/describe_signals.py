@@ -11,7 +11,7 @@ from webots_mcp.answers.answer_models import SignalMeaningsAnswer
 from webots_mcp.answers.budget import fitting, short_name, some, without_empty
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import LONGEST_NAME, AnyNames, RobotName
-from webots_mcp.questions.declaring import CHANGES, READS, question
+from webots_mcp.questions.declaration import CHANGES, READS, question
 from webots_mcp.signals.meaning import (
     DECLARED_WORDS,
     Meaning,

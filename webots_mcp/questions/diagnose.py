@@ -15,7 +15,7 @@ from webots_mcp.answers.shortening import (
     cut_text,
     tokens_in,
 )
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaration import READS, question
 from webots_mcp.setup.doctor import Checked, diagnose, subject_of, worst
 from webots_mcp.store.recording import RecordingAccess
 

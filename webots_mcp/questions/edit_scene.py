@@ -12,7 +12,7 @@ from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Cursor, RobotName
-from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, question
+from webots_mcp.questions.declaration import CHANGES, DESTROYS, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.loop_evidence import find_holder
 from webots_mcp.store.recording import RecordingAccess, view_robot

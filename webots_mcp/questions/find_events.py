@@ -25,7 +25,7 @@ from webots_mcp.questions.arguments import (
     TextCursor,
     TimeOfDay,
 )
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaration import READS, question
 from webots_mcp.store.reading.ranges import (
     USE_EVERY_ROW,
     Scope,

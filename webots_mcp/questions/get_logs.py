@@ -15,9 +15,8 @@ from webots_mcp.answers.shortening import cut_text, is_for_a_person
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.arguments import Cursor, EndS, Id, LastS, RobotName, StartS, TimeOfDay
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaration import READS, question
 from webots_mcp.simulator.console import console_state
-from webots_mcp.store.ages import wall_clock
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
     OF_CONSOLE,
@@ -31,6 +30,7 @@ from webots_mcp.store.logs import (
 )
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import RecordingAccess, RobotView
+from webots_mcp.store.relative_times import wall_clock
 from webots_mcp.store.robots import list_robots
 
 _ANY_LINE: Final = LogFilter(None, LogWindow(-math.inf, math.inf), "", "debug")

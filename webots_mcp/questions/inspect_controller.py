@@ -15,7 +15,7 @@ from webots_mcp.answers.budget import RESULT_BUDGET_TOKENS, fitting, header_of, 
 from webots_mcp.answers.shortening import cut_text, shorten
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Id, RobotName, RunId, TimeoutS
-from webots_mcp.questions.declaring import READS, SETS, Caller, question
+from webots_mcp.questions.declaration import READS, SETS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.inspections import Inspection, inspection_at, inspections_of
 from webots_mcp.store.recording import RecordingAccess, RobotView

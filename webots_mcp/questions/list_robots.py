@@ -31,7 +31,7 @@ from webots_mcp.contract import CUSTOM_DATA
 from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaration import READS, question
 from webots_mcp.store.loop_evidence import rows_waiting
 from webots_mcp.store.recording import (
     GETTING_STARTED,

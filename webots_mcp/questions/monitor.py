@@ -32,7 +32,7 @@ from webots_mcp.judging.detection.events import search_events
 from webots_mcp.judging.trends import RunTrends, trends
 from webots_mcp.judging.verdicts import Verdicts
 from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName
-from webots_mcp.questions.declaring import READS, Caller, question
+from webots_mcp.questions.declaration import READS, Caller, question
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import RecordingAccess, RobotView

@@ -19,7 +19,7 @@ from webots_mcp.answers.budget import LONGEST_NAME, fitting, header_of_only, roo
 from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import ShownLimit
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaration import READS, question
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.sql import (

@@ -5,7 +5,8 @@ The newest events and the health of the recorder belong to the full state.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, cast
 
@@ -37,9 +38,8 @@ from webots_mcp.answers.shortening import (
 from webots_mcp.contract import CUSTOM_DATA, INSPECTION_EVENT
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaration import READS, question
 from webots_mcp.questions.list_robots import BY_OBSERVER
-from webots_mcp.questions.sensor_values import sensor_part, unnamed_devices
 from webots_mcp.signals.naming import OBSERVED
 from webots_mcp.store.inspections import reference_to
 from webots_mcp.store.loop_evidence import rows_waiting
@@ -71,6 +71,16 @@ PageSize = Annotated[
         ge=1, le=2000, description="Maximum number of members, items or characters. Default 500."
     ),
 ]
+# Webots device classes that are not sensors.
+_NO_SENSORS: Final = (
+    "Brake", "Connector", "Display", "Emitter", "LED", "LinearMotor", "Motor", "Muscle", "Pen",
+    "Propeller", "RotationalMotor", "Skin", "Speaker", "Track", "VacuumGripper",
+)  # fmt: skip
+_WORDS: Final = (
+    "sensor", "lidar", "gps", "imu", "inertial", "compass", "gyro", "accel", "encoder", "touch",
+    "bumper", "distance", "range", "radar", "sonar", "light", "altimeter", "camera", "odometry",
+    "battery", "force", "contact", "scan",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -401,3 +411,48 @@ def _no_sensors(state: dict[str, Any]) -> str:
         "no member of the state is named after a sensor device or like a sensor; "
         "webots_get_robot_state shows the whole state"
     )
+
+
+def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:
+    """Return the members of a state that are named after a sensor, or contain a sensor's word."""
+    sensors = _sensor_devices(devices)
+    return {key: state[key] for key in state if key in sensors or _has_sensor_word(key)}
+
+
+def _sensor_devices(devices: dict[str, str]) -> dict[str, str]:
+    """Return the devices that are sensors: name to class."""
+    return {name: kind for name, kind in devices.items() if kind not in _NO_SENSORS}
+
+
+def unnamed_devices(state: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
+    """Return the sensor devices whose name is in no name of the published values.
+
+    The words of a name may be anywhere in a path: `front left`, `left_front` and `ds0` match
+    `front: {left: 1}` and `ds: [1]`.
+    """
+    published = [_words(path) for path in _paths(state)]
+    return {
+        name: kind
+        for name, kind in _sensor_devices(devices).items()
+        if not any(_words(name) <= words for words in published)
+    }
+
+
+def _has_sensor_word(key: str) -> bool:
+    return any(word in key.lower() for word in _WORDS)
+
+
+def _paths(value: Any, path: str = "") -> Iterator[str]:
+    """The path of each member at any depth, and of the first items of arrays."""
+    yield path
+    if isinstance(value, dict):
+        for key, member in cast("dict[str, Any]", value).items():
+            yield from _paths(member, f"{path}.{key}")
+    elif isinstance(value, list):
+        # Each item of an array may be a device.
+        for index, item in enumerate(cast("list[Any]", value)[:64]):
+            yield from _paths(item, f"{path}.{index}")
+
+
+def _words(name: str) -> set[str]:
+    return set(re.findall(r"[^\W\d_]+|\d+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()))

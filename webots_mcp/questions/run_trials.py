@@ -33,11 +33,11 @@ from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
 from webots_mcp.questions.controller_parameters import settable
-from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
+from webots_mcp.questions.declaration import DESTROYS, READS, Caller, question
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.parameter import require_known
 from webots_mcp.steering.run_command import ACTION, known_names, require_possible
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
 from webots_mcp.store.reading.segment import in_one_snapshot

@@ -28,7 +28,7 @@ from webots_mcp.answers.shortening import cut_text, is_for_a_person, shorten, to
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
 from webots_mcp.database.queue import QueuedCommand, list_commands
 from webots_mcp.questions.arguments import Cursor, Id, RobotName, TimeoutS
-from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
+from webots_mcp.questions.declaration import DESTROYS, READS, Caller, question
 from webots_mcp.steering.command_answer import shown_result
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import RecordingAccess, RobotView

@@ -24,7 +24,7 @@ from webots_mcp.contract import BreakpointAction
 from webots_mcp.database import stored_breakpoints as stored
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Id, RobotName
-from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.declaration import CHANGES, READS, Caller, question
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.run_command import holds_since

@@ -28,7 +28,7 @@ from webots_mcp.questions.arguments import (
     Seconds,
     TimeoutS,
 )
-from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.declaration import CHANGES, READS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.reading.segment import full_rate_segments, just_after

@@ -23,7 +23,7 @@ from mcp_types.version import MODERN_PROTOCOL_VERSIONS
 from pydantic import BaseModel
 
 from webots_mcp.errors import ConsentRequiredError, NotAllowedError
-from webots_mcp.questions.declaring import Reply
+from webots_mcp.questions.declaration import Reply
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import Consent, note_answer, recorded_arguments
 

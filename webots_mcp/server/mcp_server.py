@@ -37,16 +37,16 @@ from webots_mcp.database.session_cleanup import reap_if_dead
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.argument_errors import faults_of, shown_value
-from webots_mcp.questions.declaring import TIERS, Tier
+from webots_mcp.questions.declaration import TIERS, Tier
 from webots_mcp.questions.renamed_tools import current_call
-from webots_mcp.server.channel import CHANNEL_INSTRUCTIONS, Channel
-from webots_mcp.server.client_view import make_view, name_the_view
+from webots_mcp.server.channel_notifications import CHANNEL_INSTRUCTIONS, Channel
 from webots_mcp.server.connected_clients import ConnectedClients
-from webots_mcp.server.occurrences import OccurrenceReader
+from webots_mcp.server.mcp_app_view import make_view, name_the_view
+from webots_mcp.server.notable_events import OccurrenceReader
 from webots_mcp.server.prompts import add_prompts
+from webots_mcp.server.push_updates import UpdateWatch
 from webots_mcp.server.run_resources import Subscriptions, add_run_resources
 from webots_mcp.server.tools import tool_of
-from webots_mcp.server.updates import UpdateWatch
 from webots_mcp.signals.naming import perhaps_meant
 from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.launcher import Companions, Launcher

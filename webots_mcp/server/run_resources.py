@@ -27,11 +27,11 @@ from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import compact_json
 from webots_mcp.errors import NothingRecordedError, UnknownRunError, WebotsMCPError
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.declaring import Caller, Reply
+from webots_mcp.questions.declaration import Caller, Reply
 from webots_mcp.server.connected_clients import ConnectedClients, connection_of
-from webots_mcp.server.occurrences import IS_DATA, News
+from webots_mcp.server.notable_events import IS_DATA, News
+from webots_mcp.server.push_updates import UpdateWatch
 from webots_mcp.server.tools import requester_of
-from webots_mcp.server.updates import UpdateWatch
 from webots_mcp.store.recording import RecordingAccess
 
 REPORT_URI: Final = "webots://run/{run_id}/report"

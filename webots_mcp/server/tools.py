@@ -28,7 +28,7 @@ from mcp.types import (
 from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.declaration import Caller, Question, Reply
 from webots_mcp.server.consent import ask_with_consent
 from webots_mcp.server.tool_arguments import CheckedTool
 from webots_mcp.store.recording import RecordingAccess

@@ -49,6 +49,7 @@ LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is dec
 _LONGEST_UNIT: Final = 20  # characters
 _BAD_UNIT: Final = "signal {!r}: unit must be a text of up to {} characters, such as 'm/s', not {}"
 _REMEMBERED: Final = 4096  # names whose words are kept
+_ROBOTS_REMEMBERED: Final = 16  # lists of names whose meanings are kept
 
 # -- the words of names ------------------------------------------------------------------------
 
@@ -144,7 +145,6 @@ _CHOICES: Final[dict[str, tuple[str, ...]]] = {
 _DIRECTIONS: Final = frozenset(
     ("front", "rear", "left", "right", "center", "middle", "side", "sensor", "obstacle")
 )
-_DRIVING: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
 _NO_SPEED: Final = frozenset((
     "position", "angle", "tick", "distance", "torque", "force", "current", "power", "temperature",
     "radius", "base", "track", "width", "slip", "contact", "gain", "count", "voltage", "limit",
@@ -345,11 +345,14 @@ def meanings_by_name(
         kinds: The kind of each signal.
         register_roles: The roles of those that have one.
     """
-    names = frozenset(kinds)
-    return {
-        name: meaning_by_name(name, kind, register_roles.get(name), names)
-        for name, kind in kinds.items()
-    }
+    asked = tuple((name, kind, register_roles.get(name)) for name, kind in kinds.items())
+    return dict(_meanings_of_all(asked))
+
+
+@lru_cache(maxsize=_ROBOTS_REMEMBERED)  # a question about many runs asks of the same names
+def _meanings_of_all(asked: tuple[tuple[str, str, str | None], ...]) -> dict[str, Meaning]:
+    names = frozenset(name for name, _, _ in asked)
+    return {name: meaning_by_name(name, kind, role, names) for name, kind, role in asked}
 
 
 # -- meanings that only the values tell ----------------------------------------------------------
@@ -668,7 +671,12 @@ def _motion_in(
     """Which speed it is, of robot, wheel, motor or joint; None where it is no speed."""
     is_rate = unit in ("rad/s", "deg/s", "rpm")
     is_speed = bool(said & {"speed", "velocity"}) or unit in ("m/s", "cm/s", "mm/s", "km/h")
-    if not (is_rate or is_speed or base in _DRIVING or said & {"command", "motor", "wheel"}):
+    if not (
+        is_rate
+        or is_speed
+        or base in ("commanded_speed", "speed", "wheel", "commanded_wheel")
+        or said & {"command", "motor", "wheel"}
+    ):
         return None
     if said & _FREE_MOTORS:
         return "motor speed"

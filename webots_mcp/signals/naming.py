@@ -34,7 +34,6 @@ _UNITS: Final = {
 _LONGEST_UNIT: Final = 3  # words: m_per_s
 _ANGLES: Final = ("yaw", "heading", "theta", "bearing", "roll", "pitch")
 _ANGLES_IF_UNIT: Final = (*_ANGLES, "course")  # a course without a unit may be of anything
-_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 _KEPT: Final = 4096  # names whose units are remembered
 
 LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: lidar.117 is of no interest
@@ -97,9 +96,7 @@ NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x
 _OBEYED: Final = re.compile(
     r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f]|\r(?!\n)"
 )
-_BRACKETS: Final = re.compile(r"\[(\d+)\]")
 _LONGEST_PLACE: Final = 7  # digits of the place of an item
-_NO_WORD: Final = re.compile(r"\W+")
 _LONGEST_COMPARED: Final = 100  # characters of a name
 
 
@@ -115,7 +112,7 @@ def array_item(name: str) -> tuple[str, int] | None:
 
 def with_dots(name: str) -> str:
     """Return a name as signals are called: `pose[0]` as `pose.0`."""
-    return _BRACKETS.sub(r".\1", name)
+    return re.sub(r"\[(\d+)\]", r".\1", name)
 
 
 def flatten(state: dict[str, Any]) -> dict[str, Value]:
@@ -371,7 +368,7 @@ def misfit_of_parameters(
 
 def is_destructive(action: str) -> bool:
     """Return whether an action, command or option says by its name that it loses something."""
-    return not _DESTRUCTIVE.isdisjoint(words_of(_NO_WORD.sub("_", action)))
+    return not _DESTRUCTIVE.isdisjoint(words_of(re.sub(r"\W+", "_", action)))
 
 
 def harmless_first(action: str, known: Iterable[str]) -> list[str]:
@@ -442,7 +439,9 @@ def angle_unit(name: str) -> Literal["rad", "deg"] | None:
 @lru_cache(maxsize=_KEPT)
 def words_of(part: str) -> Sequence[str]:
     """The words of one part of a dotted name, in lower case: of `posX` and `pos_x` pos and x."""
-    return tuple(_HUMP.sub("_", part).lower().split("_"))
+    return tuple(
+        re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", part).lower().split("_")
+    )
 
 
 @lru_cache(maxsize=_KEPT)

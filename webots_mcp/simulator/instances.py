@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 DEFAULT_PORT: Final = 1234
 PORTS_TRIED: Final = 11  # Webots takes the next one where a port is taken, ten times
-# `webots` is a script that starts `webots-bin`, on Windows `webots` and `webotsw` start it.
-_PROGRAMS: Final = ("webots", "webots-bin", "webotsw")
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,8 @@ def _arguments(command_line: Sequence[str]) -> list[str] | None:
     """Return what a Webots was started with; None for any other program."""
     for at, word in enumerate(command_line[:2]):
         name = PurePath(word.replace("\\", "/")).name.lower().removesuffix(".exe")
-        if name in _PROGRAMS:
+        # `webots` is a script that starts `webots-bin`, on Windows `webots` and `webotsw` start it.
+        if name in ("webots", "webots-bin", "webotsw"):
             return list(command_line[at + 1 :])
         if not name.startswith(("sh", "bash", "dash", "zsh", "python")):
             return None

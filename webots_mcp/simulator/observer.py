@@ -32,10 +32,6 @@ from webots_mcp.simulator.observed_bodies import DIGITS, ObservedBodies, Observe
 
 PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
 LONGEST_PERIOD_MS: Final = 60_000
-_NOT_JUDGED: Final = (
-    "No event or check judges contacts. Webots reports none for bodies that sleep and for nested "
-    "robots: an empty list does not show that nothing touches."
-)
 _GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to come round
 
 
@@ -330,7 +326,10 @@ def _standing(node: Any, robot: Any) -> dict[str, Any]:
         return {
             "contacts": [_contact(contact, robot) for contact in contacts[:30]],
             "contacts_in_all": len(contacts),
-            "contacts_note": _NOT_JUDGED,
+            "contacts_note": (
+                "No event or check judges contacts. Webots reports none for bodies that sleep "
+                "and for nested robots: an empty list does not show that nothing touches."
+            ),
             "center_of_mass_m": [round(float(value), DIGITS) for value in node.getCenterOfMass()],
             "is_balanced": bool(node.getStaticBalance()),
         }

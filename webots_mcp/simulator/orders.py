@@ -33,7 +33,6 @@ _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "reset": ("reset", ("reset finished",)),
     "reload": ("reload", ("delete world", "loading:", "world:", "scene load completed")),
 }
-_SAID_TO_ALL: Final = ("stdout:", "stderr:", "robot")  # also without --stream
 RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
 
 
@@ -207,7 +206,8 @@ def _give(
             line = message.text.partition("\n")[0][:200] if message else ""
             if message and line.startswith(answers):
                 return OrderReply(line, is_alive=True)
-            if message and not line.startswith(_SAID_TO_ALL):
+            # also without --stream
+            if message and not line.startswith(("stdout:", "stderr:", "robot")):
                 other = other or line[:60]
             if pong.is_set() and not is_alive:
                 is_alive = True

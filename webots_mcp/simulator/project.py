@@ -26,7 +26,6 @@ _PYTHON: Final = "Python"
 _WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
 # By language: how the files of a controller end that are built before Webots starts it.
 _SOURCES: Final = {"C": (".c",), "C++": (".cpp", ".cc", ".cxx"), "Java": (".java",)}
-_ALL_SOURCES: Final = (".c", ".cpp", ".cc", ".cxx", ".java", ".m", ".h", ".hpp", ".hh")
 _CALLS: Final = {
     "C": 'wb_robot_set_custom_data("{...}")',
     "C++": 'robot->setCustomData("{...}")',
@@ -148,7 +147,11 @@ def has_bridge(controller: Path) -> bool:
 def writes_states(controller: ProjectController) -> bool:
     """Return whether a controller in another language records: by our header, or customData."""
     folder = controller.file.parent
-    files = [each for each in folder.rglob("*.*") if each.suffix in _ALL_SOURCES]
+    files = [
+        each
+        for each in folder.rglob("*.*")
+        if each.suffix in (".c", ".cpp", ".cc", ".cxx", ".java", ".m", ".h", ".hpp", ".hh")
+    ]
     return any(
         re.search(rb"webots_mcp\.h|setCustomData|wb_robot_set_custom_data", each.read_bytes())
         for each in files

@@ -33,11 +33,11 @@ from webots_mcp.steering.run_command import (
     params_of,
     result_of,
 )
-from webots_mcp.store.ages import ago
 from webots_mcp.store.loop_evidence import handler_at_work
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import RobotView
+from webots_mcp.store.relative_times import ago
 from webots_mcp.store.robot_status import PRESS_PLAY, find_block
 from webots_mcp.store.run_rows import state_at
 

@@ -22,7 +22,7 @@ from webots_mcp.contract import LOOPING
 from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command
 from webots_mcp.steering.command_answer import command_answer, correct_mode
 from webots_mcp.steering.run_command import ACTION, describe_progress
-from webots_mcp.steering.target import find_target, require_parameters
+from webots_mcp.steering.target_robot import find_target, require_parameters
 from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robot_status import BlockedLoop, find_block

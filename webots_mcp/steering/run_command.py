@@ -21,7 +21,7 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.signals.conditions import Condition, parse_condition
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.recording import RecordingAccess, RobotView

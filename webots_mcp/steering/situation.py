@@ -19,7 +19,7 @@ from webots_mcp.errors import (
 from webots_mcp.simulator.instances import Instance, instance_at, instances
 from webots_mcp.simulator.orders import Order, WebotsAddress, address_of
 from webots_mcp.simulator.own_webots import belongs
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.loop_evidence import find_holder
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.robots import list_robots, live_observer

@@ -31,7 +31,6 @@ _KINDS: Final[dict[str, Any]] = {
     "ranges": dict, "sets": int, "seed": int, _GRID: dict,
 }  # fmt: skip
 _WRITTEN: Final = {_GRID: "[grid]", "parameters": "[[parameters]]", "ranges": "[ranges]"}
-_HOW_MANY: Final = "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or [ranges] to search"
 
 
 @dataclass(frozen=True)
@@ -226,7 +225,10 @@ def stored_plan(text: str) -> TrialPlan:
 def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> WorldPlan:
     _require_kinds(found, _KINDS)
     if len(given := [_WRITTEN[name] for name in _WRITTEN if name in found]) != 1:
-        raise InvalidInputError(_HOW_MANY + (f", not {' and '.join(given)}" if given else ""))
+        raise InvalidInputError(
+            "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or [ranges] to search"
+            + (f", not {' and '.join(given)}" if given else "")
+        )
     if _GRID in found:
         found = found | {"parameters": combinations(found[_GRID], "[grid] ")}
     found = {name: value for name, value in found.items() if name != _GRID}

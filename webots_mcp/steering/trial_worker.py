@@ -22,7 +22,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostE
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, withdraw_if_blocked
 from webots_mcp.steering.run_command import ACTION
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.trial_plan import TrialPlan, stored_plan
 from webots_mcp.store.recording import Job, RecordingAccess, RobotView
 from webots_mcp.store.requests import permit

@@ -198,13 +198,14 @@ def _decode_coded(encoded: EncodedChunk, rows: int) -> Decoded:
     if len(short) != rows or short.max(initial=0) >= len(labels) + FIRST_LABEL:
         raise DamagedChunkError("damaged: its codes are not those of its rows")
     flags = [each if isinstance(each, bool) else math.nan for each in labels]
-    numbers: Array = np.array([math.nan, math.nan, *flags])[short]
+    of_codes: Array = np.array([math.nan, math.nan, *flags], np.float64)
+    codes: Indexes = short.astype(np.intp)
+    numbers: Array = of_codes[codes]
     held = short == IS_NUMBER
     if held.any():
         found = np.empty(int(np.count_nonzero(held)))
         _decompress(encoded, found)
         numbers[held] = found
-    codes: Indexes = short.astype(np.intp)
     return Decoded(numbers, codes, labels, encoded.codec == _INTEGERS)
 
 
@@ -567,6 +568,28 @@ def statistics_by_signal(
     return {signal_id: Statistics(*figures) for signal_id, *figures in rows}
 
 
+def chunks_by_signal(
+    connection: sqlite3.Connection, run_id: int, group_id: int
+) -> dict[int, EncodedChunk]:
+    """Return the chunks of all signals, times and ids in one group of a run, by their ids."""
+    rows = connection.execute(
+        "SELECT signal_id, codec, numbers, codes, labels FROM chunk "
+        "WHERE +run_id = ? AND group_id = ?",
+        (run_id, group_id),
+    ).fetchall()
+    return {signal_id: EncodedChunk(*stored) for signal_id, *stored in rows}
+
+
+def decoded_or_why(
+    encoded: EncodedChunk, rows: int, into: Array | None
+) -> Decoded | DamagedChunkError:
+    """As `decode`; of a chunk that cannot be read return the error that says why."""
+    try:
+        return decode(encoded, rows, into)
+    except DamagedChunkError as error:
+        return error
+
+
 def values_in(
     connection: sqlite3.Connection,
     run_id: int,
@@ -600,10 +623,7 @@ def values_in(
         rows = wanted.get(group_id)
         if rows is None:
             continue
-        try:
-            yield group_id, decode(EncodedChunk(*stored), rows, into.get(group_id))
-        except DamagedChunkError as error:
-            yield group_id, error
+        yield group_id, decoded_or_why(EncodedChunk(*stored), rows, into.get(group_id))
 
 
 # Chunks of a recording that is not to be written: in a temporary file of this process, made once.

@@ -86,18 +86,6 @@ _KNOWN: Final = (
     "LIMIT 1), (SELECT uuid FROM run WHERE session_id = session.id ORDER BY id DESC LIMIT 1) "
     "FROM session WHERE uuid = ?"
 )
-_SEEN_SESSION: Final = (
-    "UPDATE session SET last_seen_wall_time_s = max(last_seen_wall_time_s, :wall), "
-    "ended_wall_time_s = max(ended_wall_time_s, :wall) WHERE id = :session"
-)
-# Rows of a run that has ended came late: it was ended as its process was found gone.
-_SEEN_RUN: Final = (
-    "UPDATE run SET last_wall_time_s = max(last_wall_time_s, :wall), "
-    "last_sim_time_s = max(last_sim_time_s, :sim), "
-    "ended_wall_time_s = max(ended_wall_time_s, :wall), "
-    "row_count = CASE WHEN ended_wall_time_s IS NULL THEN row_count + :rows ELSE "
-    "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE uuid = :run"
-)
 
 
 @dataclass(frozen=True)
@@ -440,8 +428,20 @@ class _Reading:
         """Write when runs were seen last and how many rows they have, and which runs ended."""
         for run, (sim, wall, rows) in runs.items():
             values = {"run": run, "sim": sim, "wall": wall, "rows": rows, "session": session_id}
-            self.connection.execute(_SEEN_RUN, values)
-            self.connection.execute(_SEEN_SESSION, values)
+            # Rows of a run that has ended came late: it was ended as its process was found gone.
+            self.connection.execute(
+                "UPDATE run SET last_wall_time_s = max(last_wall_time_s, :wall), last_sim_time_s "
+                "= max(last_sim_time_s, :sim), ended_wall_time_s = max(ended_wall_time_s, "
+                ":wall), row_count = CASE WHEN ended_wall_time_s IS NULL THEN row_count + :rows "
+                "ELSE purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE "
+                "uuid = :run",
+                values,
+            )
+            self.connection.execute(
+                "UPDATE session SET last_seen_wall_time_s = max(last_seen_wall_time_s, :wall), "
+                "ended_wall_time_s = max(ended_wall_time_s, :wall) WHERE id = :session",
+                values,
+            )
         if begun := ends.get("run"):
             session_cleanup.end_runs(self.connection, session_id, "reset", begun["uuid"])
         if end := ends.get("session end"):

@@ -33,6 +33,21 @@ _SETTLED_S: Final = "t.finished_wall_time_s"
 MOST_WAITING: Final = 500  # of one Webots; the newest are kept
 _NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
 _CONSOLE_COLUMNS: Final = "wall_time_s, level, source, message, logger"
+_RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
+_SAYING: Final = (
+    "(:text = '' OR instr(lower(message), :text) > 0) "
+    "AND (:source IS NULL OR source = :source) "
+    f"AND CASE level {_RANKS} ELSE {LOG_LEVELS.index('error')} END >= :lowest"
+)
+_MATCHING: Final = (
+    "AND sim_time_s >= :start_s AND sim_time_s < :end_s "
+    f"AND (:before_id IS NULL OR id < :before_id) AND {_SAYING}"
+)
+_BESIDE_ROBOT: Final = (
+    "FROM log WHERE (+run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) OR "
+    + _CONSOLE_OF.format(f"SELECT id FROM run WHERE session_id IN ({_COMPANIONS})")
+    + f") {_MATCHING}"
+)
 
 
 @dataclass(frozen=True)
@@ -65,23 +80,6 @@ class ConsoleLimits:
 
 
 _CONSOLE: Final = ConsoleLimits()
-
-
-_RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
-_SAYING: Final = (
-    "(:text = '' OR instr(lower(message), :text) > 0) "
-    "AND (:source IS NULL OR source = :source) "
-    f"AND CASE level {_RANKS} ELSE {LOG_LEVELS.index('error')} END >= :lowest"
-)
-_MATCHING: Final = (
-    "AND sim_time_s >= :start_s AND sim_time_s < :end_s "
-    f"AND (:before_id IS NULL OR id < :before_id) AND {_SAYING}"
-)
-_BESIDE_ROBOT: Final = (
-    "FROM log WHERE (+run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) OR "
-    + _CONSOLE_OF.format(f"SELECT id FROM run WHERE session_id IN ({_COMPANIONS})")
-    + f") {_MATCHING}"
-)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,14 @@ from webots_mcp.database.processes import (
     is_stopped,
     signal_process,
 )
-from webots_mcp.database.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
+from webots_mcp.database.thread_stacks import (
+    LOGGER,
+    SIGNAL,
+    Stacks,
+    needs_signal,
+    stacks_at,
+    stacks_path,
+)
 from webots_mcp.database.waiting_file import (
     WaitingEntry,
     count_rows,

@@ -24,6 +24,13 @@ from webots_mcp.database.connection import FrozenConnection, connect
 from webots_mcp.database.files import PRIVATE_FILE, make_folder, whole_file
 from webots_mcp.database.schema import create_schema, require_shipped
 from webots_mcp.database.session_cleanup import end_session, reap
+from webots_mcp.database.tapes.tape import (
+    MAX_TAPE_BYTES,
+    TAPE_ENDING,
+    is_tape,
+    tape_file,
+    tape_files,
+)
 from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
@@ -77,18 +84,6 @@ _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError
 _MOST_IDS: Final = 2**40
 _NEWEST_HERE: Final = "SELECT coalesce(max(id), 0) FROM main.state"
 _RESERVED_HERE: Final = "SELECT coalesce(max(reserved_state_id), 0) FROM main.recording"
-_SIGNALS: Final = (
-    "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
-    "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} "
-    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id"
-)
-_FILL_MAP: Final = (
-    "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
-    "ON n.robot_id = :here AND n.name = s.name "
-    "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})"
-)
 _GROUP: Final = (
     "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, lost_value_count, "
     "stored_row_bytes, chunk_bytes, "
@@ -106,6 +101,7 @@ def merge(
     run_id: int | None = None,
     address: str | None = None,
     pictures: Path | None = None,
+    is_export: bool = False,
 ) -> dict[str, int]:
     """Take in all sessions of a recording that is over, and its trial sets; or one run of it.
 
@@ -116,6 +112,7 @@ def merge(
         run_id: Only this run, which has to be over, with its session, commands and trials.
         address: How SQLite is to open it, where its path is not enough.
         pictures: The folder of its pictures; None for the one that it lies in.
+        is_export: Whether a bundle is made of it, and nothing comes from elsewhere.
 
     Returns:
         By their UUIDs, the ids that its runs have here.
@@ -144,6 +141,7 @@ def merge(
                 continue
             for run, run_uuid in runs:
                 _copy_pictures(connection, data_dir, pictures or source.parent, run, run_uuid)
+            _copy_tape(data_dir, pictures or source.parent, str(uuid), imported=not is_export)
             with transaction(connection):
                 _ingest_run_rows(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
@@ -458,6 +456,18 @@ def _copy_pictures(
             shutil.copyfile(file, aside)
 
 
+def _copy_tape(data_dir: Path, source_dir: Path, session_uuid: str, *, imported: bool) -> None:
+    """Copy the tape of a session, which has all its runs; one that is there is the same."""
+    found = (each for each in tape_files(source_dir, session_uuid) if each.is_file())
+    file = next((each for each in found if not each.is_symlink()), None)
+    target = tape_file(data_dir, session_uuid, imported=imported)
+    if file is None or any(each.exists() for each in tape_files(data_dir, session_uuid)):
+        return
+    make_folder(target.parent)
+    with whole_file(target) as aside:
+        shutil.copyfile(file, aside)
+
+
 def _copy_image_rows(connection: sqlite3.Connection, run_id: int, run: int, run_uuid: str) -> None:
     for image_id, path, _ in _images(connection, "r.id = ?", run_id):
         own = {"run_id": run, "path": _path_here(path, run_uuid)}
@@ -495,7 +505,10 @@ def write_bundle(
         with small_recording(folder) as writer:
             frozen = "&immutable=1" if isinstance(connection, FrozenConnection) else ""
             address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
-            merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
+            merge(
+                writer, folder, database,
+                run_id=run_id, address=address, pictures=data_dir, is_export=True,
+            )  # fmt: skip
             writer.execute(END_SESSIONS)
         pack(folder, file, progress)
 
@@ -523,8 +536,8 @@ def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         for each in found:
             entry = zipfile.ZipInfo.from_file(each, each.relative_to(folder).as_posix())
-            is_picture = each.suffix.lower() in PICTURES  # is compressed already
-            entry.compress_type = zipfile.ZIP_STORED if is_picture else zipfile.ZIP_DEFLATED
+            is_compressed = each.suffix.lower() in (*PICTURES, TAPE_ENDING)
+            entry.compress_type = zipfile.ZIP_STORED if is_compressed else zipfile.ZIP_DEFLATED
             with each.open("rb") as source, archive.open(entry, "w") as target:
                 while piece := source.read(_PIECE_BYTES):
                     target.write(piece)
@@ -534,7 +547,8 @@ def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
 
 
 def _is_packed(path: Path) -> bool:
-    return str(path) == DATABASE_NAME or (len(path.parts) > 1 and path.suffix.lower() in PICTURES)
+    is_picture = len(path.parts) > 1 and path.suffix.lower() in PICTURES
+    return str(path) == DATABASE_NAME or is_picture or is_tape(path)
 
 
 def is_bundle(file: Path) -> bool:
@@ -608,7 +622,8 @@ def _is_ours(entry: zipfile.ZipInfo) -> bool:
         return not _is_link(entry)
     plain = not path.is_absolute() and ".." not in path.parts and len(path.parts) > 1
     named = plain and not any(sign in entry.filename for sign in "\\:\0")
-    fits = path.suffix.lower() in PICTURES and entry.file_size <= MAX_FILE_BYTES
+    is_picture = path.suffix.lower() in PICTURES and entry.file_size <= MAX_FILE_BYTES
+    fits = is_picture or (is_tape(path) and entry.file_size <= MAX_TAPE_BYTES)
     return named and fits and not _is_link(entry)
 
 
@@ -666,14 +681,26 @@ def _ingest_signals(connection: sqlite3.Connection, there: int, robot_id: int) -
     asked = {"run": there, "here": robot_id}
     seen = {
         name: Seen(path, reduction, kind, (role or "").startswith("mode"), first_s)
-        for name, path, reduction, kind, role, first_s in connection.execute(_SIGNALS, asked)
+        for name, path, reduction, kind, role, first_s in connection.execute(
+            "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
+            "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+            f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} AND EXISTS (SELECT 1 "
+            "FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id",
+            asked,
+        )
     }
     enter_signals(connection, robot_id, seen)
     connection.execute(
         "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
     )
     connection.execute("DELETE FROM temp.signal_here")
-    connection.execute(_FILL_MAP, asked)
+    connection.execute(
+        "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
+        "ON n.robot_id = :here AND n.name = s.name "
+        "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+        f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})",
+        asked,
+    )
 
 
 def _ingest_state_ids(connection: sqlite3.Connection, values: dict[str, Any], rows: int) -> None:

@@ -82,9 +82,10 @@ class Recording(SQLModel, table=True):
     )
 
 
-class Robot(SQLModel, table=True):
+class RobotTable(SQLModel, table=True):
     """A robot name that was ever seen."""
 
+    __tablename__: ClassVar[Any] = "robot"
     __table_args__ = (_KEEP_IDS,)
     id: int | None = _id()
     name: str = _text(
@@ -338,8 +339,10 @@ class ConsoleLine(SQLModel, table=True):
     logger: str | None = _text("stdout or stderr")
 
 
-class Event(SQLModel, table=True):
+class EventTable(SQLModel, table=True):
     """Something noticed when it happened."""
+
+    __tablename__: ClassVar[Any] = "event"
 
     __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
     id: int | None = _id()
@@ -495,8 +498,10 @@ class Image(SQLModel, table=True):
     size_bytes: int = _column(Integer, "of the file", nullable=False)
 
 
-class Parameter(SQLModel, table=True):
+class ParameterTable(SQLModel, table=True):
     """A parameter as a robot's controller declared it last."""
+
+    __tablename__: ClassVar[Any] = "parameter"
 
     __table_args__ = (UniqueConstraint("robot_id", "name"), _KEEP_IDS)
     id: int | None = _id()

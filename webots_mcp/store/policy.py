@@ -41,6 +41,7 @@ from webots_mcp.store.project_file import load_toml
 
 ALLOW: Final = "allow"
 LAUNCH: Final = "launch"  # stands for an action where Webots is started
+RERUN: Final = "rerun"  # stands for an action where a controller's code is run on an old run
 # The tools and commands that do an action: a rule for one of them holds for it by every route. What
 # sends no such action (webots_breakpoint, webots_report, ...) is checked by its name alone.
 TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -54,6 +55,7 @@ TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "run": ("webots_run",),
     "cancel_run": (),  # by which nothing is done
     LAUNCH: ("webots_launch_world", "launch"),
+    RERUN: ("webots_rerun_controller", RERUN),
     "load_world": ("webots_launch_world", "webots_load_world"),
     "quit": ("webots_launch_world", "webots_quit"),
     "screenshot": ("webots_take_screenshot",),
@@ -75,6 +77,7 @@ ANY_ACTION: Final = (
 _PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
 ASKS: Final = "ask"
 _HOLDS_FOR: Final = ("everyone", "assistants")
+_OTHER_KEYS: Final = ("expect", "signals", "inspect", "tape")  # which others read
 _KEYS: Final = (*_PATTERNS, "parameters", LAUNCH, "holds_for")
 _ASK: Final = (
     "Do not look for another way to the same: the person whose project it is can change that line, "
@@ -307,6 +310,11 @@ def policies_of(database: Database, data_dir: Path, files: Iterable[str]) -> Ite
             yield policy
 
 
+def is_named(policies: Iterable[Policy], action: str) -> bool:
+    """Return whether a file allows an action by its name, and not by a pattern."""
+    return any(action in policy.allow.get("actions", ()) for policy in policies)
+
+
 def read_policy(file: Path) -> Policy | None:
     """What a project's file allows; None where it has no such table.
 
@@ -315,9 +323,9 @@ def read_policy(file: Path) -> Policy | None:
     """
     try:
         text, content = load_toml(file)
-        if unknown := sorted(set(content) - {ALLOW, "expect", "signals"}):
+        if unknown := sorted(set(content) - {ALLOW, *_OTHER_KEYS}):
             raise InvalidInputError(
-                f"{file}: unknown table {unknown[0]!r}. Tables: allow, expect, signals"
+                f"{file}: unknown table {unknown[0]!r}. Tables: allow, expect, signals, inspect"
             )
         if ALLOW not in content:
             return None

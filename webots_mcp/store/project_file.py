@@ -2,6 +2,8 @@
 
 Both are compiled into the database.
 
+    tape = true                    # record each call of Webots' API; "images" with the pictures
+
     [[expect]]
     name = "keeps its distance"
     condition = "front_m > 0.1"
@@ -15,7 +17,7 @@ Both are compiled into the database.
     u = {quantity = "speed", role = "commanded", unit = "m/s"}
 
 Bridges read expectations from there, with each run. A file that is invalid changes nothing.
-`policy` reads its table `[allow]`.
+`policy` reads its table `[allow]`, and the bridge the line `tape` at its top.
 """
 
 from __future__ import annotations
@@ -84,6 +86,8 @@ def read_project(file: Path) -> ProjectFile:
     content.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
     check_table(file, content.pop(TABLE, {}))  # which bridges read themselves
     signals = content.pop("signals", {})
+    if (tape := content.pop("tape", False)) not in (True, False, "images"):
+        raise InvalidInputError(f'{file}: tape must be true, false or "images", not {tape!r:.80}')
     entries: list[Any] = content.pop("expect", [])
     is_list = type(entries) is list and all(type(each) is dict for each in entries)
     if content or not is_list:
@@ -91,7 +95,8 @@ def read_project(file: Path) -> ProjectFile:
             f"{next(iter(content))!r} is unknown" if content else "'expect' is no list of tables"
         )
         raise InvalidInputError(
-            f"{file}: {found}; it holds tables [[expect]], [signals], [inspect] and [allow]"
+            f"{file}: {found}; it holds tables [[expect]], [signals], [inspect] and [allow], "
+            "and a line tape = true"
         )
     tables = cast("list[dict[str, Any]]", entries)
     if len(tables) > MAX_BREAKPOINTS:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import KEPT_FRAME
+from webots_mcp.database.tapes.tape import tape_files
 from webots_mcp.database.transactions import LONGEST_WRITE_S, AtomicStatements, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks, remake_if_damaged
@@ -68,6 +69,10 @@ _PATHS: Final = {  # of the pictures that go with rows
     "image": "SELECT path FROM image WHERE id IN (SELECT id FROM temp.going)",
     "run": "SELECT path FROM image WHERE run_id IN (SELECT id FROM temp.going)",
 }
+_TAPES: Final = (  # of the sessions that may go with runs
+    "SELECT DISTINCT s.uuid FROM session s JOIN run r ON r.session_id = s.id "
+    "WHERE r.id IN (SELECT id FROM temp.going)"
+)
 INTERVAL_S: Final = 60.0  # between two checks; one of ten million rows takes about a second
 BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
 
@@ -116,7 +121,7 @@ class Purged:
 
     Attributes:
         rows: By table.
-        files: Pictures.
+        files: Pictures and tapes.
         freed_bytes: Given back by the database file (it shrinks with the next checkpoint).
         problems: Files that could not be deleted, and why.
         held_s: How long the last transaction held the write lock.
@@ -351,6 +356,7 @@ class _Purge:
         self._connection.execute("DELETE FROM going")
         self._connection.executemany("INSERT INTO going VALUES (?, ?)", some)
         paths = self._connection.execute(_PATHS[table]).fetchall() if table in _PATHS else []
+        taped = self._connection.execute(_TAPES).fetchall() if table == "run" else []
         started_s = time.perf_counter()
         _STEPS[table].run(self._connection, group_id)
         held_s = time.perf_counter() - started_s
@@ -361,6 +367,11 @@ class _Purge:
         for (path,) in paths:
             if not self._first("SELECT 1 FROM image WHERE path = ? LIMIT 1", path):
                 self._delete_file(path)
+        for (uuid,) in taped:
+            if self._first("SELECT 1 FROM session WHERE uuid = ?", uuid):
+                continue
+            for file in filter(Path.exists, tape_files(self._data_dir, str(uuid))):
+                self._delete_file(file.relative_to(self._data_dir).as_posix())
         return len(some)
 
     def _delete_file(self, path: str) -> None:

@@ -47,7 +47,6 @@ from webots_mcp.errors import (
     NothingRecordedError,
 )
 from webots_mcp.signals.naming import counted
-from webots_mcp.store.ages import LONG_AGO_S, utc
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.journal_intake import (
@@ -60,6 +59,7 @@ from webots_mcp.store.journal_intake import (
 from webots_mcp.store.loop_evidence import ask_stuck
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
+from webots_mcp.store.relative_times import LONG_AGO_S, utc
 from webots_mcp.store.retention_limits import Asked
 from webots_mcp.store.robot_status import Status, decide_status, stopped_for
 from webots_mcp.store.robots import RobotRecord, console_trouble

@@ -25,7 +25,6 @@ from webots_mcp.database.pauses import (
     breakpoint_at,
 )
 from webots_mcp.database.processes import is_stopped
-from webots_mcp.store.ages import age_in_words, ago
 from webots_mcp.store.loop_evidence import (
     change_since_heartbeat,
     find_backlog,
@@ -41,6 +40,7 @@ from webots_mcp.store.loop_evidence import (
     seen_by_observer,
     usual_step_s,
 )
+from webots_mcp.store.relative_times import age_in_words, ago
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.run_rows import (
     RunRecord,

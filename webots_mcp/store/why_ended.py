@@ -11,7 +11,7 @@ from typing import Final
 
 from webots_mcp.contract import CUSTOM_DATA, ENDED_BY, UNSEEN
 from webots_mcp.database.session_cleanup import EXTERN
-from webots_mcp.database.stacks import LOGGER, stacks_at, stacks_path
+from webots_mcp.database.thread_stacks import LOGGER, stacks_at, stacks_path
 from webots_mcp.store.loop_evidence import file_of_session
 from webots_mcp.store.sessions import SessionRecord
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         SimulationFactory,
     )
     from webots_mcp.testing.robot_recording import RobotRecording
+    from webots_mcp.testing.same_commands import assert_same_commands
 
 __all__ = [
     "RecordedCommand",
@@ -29,10 +30,13 @@ __all__ = [
     "RobotFactory",
     "RobotRecording",
     "SimulationFactory",
+    "assert_same_commands",
 ]
 
-_MODULES = {"RecordedCommand": "recorded_command", "RecordedSignal": "recorded_signal",
-            "RobotRecording": "robot_recording"}  # fmt: skip
+_MODULES = {
+    "RecordedCommand": "recorded_command", "RecordedSignal": "recorded_signal",
+    "RobotRecording": "robot_recording", "assert_same_commands": "same_commands",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

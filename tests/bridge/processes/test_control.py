@@ -16,7 +16,7 @@ from webots_mcp.database.connection import connect
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import view_robot
 
 LOOP = """

@@ -16,7 +16,7 @@ from tests.bridge.processes.conftest import PatientSimulation, Start, has_states
 from tests.setup.doctor.conftest import found
 from webots_mcp.contract import HANG_VARIABLE
 from webots_mcp.database.connection import connect
-from webots_mcp.database.stacks import stacks_path
+from webots_mcp.database.thread_stacks import stacks_path
 from webots_mcp.database.waiting_file import adopt, waiting_paths
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD

@@ -19,7 +19,7 @@ from tests.judging.detection.measuring import measure
 from tests.judging.detection.writing import write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
-from webots_mcp.analysis.swings import MUCH_SLOWER
+from webots_mcp.analysis.oscillations import DECIDE
 from webots_mcp.judging.detection import standstill
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
@@ -57,7 +57,7 @@ def test_an_answer_keeps_to_the_recording_and_tells_nothing_twice(kind: str, see
         if (before.source, before.run_id) == (after.source, after.run_id):
             slower = max(before.period_s or 1, after.period_s or 1)
             faster = min(before.period_s or 1, after.period_s or 1)
-            assert before.end_s <= after.start_s or slower > MUCH_SLOWER * faster
+            assert before.end_s <= after.start_s or slower > DECIDE.much_slower * faster
 
 
 STANDING = EventOptions(kinds=("standstill", "stuck"))

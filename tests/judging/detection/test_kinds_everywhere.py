@@ -19,7 +19,7 @@ from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_kinds import KINDS, drawn_kinds
 from webots_mcp.plotting.canvas import Sheet
-from webots_mcp.plotting.on_a_page import signals_figure
+from webots_mcp.plotting.interactive_svg import signals_figure
 from webots_mcp.plotting.signal_plot import compose_signals, plot_signals
 from webots_mcp.plugins.report.chapter import chapter_of
 from webots_mcp.store.reading.ranges import Scope, find_range

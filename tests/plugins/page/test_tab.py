@@ -15,8 +15,8 @@ from tests.recordings.long import build
 from tests.waiting import wait_for
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
-from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.page_data import draw, page_request
+from webots_mcp.plugins.page.page_server import ChunkMaker
 from webots_mcp.store.chunk_making import MIN_ROWS_ON_DEMAND
 from webots_mcp.store.chunks import watermark
 from webots_mcp.store.recording import RecordingAccess

@@ -12,7 +12,7 @@ import pytest
 
 from tests.browsing import chromium
 from webots_mcp.database.connection import connect
-from webots_mcp.plugins.report.making import Report, make_report
+from webots_mcp.plugins.report.make_report import Report, make_report
 
 __all__ = ["chromium"]
 

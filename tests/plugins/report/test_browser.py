@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.plugins.report.making import Report
+from webots_mcp.plugins.report.make_report import Report
 
 pytestmark = pytest.mark.slow
 DRAWN = "() => [...document.querySelectorAll('[data-figure]')].every(each => each.figure)"

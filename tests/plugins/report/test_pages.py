@@ -24,8 +24,8 @@ from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.run_measures import Measure
 from webots_mcp.judging.verdicts import Outcome
-from webots_mcp.plugins.report.making import Report, make_report
-from webots_mcp.plugins.report.opening import most_important
+from webots_mcp.plugins.report.chapter_opening import most_important
+from webots_mcp.plugins.report.make_report import Report, make_report
 from webots_mcp.plugins.report.run_comparison import verdict_of, with_repeats
 from webots_mcp.plugins.report.words import cut, describe_event, length, number
 
@@ -203,7 +203,7 @@ def test_a_fall_is_shown_with_the_signals_it_is_judged_by(
     html = make_report(recorded.connection, [robot.run_id], tmp_path).html
     text = Shown(html).text
     assert re.search(r"Failed rover ran for 30 s and its controller finished\. Fell once", text)
-    assert "Fell: tilted by 90°, stayed down" in text
+    assert "Fell: tilted by 90° (right), stayed down" in text
     figure = html.decode().split("Fall at ")[1].split("</script>")[0]
     assert '"name":"roll"' in figure
     assert '"name":"pose.x"' not in figure

@@ -15,7 +15,7 @@ from webots_mcp.errors import CommandRefusedError
 from webots_mcp.questions.list_robots import webots_get_world_info
 from webots_mcp.setup.doctor import all_checks, diagnose, subject_of
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import RecordingAccess
 
 WORLD = """#VRML_SIM R2025a utf8

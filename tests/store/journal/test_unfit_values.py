@@ -291,3 +291,16 @@ def test_the_database_stays_readable_by_name_of_a_state_with_many_levels(tmp_pat
     assert found == (2,)  # the last name ends in a dot, and stays whole
     require_counted(tmp_path, 1)
     assert main(["state", "--data-dir", str(tmp_path), "--json"]) in (0, 2)
+
+
+def test_a_journal_without_a_process_belongs_to_none_and_names_its_controller(
+    tmp_path: Path,
+) -> None:
+    controller = tmp_path / "rover.c"
+    controller.write_text("int main() {}")
+    session = HEADER["session"] | {"pid": None, "controller": str(controller)}
+    header = HEADER | {"session": session}
+    ingest(tmp_path, json.dumps(header), f'[1,"run",null,{json.dumps(RUN_VALUES)}]', state(2))
+    found = query(tmp_path, "SELECT pid, controller, extern FROM session")
+    assert found == [(0, str(controller), 0)]
+    assert numbers(tmp_path) == [2]

@@ -329,7 +329,7 @@ def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() 
     asking = {name for name, source in functions.items() if "permit(" in source}
     own = {name for name in functions if name.startswith(("testing.py", "queue.py"))}
     assert functions.keys() - asking - own == free, "who does it without asking?"
-    assert {"dispatch.py:_enqueue", "launcher.py:begin", "serving.py:launch"} <= asking
+    assert {"dispatch.py:_enqueue", "launcher.py:begin", "server_commands.py:launch"} <= asking
 
 
 async def test_texts_of_a_recording_come_marked_as_data_once_in_an_answer(

@@ -19,7 +19,7 @@ from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.plugins.page.page_orders import steer, tune
 from webots_mcp.plugins.page.page_server import ORDERS
 from webots_mcp.questions import all_questions
-from webots_mcp.store.policy import LAUNCH, TOOLS_OF_ACTIONS
+from webots_mcp.store.policy import LAUNCH, RERUN, TOOLS_OF_ACTIONS
 from webots_mcp.store.recording import RecordingAccess
 
 pytestmark = [pytest.mark.anyio, pytest.mark.usefixtures("robot")]
@@ -105,6 +105,7 @@ def routes_to(action: str, world: Path) -> list[Route]:
         "keep": [tool("webots_breakpoint", condition="steps > 1e9", action="keep")],
         "quit": [tool("webots_quit")],
         "load_world": [tool("webots_load_world", world=str(world))],
+        RERUN: [tool("webots_rerun_controller"), command("rerun")],
         LAUNCH: [tool("webots_launch_world", world=str(world))],
         "set_parameters": [
             tool("webots_set_parameters", values={"kp": 1}),
@@ -132,7 +133,7 @@ def routes_to(action: str, world: Path) -> list[Route]:
 
 
 def test_the_table_has_every_action_and_every_tool_that_does_one() -> None:
-    assert set(TOOLS_OF_ACTIONS) == {*BUILT_IN_ACTIONS, LAUNCH}
+    assert set(TOOLS_OF_ACTIONS) == {*BUILT_IN_ACTIONS, LAUNCH, RERUN}
     doing = {each.name for each in all_questions() if not each.effect.reads}
     listed = {name for names in TOOLS_OF_ACTIONS.values() for name in names}
     assert doing - listed == WITHOUT_ACTION

@@ -20,7 +20,7 @@ from webots_mcp.store.reading.frame_summary import change_points
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.registered_signals import RegisteredSignal
-from webots_mcp.store.series import query_rows
+from webots_mcp.store.signal_history import query_rows
 
 ROWS = 20_000
 INTERVAL_S = 0.1

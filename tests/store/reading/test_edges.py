@@ -18,7 +18,7 @@ from webots_mcp.judging.detection.events import find_events
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import moment_of, shown_time
-from webots_mcp.store.series import query_rows
+from webots_mcp.store.signal_history import query_rows
 
 STEP_S = 0.032
 ROWS = 700

@@ -25,7 +25,7 @@ from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.run_rows import newest_state
-from webots_mcp.store.series import query_history, query_rows
+from webots_mcp.store.signal_history import query_history, query_rows
 
 STEP_MS = 16
 CALLS = 2000

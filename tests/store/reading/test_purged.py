@@ -14,7 +14,7 @@ from webots_mcp.judging.comparison import compare_runs
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention_limits import Limit, Retention
-from webots_mcp.store.series import RunHistory, query_history
+from webots_mcp.store.signal_history import RunHistory, query_history
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:

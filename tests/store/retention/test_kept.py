@@ -18,7 +18,7 @@ from webots_mcp.store.recording import view_robot
 from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 from webots_mcp.store.run_rows import newest_state
-from webots_mcp.store.series import query_history
+from webots_mcp.store.signal_history import query_history
 
 NONE = Limit(rows=0)
 ALL = Limit()

@@ -15,7 +15,7 @@ from types import FrameType, TracebackType
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.database.secret_names import SecretNames
-from webots_mcp.database.stacks import is_library
+from webots_mcp.database.thread_stacks import is_library
 
 MOST_FRAMES: Final = 8
 _MOST_KNOWN_FILES: Final = 10_000  # of which it is remembered whether they are the controller's own

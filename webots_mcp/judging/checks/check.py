@@ -104,10 +104,10 @@ class RunUnderCheck:
         """What each of its signals means."""
         return self.search.meanings
 
-    @cached_property
+    @property
     def noise(self) -> RunNoise:
         """How noisy its signals are."""
-        return RunNoise(self.frame, self.motion)
+        return self.search.noise
 
     def events(self, kind: str) -> list[Event]:
         """What was found of a kind, in order."""

@@ -32,6 +32,7 @@ from webots_mcp.judging.detection import (
     fall,
     jump,
     oscillation,
+    pace,
     sensors,
     slip,
     targets,
@@ -66,6 +67,7 @@ _OFF: Final = (targets.OFF_TARGET.name,)
 _FALL: Final = (fall.FALL.name,)
 _SWINGS: Final = (oscillation.OSCILLATION.name,)
 _SLIP: Final = (slip.SLIP.name,)
+_SLOW: Final = (pace.SLOW_SIMULATION.name,)
 _NOISE: Final = (degradation.DEGRADATION.name,)
 # A new check is a function and a line here: question, command, report, page and docs read it.
 CHECKS: Final[list[Check]] = [
@@ -84,7 +86,7 @@ CHECKS: Final[list[Check]] = [
     Check("sensors within limits", sensor_checks.sensors_within_limits, "numbers", of_values=True),
     Check("sensors drop nothing", sensor_checks.sensors_drop_nothing, "numbers", _JUMP),
     Check("sensors keep their noise", sensor_checks.sensors_keep_noise, "numbers", _NOISE),
-    Check("keeps pace", keeps_pace, "rows", of_values=True),
+    Check("keeps pace", keeps_pace, "rows", _SLOW, of_values=True),
     Check("misses no steps", misses_no_steps, "rows", ("gap",), of_values=True),
     Check("logs no errors", logs_no_errors, "", ("log",)),
     Check("ends well", ends_well, ""),

@@ -21,7 +21,13 @@ from webots_mcp.judging.detection.standstill import (
     SPEED_UNITS,
     TURNED_RAD,
 )
-from webots_mcp.judging.detection.targets import OFF_S, OFF_SHARE, OFF_TARGET, pursuits_in
+from webots_mcp.judging.detection.targets import (
+    OFF_S,
+    OFF_SHARE,
+    OFF_TARGET,
+    OVERSHOT,
+    pursuits_in,
+)
 from webots_mcp.judging.verdicts import Coverage, Fault
 from webots_mcp.signals.meaning import words_in
 from webots_mcp.signals.naming import BRANCHES, METRES, counted, listed, words_of
@@ -166,9 +172,9 @@ def follows_targets(run: RunUnderCheck) -> Examined:
     """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
 
     Also where it made less than half of the usual share of the motion of a target that keeps
-    moving. Warns where a closed gripper lost the force with which it held something. Places where a
-    robot shall go are no targets, and grippers hold things. A target that is always 0 has no range
-    to judge by.
+    moving. Warns where a target that had stepped was passed by a quarter of the step, and where a
+    closed gripper lost the force with which it held something. Places where a robot shall go are no
+    targets, and grippers hold things. A target that is always 0 has no range to judge by.
     """
     found = run.events(OFF_TARGET.name)
     if not found:
@@ -180,8 +186,11 @@ def follows_targets(run: RunUnderCheck) -> Examined:
         said = f"{counted(len(pursuits), 'target')} followed, as by {pursuits[0].measured.name}"
         limit = f"limit {100 * OFF_SHARE:g} % off for {OFF_S:g} s"
         return run.covered(said, of=OFF_TARGET.name, limit=limit)
-    names = listed(list(dict.fromkeys(each.name or "" for each in found)), 3)
-    longest = max(found, key=lambda each: each.duration_s)
+    away = [each for each in found if OVERSHOT not in each.details]
+    if not away:
+        return _overshot(run, found)
+    names = listed(list(dict.fromkeys(each.name or "" for each in away)), 3)
+    longest = max(away, key=lambda each: each.duration_s)
     details = longest.details
     evidence = (
         f"{names}: {details['off_percent']:g} % off {details['target']} for "
@@ -190,8 +199,17 @@ def follows_targets(run: RunUnderCheck) -> Examined:
     firm = run.firmest(each.name or "" for each in found)
     more = run.more(OFF_TARGET.name)
     grips = {each.force.name for each in grips_in(run.search)}
-    severity = "warn" if grips.issuperset(each.name or "" for each in found) else "fail"
+    severity = "warn" if grips.issuperset(each.name or "" for each in away) else "fail"
     return Fault(severity, evidence, found[0].start_s, len(found), more, signals=firm)
+
+
+def _overshot(run: RunUnderCheck, found: list[Event]) -> Fault:
+    worst = max(found, key=lambda each: each.details[OVERSHOT])
+    names = listed(list(dict.fromkeys(each.name or "" for each in found)), 3)
+    evidence = f"{names}: overshot {times(len(found))}; at most {worst.details['says']}"
+    firm = run.firmest(each.name or "" for each in found)
+    more = run.more(OFF_TARGET.name)
+    return Fault("warn", evidence, found[0].start_s, len(found), more, signals=firm)
 
 
 def stays_stable(run: RunUnderCheck) -> Examined:
@@ -273,7 +291,9 @@ def stays_upright(run: RunUnderCheck) -> Examined:
     got_up = first.details.get("got_up")
     after = f"and got up {first.duration_s:.3g} s later" if got_up else "and stayed down"
     who = f"{first.name} " if first.name else ""
-    evidence = f"{who}fell {times(len(falls))}: tilted by {first.details['tilt_deg']:.3g}° {after}"
+    to = f" ({first.details['direction']})" if "direction" in first.details else ""
+    tilted = f"tilted by {first.details['tilt_deg']:.3g}°{to} {after}"
+    evidence = f"{who}fell {times(len(falls))}: {tilted}"
     return Fault("fail", evidence, first.start_s, len(falls), run.more(FALL.name))
 
 

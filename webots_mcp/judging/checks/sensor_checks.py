@@ -32,6 +32,7 @@ _CUT_OFF: Final = 5  # times at one extreme to the last digit: of values that ne
 _BRIEFLY: Final = 3  # rows: what is cut off comes back soon, what rests at a stop does not
 _SORTED_AT_ONCE: Final = 8_192  # values at first ...
 _MORE_SORTED: Final = 4  # ... and then so many times as many
+_REPEATED: Final = 1.5  # times as many as may repeat are sorted first
 _HASH_BITS: Final = 25
 _MIXES: Final = 0x9E3779B97F4A7C15  # 2^64 by the golden ratio
 _NEAR_LIMIT: Final = 0.01  # of the range
@@ -308,13 +309,19 @@ def _are_unique(values: Array) -> bool:
     Values of different hashes differ, and what repeats within some rows repeats: mostly one of
     both decides without sorting all of them.
     """
+    rows, most = _SORTED_AT_ONCE, (1 - _UNIQUE) * len(values)
+    # Of so many values enough can repeat to say no, mostly without a look at the others.
+    while rows <= _REPEATED * most:
+        rows *= _MORE_SORTED
+    if rows < len(values) and rows - len(np.unique(values[:rows])) > most + 1:
+        return False
     whole: Any = values + 0.0  # 0 and -0 are one value
     hashes = (whole.view(np.uint64) * np.uint64(_MIXES)) >> np.uint64(64 - _HASH_BITS)
     is_there = np.zeros(2**_HASH_BITS, np.bool_)
     is_there[hashes] = True
     if np.count_nonzero(is_there) >= _UNIQUE * len(values):
         return True
-    rows, most = _SORTED_AT_ONCE, (1 - _UNIQUE) * len(values)
+    rows *= _MORE_SORTED
     while rows < len(values):
         if rows - len(np.unique(values[:rows])) > most + 1:
             return False

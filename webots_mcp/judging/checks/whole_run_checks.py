@@ -6,11 +6,8 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from webots_mcp.analysis.arrays import Array, np
-from webots_mcp.analysis.levels import level_changes
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.judging.checks.check import (
     Examined,
@@ -24,6 +21,7 @@ from webots_mcp.judging.detection.condition import (
     judge_expectation,
 )
 from webots_mcp.judging.detection.event import NotSearchableError
+from webots_mcp.judging.detection.pace import SLOW, SLOW_SIMULATION, PacePart, pace_of, together
 from webots_mcp.judging.verdicts import Coverage, Fault
 from webots_mcp.signals.conditions.expectation import Expectation
 from webots_mcp.signals.meaning import DECLARED_WORDS, declaration_of
@@ -31,100 +29,37 @@ from webots_mcp.signals.naming import counted, listed
 from webots_mcp.store.recording import waiting_rows_note
 from webots_mcp.store.sessions import fetch_session
 
-SLOW: Final = 0.9  # of real time
-_CELL_S: Final = 1.0  # of simulation time, over which the pace is measured, or longer
-_MOST_CELLS: Final = 500
 _MOST_PARTS: Final = 3  # slow ones that are named
-_FALSE_ALARMS: Final = 1e-3  # that a run of one pace is divided
 _LONGEST_MESSAGE: Final = 120
 _MUCH: Final = 0.05  # of the run, or of its rows
 _HABIT: Final = 3  # so many times: its code does it
-_RESET_BY: Final = (
-    "SELECT count(*) FROM command WHERE session_id = :session AND status = 'done' "
-    "AND (action IN ('reset', 'reload', 'load_world', 'quit') "
-    "OR action = 'run' AND json_extract(params, '$.reset')) "
-    "AND claimed_wall_time_s BETWEEN :last - 30 AND :last + 30"
-)
-_ENDS_OF_SESSION: Final = (
-    "SELECT count(*) FROM run WHERE session_id = ? AND end_reason = 'reset' AND id <> ?"
-)
-_LOST: Final = "SELECT rows_waiting, last_error FROM session WHERE id = ?"
-_GOAL: Final = (
-    "SELECT json_extract(params, '$.until'), json_extract(result, '$.ended'), "
-    "json_extract(result, '$.advanced_s'), json_extract(result, '$.sim_time_s') FROM command "
-    "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
-    "AND json_extract(result, '$.run_id') = ? AND json_extract(params, '$.until') IS NOT NULL "
-    "ORDER BY id DESC LIMIT 1"
-)
 _MOST_UNKNOWN: Final = 5  # names in the evidence
 
 
 def keeps_pace(run: RunUnderCheck) -> Examined:
     """Warns where a part of it was slower than 0.9 of real time; waits do not count.
 
-    Parts are divided where the pace changes for good, by a rank test with a false-alarm rate of
-    1 in 1,000 for a run. A wait is over a second long and over 20 times as long as its step.
+    Parts are divided where the pace changes, also for a while, by a test of ranks with a
+    false-alarm rate of 1 in 1,000 for a run. A wait is over a second long and over 20 times as long
+    as its step.
     """
-    frame = run.frame
-    steps, waits = np.diff(frame.times), np.diff(frame.wall_times)
-    moved = (steps > 0) & (waits >= 0)
-    usual_s = float(np.median(waits[moved])) if moved.any() else 0.0  # of who is slow all the time
-    goes_on = moved & (waits <= np.maximum(max(1.0, 3 * usual_s), 20 * steps))
-    if float(waits[goes_on].sum()) < 1.0:
-        raise NotSearchableError("it lasted less than a second of wall time")
-    longest = float(waits[moved].max())
-    waited = f"; longest wait between two rows {longest:.3g} s" if longest > 1.0 else ""
-    parts = _paces(frame.times[1:][goes_on], steps[goes_on], waits[goes_on])
-    slow = [part for part in parts if part.factor < SLOW]
-    said = [f"{part.factor:.3g} times real time" for part in slow or [_in_all(parts)]]
-    if len(parts) > 1 and slow:
-        others = [part for part in parts if part.factor >= SLOW]
-        said = [f"{e.factor:.3g} times real time {_span(e, parts)}" for e in slow[:_MOST_PARTS]]
-        said += [f"else {_in_all(others).factor:.3g}"] if others else []
+    found = pace_of(run.search)
+    waited = f"; longest wait between two rows {found.longest_wait_s:.3g} s"
+    waited = waited if found.longest_wait_s > 1.0 else ""
+    slow = [part for part in found.slow if part.factor < SLOW]
+    said = [f"{part.factor:.3g} times real time" for part in slow or [together(found.parts)]]
+    if len(found.parts) > 1 and slow:
+        others = [part for part in found.parts if part not in slow]
+        said = [
+            f"{e.factor:.3g} times real time {_span(e, found.parts)}" for e in slow[:_MOST_PARTS]
+        ]
+        said += [f"else {together(others).factor:.3g}"] if others else []
     evidence = ", ".join(said) + waited
     if not slow:
-        judged = counted(len(frame), "row")
+        judged = counted(len(run.frame), "row")
         return run.covered(evidence, judged=judged, limit=f"limit {SLOW:g} times real time")
-    since_s = slow[0].start_s if slow[0] is not parts[0] else float(frame.times[0])
-    more = f"webots_list_runs(cursor={run.info.run_id + 1})"
-    return Fault("warn", evidence, since_s, None, more)
-
-
-class PacePart(NamedTuple):
-    """A part of a run of one pace: simulated and wall seconds without waits."""
-
-    start_s: float
-    end_s: float
-    sim_s: float
-    wall_s: float
-
-    @property
-    def factor(self) -> float:
-        """The real-time factor."""
-        return self.sim_s / max(self.wall_s, 1e-9)
-
-
-def _paces(times: Array, steps: Array, waits: Array) -> list[PacePart]:
-    """The parts of a run between changes of its pace."""
-    cell_s = max(_CELL_S, float(times[-1] - times[0]) / _MOST_CELLS)
-    cells = ((times - times[0]) // cell_s).astype(np.intp)
-    firsts = np.flatnonzero(np.diff(cells, prepend=-1))
-    sim_s, wall_s = np.add.reduceat(steps, firsts), np.add.reduceat(waits, firsts)
-    edges = [0, *level_changes(sim_s / np.maximum(wall_s, 1e-9), _FALSE_ALARMS), len(firsts)]
-    ends_s = np.append(times[firsts[1:]] - steps[firsts[1:]], times[-1])
-    begins_s = times[firsts] - steps[firsts]
-    return [
-        PacePart(
-            float(begins_s[a]), float(ends_s[b - 1]), float(sim_s[a:b].sum()),
-            float(wall_s[a:b].sum()),
-        )
-        for a, b in pairwise(edges)
-    ]  # fmt: skip
-
-
-def _in_all(parts: Sequence[PacePart]) -> PacePart:
-    sim_s, wall_s = sum(each.sim_s for each in parts), sum(each.wall_s for each in parts)
-    return PacePart(parts[0].start_s, parts[-1].end_s, sim_s, wall_s)
+    since_s = slow[0].start_s if slow[0] is not found.parts[0] else float(run.frame.times[0])
+    return Fault("warn", evidence, since_s, len(slow), run.more(SLOW_SIMULATION.name))
 
 
 def _span(part: PacePart, parts: Sequence[PacePart]) -> str:
@@ -192,10 +127,21 @@ def ends_well(run: RunUnderCheck) -> Examined:
         return _of_end(run, f"it ended: {reason}")
     last_s = run.info.started_wall_time_s + run.info.wall_duration_s
     asked = {"session": session, "last": last_s}
-    if run.search.connection.execute(_RESET_BY, asked).fetchone()[0]:
+    if run.search.connection.execute(
+        "SELECT count(*) FROM command WHERE session_id = :session AND status = 'done' "
+        "AND (action IN ('reset', 'reload', 'load_world', 'quit') "
+        "OR action = 'run' AND json_extract(params, '$.reset')) "
+        "AND claimed_wall_time_s BETWEEN :last - 30 AND :last + 30",
+        asked,
+    ).fetchone()[0]:
         return _of_end(run, f"it ended by a {reason} that a command asked for")
     others = (session, run.info.run_id)
-    habit = int(run.search.connection.execute(_ENDS_OF_SESSION, others).fetchone()[0])
+    habit = int(
+        run.search.connection.execute(
+            "SELECT count(*) FROM run WHERE session_id = ? AND end_reason = 'reset' AND id <> ?",
+            others,
+        ).fetchone()[0]
+    )
     if reason == "reset" and habit >= _HABIT:  # other runs of the session
         return _of_end(run, f"it ended by a reset, as {habit} others of its session")
     evidence = f"it ended by a {reason} that no command asked for: by hand, or by code"
@@ -217,7 +163,9 @@ def loses_no_rows(run: RunUnderCheck) -> Examined:
     if not run.info.row_count:
         return Fault("warn", f"run {run.info.run_id} has no state row: call bridge.publish")
     verb = "were" if run.info.purged_rows else "are"  # they were deleted since
-    waiting, error = run.search.connection.execute(_LOST, (run.info.session_id,)).fetchone()
+    waiting, error = run.search.connection.execute(
+        "SELECT rows_waiting, last_error FROM session WHERE id = ?", (run.info.session_id,)
+    ).fetchone()
     if run.info.end_reason and waiting:
         left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
         return Fault("warn", left)
@@ -288,7 +236,13 @@ def _violated(run: RunUnderCheck, each: Expectation, held: Adherence, evidence: 
 def reaches_goal(run: RunUnderCheck) -> Examined:
     """Fails where the condition of its last run command, or trial, did not come to hold."""
     asked = (run.robot_id, run.info.run_id)
-    row = run.search.connection.execute(_GOAL, asked).fetchone()
+    row = run.search.connection.execute(
+        "SELECT json_extract(params, '$.until'), json_extract(result, '$.ended'), "
+        "json_extract(result, '$.advanced_s'), json_extract(result, '$.sim_time_s') FROM command "
+        "WHERE robot_id = ? AND action = 'run' AND json_valid(result) AND json_extract(result, "
+        "'$.run_id') = ? AND json_extract(params, '$.until') IS NOT NULL ORDER BY id DESC LIMIT 1",
+        asked,
+    ).fetchone()
     if row is None:
         raise NotSearchableError("no finished run command had a goal: webots_run(until=...)")
     goal, ended, took_s, at_s = row

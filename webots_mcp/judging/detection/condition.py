@@ -67,7 +67,7 @@ from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import recorded_share
 from webots_mcp.store.reading.segment import Segment, full_rate_parts, just_after
 from webots_mcp.store.registered_signals import RegisteredSignal
-from webots_mcp.store.series import WEIGHTED
+from webots_mcp.store.signal_history import WEIGHTED
 
 _MOST_VALUES: Final = 8
 _MOST_IN_ALL: Final = 4  # numbers whose figures over all times are given

@@ -15,7 +15,8 @@ from typing import Final
 from webots_mcp.analysis.arrays import Array, Indexes, noise_of, np
 from webots_mcp.judging.detection.event import Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, places_in, were_not_searched
-from webots_mcp.signals.meaning import Quantity
+from webots_mcp.signals.meaning import Quantity, words_in
+from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal
 
@@ -30,6 +31,10 @@ _DIFFERENCES: Final = 4  # leave out smooth motion; of independent noise they ha
 _DIFFERENCE_VARIANCE: Final = 70.0  # ... so many times its variance
 _OUTLIER: Final = 4.0  # standard deviations of the larger noise; more does not count more
 _SAME_MOTION: Final = 2.0  # times as fast: then the motion may explain the noise
+_NEAR_BLOCKS: Final = 2  # before and after: something else that changed then may explain the noise
+_LEFT: Final = 5.0  # times the range, or the noise, that a height had kept before
+_FEW: Final = 0.1  # of the rows after that may lie in the former range
+_DEPTHS: Final = frozenset(("depth", "altitude"))
 _SHAKEN: Final[frozenset[Quantity | None]] = frozenset(("angular velocity", "acceleration"))
 # Quantities whose noise does not depend on how the robot moves.
 _STEADY: Final[frozenset[Quantity | None]] = frozenset(
@@ -70,16 +75,27 @@ def degradation_events(search: Search) -> Iterator[Event]:
         if not signals:
             raise NotSearchableError(why, "undecided")
         search.not_searched("degradation", why)
-    found_any = False
+    found_any, excused = False, list[tuple[str, float, float, float, str]]()
     for signal in search.in_time("degradation", signals):
         found = _change_of(search, signal)
         if found is None:
             continue
-        found_any = True
         start_s, before, after = found
+        if why := _explained_by(search, signal, start_s):
+            excused.append((signal.name, before, after, start_s, why))
+            continue
+        found_any = True
         end_s = float(search.frame.times[-1])
         details = {"noise_before": float(f"{before:.3g}"), "noise_after": float(f"{after:.3g}")}
         yield search.event("degradation", start_s, end_s, signal.name, **details)
+    for name, before, after, start_s, why in excused[:1]:
+        others = f" (and {len(excused) - 1} more)" if len(excused) > 1 else ""
+        search.not_searched(
+            "degradation",
+            f"noise of {name}{others} grew from {before:.3g} to {after:.3g} at {start_s:.4g} s, "
+            f"when {why}: nothing recorded says whether the sensor or its surroundings did so",
+            cause="undecided",
+        )
     if not found_any and search.frame.times[:1].tolist() > [search.began_s]:
         search.not_searched(
             "degradation", "noise that grew earlier is not seen: ask for the whole run"
@@ -128,6 +144,43 @@ def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, 
     if after < TIMES * before or not _moves_alike(search, times, row):
         return None
     return float(times[row]), before, after
+
+
+def _explained_by(search: Search, signal: RegisteredSignal, start_s: float) -> str | None:
+    """Return what else changed for good when the noise of a signal grew; None where nothing did.
+
+    A receiver below the surface, or off the ground, measures in other surroundings. What counts is
+    a mode that begins then and was never there before, and a height or depth that leaves then the
+    range that it had kept.
+    """
+    frame, margin_s = search.frame, (search.length_s / _BLOCKS) * _NEAR_BLOCKS
+    before = frame.between(search.began_s, start_s - margin_s)
+    after = frame.between(start_s + margin_s, search.ended_s)
+    if len(before) < 2 or len(after) < 2:
+        return None
+    mode = search.motion.mode
+    if mode is not None and mode.name in frame:
+        codes, labels = frame.coded(mode.name)
+        first, stop = frame.places([start_s - margin_s, start_s + margin_s]).tolist()
+        earlier: set[int] = set(codes[:first].tolist())
+        later: set[int] = set(codes[stop:].tolist())
+        around = codes[max(0, first - 1) : stop + 1]
+        if earlier.isdisjoint(later) and len(set(around.tolist())) > 1:
+            return f"{mode.name} became {shown(labels[int(codes[min(stop, len(codes) - 1)])])}"
+    for name, meaning in search.meanings.items():
+        is_height = meaning.quantity == "height" or _DEPTHS.intersection(words_in(name))
+        if not is_height or not meaning.is_sensed or name == signal.name or name not in frame:
+            continue
+        low_high = before.usable(name)[1]
+        values = after.usable(name)[1]
+        if len(low_high) < 2 or len(values) < 2:
+            continue
+        kept = float(np.ptp(low_high))
+        away = min(abs(float(np.median(values)) - end) for end in (low_high.min(), low_high.max()))
+        outside = (values < low_high.min()) | (values > low_high.max())
+        if away > max(_LEFT * kept, _LEFT * search.noise.of(name)) and outside.mean() > 1 - _FEW:
+            return f"{name} left {float(np.median(low_high)):.3g}"
+    return None
 
 
 def _rows_of(search: Search, signal: RegisteredSignal) -> int:

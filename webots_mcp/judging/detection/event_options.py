@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from webots_mcp.analysis.swings import LEAST_HALF_SWINGS
+from webots_mcp.analysis.oscillations import LEAST_HALF_SWINGS
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError
 

@@ -1,15 +1,16 @@
 """`fall`: a robot that stood upright tipped over and stayed down.
 
 The tilt is the angle between the robot's up axis now and while it stood at first, from its roll and
-pitch, so that a sensor that is mounted upside down does not matter. What flies or climbs at such a
-tilt has not fallen: its position goes on changing.
+pitch, so that a sensor that is mounted upside down does not matter. To which side it fell follows
+from the world's up direction in the robot's own axes: x ahead, y to the left, z up. What flies or
+climbs at such a tilt has not fallen: its position goes on changing.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
 from webots_mcp.judging.detection.event import Event, NotSearchableError
@@ -24,6 +25,7 @@ DOWN_RAD: Final = math.radians(45)  # ... and beyond this it lies
 SETTLED_S: Final = 1.0  # for so long each of them has to last
 MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
 _BY_WHEELS: Final = frozenset(("odom", "odometry"))
+_BETWEEN: Final = math.tan(math.radians(67.5))  # nearer to one side than to between two sides
 _NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
 _FALLEN_DEG: Final = math.degrees(FALLEN_RAD)
 NO_ATTITUDE: Final = (
@@ -55,7 +57,8 @@ def fall_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError(NO_ATTITUDE)
     are_known = False
     for attitude in attitudes:
-        times, tilt = tilt_of(search.frame, attitude.roll, attitude.pitch)
+        tilted = tilt_of(search.frame, attitude.roll, attitude.pitch)
+        times, tilt = tilted.times, tilted.tilt
         if len(times) < 2:
             continue
         are_known = True
@@ -64,7 +67,7 @@ def fall_events(search: Search) -> Iterator[Event]:
             filter(None, (attitude.roll, attitude.pitch)),
             [(float(times[0]), float(times[-1]))],
         )
-        yield from _falls_of(search, attitude.body, times, tilt)
+        yield from _falls_of(search, attitude.body, tilted)
         largest_deg = math.degrees(float(tilt.max()))
         of_body = "" if attitude.body is None else f" of {attitude.body}"
         what = f"largest tilt{of_body} was {largest_deg:.0f}°; {_FALLEN_DEG:.0f}° count"
@@ -73,8 +76,8 @@ def fall_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError("roll and pitch have no value in that range")
 
 
-def _falls_of(search: Search, body: str | None, times: Array, tilt: Array) -> Iterator[Event]:
-    fell_s = -math.inf
+def _falls_of(search: Search, body: str | None, tilted: Tilt) -> Iterator[Event]:
+    fell_s, times, tilt = -math.inf, tilted.times, tilted.tilt
     for run in runs_of(tilt > DOWN_RAD, times).spans():
         lies = tilt[run.start : run.stop]
         lasts_s = run.end_s - run.start_s
@@ -92,14 +95,13 @@ def _falls_of(search: Search, body: str | None, times: Array, tilt: Array) -> It
         again = runs_of(tilt[run.stop :] <= UPRIGHT_RAD, times[run.stop :])
         up = again.only(again.durations_s >= SETTLED_S)
         fell_s = float(up.starts_s[0]) if len(up) else float(times[-1])
-        yield search.event(
-            "fall",
-            float(times[left]),
-            fell_s,
-            body,
-            tilt_deg=round(math.degrees(float(np.median(lies))), 1),
-            got_up=bool(len(up)),
-        )
+        details: dict[str, Any] = {
+            "tilt_deg": round(math.degrees(float(np.median(lies))), 1),
+            "got_up": bool(len(up)),
+        }
+        if direction := tilted.direction(slice(run.start, run.stop)):
+            details["direction"] = direction
+        yield search.event("fall", float(times[left]), fell_s, body, **details)
 
 
 def _moves_on(search: Search, start_s: float, end_s: float) -> bool:
@@ -131,10 +133,38 @@ def _moves_on(search: Search, start_s: float, end_s: float) -> bool:
     return bool(np.count_nonzero(moved_m2 > least_m**2) > len(moved_m2) / 2)
 
 
-def tilt_of(
-    frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal | None
-) -> tuple[Array, Array]:
-    """Return the times of rows with an attitude, and the tilt in them, in rad.
+class Tilt(NamedTuple):
+    """How a body is tilted in rows with an attitude.
+
+    Attributes:
+        times: Of the rows.
+        tilt: From how it stood in its first second, in rad.
+        ahead: How far the world's up direction points ahead in the body; 0 where it stands.
+        left: How far it points to the body's left.
+    """
+
+    times: Array
+    tilt: Array
+    ahead: Array
+    left: Array
+
+    def direction(self, rows: slice) -> str:
+        """Return to which side it lies in some rows; empty where that is not known.
+
+        What points up is opposite to the side that it lies on. A body that lies between two sides
+        is named by both.
+        """
+        ahead, left = (float(np.median(each[rows])) for each in (self.ahead, self.left))
+        if math.hypot(ahead, left) < math.sin(UPRIGHT_RAD):
+            return ""
+        along, across = "back" if ahead > 0 else "forward", "right" if left > 0 else "left"
+        if abs(ahead) > _BETWEEN * abs(left):
+            return along
+        return across if abs(left) > _BETWEEN * abs(ahead) else f"{along} {across}"
+
+
+def tilt_of(frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal | None) -> Tilt:
+    """Return how a body is tilted.
 
     Args:
         frame: The rows.
@@ -151,11 +181,14 @@ def tilt_of(
     across, along = (each[there] for each in angles)
     times = frame.times[there]
     if not len(times):
-        return times, across
+        return Tilt(times, across, across, across)
     up = np.stack((-np.sin(along), np.sin(across) * np.cos(along), np.cos(across) * np.cos(along)))
     first = np.median(up[:, times <= times[0] + SETTLED_S], axis=1)
     first /= np.linalg.norm(first) or 1.0
-    return times, np.arccos(np.minimum(np.maximum(first @ up, -1.0), 1.0))
+    tilt = np.arccos(np.minimum(np.maximum(first @ up, -1.0), 1.0))
+    ahead: Array = np.array([1.0, 0.0, 0.0]) - first[0] * first
+    ahead /= float(np.linalg.norm(ahead)) or 1.0
+    return Tilt(times, tilt, ahead @ up, np.cross(first, ahead) @ up)
 
 
 def attitudes_in(search: Search) -> list[Attitude]:

@@ -13,11 +13,12 @@ from webots_mcp.analysis.arrays import (
     Flags,
     Indexes,
     gap_borders,
+    in_order,
     median,
     np,
     usual_interval_s,
 )
-from webots_mcp.analysis.swings import (
+from webots_mcp.analysis.oscillations import (
     LEAST_HALF_SWINGS,
     Swing,
     find_swings,
@@ -208,16 +209,21 @@ def find_jumps(
     """
     zones = frame.zone_map(name)
     changes, largest = _steps_of(zones)
+    changing = np.count_nonzero(changes)
+    if not changing:
+        return [], float(largest.max(initial=0.0)), math.inf
     for most in (1, SAMPLED_CHUNKS):
         parts = [frame.rows(*span).usable(name) for span in _sampled(zones, changes, most)]
         interval_s = _interval_s([times for times, _ in parts])
         staying = (_staying(*part, interval_s, turns) for part in parts)
         sizes = np.concatenate([np.zeros(0), *staying])
         is_known = len(sizes) >= LEAST_STEPS
-        middle = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2]) if is_known else 0.0
+        middle = in_order(sizes, len(sizes) // 2) if is_known else 0.0
         limit = middle + score * middle / 0.6745
         if is_known and largest.max() < CERTAINLY_LESS * limit:
             return [], float(largest.max()), limit
+        if changing == 1:
+            break
     wanted = zones.spans(largest > limit if is_known else changes > 0)
     found: dict[float, Jump] = {}
     for start, stop in wanted:
@@ -281,6 +287,8 @@ def _staying(times: Array, values: Array, interval_s: float, turns: tuple[float,
     """The sizes of the steps that are not zero and are no part of an excursion."""
     steps = np.abs(np.diff(values))
     stays = steps > 0
+    if stays.all():
+        return steps
     for left, back in zip(*_come_back(times, values, steps, interval_s, turns), strict=True):
         stays[left:back] = False
     return steps[stays]
@@ -306,7 +314,10 @@ def _come_back(
     What was recorded on the other side of a gap is not soon after.
     """
     # At the turn of a swing two rows may meet the same value; three are a rest.
-    left = np.flatnonzero((steps[2:] > 0) & (steps[1:-1] == 0) & (steps[:-2] == 0)) + 2
+    rests = steps[1:-1] == 0
+    if not rests.any():
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    left = np.flatnonzero((steps[2:] > 0) & rests & (steps[:-2] == 0)) + 2
     left = left[_step(values[left], values[left + 1], turns) > 0]
     backs = np.zeros(len(left), np.intp)
     for later in range(LONGEST_EXCURSION + 1, 1, -1):

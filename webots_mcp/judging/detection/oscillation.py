@@ -17,20 +17,20 @@ from webots_mcp.analysis.arrays import (
     np,
     usual_interval_s,
 )
-from webots_mcp.analysis.fast_swings import (
+from webots_mcp.analysis.fast_oscillations import (
     LEAST_FAST_ROWS,
     LONGEST_FAST_ROWS,
     SwingCourse,
     course_of,
     find_fast_swings,
 )
-from webots_mcp.analysis.summary import unwrap
-from webots_mcp.analysis.swings import (
+from webots_mcp.analysis.oscillations import (
     SLOW_HALF_SWINGS,
     EvenRows,
     Swing,
     swings_in,
 )
+from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import EventKind, Search
@@ -239,7 +239,7 @@ def _found(
             rows = rows if len(times) == len(part) else EvenRows.of(times)
             if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
                 numbers = unwrap(numbers, signal.turn)
-            courses = _Courses(times, numbers)
+            courses = _Courses(rows, times, numbers)
             found = [courses.of(swing) for swing in swings_in(rows, numbers, *asked)]
             fast = (
                 SwingCourse(swing, swing.amplitude, swing.amplitude)
@@ -252,14 +252,15 @@ def _found(
 class _Courses:
     """The rows of a signal in which oscillations are followed to their ends."""
 
-    def __init__(self, times: Array, values: Array) -> None:
-        self._times, self._values = times, values
+    def __init__(self, rows: EvenRows, times: Array, values: Array) -> None:
+        self._rows, self._times, self._values = rows, times, values
         self._noises: dict[int, float] = {}
 
     @cached_property
     def _edges(self) -> Indexes:
         """Where stretches without a gap begin, and the number of rows."""
-        gaps = gap_borders(self._times, usual_interval_s(self._times) or 0.0)
+        is_paused = self._rows.moving is not None
+        gaps = gap_borders(self._times, self._rows.interval_s) if is_paused else self._rows.borders
         return np.concatenate(([0], gaps, [len(self._times)]))
 
     def of(self, swing: Swing) -> SwingCourse:

@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import Any, Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
+from webots_mcp.analysis.path_length import PathLength, SmoothedTrack, tracks_of
 from webots_mcp.analysis.summary import LARGEST
-from webots_mcp.analysis.track import PathLength, SmoothedTrack, tracks_of
 from webots_mcp.judging.detection.event import Alike, Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.verdicts import Cause, JudgedInterval, SearchCoverage
@@ -28,7 +28,7 @@ from webots_mcp.store.reading.behaviour import with_behaviour
 from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
-from webots_mcp.store.reading.segment import Deadline, Segment, just_after
+from webots_mcp.store.reading.segment import Deadline, Segment, just_after, read_so_far
 from webots_mcp.store.registered_signals import RegisteredSignal, roles_of, stored_roles
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
@@ -42,7 +42,7 @@ AWAY_S: Final = 20.0
 LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
 USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
 LEAST_VISITS: Final = 3
-_OF_MOTION: Final = ("speed", "turn rate", "wheel speed")
+_OF_MOTION: Final = ("speed", "turn rate", "wheel speed", "heading")
 EARLIER_RUNS: Final = 3
 MOST_ROWS: Final = 2_000_000  # of a run: its first ones
 _STANDS_SHARE: Final = 0.8  # of a visit
@@ -179,12 +179,17 @@ def find_motion(
         commanded,
         None if commanded else speed,
         (declared.get("mode") if options.mode is None else None) or first("mode", options.mode),
-        heading=declared.get("heading") or first("yaw"),
+        heading=declared.get("heading") or first("yaw") or _heading_among(meant),
         wheels=tuple(each for each in wheels if each != commanded),
         height=declared.get("height") or signals.get(f"z{place}"),
         wheel_commands=tuple(each for each in wheel_commands if each != commanded),
         turn_command=next(iter(meant("turn rate", sets=True)), None),
     )
+
+
+def _heading_among(meant: Callable[..., list[RegisteredSignal]]) -> RegisteredSignal | None:
+    """The first measured heading of which it is known what a whole turn is."""
+    return next((each for each in meant("heading", sets=False) if each.turn), None)
 
 
 _OF_ROLES: Final = {"x": "x", "y": "y", "z": "height", "yaw": "heading", "mode": "mode"}
@@ -494,6 +499,7 @@ class Search:
     coverage: SearchCoverage = field(default_factory=SearchCoverage)
     asked: Segment | None = None
     shared: dict[type, Any] = field(default_factory=dict[type, Any])
+    _walls: dict[float, float] = field(default_factory=dict[float, float])
 
     def of(self, segment: Segment, **changes: Any) -> Search:
         """The same in another segment of the run, of which it is known what is known of this."""
@@ -545,11 +551,19 @@ class Search:
     @cached_property
     def meanings(self) -> dict[str, Meaning]:
         """What each signal of the robot means, also by its values where they were read."""
+        memo = read_so_far(self.connection).setdefault(("meanings", self.segment.run_id), [])
+        for known, meanings in memo:
+            if known == self.known:
+                return meanings
         meanings = meanings_of(self.known)
         try:
-            return with_behaviour(meanings, self.known, self.whole)
+            whole = self.whole
         except NotSearchableError:
             return meanings
+        meanings = with_behaviour(meanings, self.known, whole)
+        if whole.cut_at_s is None:
+            memo.append((self.known, meanings))
+        return meanings
 
     @cached_property
     def signals(self) -> list[RegisteredSignal]:
@@ -620,10 +634,12 @@ class Search:
         if self._purged is not None and len(self._purged):
             place = int(np.searchsorted(self._purged.times, time_s, "right")) - 1
             return float(self._purged.wall_times[max(place, 0)])
-        run_id = self.segment.run_id
-        row = self.connection.execute(_LAST_ROW, (run_id, time_s)).fetchone()
-        row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
-        return float(row[0]) if row else 0.0
+        if (known := self._walls.get(time_s)) is None:
+            run_id = self.segment.run_id
+            row = self.connection.execute(_LAST_ROW, (run_id, time_s)).fetchone()
+            row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+            known = self._walls[time_s] = float(row[0]) if row else 0.0
+        return known
 
     def not_searched(self, kind: str, *reasons: str, cause: Cause | None = None) -> None:
         """Note why a kind was not looked for, or where it was not."""
@@ -713,7 +729,10 @@ class Search:
 
     def _is_large(self, signal: RegisteredSignal) -> bool:
         zones = self.frame.zone_map(signal.name)
-        spans = zones.spans(zones.value_count < zones.held_count)
+        may_be_large = zones.value_count < zones.held_count
+        if not may_be_large.any():
+            return False
+        spans = zones.spans(may_be_large)
         parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)
         return any((np.abs(part) > LARGEST).any() for part in parts)
 

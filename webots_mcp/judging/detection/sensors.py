@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import (
     MOSTLY,
@@ -17,6 +17,8 @@ from webots_mcp.analysis.arrays import (
     RowSpan,
     Runs,
     constant_runs,
+    median,
+    no_runs,
     noise_of,
     np,
     runs_of,
@@ -111,6 +113,13 @@ def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[RowSpan]:
             yield run._replace(**rows, value=float(numbers[run.start]))
 
 
+class _RowCount(NamedTuple):
+    """How many rows have a value, or at least so many."""
+
+    rows: int
+    is_all: bool
+
+
 @dataclass
 class _Resting:
     """A signal that rests at times: what its rests show, and how it changes otherwise.
@@ -122,7 +131,7 @@ class _Resting:
     search: Search
     signal: RegisteredSignal
     least_s: float
-    _counts: dict[float, int] = field(default_factory=dict[float, int])
+    _counts: dict[float, _RowCount] = field(default_factory=dict[float, _RowCount])
 
     @cached_property
     def rests(self) -> list[RowSpan]:
@@ -156,7 +165,7 @@ class _Resting:
             says = f"at its limit of {value}" + (f", though {why}" if why else "")
         elif why:
             says = f"frozen: {why}"
-        elif self._rows_elsewhere(rest) >= HABITUAL_ROWS:
+        elif self._is_elsewhere(rest, HABITUAL_ROWS):
             says = f"at {value}, as at other times"
         details = {"value": rest.value} | ({"says": says} if says else {})
         return self.search.event("flat", rest.start_s, rest.end_s, self.signal.name, **details)
@@ -174,7 +183,7 @@ class _Resting:
         Only then it is where a sensor ends, or what a gate lets through: what counts or creeps is
         at its extreme wherever it stops.
         """
-        return rest.value in self._extremes(self.signal) and self._rows_elsewhere(rest) > 0
+        return rest.value in self._extremes(self.signal) and self._is_elsewhere(rest, 1)
 
     def target_went_on(self, rest: RowSpan) -> str | None:
         """Whether its target moved, or it was commanded to move, while it stayed; None if neither.
@@ -194,25 +203,36 @@ class _Resting:
             return f"{speed.name} was {float(np.median(nonzero)):.4g}"
         return None
 
-    def _rows_elsewhere(self, rest: RowSpan) -> int:
-        """How many other rows of the run have the same value."""
-        if rest.value not in self._counts:
-            self._counts[rest.value] = self._rows_with(rest.value)
-        return self._counts[rest.value] - (rest.stop - rest.start)
+    def _is_elsewhere(self, rest: RowSpan, least: int) -> bool:
+        """Whether so many other rows of the run have the same value."""
+        wanted = rest.stop - rest.start + least
+        known = self._counts.get(rest.value)
+        if known is None or (known.rows < wanted and not known.is_all):
+            known = self._counts[rest.value] = self._rows_with(rest.value, wanted)
+        return known.rows >= wanted
 
-    def _rows_with(self, value: float) -> int:
-        """How many rows of the run have a value; once many are asked for, of the sorted ones."""
-        if len(self._counts) < FEW_VALUES:
-            whole = self.search.whole
-            zones = whole.zone_map(self.signal.name)
-            may_have = (zones.min <= value) & (value <= zones.max)
-            constant = may_have & (zones.min == zones.max)
-            opened = whole.opened(self.signal.name, may_have & ~constant)
-            counts = [np.count_nonzero(numbers == value) for _, numbers in opened]
-            return int(zones.value_count[constant].sum()) + sum(map(int, counts))
-        ends = (np.searchsorted(self._sorted, value, side) for side in ("left", "right"))
-        first, stop = map(int, ends)
-        return stop - first
+    def _rows_with(self, value: float, wanted: int) -> _RowCount:
+        """Count the rows of the run that have a value, no further than so many.
+
+        Once many values are asked for, the sorted ones tell.
+        """
+        if len(self._counts) >= FEW_VALUES:
+            ends = (np.searchsorted(self._sorted, value, side) for side in ("left", "right"))
+            first, stop = map(int, ends)
+            return _RowCount(stop - first, is_all=True)
+        whole = self.search.whole
+        zones = whole.zone_map(self.signal.name)
+        may_have = (zones.min <= value) & (value <= zones.max)
+        constant = may_have & (zones.min == zones.max)
+        rows = int(zones.value_count[constant].sum())
+        if rows < wanted:
+            for _, numbers in whole.opened(self.signal.name, may_have & ~constant):
+                rows += int(np.count_nonzero(numbers == value))
+                if rows >= wanted:
+                    break
+            else:
+                return _RowCount(rows, is_all=True)
+        return _RowCount(rows, is_all=False)
 
     @cached_property
     def _sorted(self) -> Array:
@@ -276,9 +296,10 @@ def is_noisy(values: Array) -> bool:
     A smooth course, such as the exact position of a simulated robot, rests when the robot does.
     """
     steps = np.abs(np.diff(values))
-    if len(steps) < 2 * FEWEST_ROWS or np.mean(steps == 0) > MOST_REPEATED:
+    repeated = len(steps) - int(np.count_nonzero(steps))
+    if len(steps) < 2 * FEWEST_ROWS or repeated / len(steps) > MOST_REPEATED:
         return False
-    return noise_of(values) >= LEAST_NOISE * float(np.median(steps))
+    return noise_of(values) >= LEAST_NOISE * median(steps)
 
 
 def is_lively(run: Frame, name: str) -> bool:
@@ -368,12 +389,12 @@ def missing_events(search: Search) -> Iterator[Event]:
 
 def _silences(search: Search, signal: RegisteredSignal) -> Runs:
     """Where neither the signal has a value nor its array in its other form, long or short."""
-    frame, other = search.frame, other_form(search.known, signal)
-    signals = [each for each in (signal, other) if each]
-    missing = [rows_without_value(frame, each.name) for each in signals]
-    lacking = [each for each in missing if each is not None]
-    if len(lacking) < len(missing):
-        return runs_of(np.zeros(0, np.bool_), frame.times)
+    frame, lacking = search.frame, list[Flags]()
+    signals = [each for each in (signal, other_form(search.known, signal)) if each]
+    for each in signals:
+        if (missing := rows_without_value(frame, each.name)) is None:
+            return no_runs()
+        lacking.append(missing)
     runs = runs_of(np.all(lacking, axis=0), frame.times)
     return runs.only(_have_begun(search, signals, runs) & ~_are_shorter(search, signal, runs))
 

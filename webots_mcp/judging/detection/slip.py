@@ -1,8 +1,8 @@
 """`slip`: the wheels drove, and the robot did not go as far or not as straight as they turned.
 
 How far it usually goes for a turn of its wheels follows from the whole run, so that the same is
-found whatever part of it is asked about. A robot that turns while the wheels of both sides turn
-alike slips on the side that goes ahead less.
+found whatever part of it is asked about. Which side slips follows from how far each one rolled. A
+robot that turns while the wheels of both sides turn alike slips on the side that goes ahead less.
 """
 
 from __future__ import annotations
@@ -15,15 +15,22 @@ from webots_mcp.analysis.arrays import Array, median, np, runs_of
 from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.search import EventKind, Search, in_metres, places_in
+from webots_mcp.judging.detection.side_slip import (
+    SLIP_S,
+    SLIPS,
+    SideSlip,
+    side_slips,
+    wheels_by_side,
+)
 from webots_mcp.judging.detection.standstill import ON_THE_SPOT
 from webots_mcp.signals.meaning import words_in
 from webots_mcp.signals.naming import METRES, unit_in
 from webots_mcp.store.registered_signals import RegisteredSignal
 
-SLIP_S: Final = 3.0  # for so long
 _ALIKE: Final = 0.05  # of the faster side: wheels that differ by less drive straight on
-_TURNED_ALONE_RAD: Final = 0.3  # in 3 s, while both sides turn alike
-SLIPS: Final = 0.5  # of the usual way per turn of the wheels
+_TURNED_ALONE_RAD: Final = 0.3  # in 3 s beyond what is usual, while both sides turn alike
+_CELL_S: Final = 1.0  # over which headings and speeds are averaged for that
+_WINDOW: Final = 3  # such cells
 _CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
 _NOISE_SHARE: Final = 0.1  # of the speed that it may take
 _CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
@@ -34,8 +41,6 @@ _BY_WHEELS: Final = ("odom", "odometry")
 _OFF_THE_FLOOR_M: Final = 0.3
 _NOISE: Final = 6.0  # standard deviations
 _OWN_HEIGHT: Final = frozenset(("altitude", "height", "m", "cm", "pressure", "gps", "position"))
-_ON_THE_GROUND: Final = frozenset(("wheel", "track", "caterpillar"))
-_RUDDERS: Final = frozenset(("steering", "rudder", "aileron", "elevon", "fin"))
 
 
 class _Slip(NamedTuple):
@@ -63,11 +68,12 @@ def slip_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError(
             "its motors lift it"
             if wheels and flies(search)
-            else "no position, or no speeds of its wheels, are recorded: publish them"
+            else "publish the position and the speeds of its wheels"
         )
     if _Slip not in search.shared:
         search.shared[_Slip] = _slips_of(search, search.motion.position, wheels)
-    slips, rolls, kept = search.shared[_Slip]
+    slips, rolls, kept, no_side = search.shared[_Slip]
+    search.not_searched("slip", *no_side)
     search.judged("slip", [*search.motion.position, *wheels], [search.whole.bounds_s])
     segment = search.segment
     for slip in slips:
@@ -104,8 +110,8 @@ def _slips_of(
     search: Search,
     position: tuple[RegisteredSignal, RegisteredSignal],
     wheels: list[RegisteredSignal],
-) -> tuple[list[_Slip], str, float]:
-    """Where it slipped, how it rolls otherwise, and the least of that without a slip.
+) -> tuple[list[_Slip], str, float, list[str]]:
+    """Where it slipped, how it rolls otherwise, the least of that without a slip; why no side is.
 
     Raises:
         NotSearchableError: It cannot be told how far it usually goes.
@@ -124,62 +130,93 @@ def _slips_of(
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
     rolls = f"rolls {usual:.3g} m/s{unit}"
     runs = runs_of(ratios < SLIPS * usual, starts_s)
-    slips = list(_turns_though_straight(search, wheels))
+    no_side = list[str]()
+    of_sides, factor = list[SideSlip](), 0.0
+    try:
+        of_sides, factor = side_slips(search, wheels, usual)
+    except NotSearchableError as error:
+        if all(wheels_by_side(search, wheels)):
+            no_side.append(f"not by side: {error}")
+    turns = _turns_though_straight(search, wheels, factor)
+    slips = [each for each in turns if not _is_within(each, of_sides)]
+    slips += [_Slip(e.start_s, e.end_s, e.side, _says(e)) for e in of_sides]
     for run in runs.only(runs.durations_s + 2 * lasts_s >= SLIP_S).spans():
         least = float(np.nanmin(ratios[run.start : run.stop]))
         end_s = min(run.end_s + 2 * lasts_s, search.ended_s)
-        slips.append(_Slip(run.start_s, end_s, None, f"{rolls}, then {least:.3g}"))
-    slips.sort()
+        whole = _Slip(run.start_s, end_s, None, f"{rolls}, then {least:.3g}")
+        slips += [] if _is_within(whole, of_sides) else [whole]
+    slips.sort(key=lambda each: each.start_s)
     kept = float(np.min(rolled)) / usual
     lasts_s *= np.count_nonzero(known)
-    return slips, f"{rolls} for {lasts_s:.3g} s; under {100 * SLIPS:g} % of it counts", kept
+    rolls = f"{rolls} for {lasts_s:.3g} s; under {100 * SLIPS:g} % of it counts"
+    return slips, rolls, kept, no_side
 
 
-def _turns_though_straight(search: Search, wheels: list[RegisteredSignal]) -> Iterator[_Slip]:
+def _says(slip: SideSlip) -> str:
+    return (
+        f"the {slip.side} side slipped: it rolled {100 * max(slip.share, 0.0):.0f} % of what its "
+        "wheels turned, while the other side rolled"
+    )
+
+
+def _is_within(slip: _Slip, others: Sequence[SideSlip]) -> bool:
+    """Whether most of a slip lies in one whose side is known."""
+    shared_s = (min(slip.end_s, e.end_s) - max(slip.start_s, e.start_s) for e in others)
+    return any(2 * each > slip.end_s - slip.start_s for each in shared_s)
+
+
+def _turns_though_straight(
+    search: Search, wheels: list[RegisteredSignal], factor: float
+) -> Iterator[_Slip]:
     """A robot that turned for long while the wheels of both sides turned alike: one side slips.
 
-    A robot that steers turns so by nature, and where none of its wheels has a side nothing is said.
-    Motors that are not known to drive wheels may be those of propellers.
+    Where none of its wheels has a side nothing is said.
+
+    Args:
+        search: In which run.
+        wheels: Of both sides.
+        factor: How fast it turns per difference of its wheels; 0 where that is not known.
     """
-    heading = search.motion.heading
-    sides = {
-        side: [w for w in wheels if (search.meanings[w.name].side or "").endswith(side)]
-        for side in ("left", "right")
-    }
-    steers = any(not _RUDDERS.isdisjoint(words_in(name)) for name in search.known)
-    on_ground = all(
-        not _ON_THE_GROUND.isdisjoint(words_in(each.name))
-        or search.meanings[each.name].source in ("declared", "device")
-        for each in wheels
-    )
-    if heading is None or steers or not on_ground or not all(sides.values()):
+    heading, sides = search.motion.heading, wheels_by_side(search, wheels)
+    if heading is None or not all(sides):
         return
     frame, turn = search.whole, heading.turn or math.tau
     course = unwrap(frame.numbers(heading.name), turn) * math.tau / turn
-    left, right = (
-        np.mean([frame.numbers(each.name) for each in wheels], axis=0) for wheels in sides.values()
-    )
-    fastest = np.maximum(np.abs(left), np.abs(right))
-    alike = (np.abs(left - right) <= _ALIKE * fastest) & (fastest > 0) & np.isfinite(course)
+    speeds = (np.mean([frame.numbers(e.name) for e in wheels], axis=0) for wheels in sides)
+    columns = np.array([frame.times, course, *speeds])
+    columns = columns[:, np.isfinite(columns).all(axis=0)]
+    cells = (columns[0] // _CELL_S).astype(np.intp)
+    firsts = np.flatnonzero(np.diff(cells, prepend=-1))
+    if len(firsts) < 2:
+        return
+    counts = np.diff(firsts, append=len(cells))
+    t, course, left, right = np.add.reduceat(columns, firsts, axis=1) / counts
+    fastest, mean = np.maximum(np.abs(left), np.abs(right)), (left + right) / 2
+    alike = (np.abs(left - right) <= _ALIKE * fastest) & (fastest > _CREEPS * fastest.max())
+    alike = alike[1:] & alike[:-1] & (mean[1:] * mean[:-1] > 0) & (np.diff(cells[firsts]) == 1)
+    if not alike.any():
+        return
+    steps_s, apart = np.diff(t), right - left
+    turned, driven = np.diff(course), (mean[1:] + mean[:-1]) / 2 * steps_s
+    turned = turned - factor * (apart[1:] + apart[:-1]) / 2 * steps_s  # what wheels explain
+    # Wheels of unlike radius make it turn all the time: what it does in a tenth of it is usual.
+    ratios = turned[alike] / driven[alike]
+    usual = float(ratios[np.argsort(np.abs(ratios))[len(ratios) // 10]])
+    excess = (turned - usual * driven) * np.sign(mean[1:])
     noise = search.noise.of(heading.name) * math.tau / turn
-    for rest in runs_of(alike, frame.times).spans():
-        if rest.end_s - rest.start_s < SLIP_S:
-            continue
-        part = course[rest.start : rest.stop]
-        clock = frame.times[rest.start : rest.stop]
-        cells = np.searchsorted(clock, np.arange(clock[0], clock[-1], SLIP_S))
-        turned = np.diff(part[cells])
-        edges = clock[cells]
-        for sign in (-1, 1):
-            far = sign * turned > max(_TURNED_ALONE_RAD, _NOISE * noise)
-            for span in runs_of(far, edges[:-1]).spans():
-                side = "left" if sign > 0 else "right"
-                total = float(np.abs(turned[span.start : span.stop]).sum())
-                says = (
-                    f"the {side} side slipped: it turned by {total:.3g} rad while the wheels of "
-                    "both sides turned alike"
-                )
-                yield _Slip(float(edges[span.start]), float(edges[span.stop]), side, says)
+    for sign, side in ((1, "left"), (-1, "right")):
+        total = np.convolve(np.where(alike, sign * excess, -math.inf), np.ones(_WINDOW), "valid")
+        far = np.flatnonzero(total > max(_TURNED_ALONE_RAD, _NOISE * noise))
+        slips = np.zeros(len(alike), np.bool_)
+        for at in range(_WINDOW):
+            slips[far + at] = True
+        for span in runs_of(slips, t[:-1]).spans():
+            by = float(np.abs(turned[span.start : span.stop]).sum())
+            says = (
+                f"the {side} side slipped: it turned by {by:.3g} rad while the wheels of both "
+                "sides turned alike"
+            )
+            yield _Slip(float(t[span.start]), float(t[span.stop]), side, says)
 
 
 def _ratios(

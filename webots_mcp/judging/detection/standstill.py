@@ -9,13 +9,13 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, runs_of
-from webots_mcp.analysis.still_intervals import (
+from webots_mcp.analysis.path_length import SmoothedTrack, track_of
+from webots_mcp.analysis.standstills import (
     MOST_AROUND,
     NEARLY,
     find_standstills,
     shortest_seen_s,
 )
-from webots_mcp.analysis.track import SmoothedTrack, track_of
 from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import (
@@ -367,20 +367,22 @@ class Standings:
             said = []
         told, wheels = self.told[rows], self.wheel_drives[rows] != 0
         speeds, is_measured = np.zeros(0), self.motion.commanded is None
-        if self.speed is not None and told.sum() > TOLD_SHARE * len(told):
+        was_told, turned = (int(np.count_nonzero(each)) for each in (told, wheels))
+        if self.speed is not None and was_told > TOLD_SHARE * len(told):
             speeds = self.speeds[rows][told]
             said.append(f"{self.speed.name} {median(speeds):.3g}")
-        if wheels.sum() > TOLD_SHARE * len(wheels):
+        if turned > TOLD_SHARE * len(wheels):
             unit = " rad/s" if all(wheel.unit in _TURNS for wheel in self.wheels) else ""
-            turning = (self.wheel_drives * self.fastest)[rows][wheels]
+            turning = (self.wheel_drives[rows] * self.fastest[rows])[wheels]
             said.append(f"wheels at {median(abs(turning)):.3g}{unit}")
-            if wheels.sum() > told.sum():
+            if turned > was_told:
                 speeds, is_measured = turning, not self.motion.wheel_commands
         turning = self.told_to_turn[rows]
-        if (command := self.motion.turn_command) and turning.sum() > TOLD_SHARE * len(turning):
+        told_to_turn = int(np.count_nonzero(turning))
+        if (command := self.motion.turn_command) and told_to_turn > TOLD_SHARE * len(turning):
             rates = self.turn_speeds[rows][turning]
             said.append(f"{command.name} {median(rates):.3g}")
-            if turning.sum() > told.sum():
+            if told_to_turn > was_told:
                 speeds, is_measured = rates, False
         if not said:
             return said, self._why_mode_is_not_enough(rows)
@@ -638,9 +640,11 @@ def _at_one_height(
     Noise does neither: with it, heights reach farther than the robot does.
     """
     there = np.flatnonzero(np.isfinite(heights))
-    up = track_of(
-        track.times[first + there], heights[there], np.zeros(len(there)), noise_of(heights[there])
-    )
+    noise_m = noise_of(heights[there])
+    if not noise_m and (not len(there) or float(np.ptp(heights[there])) <= options.stuck_m):
+        yield first, first + len(heights)
+        return
+    up = track_of(track.times[first + there], heights[there], np.zeros(len(there)), noise_m)
     far_m = np.ptp(up.x) if len(there) > 1 else 0.0
     if far_m <= options.stuck_m + NOISE_RANGE * up.left_m:
         yield first, first + len(heights)

@@ -2,8 +2,8 @@
 
 Judged is by medians of cells of a second, whose error is known from the noise of both signals, so
 that neither noise nor the rate of rows decides. A target that keeps moving is judged by how it is
-followed. A height takes as long as it takes: it is off only where it never came to a target that
-stayed, nor any nearer in the second half of its stay.
+followed, and one that steps also by how far it is passed. A height takes as long as it takes: it is
+off only where it never came to a target that stayed, nor any nearer in the second half of its stay.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from webots_mcp.judging.detection.event import (
 )
 from webots_mcp.judging.detection.following import following_of
 from webots_mcp.judging.detection.holding import Grip, grips_in, lost_grips
+from webots_mcp.judging.detection.overshoot import overshoots_of
 from webots_mcp.judging.detection.search import EventKind, Search
 from webots_mcp.signals.meaning import HOLDING, Meaning, Quantity, targets_in, words_in
 from webots_mcp.signals.naming import METRES
@@ -38,6 +39,7 @@ from webots_mcp.store.reading.segment import just_after
 from webots_mcp.store.registered_signals import RegisteredSignal
 
 OFF_S: Final = 3.0  # away for so long, without coming nearer
+OVERSHOT: Final = "overshoot_percent"  # of the step, in the details of an event
 OFF_SHARE: Final = 0.1  # of the largest step or size of the target
 _CELL_S: Final = 1.0  # over which medians are taken
 _ERRORS: Final = 4.0  # standard errors of a median: one cell in 16,000 is beyond by noise alone
@@ -131,7 +133,11 @@ def off_target_events(search: Search) -> Iterator[Event]:
     search.judged("off_target", [each.target for each in pursuits])
     for signal in search.in_time("off_target", [each.measured for each in pursuits]):
         pursuit = targets[signal.name]
-        yield from (_never_reached if pursuit.is_height else _off_or_lost)(search, pursuit)
+        found = list((_never_reached if pursuit.is_height else _off_or_lost)(search, pursuit))
+        yield from found
+        for each in _overshoots(search, pursuit):
+            if all(each.end_s < e.start_s or each.start_s > e.end_s for e in found):
+                yield each
 
 
 def _lost_grips(search: Search, grips: Sequence[Grip]) -> Iterator[Event]:
@@ -307,6 +313,34 @@ def _size_of(search: Search, pursuit: Pursuit) -> float:
     return float(np.ptp(aims)) or float(np.abs(aims).max())
 
 
+def _overshoots(search: Search, pursuit: Pursuit) -> Iterator[Event]:
+    """Where it passed a target that had stepped by a quarter of the step, however short."""
+    frame, measured, target = search.frame, pursuit.measured, pursuit.target
+    values, aims = frame.numbers(measured.name), pursuit.scale * frame.numbers(target.name)
+    there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
+    if len(there) < 2:
+        return
+    size, noise = _size_of(search, pursuit), search.noise.of(measured.name)
+    for each in overshoots_of(
+        frame.times[there], values[there], aims[there], OFF_SHARE * size, noise, measured.turn
+    ):
+        says = (
+            f"it passed its target of {each.target:.4g} by {abs(each.beyond):.3g}, "
+            f"{100 * each.share:.0f} % of the step of {abs(each.step):.3g}"
+        )
+        error = np.array([each.beyond])
+        event = _off_target(search, pursuit, each.start_s, each.end_s, error, size)
+        details = event.details | {OVERSHOT: round(100 * each.share, 1), "says": says}
+        yield replace(event, details=details)
+
+
+def _alike(events: Sequence[Event], unit: str) -> str:
+    if OVERSHOT in events[0].details:
+        shares = [each.details[OVERSHOT] for each in events]
+        return f"overshoots of {min(shares):.0f} to {max(shares):.0f} % of the step"
+    return "times off target"
+
+
 def _never_reached(search: Search, pursuit: Pursuit) -> Iterator[Event]:
     """Where a target stayed, was never reached, and came no nearer in the second half of that."""
     frame, measured, target = search.frame, pursuit.measured, pursuit.target
@@ -323,11 +357,19 @@ def _never_reached(search: Search, pursuit: Pursuit) -> Iterator[Event]:
         nearest = max(OFF_SHARE * size, margin)
         nearer = max(_ON_ITS_WAY * size, 2 * margin)
         crosses = np.any(np.sign(error) != np.sign(error[0]))
-        if crosses or away.min() <= nearest or away[half:].max() - away[-1] > nearer:
+        if crosses or away.min() <= nearest or _drop_of(away[half:]) > nearer:
             continue
-        first = int(np.flatnonzero(np.append(True, away[:-1] > away[-1] + nearer))[-1])
+        # Gusts move it to and fro while it stays away; before, it was on its way.
+        farthest = float(away[half:].max()) + nearer
+        first = int(np.flatnonzero(np.append(True, away[:half] > farthest))[-1])
         start_s, end_s = float(cells.starts_s[cells.is_full][first]), stay.end_s
         yield _off_target(search, pursuit, start_s, end_s, error[first:], size)
+
+
+def _drop_of(values: Array) -> float:
+    """By how much the straight line through some values falls from the first to the last."""
+    at = np.arange(len(values)) - (len(values) - 1) / 2
+    return -float((at * values).sum() / max(float((at * at).sum()), 1.0)) * (len(values) - 1)
 
 
 def _off_target(
@@ -408,6 +450,6 @@ OFF_TARGET: Final = EventKind(
     least_s=lambda options: OFF_S,
     ends_within_s=lambda event: 2 * _CELL_S,
     drawn=4,
-    alike=Alike(lambda events, unit: "times off target"),
+    alike=Alike(_alike, sort=lambda event: OVERSHOT in event.details),
     severity=60,
 )

@@ -29,13 +29,12 @@ from webots_mcp.errors import (
 from webots_mcp.extras.requirements import quoted
 from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.plotting import changed_most
-from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
+from webots_mcp.plotting.interactive_svg import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.controller_variables import shown_variables
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.signals.naming import flatten, spelled_out
-from webots_mcp.store.ages import age_in_words
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.inspections import inspections_of
 from webots_mcp.store.logs import LogFilter, LogLine, LogWindow, newest_lines
@@ -43,6 +42,7 @@ from webots_mcp.store.meanings import meanings_of
 from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, recorded_bounds
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_of
+from webots_mcp.store.relative_times import age_in_words
 from webots_mcp.store.robot_status import RUNNING
 from webots_mcp.store.robots import list_robots, nothing_recorded, without_observers
 from webots_mcp.store.run_parameters import described

@@ -23,8 +23,7 @@ from typing import Any, Final, cast
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
-from webots_mcp.plotting.on_a_page import figure_part
-from webots_mcp.plugins.page.chunk_maker import ChunkMaker
+from webots_mcp.plotting.interactive_svg import figure_part
 from webots_mcp.plugins.page.page_data import (
     controller_variables,
     describe_signals,
@@ -41,6 +40,7 @@ from webots_mcp.plugins.page.page_orders import (
     why_not_steerable,
 )
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
+from webots_mcp.store.chunk_making import make_missing_chunks
 from webots_mcp.store.recording import RecordingAccess
 
 HOST: Final = LOOPBACK[0]
@@ -57,6 +57,7 @@ _HEADERS: Final = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+_PERIOD_S: Final = 1.0
 
 
 @dataclass(frozen=True)
@@ -426,3 +427,45 @@ _QUESTIONS: Final = {
     "signals": _answer_signals,
     "variables": _answer_variables,
 }
+
+
+class ChunkMaker(threading.Thread):
+    """Checks once a second whether rows can be put into chunks.
+
+    Attributes:
+        says: Its progress, or why it stopped; "" if nothing is left.
+        rounds: How often it has put all rows into chunks.
+    """
+
+    def __init__(self, recording: RecordingAccess) -> None:
+        super().__init__(name="webots-mcp page", daemon=True)
+        self._recording = recording
+        self._ending = threading.Event()
+        self.says = ""
+        self.rounds = 0
+
+    def run(self) -> None:
+        """Make chunks until stopped."""
+        while not self._ending.is_set():
+            self.make_chunks()
+            self._ending.wait(_PERIOD_S)
+
+    def make_chunks(self) -> None:
+        """Put the rows that are there into chunks."""
+        worked = False
+
+        def note(done: int, of: int) -> None:
+            nonlocal worked
+            worked = True
+            self.says = f"making chunks of what was recorded: {100 * done // max(of, 1)} %"
+
+        try:
+            self.says = make_missing_chunks(self._recording, note, called_off=self._ending.is_set)
+        except WebotsMCPError:  # The tabs report it.
+            self.says = ""
+        self.rounds += worked
+
+    def stop(self) -> None:
+        """Stop the thread, and wait for it for at most 2 s."""
+        self._ending.set()
+        self.join(timeout=2)

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from cyclopts.validators import Number
 
-from webots_mcp.cli.ending import ending_in_time
+from webots_mcp.cli.interrupts import ending_in_time
 from webots_mcp.cli.options import HERE, Json, Parameter, Where, whole_number
 from webots_mcp.cli.server_commands import MAX_PORT
 from webots_mcp.cli.terminal import print_json

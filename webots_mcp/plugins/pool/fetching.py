@@ -22,6 +22,7 @@ from typing import Final
 
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.processes import process_alive
+from webots_mcp.database.tapes.tape import tape_file
 from webots_mcp.database.transactions import transaction
 from webots_mcp.plugins.pool.pool_contents import ChosenRuns, PooledRun
 from webots_mcp.plugins.pool.pool_interface import Pool, is_whole, table
@@ -152,6 +153,7 @@ class _Fetcher:
                     copy.rows(name, "run_id", ids)
                 copy.rows("state", "run_id", ids, copied)
                 copy.pictures(folder)
+                copy.tapes(folder)
                 lacking = self._settle(small, runs)
                 copy.rows(
                     "row_group", "run_id", lacking
@@ -298,6 +300,15 @@ class _Copy:
             is_ours = file.resolve().is_relative_to(folder.resolve())
             if not is_ours or file.suffix.lower() not in PICTURES:
                 continue
+            if (content := self._pool.picture(self._recording_uuid, path)) is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(content)
+
+    def tapes(self, folder: Path) -> None:
+        """Copy the tapes that were shipped."""
+        for (uuid,) in self._small.execute("SELECT uuid FROM session").fetchall():
+            file = tape_file(folder, str(uuid))
+            path = file.relative_to(folder).as_posix()
             if (content := self._pool.picture(self._recording_uuid, path)) is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_bytes(content)

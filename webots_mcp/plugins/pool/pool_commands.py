@@ -252,7 +252,9 @@ def ship(
             help="Ship every state. Default: chunks of all states, and full-rate segments.",
         ),
     ] = False,
-    pictures: Annotated[bool, Parameter("--pictures", help="Also ship the picture files.")] = False,
+    pictures: Annotated[
+        bool, Parameter("--pictures", help="Also ship the files of pictures and tapes.")
+    ] = False,
     pause_s: Annotated[
         float | None,
         Parameter(

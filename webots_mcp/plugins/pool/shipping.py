@@ -22,6 +22,7 @@ from typing import Final, NoReturn
 
 from webots_mcp.database.connection import FrozenConnection
 from webots_mcp.database.session_cleanup import find_dead_sessions
+from webots_mcp.database.tapes.tape import tape_file
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
@@ -54,6 +55,7 @@ from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
 # Names in the progress: the last shipped picture file, and the last state of a full-rate segment.
 _PICTURE: Final = "picture"
+_TAPE: Final = "tape"  # in the progress: the last session whose tape was shipped
 _STRETCH: Final = "kept_stretch/"
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {}"
 # The last group before the first incomplete one: groups with lower ids are not checked again.
@@ -292,6 +294,7 @@ class Shipper:
                 self._ship_kept(source, thorough=thorough)
             if self._order.pictures:
                 self._ship_pictures(source)
+                self._ship_tapes(connection)
             if is_complete and thorough:  # Otherwise not all rows were compared.
                 whole = whole_runs(ended - source.foreign).items()
                 self._put(None, {name: n | self._progress.get(name, 0) for name, n in whole})
@@ -513,6 +516,23 @@ class Shipper:
                     last = int(str(row[0]))
                     break
             self._add(None, {_PICTURE: last})
+            self._send()
+
+    def _ship_tapes(self, connection: sqlite3.Connection) -> None:
+        """Ship the tapes of the sessions that have ended since the last one, as files."""
+        ended = connection.execute(
+            "SELECT id, uuid FROM session WHERE id > ? AND id < coalesce((SELECT min(id) "
+            "FROM session WHERE ended_wall_time_s IS NULL), id + 1) ORDER BY id",
+            (self._progress.get(_TAPE, 0),),
+        ).fetchall()
+        for session_id, uuid in ended:
+            data_dir = self._order.recording.data_dir
+            file = tape_file(data_dir, str(uuid))
+            if file.is_file() and not file.is_symlink():
+                self._shipment.write_picture(
+                    file.relative_to(data_dir).as_posix(), file.read_bytes()
+                )
+            self._add(None, {_TAPE: session_id})
             self._send()
 
     def _ship_picture(self, path: str) -> int:

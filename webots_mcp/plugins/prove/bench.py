@@ -14,12 +14,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
-from webots_mcp.cli.asking import ask
 from webots_mcp.cli.options import Where
+from webots_mcp.cli.question_commands import ask
 from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, host_name
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.questions.control_simulation import webots_simulation_control
-from webots_mcp.questions.declaring import Question
+from webots_mcp.questions.declaration import Question
 from webots_mcp.questions.send_command import webots_send_command
 from webots_mcp.setup.observer_edits import controller_change, python_change, with_observer
 from webots_mcp.simulator.launch import WebotsLaunch

@@ -20,9 +20,7 @@ from webots_mcp.judging.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.judging.verdicts import AS_STUCK, Verdicts
 from webots_mcp.plotting.intervals import at_resolution, lane_of
 from webots_mcp.plotting.plotted_runs import plotted_runs
-from webots_mcp.plugins.report.controller_variables import ShownVariables, shown_variables
-from webots_mcp.plugins.report.grid import Grid, GridRow
-from webots_mcp.plugins.report.opening import (
+from webots_mcp.plugins.report.chapter_opening import (
     CRASH,
     MOMENTS,
     ModeInterval,
@@ -31,6 +29,8 @@ from webots_mcp.plugins.report.opening import (
     most_important,
     opening_of,
 )
+from webots_mcp.plugins.report.controller_variables import ShownVariables, shown_variables
+from webots_mcp.plugins.report.tables import Grid, GridRow
 from webots_mcp.plugins.report.words import (
     capitalised,
     clock,

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import Room
-from webots_mcp.plotting.on_a_page import Figure, signals_figure, way_figure
+from webots_mcp.plotting.interactive_svg import Figure, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.report.chapter import Chapter, EventContext

@@ -64,7 +64,7 @@ def report(
     timeline), interactive figures, the path, pictures, commands and the log. The file is
     self-contained and needs no network.
     """
-    from webots_mcp.plugins.report.making import (
+    from webots_mcp.plugins.report.make_report import (
         file_name,
         make_report,
         require_folder,

@@ -13,7 +13,7 @@ from webots_mcp.judging.checks.check_run import CheckedRun
 from webots_mcp.judging.comparison import Comparison, Difference, compare_runs
 from webots_mcp.judging.run_measures import GOAL_REACHED, Measure
 from webots_mcp.judging.verdicts import WORST_FIRST
-from webots_mcp.plugins.report.grid import Grid, GridRow
+from webots_mcp.plugins.report.tables import Grid, GridRow
 from webots_mcp.plugins.report.words import cut, format_value, length, number
 from webots_mcp.signals import naming
 from webots_mcp.store.run_parameters import RunParameter, parameters_of
@@ -34,11 +34,6 @@ _MOST_REPEATS: Final = 5  # runs of each side, with the one that was named
 _AS_LONG: Final = 0.95  # of the shorter run: a repeat lasted at least that long
 # Measures of which one direction is better, with the sign of that direction.
 _BETTER_IF: Final = {GOAL_REACHED: 1, "time_to_goal_s": -1}
-_OF_SAME_CODE: Final = (
-    "SELECT r.id FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.robot_id = ? AND s.controller_sha256 = ? AND r.world IS ? AND r.row_count > 0 "
-    "AND r.last_sim_time_s - r.started_sim_time_s >= ? ORDER BY r.id DESC LIMIT 200"
-)
 _LARGE: Final = ((0.8, "large"), (0.5, "medium"), (0.2, "small"))  # Cohen's names for sizes of d.
 
 
@@ -132,7 +127,15 @@ def with_repeats(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list
             return list(run_ids)
         robot_id = fetch_run(connection, info.run_id).robot_id
         asked = (robot_id, info.controller_sha256, info.world, least_s)
-        others = [row[0] for row in connection.execute(_OF_SAME_CODE, asked)]
+        others = [
+            row[0]
+            for row in connection.execute(
+                "SELECT r.id FROM run r JOIN session s ON s.id = r.session_id WHERE r.robot_id = ? "
+                "AND s.controller_sha256 = ? AND r.world IS ? AND r.row_count > 0 "
+                "AND r.last_sim_time_s - r.started_sim_time_s >= ? ORDER BY r.id DESC LIMIT 200",
+                asked,
+            )
+        ]
         known = parameters_of(connection, [info.run_id, *others])
         values = {run_id: _parameter_values(each) for run_id, each in known.items()}
         same = [each for each in others if values[each] == values[info.run_id]]

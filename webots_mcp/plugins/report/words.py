@@ -195,6 +195,7 @@ def _describe_others(event: Event) -> str:
 
 def _describe_fall(event: Event) -> str:
     tilted = f"tilted by {format_value(event.details.get('tilt_deg'))}°"
+    tilted += f" ({event.details['direction']})" if "direction" in event.details else ""
     who = f"{event.name} " if event.name else ""
     after = "got up again" if event.details.get("got_up") else "stayed down"
     return f"{who}fell: {tilted}, {after}"

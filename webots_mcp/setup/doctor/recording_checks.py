@@ -26,10 +26,10 @@ from webots_mcp.setup.doctor import (
     warning,
     wrong,
 )
-from webots_mcp.store.ages import ago
 from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.loop_evidence import handler_at_work, rows_waiting
 from webots_mcp.store.recording import GETTING_STARTED, RobotView, name_of
+from webots_mcp.store.relative_times import ago
 from webots_mcp.store.robots import nothing_recorded
 from webots_mcp.store.sessions import fetch_session
 

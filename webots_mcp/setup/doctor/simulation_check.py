@@ -38,9 +38,6 @@ if TYPE_CHECKING:
     from webots_mcp.simulator.instances import Instance
 
 
-_RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
-
-
 @dataclass(frozen=True)
 class WatchLimits:
     """How processes of a simulation are watched.
@@ -125,7 +122,13 @@ def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
     webots = _webots_of(subject, session)
     reload, play = (
         _also_by_websocket(fix, order, webots)
-        for fix, order in ((_RELOAD, "reload"), ("press play in Webots", "resume"))
+        for fix, order in (
+            (
+                "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)",
+                "reload",
+            ),
+            ("press play in Webots", "resume"),
+        )
     )
     others = None if session.host != host_name() else _controllers_beside(view, session, webots)
     busy = None if others is None else _computing({session.pid, *others.pids})

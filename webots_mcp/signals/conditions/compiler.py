@@ -57,7 +57,6 @@ _NO_COMPARISON: Final = (ast.LShift, ast.RShift, ast.BitAnd, ast.BitOr, ast.BitX
 _COMPARE: Final = (
     "compare with < <= > >= == or !=; instead of `in` write mode == 'a' or mode == 'b'"
 )
-_OF_A_RUN: Final = ("mean", "avg", "average", "first", "last")
 
 
 def _as_it_is(value: Any) -> Any:
@@ -472,7 +471,7 @@ class Compiler(Nodes):
         if name is None:
             return "only these functions can be called: " + ", ".join(f"{f}()" for f in FUNCTIONS)
         offer = ", ".join(f"{each}()" for each in nearest_first(name, FUNCTIONS))
-        if name in _OF_A_RUN:
+        if name in ("mean", "avg", "average", "first", "last"):
             return (
                 f"{name}() is possible only in a score; webots_get_trends has the mean, minimum "
                 f"and maximum of a signal. Functions of a condition: {offer}"

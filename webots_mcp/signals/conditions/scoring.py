@@ -19,7 +19,6 @@ from webots_mcp.signals.conditions.syntax import Nodes, Scanned, function_of, is
 from webots_mcp.signals.naming import nearest_first
 
 _REDUCTIONS: Final = ("min", "max", "first", "last", "mean")
-_DURATION: Final = "duration"
 _FUNCTIONS: Final = (*_REDUCTIONS, "abs", "time", "count")
 _MOST_OFFERED: Final = 3
 _MISPLACED_FOR: Final = "`for` belongs to a condition, as in time(x < 1 for 2)"
@@ -149,7 +148,7 @@ class _Compiler(Nodes):
             if isinstance(value, str):
                 self._refuse(node, "a number is needed here")
             return lambda facts: value
-        if isinstance(node, ast.Name) and node.id == _DURATION:
+        if isinstance(node, ast.Name) and node.id == "duration":
             return lambda facts: facts.duration_s
         if is_signal(node):
             several = "a signal has a value in each state: write mean(...), max(...), last(...)"

@@ -26,7 +26,6 @@ _TOKEN: Final = re.compile(
     re.VERBOSE,
 )
 _SUCH_AS: Final = {"condition": "front_m < 0.1 for 0.5", "score": "mean(abs(error))"}
-_NAMES: Final = ("word", "item")
 _NEVER_TOGETHER: Final = frozenset(
     (
         ("number", "word"),
@@ -103,7 +102,11 @@ def scan(text: str, what: str = "condition") -> Scanned:
         if found is None:
             raise refusal(unread, place, _why_unknown(text[place]))
         kind, token = str(found.lastgroup), found.group()
-        if kind == "number" and token[0] == "." and (before in _NAMES or text[place - 1] in ")]"):
+        if (
+            kind == "number"
+            and token[0] == "."
+            and (before in ("word", "item") or text[place - 1] in ")]")
+        ):
             kind = "item"
         if (before, kind) in _NEVER_TOGETHER:
             raise refusal(unread, place, _missing_before(before, token))

@@ -435,7 +435,7 @@ class Frame:
         for at in cut:
             rows = self.rows(int(edges[at]), int(edges[at + 1]))
             table[at] = statistics_of(rows._decoded(name))
-        figures: dict[str, Array] = dict(zip(Statistics._fields, table.T, strict=True))
+        figures: dict[str, Array] = dict(zip(Statistics._fields, np.transpose(table), strict=True))
         held: Indexes = figures.pop("row_count").astype(np.intp)
         present: Indexes = figures.pop("value_count").astype(np.intp)
         changed: Indexes = figures.pop("change_count").astype(np.intp)
@@ -640,9 +640,10 @@ def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:
 
 def _coded(values: Decoded, *, numbers: bool) -> Coded:
     labels: list[Value] = [None]
-    codes = np.zeros(len(values.numbers), np.intp)
+    codes: Indexes | None = None
     is_number = None if values.codes is None else values.codes == IS_NUMBER
     if numbers and (is_number is None or is_number.any()):
+        codes = np.zeros(len(values.numbers), np.intp)
         held = ~np.isnan(values.numbers)
         if is_number is not None:
             held &= is_number
@@ -657,8 +658,9 @@ def _coded(values: Decoded, *, numbers: bool) -> Coded:
             if isinstance(label, str) or (numbers and isinstance(label, bool)):
                 of_code[code] = len(labels)
                 labels.append(label)
-        codes += of_code[values.codes]
-    return Coded(codes, labels)
+        of_others: Indexes = of_code[values.codes]
+        codes = of_others if codes is None else codes + of_others
+    return Coded(np.zeros(len(values.numbers), np.intp) if codes is None else codes, labels)
 
 
 def _number(value: float) -> float:

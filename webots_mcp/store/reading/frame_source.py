@@ -24,9 +24,12 @@ from webots_mcp.store.chunks import (
     WALL_TIMES,
     DamagedChunkError,
     Decoded,
+    EncodedChunk,
     StateColumns,
     Statistics,
+    chunks_by_signal,
     decoded_of,
+    decoded_or_why,
     statistics_by_signal,
     statistics_in,
     statistics_of,
@@ -42,6 +45,7 @@ _OF_ITEMS: Final = (
 )
 _ITEMS: Final = _OF_ITEMS.format("state")
 _KEPT_ITEMS: Final = _OF_ITEMS.format("kept_state")
+_FEW_COLUMNS: Final = 4  # of a short run are read one by one
 _MOST_GROUP_ROWS: Final = 2**20  # far more than any maker puts into a group
 _NAMES: Final[dict[Column, str]] = {
     SIM_TIMES: "simulation times",
@@ -86,6 +90,7 @@ class FrameSource:
         self.bounds: tuple[int, int] = (0, 0)
         self.frames: dict[tuple[int, int], None] = {}
         self._cache = _ArrayCache()
+        self._columns_read = 0
         self._noting: list[dict[Unread, Column | None]] = []
         groups = self._sound(groups)
         self._group_ids: Indexes = groups[:, 0].astype(np.intp)
@@ -240,7 +245,7 @@ class FrameSource:
         targets: dict[int, Array] = {}
         if into:
             targets = {ids[n]: into[place] for n, place in enumerate(places) if place in into}
-        found = values_in(self.connection, self.run_id, signal_id, wanted, targets)
+        found = self._stored(signal_id, wanted, targets)
         for group_id, values in found:
             missing.pop(group_id, None)
             place = of_group[group_id]
@@ -252,6 +257,25 @@ class FrameSource:
             instead = self._without_chunk(place, column, DamagedChunkError("missing"))
             if instead is not None:
                 yield place, instead
+
+    def _stored(
+        self, signal_id: int, wanted: Mapping[int, int], targets: Mapping[int, Array]
+    ) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
+        """Yield what `values_in` does; of a short run all chunks are read once many are wanted."""
+        self._columns_read += 1
+        if len(self._ids_of_groups) > 1 or self._columns_read <= _FEW_COLUMNS:
+            yield from values_in(self.connection, self.run_id, signal_id, wanted, targets)
+            return
+        chunk = self._chunks_of_one_group.get(signal_id)
+        if chunk is None:
+            return
+        for group_id, rows in wanted.items():
+            yield group_id, decoded_or_why(chunk, rows, targets.get(group_id))
+
+    @cached_property
+    def _chunks_of_one_group(self) -> dict[int, EncodedChunk]:
+        """The chunks of all signals of a short run, read at once."""
+        return chunks_by_signal(self.connection, self.run_id, self._ids_of_groups[0])
 
     def _signal_id(self, column: Column) -> int | None:
         return self.ids.get(column) if isinstance(column, str) else column

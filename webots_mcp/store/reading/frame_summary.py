@@ -584,9 +584,11 @@ def _first_of_last_equal(frame: Frame, signal: RegisteredSignal, value: str | bo
 def _points_in(frame: Frame, signal: RegisteredSignal) -> list[Point]:
     """The first value of a frame, and each that is unlike the one before."""
     values, codes = _valued(frame, signal)
-    read = frame.was_read(signal.name)
-    times, codes = frame.times[read], codes[read]
-    rows = np.flatnonzero(np.diff(codes, prepend=-1))
+    times = frame.times
+    if frame.unread:
+        read = frame.was_read(signal.name)
+        times, codes = times[read], codes[read]
+    rows = np.flatnonzero(np.append(True, codes[1:] != codes[:-1])[: len(codes)])
     at = zip(times[rows].tolist(), codes[rows].tolist(), strict=True)
     return [Point(time_s, values[code]) for time_s, code in at]
 
@@ -596,6 +598,8 @@ def _valued(frame: Frame, signal: RegisteredSignal) -> tuple[list[str | bool | N
     codes, labels = frame.coded(signal.name)
     of_label = [_value(signal, label) for label in labels]
     values = list(dict.fromkeys(of_label))
+    if values == of_label:
+        return values, codes
     places = {value: place for place, value in enumerate(values)}
     return values, np.array([places[value] for value in of_label], np.intp)[codes]
 

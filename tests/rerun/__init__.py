@@ -1,0 +1,1 @@
+"""Tapes of controllers, and new code on old runs."""

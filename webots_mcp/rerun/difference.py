@@ -1,0 +1,139 @@
+"""Compares what two versions of a controller command, round by round.
+
+A setting of an actuator holds until it is set again. So a version that sets it only when it
+changes commands the same as one that sets it in each round: what holds at the end of a round is
+compared. Of other commands, such as a packet that is sent, each counts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple, cast
+
+from webots_mcp.database.tapes.tape import TapedPlace
+
+MOST_SHOWN: Final = 8
+_HOLDING: Final = frozenset({"Motor", "LED", "Brake", "Pen", "VacuumGripper", "Connector", "Skin"})
+_SENSORS_HOLD: Final = ("enable", "disable")
+_OPPOSITES: Final = {
+    "disable": ("enable", [0]), "turnOn": ("turnOn", [1]), "turnOff": ("turnOn", [0]),
+    "lock": ("lock", [1]), "unlock": ("lock", [0]),
+    ".sampling_period": ("enable", None), ".target_position": ("setPosition", None),
+    ".target_velocity": ("setVelocity", None), ".available_force": ("setAvailableForce", None),
+    ".available_torque": ("setAvailableTorque", None),
+    ".target_acceleration": ("setAcceleration", None),
+}  # fmt: skip
+_CONTROL: Final = "control"  # by which of these a motor is driven: the last one that was set
+_CONTROLS: Final = {"setPosition": "position", "setForce": "force", "setTorque": "torque"}
+
+
+class GivenCommand(NamedTuple):
+    """A command to a device, the robot or the scene, as a tape has it."""
+
+    path: str
+    owner: str
+    name: str
+    arguments: list[Any]
+    place: TapedPlace | None
+
+
+Commands = dict[tuple[str, str], GivenCommand]
+
+
+class CommandDifference(NamedTuple):
+    """What the new version commanded instead of the old one; None where it commanded nothing."""
+
+    command: str
+    old: list[Any] | None
+    new: list[Any] | None
+    old_place: TapedPlace | None
+    new_place: TapedPlace | None
+
+    def __str__(self) -> str:
+        return f"{self.command} {_shown(self.new)} instead of {_shown(self.old)}"
+
+
+def _shown(arguments: list[Any] | None) -> str:
+    if arguments is None:
+        return "nothing"
+    return ", ".join(_short(each) for each in arguments) or "a call"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        value = next(iter(cast("dict[str, Any]", value).values()))
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+@dataclass
+class Commanded:
+    """What a controller has commanded: settings that hold, and the other commands of this round."""
+
+    holding: dict[tuple[str, str], GivenCommand] = field(
+        default_factory=dict[tuple[str, str], GivenCommand]
+    )
+    once: dict[tuple[str, str], GivenCommand] = field(
+        default_factory=dict[tuple[str, str], GivenCommand]
+    )
+
+    def begin_round(self) -> None:
+        """Forget the commands that were given once."""
+        self.once = {}
+
+    def add(self, command: GivenCommand) -> None:
+        """Add a command in its order."""
+        name, arguments = command.name, command.arguments
+        if name in _OPPOSITES:
+            name, fixed = _OPPOSITES[name]
+            arguments = arguments if fixed is None else fixed
+        command = command._replace(name=name, arguments=arguments)
+        key = (command.path, name)
+        if command.owner in _HOLDING or name in _SENSORS_HOLD or name.endswith("Period"):
+            self.holding[key] = command
+            if command.owner == "Motor" and name in _CONTROLS:
+                control = command._replace(name=_CONTROL, arguments=[_CONTROLS[name]])
+                self.holding[command.path, _CONTROL] = control
+            return
+        same = (of for path, of in self.once if path == command.path)
+        number = sum(1 for of in same if of.rpartition(" ")[0] == name)
+        self.once[command.path, f"{name} {number}"] = command
+
+
+def differences(old: Commanded, new: Commanded) -> list[CommandDifference]:
+    """Return how the commands of a round differ; empty where they are equal."""
+    found: list[CommandDifference] = []
+    for before, after in ((old.holding, new.holding), (old.once, new.once)):
+        for key in dict.fromkeys([*before, *after]):
+            one, other = before.get(key), after.get(key)
+            if one is not None and other is not None and _equal(one.arguments, other.arguments):
+                continue
+            known = one or other
+            is_implied = key[1] == _CONTROL and (one is None or other is None)
+            if known is None or is_implied or len(found) == MOST_SHOWN:
+                continue
+            place = (one.place if one else None, other.place if other else None)
+            found.append(
+                CommandDifference(
+                    _name_of(known),
+                    one.arguments if one else None,
+                    other.arguments if other else None,
+                    *place,
+                )
+            )
+    return found
+
+
+def _name_of(command: GivenCommand) -> str:
+    return f"{command.path.removeprefix('device:')}.{command.name.removeprefix('.')}"
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Return whether values are equal to the last digit; NaN equals NaN."""
+    if isinstance(one, list) and isinstance(other, list):
+        pair = cast("list[Any]", one), cast("list[Any]", other)
+        return len(pair[0]) == len(pair[1]) and all(map(_equal, *pair))
+    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
+        return math.isnan(other)
+    return one == other

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -39,7 +41,8 @@ from tests.benchmarks.ways import (
 from webots_mcp import MCPBridge
 from webots_mcp.bridge.camera_frames import scale_down
 from webots_mcp.bridge.picture_files import encode_png
-from webots_mcp.contract import KEEP_LAST_S
+from webots_mcp.contract import DATABASE_NAME, KEEP_LAST_S
+from webots_mcp.database.connection import connect
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.simulator.observer import Observer
 from webots_mcp.standin import InProcessSupervisor
@@ -279,6 +282,82 @@ def _filming(folder: Path, camera: _Camera | None, calls: int) -> Callable[[], f
     )
 
 
+@benchmark("inspection", "reading the controller's variables: at a hit, and watched paths")
+def measure_inspection(bench: Bench) -> Iterable[Line]:
+    """Processor time of a publish with and without five watched paths, and of a hit."""
+    calls = bench.count(2000, least=20)
+    with ExitStack() as stack:
+        bridges = {
+            name: stack.enter_context(closing(MCPBridge(Rover(), data_dir=bench.place(name))))
+            for name in ("watched", "plain", "hit")
+        }
+        loops = {name: _Loop(bridge) for name, bridge in bridges.items()}
+        loops["watched"].watch()
+        blocks = {name: partial(loops[name].publish, calls) for name in ("watched", "plain")}
+        taken = {name: median(found) for name, found in alternate(blocks, bench.count(12)).items()}
+        plain, watched = taken["plain"], taken["watched"]
+        yield added("mean, five watched paths, one publish", watched, "no path", plain, "us", 20)
+        hits = bench.count(300, least=5)
+        with ThreadPoolExecutor(1) as thread:  # without the frames of the benchmark itself
+            rounds = bench.count(9, least=2)
+            hit_s = median(thread.submit(loops["hit"].hit, hits).result() for _ in range(rounds))
+        yield added("mean, one hit", hit_s, "", 0, "us", 1000)
+        size = loops["hit"].bytes_of_inspection()
+        yield Line("one inspection", f"{size} bytes", "", size, "bytes", Target(3000))
+
+
+class _Pid:
+    def __init__(self) -> None:
+        self.kp, self.ki, self.kd = 2.0, 0.1, 0.01
+        self.integral = 0.0
+
+
+class _Loop:
+    """A controller of the usual form: an object with a loop, and its controllers."""
+
+    def __init__(self, bridge: MCPBridge) -> None:
+        self.bridge = bridge
+        self.pid = _Pid()
+        self.mode, self.speed = "drive", 2.0
+        self.path = [(float(i), float(i)) for i in range(40)]
+        self.table = {"x": 1.0, "y": 2.0}
+        self.scan = [1.0] * 360
+        self._state = make_states(1)[0]
+
+    def watch(self) -> None:
+        variables = self.bridge._session.variables  # pyright: ignore[reportPrivateUsage]
+        error = 0.0
+        for path in ("self.pid.integral", "self.mode", "self.path[3]", "self.table['x']", "error"):
+            variables.watch({"path": path}, sys._getframe())  # pyright: ignore[reportPrivateUsage]
+        self.pid.integral = error
+
+    def publish(self, calls: int) -> float:
+        def work() -> None:
+            for turn in range(calls):
+                error = 0.1 * turn
+                self.pid.integral += error
+                self.bridge.publish(self._state)
+
+        return processor_s(work) / calls
+
+    def hit(self, hits: int) -> float:
+        variables = self.bridge._session.variables  # pyright: ignore[reportPrivateUsage]
+        variables.prepare()
+
+        def work() -> None:
+            for turn in range(hits):
+                variables.record("breakpoint", "mode == 'drive'", object())
+                self.pid.integral += turn
+
+        return processor_s(work) / hits
+
+    def bytes_of_inspection(self) -> int:
+        """The size of the newest one in the database."""
+        with closing(connect(self.bridge.data_dir / DATABASE_NAME, "reader")) as connection:
+            sizes = "SELECT length(data) FROM event WHERE kind = 'inspection' ORDER BY id DESC"
+            return int(connection.execute(sizes).fetchone()[0])
+
+
 @benchmark("conditions", "a condition, evaluated with each published state (processor time)")
 def measure_conditions(bench: Bench) -> Iterable[Line]:
     """Each kind by itself, and 32 at once as a robot may have."""
@@ -377,5 +456,6 @@ BENCHMARKS = (
     measure_watching,
     measure_fast_mode,
     measure_frames,
+    measure_inspection,
     measure_conditions,
 )

@@ -56,8 +56,8 @@ async def test_of_a_recording_without_inspections_it_says_when_there_are_any(
     recorded.robot("rover", ended_wall_time_s=1.0, end_reason="finished").state(0.0, {"x": 1})
     async with connect(tools="all") as client:
         answer = await ask(client, "webots_inspect_controller")
-        assert "no inspection is recorded in this run" in answer["hint"]
-        assert "no controller runs" in await fail(client, "webots_inspect_controller", path="x")
+        assert "no variables are recorded in this run" in answer["hint"]
+        assert "and none runs" in await fail(client, "webots_inspect_controller", path="x")
         error = await fail(client, "webots_inspect_controller", event_id=1)
         assert "event 1 has no variables of the controller" in error
 

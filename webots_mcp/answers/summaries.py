@@ -204,8 +204,10 @@ def _(answer: BreakpointsAnswer) -> str:
 @_summary.register
 def _(answer: InspectionAnswer) -> str:
     if answer.path is not None:
-        value = answer.value if isinstance(answer.value, int | float | str) else "see value"
-        return f"{answer.path} is {value}, at {answer.line or 'an unknown line'}."
+        at = f" at {answer.line}" if answer.line else ""
+        if isinstance(answer.value, dict | list):
+            return f"{answer.path} was read{at}: value has its contents."
+        return f"{answer.path} is {answer.value}{at}."
     if not answer.frames:
         return f"No variables of the controller of {_subject(answer)} are recorded here."
     inner = answer.frames[0]

@@ -158,6 +158,8 @@ class Breakpoints:
             stored = [known.get(row[0]) or self._read(*row) for row in rows]
             self.armed = [*unstored, *filter(None, stored)]
         self.run = run
+        if self.armed:
+            self._variables.prepare()
         return True
 
     def _read_later(self) -> tuple[()]:
@@ -230,6 +232,7 @@ class Breakpoints:
             raise InvalidInputError(f"{MAX_BREAKPOINTS} breakpoints are armed already: remove one")
         new.id = self._store(*new.asks)
         self.armed.append(new)
+        self._variables.prepare()
         return new.id
 
     def _store(self, text: str, action: str, after_hits: int, *expected: str | None) -> int | None:

@@ -6,21 +6,24 @@ The modules that read them (`webots_mcp.bridge.inspection`) are imported when th
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import this_call
 from webots_mcp.bridge.simulation import Clock
-from webots_mcp.contract import WATCHED
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.inspection.inspector import Inspector
     from webots_mcp.bridge.inspection.watches import Watches
+
+
+_STARTED_S: Final = time.time()  # the bridge is imported when the controller starts
 
 
 class ControllerVariables:
@@ -53,6 +56,13 @@ class ControllerVariables:
         """
         try:
             self.inspector.record(cause, name, key, this_call(1))
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("inspection", error)
+
+    def prepare(self) -> None:
+        """Import what reads variables, so that the first hit of a breakpoint need not."""
+        try:
+            self.inspector.prepare()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("inspection", error)
 
@@ -105,12 +115,11 @@ class ControllerVariables:
             )
         watches = self.watches = self.watches or Watches(self._journal)
         if stop:
-            watches.remove(path.text)
-            return {"stopped": f"{WATCHED}.{path.text}", "watched": watches.signals}
-        shown = self.inspector.show(path.text, frame)
+            watches.remove(path)
+            return {"stopped": path.signal, "watched": watches.signals}
+        shown = self.inspector.signal(path, frame)
         watches.add(path, every)
-        signal = f"{WATCHED}.{path.text}"
-        return {"signal": signal, "value": shown["value"], "watched": watches.signals}
+        return {"signal": path.signal, **shown, "watched": watches.signals}
 
     @property
     def inspector(self) -> Inspector:
@@ -118,5 +127,7 @@ class ControllerVariables:
         if self._inspector is None:
             from webots_mcp.bridge.inspection.inspector import Inspector
 
-            self._inspector = Inspector(self._clock, self._journal, self._errors, self._data_dir)
+            self._inspector = Inspector(
+                self._clock, self._journal, self._errors, self._data_dir, _STARTED_S
+            )
         return self._inspector

@@ -157,6 +157,8 @@ class Publisher:
             self._record_changes(state)
         self._own_bytes = _BYTES_PER_CHARACTER * len(encoded.text)
         self._names.register(state, encoded.text, self._recorder.enter_signals)
+        if self._variables.watches is not None:
+            self._variables.watches.recorded()
         self._heartbeat.beat_if_due()
         self._count(time.perf_counter() - started_s)
 

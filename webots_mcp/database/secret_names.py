@@ -24,8 +24,11 @@ TABLE: Final = "inspect"
 LEFT_OUT: Final = "(left out: its name looks secret)"
 # Parts of names, in either case: `api_key`, `accessToken`, `DB_PASSWORD`; not `author` or `passed`.
 _SECRET: Final = (
-    r"(?i)passw|passphrase|\bpwd\b|secret|token|api_?key|private_?key|credential|cookie|auth(?!or)"
+    r"(?i)passw|passphrase|passcode|pwd|secret|token|credential|cookie|auth(?!or)"
+    r"|(?:api|access|private|encryption|signing|ssh)[-_ ]?key"
 )
+_MOST_KNOWN: Final = 2_000  # names whose answer is remembered
+_LONGEST_KNOWN: Final = 200
 _KEYS: Final = ("secret", "enabled")
 _OFF: Final = ("0", "false", "no", "off")
 _ENDED: Final = "inspection is switched off by {}"
@@ -40,9 +43,18 @@ class SecretNames:
 
     def __init__(self, patterns: tuple[str, ...] = ()) -> None:
         self._patterns = tuple(each.lower() for each in patterns)
+        self._known: dict[str, bool] = {}  # most names come again
 
     def has(self, name: str) -> bool:
         """Return whether a name looks secret."""
+        known = self._known.get(name)
+        if known is None:
+            known = self._judge(name)
+            if len(self._known) < _MOST_KNOWN and len(name) <= _LONGEST_KNOWN:
+                self._known[name] = known
+        return known
+
+    def _judge(self, name: str) -> bool:
         if re.search(_SECRET, name) is not None:
             return True
         lowered = name.lower()

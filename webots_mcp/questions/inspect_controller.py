@@ -25,8 +25,8 @@ _WAIT_S: Final = 10.0
 _LIST_BUDGET_TOKENS: Final = 500
 _LONGEST_NAME: Final = 120
 _NOTHING: Final = (
-    "no inspection is recorded in this run: the variables are recorded at the hits of a breakpoint "
-    "(webots_breakpoint), violations of an expectation, logged errors and hangs"
+    "no variables are recorded in this run. They are recorded at breakpoint hits "
+    "(webots_breakpoint), violated expectations, logged errors and hangs"
 )
 _PATH: Final = Field(
     max_length=200,
@@ -49,7 +49,10 @@ async def webots_inspect_controller(
     path: Annotated[str | None, _PATH] = None,
     event_id: Annotated[
         Id | None,
-        Field(description="Event of which to show them, from webots_find_events. Default: now."),
+        Field(
+            description="Event from webots_find_events of which to show the recorded variables. "
+            "Default: the variables now."
+        ),
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,
@@ -57,14 +60,15 @@ async def webots_inspect_controller(
 ) -> InspectionAnswer:
     """Show the controller's own variables: which line it executed and what its variables held.
 
-    With `event_id` or `run_id` as recorded at breakpoint hits, violations, errors and hangs; else
-    as they are now, in the running or paused loop. It runs no code of the controller and changes
-    nothing. To record a variable as a signal use webots_watch.
+    Without arguments it asks the running or paused controller; `path` asks for one variable. With
+    `event_id` or `run_id` it shows what was recorded at breakpoint hits, violations, errors and
+    hangs. It runs no code of the controller and changes nothing. To record a variable as a signal
+    use webots_watch.
     """
     if path is not None and (event_id is not None or run_id is not None):
         raise InvalidInputError(
-            "path asks the running controller. For what was recorded leave path out: give "
-            "event_id or run_id alone"
+            "path asks the running controller, not the recording. To see what was recorded, give "
+            "event_id or run_id and leave path out"
         )
     if event_id is not None:
         return await to_thread.run_sync(_recorded, recording, robot, event_id)
@@ -73,8 +77,8 @@ async def webots_inspect_controller(
         return await _now(recording, caller, path, robot, timeout_wall_s)
     if path is not None:
         raise CommandRefusedError(
-            "no controller runs that could be asked for a path. Leave path out for the variables "
-            "that were recorded at breakpoint hits, errors and hangs"
+            f"path {path!r} needs a running Python controller with a bridge, and none runs. To see "
+            "the variables recorded at breakpoint hits, errors and hangs, leave path out"
         )
     return await to_thread.run_sync(_newest, recording, robot, run_id)
 
@@ -88,16 +92,17 @@ async def webots_watch(
     path: Annotated[str, _PATH],
     caller: Caller,
     every: Annotated[
-        int, Field(ge=1, le=1_000_000, description="Record it in every Nth state.")
+        int, Field(ge=1, le=1_000_000, description="Record the value with every Nth state.")
     ] = 1,
-    stop: Annotated[bool, Field(description="Watch it no longer.")] = False,
+    stop: Annotated[bool, Field(description="Stop watching this path.")] = False,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Record a variable of the running controller as a signal from now on: watched.PATH.
 
-    Plots, events, breakpoints and comparisons take it like any signal. It ends with the
-    controller. To see variables once use webots_inspect_controller.
+    In the name of the signal a dot stands for brackets: path[3] becomes watched.path.3. Plots,
+    events, breakpoints and comparisons take it like any signal. Recording ends with `stop`, or
+    when the controller ends. To see a variable once use webots_inspect_controller.
     """
     params = {"path": path, "every": every} | ({"stop": True} if stop else {})
     return await Dispatcher(recording, caller.report).ask(robot, "watch", timeout_wall_s, params)
@@ -112,8 +117,10 @@ def _recorded(recording: RecordingAccess, robot: str | None, event_id: int) -> I
         if found is None:
             listed = _listed(view, _run_of(view, None))
             ids = [row[0] for row in listed]
-            there = f"event_id may be {', '.join(map(str, ids[:5]))}" if ids else _NOTHING
-            raise InvalidInputError(f"event {event_id} has no variables of the controller: {there}")
+            known = f"the newest with variables are {', '.join(map(str, ids[:5]))}"
+            raise InvalidInputError(
+                f"event {event_id} has no variables of the controller: {known if ids else _NOTHING}"
+            )
         return _answer(view, found, [])
 
 

@@ -9,10 +9,12 @@ from typing import Any, Final, NamedTuple, cast
 from webots_mcp.contract import INSPECTION_EVENT
 
 _COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, name, data"
+_COMPARED: Final = 200  # characters of a name: an inspection has those of its event
 _AT: Final = (  # of an event: it is written right after it
-    f"SELECT {_COLUMNS} FROM event WHERE kind = '{INSPECTION_EVENT}' AND id >= :id AND run_id = "
-    "(SELECT run_id FROM event WHERE id = :id) AND sim_time_s = "
-    "(SELECT sim_time_s FROM event WHERE id = :id) ORDER BY id LIMIT 1"
+    f"SELECT {', '.join(f'i.{name}' for name in _COLUMNS.split(', '))} FROM event i JOIN event e "
+    f"ON e.id = :id WHERE i.kind = '{INSPECTION_EVENT}' AND i.id >= e.id AND i.run_id = e.run_id "
+    "AND i.sim_time_s = e.sim_time_s AND "
+    f"substr(i.name, 1, {_COMPARED}) = substr(e.name, 1, {_COMPARED}) ORDER BY i.id LIMIT 1"
 )
 _OF_RUN: Final = (
     f"SELECT {_COLUMNS} FROM event WHERE run_id = ? AND kind = '{INSPECTION_EVENT}' "

@@ -115,7 +115,7 @@ class Metres(float):
         (hostile.Loud(), {"<class>": "Loud", "kept": 3}),
         (hostile.Loud, "<class Loud>"),
         ({hostile.Loud(): 1}, {"<Loud>": 1}),
-        (hostile.LoudDict(a=1), {"<class>": "LoudDict"}),
+        (hostile.LoudDict(a=1), {"<class>": "LoudDict", "<items>": {"a": 1}}),
     ],
 )
 def test_a_value_is_shown_as_what_it_is(value: object, expected: object) -> None:

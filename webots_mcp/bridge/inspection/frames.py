@@ -6,13 +6,15 @@ Frames of Python's library, of installed packages, of Webots and of the bridge a
 from __future__ import annotations
 
 import os
+import re
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from stat import S_ISREG
 from types import FrameType, TracebackType
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.database.secret_names import SecretNames
 from webots_mcp.database.thread_stacks import is_library
 
 MOST_FRAMES: Final = 8
@@ -22,6 +24,8 @@ _LINES_AROUND: Final = 1  # before and after the line
 _MOST_FILES: Final = 50
 _MOST_FILE_BYTES: Final = 1_000_000
 _LONGEST_LINE: Final = 160
+_LITERAL: Final = r"['\"]|(?<!\w)\d"
+_WITH_SECRET: Final = "(left out: it names a secret and may hold its value)"
 
 
 def _kinds_of_locals() -> tuple[type, ...]:
@@ -101,17 +105,32 @@ class SourceLines:
 
     A file that was changed after the controller had started has other lines than the code that
     runs: none of them are given.
+
+    Args:
+        started_s: When the controller had started, in Unix time.
+        secrets: Names next to which no text or number is shown.
     """
 
-    def __init__(self) -> None:
-        self._started_s = time.time()
+    def __init__(self, started_s: float, secrets: SecretNames) -> None:
+        self._started_s = started_s
+        self._secrets = secrets
         self._lines: dict[str, list[str]] = {}
 
     def around(self, own: OwnFrame) -> list[str]:
         """Return the line of a frame with the ones before and after it; empty if not known."""
         lines = self._lines_of(own.frame.f_code.co_filename)
         first = max(own.line - 1 - _LINES_AROUND, 0)
-        return [line[:_LONGEST_LINE] for line in lines[first : own.line + _LINES_AROUND]]
+        shown = lines[first : own.line + _LINES_AROUND]
+        return [_WITH_SECRET if self._has_secret(line) else line[:_LONGEST_LINE] for line in shown]
+
+    def _has_secret(self, line: str) -> bool:
+        """Return whether a line names a secret next to a text or a number, which may be its value.
+
+        The project's patterns are for whole names.
+        """
+        if re.search(_LITERAL, line) is None:
+            return False
+        return self._secrets.has(line) or any(map(self._secrets.has, re.findall(r"\w+", line)))
 
     def _lines_of(self, file: str) -> list[str]:
         lines = self._lines.get(file)
@@ -124,9 +143,12 @@ class SourceLines:
     def _read(self, file: str) -> list[str]:
         try:
             path = Path(file)
-            about = path.stat()
-            if about.st_mtime > self._started_s or about.st_size > _MOST_FILE_BYTES:
+            about = path.stat()  # reading a pipe would block, or take what is not for the bridge
+            if not S_ISREG(about.st_mode) or about.st_size > _MOST_FILE_BYTES:
                 return []
-            return path.read_text("utf-8", "replace").splitlines()
+            if about.st_mtime > self._started_s:
+                return []
+            # `splitlines` would also break a line at a form feed, where Python does not.
+            return path.read_text("utf-8-sig", "replace").split("\n")
         except (OSError, ValueError):  # a name such as "<string>", or with a null character
             return []

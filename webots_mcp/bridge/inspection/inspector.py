@@ -10,11 +10,12 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import FrameType, ModuleType, TracebackType
 from typing import Any, Final
 
 from webots_mcp.bridge.error_report import ErrorReport, cut
 from webots_mcp.bridge.inspection.attribute_paths import (
+    AttributePath,
     PathEndsError,
     find_root,
     follow,
@@ -26,7 +27,8 @@ from webots_mcp.bridge.inspection.frames import (
     frames_of_error,
     own_frames,
 )
-from webots_mcp.bridge.inspection.values import Renderer, has_base
+from webots_mcp.bridge.inspection.objects import class_of, has_base, own_text
+from webots_mcp.bridge.inspection.values import Renderer, signal_value
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import INSPECTION_EVENT
@@ -36,9 +38,15 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 MOST_INSPECTIONS: Final = 20  # of one cause in a run
 _MOST_VARIABLES: Final = 40  # of one frame
 _LONGEST_CAUSE: Final = 200
+_LONGEST_NAME: Final = 120  # of a function or a file
 _DEPTH: Final = 2  # an object and its attributes; a list and its items
 _DEPTH_OF_PATH: Final = 3
 _ANSWER_CHARACTERS: Final = 5_000
+_CHANGED: Final = "another thread changed it meanwhile ({}): ask again"
+_NOT_RECORDED: Final = (
+    "only this text is recorded, not the contents: watch a number, text or short list in it"
+)
+_TRACEBACK: Final[Any] = vars(BaseException)["__traceback__"]
 
 
 class Inspector:
@@ -46,16 +54,25 @@ class Inspector:
 
     Args:
         data_dir: The recording's folder, whose project may name more secrets.
+        started_s: When the controller had started, in Unix time.
     """
 
-    def __init__(self, clock: Clock, journal: Journal, errors: ErrorReport, data_dir: Path) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        journal: Journal,
+        errors: ErrorReport,
+        data_dir: Path,
+        started_s: float,
+    ) -> None:
         self._clock = clock
         self._journal = journal
         self._errors = errors
         self._data_dir = data_dir
         self._run = clock.run
         self._counts: Counter[tuple[str, object]] = Counter()
-        self._source = SourceLines()
+        self._started_s = started_s
+        self._source: SourceLines | None = None
         self._secrets: SecretNames | None = None
         self.off: str | None = None  # why nothing is inspected
 
@@ -72,15 +89,19 @@ class Inspector:
         """
         if self._is_wanted(cause, key):
             error = sys.exc_info()[1] if cause == "error" else None
-            raised = frames_of_error(error.__traceback__) if error is not None else []
+            raised = frames_of_error(_traceback_of(error)) if error is not None else []
             known = {id(each.frame) for each in raised}
             callers = [each for each in own_frames(frame) if id(each.frame) not in known]
             self._record(cause, name, [*raised, *callers])
 
+    def prepare(self) -> None:
+        """Read what the project says of secrets."""
+        self._read_secrets()
+
     def record_error(self, error: BaseException, name: str) -> None:
         """Record the variables where an exception was raised that ends the controller."""
         if self._is_wanted("error", "uncaught"):
-            self._record("error", name, frames_of_error(error.__traceback__))
+            self._record("error", name, frames_of_error(_traceback_of(error)))
 
     def _is_wanted(self, cause: str, key: object) -> bool:
         if self._clock.run is not self._run:
@@ -113,7 +134,7 @@ class Inspector:
             if path is None:
                 return {"frames": self._shown_frames(frames, _ANSWER_CHARACTERS)}
             parsed = parse_path(path, secrets)
-            value = follow(parsed, find_root(parsed, frames))
+            value = _value_at(parsed, frames)
             renderer = Renderer(secrets, _ANSWER_CHARACTERS)
             where = self._place(frames[0]) if frames else {}
             return {
@@ -121,10 +142,20 @@ class Inspector:
                 "value": renderer.render(value, _DEPTH_OF_PATH, parsed.text),
                 **where,
             }
-        except PathEndsError as error:
-            raise CommandRefusedError(f"{path}: {error}") from error
-        except RuntimeError as error:
-            raise CommandRefusedError(f"another thread changed it meanwhile: {error}") from error
+        except (RuntimeError, LookupError) as error:
+            raise CommandRefusedError(_CHANGED.format(error)) from error
+
+    def signal(self, path: AttributePath, frame: FrameType | None) -> dict[str, object]:
+        """Return the value at a path as it would be recorded.
+
+        Raises:
+            CommandRefusedError: The path ends before its end.
+        """
+        value = _value_at(path, own_frames(frame))
+        recorded = signal_value(value)
+        if class_of(recorded) is str and class_of(value) is not str and recorded[0] == "<":
+            return {"value": recorded, "note": _NOT_RECORDED}
+        return {"value": recorded}
 
     def secrets(self) -> SecretNames:
         """Return the names whose values are left out.
@@ -155,31 +186,50 @@ class Inspector:
     ) -> list[dict[str, object]]:
         secrets = self.secrets()
         renderer = Renderer(secrets, characters) if characters else Renderer(secrets)
-        return [
-            {**self._place(each), "variables": self._variables(each, renderer)} for each in frames
-        ]
+        shown: list[dict[str, object]] = []
+        for own in frames:
+            place = self._place(own, with_source=not renderer.is_full)
+            renderer.spend(sum(map(len, map(str, place.values()))))
+            shown.append({**place, "variables": self._variables(own, renderer)})
+        return shown
 
-    def _place(self, own: OwnFrame) -> dict[str, object]:
+    def _place(self, own: OwnFrame, *, with_source: bool = True) -> dict[str, object]:
         code = own.frame.f_code
         place: dict[str, object] = {
-            "at": f"{Path(code.co_filename).name}:{own.line}",
-            "function": code.co_name,
+            "at": f"{Path(code.co_filename).name[-_LONGEST_NAME:]}:{own.line}",
+            "function": own_text(code.co_name)[:_LONGEST_NAME],
         }
+        if not with_source:
+            return place
+        if self._source is None:
+            self._source = SourceLines(self._started_s, self.secrets())
         source = self._source.around(own)
         return {**place, "source": source} if source else place
 
     def _variables(self, own: OwnFrame, renderer: Renderer) -> dict[str, Any]:
-        names = own.variables
-        is_module = own.frame.f_code.co_name == "<module>"
-        shown: dict[str, Any] = {}
-        for name, value in list(names.items()):
-            if is_module and (name.startswith("__") or _is_definition(value)):
-                continue
-            if len(shown) == _MOST_VARIABLES:
-                shown["..."] = f"{len(names)} in all"
-                break
-            shown[name] = renderer.named(name, value, _DEPTH)
-        return shown
+        names = list(own.variables.items())
+        if own.frame.f_code.co_name == "<module>":
+            names = [
+                (name, value)
+                for name, value in names
+                if not (name.startswith("__") or _is_definition(value))
+            ]
+        shown = renderer.members(names[:_MOST_VARIABLES], _DEPTH)
+        return {**shown, "...": f"{len(names)} in all"} if len(names) > len(shown) else shown
+
+
+def _value_at(path: AttributePath, frames: list[OwnFrame]) -> Any:
+    try:
+        return follow(path, find_root(path, frames))
+    except PathEndsError as error:
+        raise CommandRefusedError(f"{path.text}: {error}") from error
+    except (RuntimeError, LookupError) as error:
+        raise CommandRefusedError(_CHANGED.format(error)) from error
+
+
+def _traceback_of(error: BaseException) -> TracebackType | None:
+    """Return the traceback of an error, whose class may define a property of that name."""
+    return _TRACEBACK.__get__(error)
 
 
 def _is_definition(value: object) -> bool:

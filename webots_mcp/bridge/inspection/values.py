@@ -1,16 +1,13 @@
 """Values of any objects as bounded JSON, without running any code of the user.
 
 No property, descriptor, `__getattr__`, `__repr__`, `__len__`, `__iter__` or metaclass of a class
-that is not known is called: types are read from `type`'s own descriptors, attributes from
-`__dict__` and slots, items by the methods of Python's own containers. Classes are compared by
-identity alone, since `==`, `in` and a dict would call the metaclass of the user.
+that is not known is called. Items are read by the methods of Python's own containers.
 """
 
 from __future__ import annotations
 
-import sys
-from collections import OrderedDict, defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter, OrderedDict, defaultdict, deque
+from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from math import isfinite
 from types import (
@@ -18,48 +15,56 @@ from types import (
     CoroutineType,
     FunctionType,
     GeneratorType,
-    GetSetDescriptorType,
-    MemberDescriptorType,
     MethodType,
     ModuleType,
 )
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.inspection.frames import is_own
+from webots_mcp.bridge.inspection.frames import has_text_keys
+from webots_mcp.bridge.inspection.objects import (
+    attributes_of,
+    c_array_class,
+    c_items,
+    class_of,
+    dict_items,
+    has_base,
+    instance_dict,
+    is_own_class,
+    loaded_class,
+    module_members,
+    name_of,
+    numpy_class,
+    own_text,
+)
 from webots_mcp.database.secret_names import LEFT_OUT, SecretNames
 
-MOST_CHARACTERS: Final = 3_000  # of one inspection
+MOST_CHARACTERS: Final = 2_300  # of one inspection: about 3 kB with the marks of JSON
 _LONGEST_TEXT: Final = 120
 _LONGEST_NAME: Final = 60
 _MOST_ITEMS: Final = 8
 _MOST_KEYS: Final = 12
+_MOST_IN_KEY: Final = 4  # items of a tuple that is a key
 _MOST_ATTRIBUTES: Final = 24
 _ARRAY_ITEMS: Final = 6
 _OVERHEAD: Final = 8  # characters of a value besides its text
-_MOST_CLASSES: Final = 10_000  # that are remembered
 _LARGEST_INT: Final = 2**63
 _SIGNAL_ITEMS: Final = 64  # of an array that is recorded as a signal
-_AS_TEXT: Final = {  # classes of Python's library whose text shows their value
-    "decimal": ("Decimal",), "fractions": ("Fraction",), "uuid": ("UUID",),
-    "datetime": ("datetime", "date", "time", "timedelta"),
-    "pathlib": ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"),
+_AS_TEXT: Final = {  # classes of Python's library whose text shows their value, by their name
+    "Decimal": "decimal", "Fraction": "fractions", "UUID": "uuid", "date": "datetime",
+    "datetime": "datetime", "time": "datetime", "timedelta": "datetime", "PosixPath": "pathlib",
+    "WindowsPath": "pathlib", "PurePosixPath": "pathlib", "PureWindowsPath": "pathlib",
 }  # fmt: skip
+_LONGEST_INT: Final = 1_000  # bits of an integer within another value: a text of it is slow
 
 # The ids of classes that live as long as the interpreter.
 _LISTS: Final = frozenset(map(id, (list, tuple, deque, set, frozenset)))
 _DICTS: Final = frozenset(map(id, (dict, OrderedDict, defaultdict)))
 _PLAIN: Final = frozenset(map(id, (type(None), bool, int, float, str)))
 _NUMBERS: Final = frozenset(map(id, (bool, int, float)))
+_CONTAINERS: Final = (dict, list, tuple, set, frozenset, deque)  # and their subclasses
 _SIZED: Final = frozenset(map(id, (bytes, bytearray, range)))
 
-_of_type = cast("Mapping[str, Any]", vars(type))
-class_of = cast("Callable[[object], type[Any]]", type)
-mro_of = cast("Callable[[type], tuple[type[Any], ...]]", _of_type["__mro__"].__get__)
-dict_items = cast("Callable[[Any], Iterable[tuple[Any, Any]]]", vars(dict)["items"])
-_type_dict = cast("Callable[[type], Mapping[Any, Any]]", _of_type["__dict__"].__get__)
-_type_name = cast("Callable[[type], str]", _of_type["__name__"].__get__)
-_type_module = cast("Callable[[type], object]", _of_type["__module__"].__get__)
-_module_dict = cast("Callable[[Any], dict[str, Any]]", vars(ModuleType)["__dict__"].__get__)
+_error_args = cast("Callable[[Any], Any]", vars(BaseException)["args"].__get__)
 
 
 class Renderer:
@@ -75,11 +80,37 @@ class Renderer:
         self._left = characters
         self._seen: dict[int, tuple[str, object]] = {}  # with the object, whose id stays taken
 
-    def named(self, name: str, value: object, depth: int, path: str = "") -> Any:
-        """Render a value that has a name, unless that looks secret."""
-        if self._secrets.has(name):
-            return LEFT_OUT
-        return self.render(value, depth, path or name)
+    @property
+    def is_full(self) -> bool:
+        """Whether the number of characters is used up."""
+        return self._left < 0
+
+    def spend(self, characters: int) -> None:
+        """Leave less space, because of what is shown next to the values."""
+        self._left -= characters
+
+    def members(
+        self, found: Sequence[tuple[str, object]], depth: int, path: Callable[[str], str] = str
+    ) -> dict[str, Any]:
+        """Render named values, without those that find no space.
+
+        Numbers and texts come first, so that a long list leaves them their space; the order is
+        that of `found`.
+
+        Args:
+            found: Each name with its value.
+            depth: How many levels of items and attributes are shown.
+            path: Returns where a name's value is found.
+        """
+        shown: dict[str, Any] = {}
+        for name, value in sorted(found, key=lambda each: id(class_of(each[1])) not in _PLAIN):
+            if self.is_full:
+                break
+            cut_name = name[:_LONGEST_NAME]
+            self._left -= len(cut_name)
+            is_secret = self._secrets.has(name)
+            shown[name] = LEFT_OUT if is_secret else self.render(value, depth, path(cut_name))
+        return {name[:_LONGEST_NAME]: shown[name] for name, _ in found if name in shown}
 
     def render(self, value: object, depth: int, path: str) -> Any:
         """Render a value.
@@ -96,14 +127,12 @@ class Renderer:
         kind = id(cls)
         if kind in _PLAIN:
             return self._plain(value)
-        if kind in _LISTS or kind in _DICTS or _is_own_class(cls):
+        if kind in _LISTS or kind in _DICTS or is_own_class(cls):
             if (known := self._seen.get(id(value))) is not None:
-                return f"(the same as {known[0]})"
+                return f"(the same as {'above' if known[0] == path else known[0]})"
             self._seen[id(value)] = path, value
-        if kind in _LISTS:
-            return self._items(value, cls, depth, path)
-        if kind in _DICTS:
-            return self._entries(value, cls, depth, path)
+        if kind in _LISTS or kind in _DICTS:
+            return self._container(value, cls, depth, path)
         return self._other(value, cls, depth, path)
 
     def _plain(self, value: Any) -> Any:
@@ -117,101 +146,50 @@ class Renderer:
             return f"<int of {value.bit_length()} bits>"
         return value
 
-    def _items(self, value: Any, cls: type, depth: int, path: str) -> Any:
-        count = len(value)
+    def _container(self, value: Any, base: Any, depth: int, path: str) -> Any:
+        """Render items or entries, by the methods of the container of Python's own."""
+        count = base.__len__(value)
         if depth <= 0 and count:
-            return f"<{cls.__name__} of {count}>"
-        shown = [
-            self.render(item, depth - 1, f"{path}[{index}]")
-            for index, item in enumerate(islice(cast("Iterable[Any]", value), _MOST_ITEMS))
-        ]
-        return [*shown, f"... {count} in all"] if count > _MOST_ITEMS else shown
+            return f"<{base.__name__} of {count}>"
+        is_dict = issubclass(base, dict)
+        try:  # in one go: between two steps of a loop another thread may change it
+            most = _MOST_KEYS if is_dict else _MOST_ITEMS
+            found = list(islice(dict_items(value) if is_dict else base.__iter__(value), most))
+        except RuntimeError:
+            return f"<{base.__name__} of {count}, which changes at this moment>"
+        if not is_dict:
+            return self._items(found, count, depth, path)
+        names = _distinct([_key_text(key) for key, _ in found])
+        entries = [(name, item) for name, (_, item) in zip(names, found, strict=True)]
+        shown = self.members(entries, depth - 1, lambda name: f"{path}[{name!r}]")
+        return {**shown, "...": f"{count} in all"} if count > len(shown) else shown
 
-    def _entries(self, value: Any, cls: type, depth: int, path: str) -> Any:
-        count = len(value)
-        if depth <= 0 and count:
-            return f"<{cls.__name__} of {count}>"
-        shown: dict[str, Any] = {}
-        for key, item in islice(dict_items(value), _MOST_KEYS):
-            is_shown = class_of(key) is str or id(class_of(key)) in _NUMBERS
-            name = str(key)[:_LONGEST_NAME] if is_shown else f"<{name_of(class_of(key))}>"
-            shown[name] = self.named(name, item, depth - 1, f"{path}[{name!r}]")
-        return {**shown, "...": f"{count} in all"} if count > _MOST_KEYS else shown
+    def _items(self, found: list[Any], count: int, depth: int, path: str) -> list[Any]:
+        shown: list[Any] = []
+        for index, item in enumerate(found):
+            if self.is_full:
+                break
+            shown.append(self.render(item, depth - 1, f"{path}[{index}]"))
+        return [*shown, f"... {count} in all"] if count > len(shown) else shown
 
     def _other(self, value: Any, cls: type, depth: int, path: str) -> Any:
         """Render what is neither plain nor a container of Python's own."""
-        for convert in (_number_or_array, _named_thing, _text_of_known):
+        for convert in (_number_or_array, _c_number_or_array, _named_thing, _text_of_known):
             if (shown := convert(value, cls)) is not None:
                 self._left -= len(str(shown))
                 return shown
-        if depth <= 0 or not _is_own_class(cls):
+        if depth <= 0 or not is_own_class(cls):
             return f"<{name_of(cls)}>"
         shown = {"<class>": name_of(cls)}
         if (plain := _plain_base(value, cls)) is not None:
             shown["<value>"] = self._plain(plain)
-        for name, attribute in islice(attributes_of(value), _MOST_ATTRIBUTES):
-            shown[name[:_LONGEST_NAME]] = self.named(name, attribute, depth - 1, f"{path}.{name}")
-        return shown
-
-
-def has_base(cls: type, base: type) -> bool:
-    """Return whether a class is `base` or inherits from it."""
-    return any(each is base for each in mro_of(cls))
-
-
-def name_of(cls: type) -> str:
-    """Return the name of a class, whatever its metaclass answers."""
-    return _type_name(cls)
-
-
-def attributes_of(value: object) -> Iterator[tuple[str, object]]:
-    """Yield the attributes that an object itself has: of its `__dict__`, then of its slots."""
-    cls = class_of(value)
-    own = instance_dict(value)
-    for name, attribute in list(own.items()) if own is not None else ():
-        if class_of(name) is str:
-            yield name, attribute
-    for base in mro_of(cls):
-        for name, member in _type_dict(base).items():
-            if class_of(member) is MemberDescriptorType and class_of(name) is str:
-                try:
-                    yield name, member.__get__(value, cls)
-                except AttributeError:  # a slot without a value
-                    continue
-
-
-def instance_dict(value: object) -> dict[Any, Any] | None:
-    """Return an object's own `__dict__`; None if it has none.
-
-    A class may define a property of that name, so only the interpreter's own descriptor is asked.
-    """
-    cls = class_of(value)
-    known = _dict_getters.get(id(cls)) or _find_dict_getter(cls)
-    if known[1] is None:
-        return None
-    own: Any = known[1].__get__(value, cls)
-    return own if class_of(own) is dict else None
-
-
-def _find_dict_getter(cls: type) -> tuple[type, Any]:
-    members = (_type_dict(base).get("__dict__") for base in mro_of(cls))
-    found = cls, next((each for each in members if class_of(each) is GetSetDescriptorType), None)
-    if len(_dict_getters) < _MOST_CLASSES:
-        _dict_getters[id(cls)] = found
-    return found
-
-
-def class_member(cls: type, name: str) -> Any:
-    """Return what a class or its bases define under a name.
-
-    Raises:
-        KeyError: None of them does.
-    """
-    for base in mro_of(cls):
-        members = _type_dict(base)
-        if name in members:
-            return members[name]
-    raise KeyError(name)
+        attributes = list(islice(attributes_of(value), _MOST_ATTRIBUTES))
+        members = self.members(attributes, depth - 1, lambda name: f"{path}.{name}")
+        if not attributes or not has_base(cls, tuple):  # a named tuple's fields are its items
+            base = next((each for each in _CONTAINERS if has_base(cls, each)), None)
+            if base is not None:
+                shown["<items>"] = self._container(value, base, depth - 1, path)
+        return {**shown, **members}
 
 
 def signal_value(value: Any) -> Any:
@@ -221,14 +199,21 @@ def signal_value(value: Any) -> Any:
         return value
     if cls is str:
         return value[:_LONGEST_TEXT]
-    if (array := numpy_class("ndarray")) is not None and cls is array:
-        is_short = value.dtype.kind in "biuf" and value.size <= _SIGNAL_ITEMS
-        return value.tolist() if is_short else _array(value)
-    if (cls is list or cls is tuple) and len(value) <= _SIGNAL_ITEMS:
+    if cls is numpy_class("ndarray") and value.dtype.kind in "biuf" and value.size <= _SIGNAL_ITEMS:
+        return value.tolist()
+    if (cls is list or cls is tuple or cls is deque) and len(value) <= _SIGNAL_ITEMS:
         items = list(value)
-        if all(id(class_of(each)) in _NUMBERS for each in items):
+        if _are_numbers(items):
             return items
+    if c_array_class(cls) is not None:
+        items = list(islice(c_items(value), _SIGNAL_ITEMS + 1))
+        if len(items) <= _SIGNAL_ITEMS and _are_numbers(items):
+            return items
+    if id(cls) in _LISTS or id(cls) in _DICTS:
+        return f"<{cls.__name__}>"
     number = _number_or_array(value, cls)
+    if number is None:
+        number = _c_number_or_array(value, cls)
     if number is not None:
         return number
     plain = _plain_base(value, cls)
@@ -238,75 +223,163 @@ def signal_value(value: Any) -> Any:
 # -- kinds of objects ------------------------------------------------------------------------------
 
 
+def _distinct(names: list[str]) -> list[str]:
+    """Return names, those that came before with a number."""
+    known: Counter[str] = Counter()
+    found: list[str] = []
+    for name in names:
+        known[name] += 1
+        found.append(name if known[name] == 1 else f"{name} ({known[name]})")
+    return found
+
+
+def _key_text(key: Any) -> str:
+    """Return the text of a dict's key: of numbers, enum members and tuples of them too."""
+    cls = class_of(key)
+    if cls is tuple:
+        return f"({', '.join(map(_atom_text, key[:_MOST_IN_KEY]))})"
+    return _atom_text(key)
+
+
+def _atom_text(key: Any) -> str:
+    cls = class_of(key)
+    if cls is str:
+        return key
+    if cls is int and key.bit_length() > _LONGEST_INT:
+        return f"<int of {key.bit_length()} bits>"
+    if key is None or id(cls) in _NUMBERS:
+        return str(key)
+    number = _number_or_array(key, cls)
+    if id(class_of(number)) in _NUMBERS:
+        return str(number)
+    return _text_of_enum(key, cls) or f"<{name_of(cls)}>"
+
+
+def _are_numbers(items: list[Any]) -> bool:
+    return _NUMBERS.issuperset(map(id, map(type, items)))
+
+
 def _number_or_array(value: Any, cls: type) -> Any:
     if cls is complex or id(cls) in _SIZED:
         return complex.__repr__(value) if cls is complex else f"<{cls.__name__} of {len(value)}>"
-    if (array := numpy_class("ndarray")) is not None and cls is array:
-        return _array(value)
+    array = numpy_class("ndarray")
+    if array is not None and has_base(cls, array):
+        return _array(value, cls, array)
     generic = numpy_class("generic")
-    if generic is not None and has_base(cls, generic):
-        plain = generic.item(value)
-        if id(class_of(plain)) in _NUMBERS:
-            return plain if class_of(plain) is not float or isfinite(plain) else str(plain)
-        return f"<{name_of(cls)}>"
-    return None
+    if generic is None or not has_base(cls, generic):
+        return None
+    plain = generic.item(value)
+    if id(class_of(plain)) in _NUMBERS:
+        return plain if class_of(plain) is not float or isfinite(plain) else str(plain)
+    if class_of(plain) is str:
+        return plain[:_LONGEST_TEXT]
+    return complex.__repr__(plain) if class_of(plain) is complex else f"<{name_of(cls)}>"
 
 
-def _array(array: Any) -> str:
-    """Return type and shape of an array of numpy, and its first values."""
-    shape = " x ".join(map(str, array.shape)) or "1 value"
-    if array.dtype.kind not in "biuf":
-        return f"<array {shape} of {array.dtype}>"
+def _array(array: Any, cls: type, base: Any) -> str:
+    """Return type and shape of an array of numpy, and its first values.
+
+    Of a class derived from `base` only shape and type are read, with the descriptors of `base`:
+    which values hold, a mask for example decides.
+    """
+    members = cast("Mapping[str, Any]", vars(base))
+    sizes, dtype = members["shape"].__get__(array), members["dtype"].__get__(array)
+    shape = " x ".join(map(str, sizes)) or "1 value"
+    about = f"{'array' if cls is base else name_of(cls)} {shape} of {dtype!s:.60}"
+    if cls is not base or dtype.kind not in "biuf" or not array.size:
+        return f"<{about}>"
     first = ", ".join(f"{each.item():.6g}" for each in islice(array.flat, _ARRAY_ITEMS))
-    more = ", ..." if array.size > _ARRAY_ITEMS else ""
-    return f"<array {shape} of {array.dtype}: {first}{more}>"
+    return f"<{about}: {first}{', ...' if array.size > _ARRAY_ITEMS else ''}>"
 
 
-def numpy_class(name: str) -> Any:
-    """Return a class of numpy; None while numpy is not imported."""
-    numpy = sys.modules.get("numpy")
-    return _module_dict(numpy).get(name) if class_of(numpy) is ModuleType else None
+def _c_number_or_array(value: Any, cls: type) -> Any:
+    """Return the value of a number of ctypes, or the first ones of an array."""
+    simple: Any = loaded_class("_ctypes", "_SimpleCData")
+    if simple is not None and has_base(cls, simple):
+        members = cast("Mapping[str, Any]", vars(simple))
+        plain = members["value"].__get__(value)
+        return plain if id(class_of(plain)) in _NUMBERS else f"<{name_of(cls)}>"
+    if c_array_class(cls) is None:
+        return None
+    items = list(islice(c_items(value), _ARRAY_ITEMS + 1))
+    if not _are_numbers(items):
+        return f"<{name_of(cls)}>"
+    first = ", ".join(f"{each:.6g}" for each in items[:_ARRAY_ITEMS])
+    return f"<{name_of(cls)}: {first}{', ...' if len(items) > _ARRAY_ITEMS else ''}>"
 
 
 def _named_thing(value: Any, cls: type) -> str | None:
-    """Return the name of a class, function, module, generator or enum member."""
+    """Return the name of a class, function, module, generator, error or enum member."""
     if has_base(cls, type):
         return f"<class {name_of(value)}>"
     if cls is FunctionType:
-        return f"<function {value.__qualname__}>"
+        return f"<function {own_text(value.__qualname__)[:_LONGEST_TEXT]}>"
     if cls is MethodType:
         function = value.__func__
-        named = function.__qualname__ if class_of(function) is FunctionType else "of an object"
-        return f"<method {named}>"
+        is_function = class_of(function) is FunctionType
+        named = own_text(function.__qualname__) if is_function else "of an object"
+        return f"<method {named[:_LONGEST_TEXT]}>"
     if cls is BuiltinFunctionType:
         return f"<function {value.__name__}>"
     if cls is ModuleType:
-        return f"<module {_module_dict(value).get('__name__')!s:.60}>"
+        name: Any = module_members(value).get("__name__")
+        return f"<module {name[:_LONGEST_NAME]}>" if class_of(name) is str else "<module>"
     if cls is GeneratorType or cls is CoroutineType:
         frame = value.gi_frame if cls is GeneratorType else value.cr_frame
         code = value.gi_code if cls is GeneratorType else value.cr_code
         at = f", at line {frame.f_lineno}" if frame is not None else ", ended"
-        return f"<{name_of(cls)} {code.co_name}{at}>"
+        return f"<{name_of(cls)} {own_text(code.co_name)[:_LONGEST_NAME]}{at}>"
+    if has_base(cls, BaseException):
+        texts: list[Any] = [each for each in _args_of(value) if class_of(each) is str]
+        return f"<{name_of(cls)}: {texts[0][:_LONGEST_TEXT]}>" if texts else f"<{name_of(cls)}>"
     return _text_of_enum(value, cls)
 
 
+def _args_of(error: object) -> tuple[Any, ...]:
+    args: Any = _error_args(error)
+    return args if class_of(args) is tuple else ()
+
+
 def _text_of_enum(value: object, cls: type) -> str | None:
-    enum = sys.modules.get("enum")
-    base = _module_dict(enum).get("Enum") if class_of(enum) is ModuleType else None
+    base = loaded_class("enum", "Enum")
     if base is None or not has_base(cls, base):
         return None
-    name = (instance_dict(value) or {}).get("_name_")
-    return f"{name_of(cls)}.{name}" if class_of(name) is str else f"<{name_of(cls)}>"
+    members: dict[str, Any] = instance_dict(value) or {}
+    if not has_text_keys(members):
+        return f"<{name_of(cls)}>"
+    known: list[Any] = [members.get("_name_"), members.get("_value_")]
+    for name in known:  # flags may have no name
+        if class_of(name) is str:
+            return f"{name_of(cls)}.{name[:_LONGEST_NAME]}"
+        if class_of(name) is int and name.bit_length() <= _LONGEST_INT:
+            return f"{name_of(cls)}({name})"
+    return f"<{name_of(cls)}>"
 
 
-def _text_of_known(value: object, cls: type) -> str | None:
+def _text_of_known(value: Any, cls: type) -> str | None:
     """Return the text of a class of Python's library that shows its value."""
-    module = _module_of(cls)
-    if name_of(cls) in _AS_TEXT.get(module, ()):
-        loaded = sys.modules.get(module)
-        if class_of(loaded) is ModuleType and _module_dict(loaded).get(name_of(cls)) is cls:
-            return str(value)[:_LONGEST_TEXT]
-    return None
+    module = _AS_TEXT.get(name_of(cls))
+    if module is None or loaded_class(module, name_of(cls)) is not cls:
+        return None
+    if name_of(cls) in ("datetime", "time") and value.tzinfo is not None:
+        return str(value.replace(tzinfo=None))  # the zone may be a class of the user
+    held: list[Any] = [each for _, each in attributes_of(value)]
+    held += [item for each in held if class_of(each) is list for item in each]
+    if all(map(_is_harmless, held)):
+        return str(value)[:_LONGEST_TEXT]
+    return f"<{name_of(cls)}>"
+
+
+def _is_harmless(held: Any) -> bool:
+    """Return whether what an object of Python's library holds is no number or text of the user."""
+    cls = class_of(held)
+    if cls is int:
+        return held.bit_length() <= _LONGEST_INT
+    return (
+        id(cls) in _PLAIN
+        or not (has_base(cls, str) or has_base(cls, int))
+        or not (is_own_class(cls))
+    )
 
 
 def _plain_base(value: Any, cls: type) -> Any:
@@ -316,30 +389,3 @@ def _plain_base(value: Any, cls: type) -> Any:
     if has_base(cls, int):
         return int.__int__(value)
     return str.__str__(value) if has_base(cls, str) else None
-
-
-# By the ids of classes, with the class, whose id stays taken.
-_own_classes: dict[int, tuple[type, bool]] = {}
-_dict_getters: dict[int, tuple[type, Any]] = {}
-
-
-def _is_own_class(cls: type) -> bool:
-    """Return whether a class is defined in the controller's own code; each is judged once."""
-    known = _own_classes.get(id(cls))
-    if known is not None:
-        return known[1]
-    name = _module_of(cls)
-    module = sys.modules.get(name)
-    file = _module_dict(module).get("__file__") if class_of(module) is ModuleType else None
-    if isinstance(file, str):
-        is_own_class = is_own(file)
-    else:  # made by `exec`, or of the interpreter itself
-        is_own_class = class_of(module) is not ModuleType or name == "__main__"
-    if len(_own_classes) < _MOST_CLASSES:
-        _own_classes[id(cls)] = cls, is_own_class
-    return is_own_class
-
-
-def _module_of(cls: type) -> str:
-    module = _type_module(cls)
-    return module if isinstance(module, str) else ""

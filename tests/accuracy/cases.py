@@ -12,7 +12,7 @@ import numpy as np
 
 from tests.accuracy.page import table
 from tests.benchmarks.core import Bench
-from tests.cases import healthy_robots, problems
+from tests.cases import healthy_robots, more_unfamiliar, problems
 from tests.cases.columns import TURN, Array, Random
 from tests.cases.public import FIRST_POINTS, PUBLIC, RIGHT, labels, score
 from tests.cases.rates import FAULTS, INTERVALS_S, NOISES, answer
@@ -20,7 +20,7 @@ from tests.cases.situations import HEALTHY, PROBLEMS, Columns, Situation, failur
 from tests.cases.unfamiliar import FIRST_ANSWERS, ROBOTS, ask_faulty, ask_healthy
 from tests.cases.unfamiliar import INTERVALS_S as INTERVALS_OF_ROBOTS_S
 
-_MODULES = (healthy_robots, problems)  # which fill the registries
+_MODULES = (healthy_robots, problems, more_unfamiliar)  # which fill the registries
 _OTHER_INTERVALS_S: Final = (0.016, 0.064, 0.16)
 _INTRODUCTION: Final = """\
 `tests/cases` rebuilds situations from public reports as recordings, with the answer that an

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.cases import more_unfamiliar  # which enters its robots into `ROBOTS`
 from tests.cases.unfamiliar import (
     GOOD,
     HELPFUL,
@@ -15,6 +16,7 @@ from tests.cases.unfamiliar import (
     ask_healthy,
 )
 
+_REGISTERED = more_unfamiliar
 _NOT_JUDGED = {"tracked excavator": "speeds of tracks are not known to be those of wheels"}
 
 

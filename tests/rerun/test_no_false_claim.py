@@ -22,7 +22,7 @@ class RoundOnTape(Tape):
     """A tape with one round, of given events."""
 
     def __init__(self, events: list[Any]) -> None:
-        head = {"devices": {}, "facts": {}, "packages": {}, "began_late": False}
+        head: dict[str, Any] = {"devices": {}, "facts": {}, "packages": {}, "began_late": False}
         super().__init__(Path("none.tape"), head, {1: KEYS, 2: LENGTH, 3: NEXT})
         self._events = events
 

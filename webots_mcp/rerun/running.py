@@ -171,7 +171,11 @@ def find_taped_run(database: Database, data_dir: Path, run_id: int) -> TapedRun:
             f"Run {run_id} has no tape, so no code can be run on it: its rows lack what was asked "
             f"between them. {HOW_TO_RECORD}."
         )
-    return TapedRun(run_id, open_tape(file), int(row[1]), is_imported=file != own)
+    tape = open_tape(file)
+    number = tape.number_of_run(str(row[2]))
+    # Earlier runs of the session may be deleted, or were not exported.
+    number = int(row[1]) if number is None else number
+    return TapedRun(run_id, tape, number, is_imported=file != own)
 
 
 def require_own_tape(taped: TapedRun, *, trusted: bool) -> None:

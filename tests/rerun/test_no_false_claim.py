@@ -148,3 +148,16 @@ def test_code_that_fails_today_says_how(tmp_path: Path) -> None:
     found = rerun_of(tmp_path, controller)
     assert found.outcome == "not repeatable"
     assert "an environment variable (os.environ at controllers/rover/rover.py:" in found.text
+
+
+def test_a_wrong_syntax_is_named_at_its_own_line_in_one_line(tmp_path: Path) -> None:
+    controller = recorded(tmp_path, AVOID, 0.5)
+    helper = controller.with_name("helper.py")
+    helper.write_text("x = 1\ndef f(:\n    pass\n", "utf-8")
+    controller.write_text("import helper\n" + AVOID, "utf-8")
+    found = rerun_of(tmp_path, controller)
+    assert found.outcome == "ended early"
+    assert found.text == (
+        "equal for 0 rounds until 0.000 s; then the new code ended by SyntaxError: invalid syntax "
+        "(controllers/rover/helper.py:2), while the old one went on"
+    )

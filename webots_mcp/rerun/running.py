@@ -129,7 +129,8 @@ class Rerun:
                 f"{whose} does not repeat itself from {until} on, so nothing can be said about "
                 f"an edit. Likely cause: {causes or 'not known'}"
             )
-        equal = f"equal for {self.rounds:,} rounds until {until}"
+        noun = "round" if self.rounds == 1 else "rounds"
+        equal = f"equal for {self.rounds:,} {noun} until {until}"
         if self.outcome == "equal":
             version = "the unchanged code" if self.is_unchanged else "the new code"
             ended = f"; then it ended by {self.exception} at {self.place}" if self.exception else ""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
@@ -98,3 +100,37 @@ def test_what_is_no_tape_is_refused(tmp_path: Path, content: bytes) -> None:
 
 def test_a_session_cannot_name_a_file_elsewhere(tmp_path: Path) -> None:
     assert tape_file(tmp_path, "../../etc/passwd").parent == tmp_path / "tapes"
+
+
+def test_a_damaged_line_ends_the_tape_instead_of_shifting_its_rounds(tmp_path: Path) -> None:
+    file = tmp_path / "a.tape"
+    write(file, 20, close=False)
+    lines = file.read_bytes().split(b"\n")
+    lines[10] = lines[10].replace(b"[", b"(", 1)
+    file.write_bytes(b"\n".join(lines))
+    assert [each.number for each in open_tape(file).rounds()] == list(range(7))
+
+
+def test_a_block_that_unpacks_to_too_much_is_not_read(tmp_path: Path) -> None:
+    file = tmp_path / "a.tape"
+    head = b'[0,"head",{"a":"' + b"x" * 40_000_000 + b'"}]\n'
+    packed = zlib.compress(head)
+    file.write_bytes(
+        MAGIC + struct.pack(">4sII", b"\0BLK", len(packed), zlib.crc32(packed)) + packed
+    )
+    assert len(packed) < 100_000
+    with pytest.raises(InvalidInputError, match="it has no head"):
+        open_tape(file)
+
+
+def test_a_head_of_another_form_is_refused(tmp_path: Path) -> None:
+    writer = TapeWriter(tmp_path / "a.tape")
+    writer.write([["head", {"devices": 3}]])
+    with pytest.raises(InvalidInputError, match="'devices' of its head is wrong"):
+        open_tape(tmp_path / "a.tape")
+
+
+def test_lines_of_another_form_end_a_tape(tmp_path: Path) -> None:
+    writer = TapeWriter(tmp_path / "a.tape")
+    writer.write([["head", {}], ["round", 0, 0.1, "step", [], 0, []], ["round", 1], ["call", 1]])
+    assert len(list(open_tape(tmp_path / "a.tape").rounds())) == 1

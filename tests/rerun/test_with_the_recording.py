@@ -9,6 +9,7 @@ import pytest
 
 from tests.rerun.taping import WORLD, data_dir_of, record, recorded, rerun_of, tapes
 from tests.rerun.taping import project as make_project
+from tests.rerun.test_repeating import RESETS
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect
@@ -135,3 +136,16 @@ while robot.step(step_ms) != -1:
     assert said == {3.0, 4.5, 6.5}
     controller.write_text(code.replace("+ extra[0]", "+ 2 * extra[0]"), "utf-8")
     assert "setVelocity 6.0 instead of 4.5" in rerun_of(tmp_path, controller).text
+
+
+def test_an_exported_later_run_of_a_session_is_still_that_run(tmp_path: Path) -> None:
+    controller = make_project(tmp_path, RESETS)
+    record(tmp_path / "worlds" / "arena.wbt", data_dir_of(tmp_path), 4.0)
+    bundle = tmp_path / "second.zip"
+    where = ["--data-dir", str(data_dir_of(tmp_path))]
+    main(["export", "--run", "2", "-o", str(bundle), *where])
+    whole = rerun_of(tmp_path, controller)
+    assert whole.outcome == "equal", whole.text
+    controller.write_text(RESETS.replace("+ x_m % 1)", "+ x_m % 1 + (resets == 1))"), "utf-8")
+    with pytest.raises(AssertionError, match="setVelocity"):
+        assert_same_commands(bundle, controller)

@@ -135,7 +135,8 @@ class MCPBridge:
         self._publisher = self._session.publisher
         self._session.begin()
         if taped is not None:
-            taped.open(self.data_dir, self._session.recorder.uuid, robot)
+            run_uuid = self._session.recorder.run_uuid
+            taped.open(self.data_dir, self._session.recorder.uuid, robot, run_uuid)
         self._capture = self._capture_output() if capture_output else None
         self._attachment: Attachment | None = None
         _bridges[id(robot)] = self

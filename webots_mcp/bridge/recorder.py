@@ -308,6 +308,10 @@ class Recorder:
         self._backlog.abandon()
         self.off = "a forked process does not record for its parent"
 
+    def run_uuid(self) -> str:
+        """Return the identity of the run that is under way."""
+        return self.run.uuid
+
     def describe_run(self, run: CurrentRun) -> dict[str, Any]:
         """Return the values of a run's own row."""
         return {

@@ -38,7 +38,7 @@ from webots_mcp.database.tapes.package_surface import (
     kind_of_member,
 )
 from webots_mcp.database.tapes.source_files import read_sources, relative_source, root_of
-from webots_mcp.database.tapes.tape import MAX_TAPE_BYTES, NOTES, TapeWriter, tape_file
+from webots_mcp.database.tapes.tape import MAX_TAPE_BYTES, NOTES, RUN, TapeWriter, tape_file
 from webots_mcp.database.tapes.tape_values import encode_value
 from webots_mcp.errors import warn
 
@@ -101,6 +101,10 @@ class TapeRecorder:
         self._robot: Any = None
         self._get_time: Callable[[Any], float] | None = None
         self._rounds = 0
+        self._runs = 0  # in which time has gone back, before this one
+        self._time_s = 0.0
+        self._run_uuid: Callable[[], str] | None = None
+        self._noted_run = ""
         self._calls: dict[tuple[str, str, str], int] = {}
         self._places: dict[tuple[str, int], int] = {}
         self._unnamed: dict[str, int] = {}
@@ -189,9 +193,14 @@ class TapeRecorder:
         if self._get_time is None:
             self._get_time = _unwrapped(robot, "getTime")
             self._robot = robot
+        if self._run_uuid is not None and self._run_uuid() != self._noted_run:
+            self._noted_run = self._run_uuid()
+            self.note(RUN, [self._noted_run, self._runs])
         events = self.events[:]
         del self.events[: len(events)]
         time_s = self._get_time(robot)
+        self._runs += time_s < self._time_s - 1e-9
+        self._time_s = time_s
         end = ["round", self._rounds, time_s, name, list(arguments), answer, events]
         self._rounds += 1
         definitions, self._definitions = self._definitions, []
@@ -290,7 +299,9 @@ class TapeRecorder:
 
     # -- the file --------------------------------------------------------------------------------
 
-    def open(self, data_dir: Path, session_uuid: str, robot: Any) -> None:
+    def open(
+        self, data_dir: Path, session_uuid: str, robot: Any, run_uuid: Callable[[], str]
+    ) -> None:
         """Write the head and all that waits to the tape of a session, and go on there."""
         if self.why_not is not None or self._writer is not None:
             return
@@ -302,11 +313,14 @@ class TapeRecorder:
             head = self._head(robot, session_uuid, controller)
             waiting, self._waiting = self._waiting, []
             self._writer = TapeWriter(file)
-            self._writer.write([["head", head], *self._new_sources(), *waiting])
+            self._writer.write([["head", head]])
+            for each in (*self._new_sources(), *waiting):
+                self._writer.write([each])
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._stop(f"{type(error).__name__}: {error}")
             return
         self.file = file
+        self._run_uuid = run_uuid
         tape_notes.note = self.note
         atexit.register(self.close, "finished")
 

@@ -110,7 +110,9 @@ def differences(old: Commanded, new: Commanded) -> list[CommandDifference]:
             if one is not None and other is not None and _equal(one.arguments, other.arguments):
                 continue
             known = one or other
-            is_implied = key[1] == _CONTROL and (one is None or other is None)
+            # A sensor that only one of them enables moves nothing.
+            may_be_missing = key[1] == _CONTROL or key[1] in _SENSORS_HOLD
+            is_implied = may_be_missing and (one is None or other is None)
             if known is None or is_implied or len(found) == MOST_SHOWN:
                 continue
             place = (one.place if one else None, other.place if other else None)
@@ -122,7 +124,22 @@ def differences(old: Commanded, new: Commanded) -> list[CommandDifference]:
                     *place,
                 )
             )
-    return found
+    return found or _differing_order(old, new)
+
+
+def _differing_order(old: Commanded, new: Commanded) -> list[CommandDifference]:
+    """Return the first object whose commands came in another order."""
+    for path in dict.fromkeys(path for path, _ in old.once):
+        before, after = (
+            [each for (of, _), each in both.once.items() if of == path] for both in (old, new)
+        )
+        for one, other in zip(before, after, strict=True):
+            if one.name != other.name:
+                shown = f"{path.removeprefix('device:')} in this order:"
+                old_names = [each.name for each in before[:MOST_SHOWN]]
+                new_names = [each.name for each in after[:MOST_SHOWN]]
+                return [CommandDifference(shown, old_names, new_names, one.place, other.place)]
+    return []
 
 
 def _name_of(command: GivenCommand) -> str:

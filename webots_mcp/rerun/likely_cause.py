@@ -145,6 +145,26 @@ class Witnesses:
             self.found[cause] = Witness(cause, call, place, self._round_of())
 
 
+_OUTSIDE: Final = (  # what a replay has as it is today; searched for where nothing else explains it
+    ("an environment variable", ("os.environ", "getenv(")),
+    ("a file that may have changed since", ("open(", "read_text(", "read_bytes(", ".load(")),
+    ("the state of another process", ("subprocess.", "socket.", "input(")),
+)
+
+
+def outside_lines(sources: dict[str, str]) -> list[Witness]:
+    """Return the first line for each thing outside of the code that a controller may depend on."""
+    found: dict[str, Witness] = {}
+    for file, text in sources.items():
+        for number, line in enumerate(text.splitlines(), 1):
+            code = line.partition("#")[0]
+            for cause, calls in _OUTSIDE:
+                call = next((each for each in calls if each in code), None)
+                if call is not None and cause not in found:
+                    found[cause] = Witness(cause, call.strip("(."), f"{file}:{number}", 0)
+    return list(found.values())
+
+
 def dated_lines(sources: dict[str, str]) -> list[Witness]:
     """Return the first line that asks `datetime` for the time, whose type cannot be replaced."""
     for file, text in sources.items():

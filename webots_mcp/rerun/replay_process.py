@@ -140,7 +140,13 @@ class _Replay:
             result.place = self._place_of(error.__traceback__)
         except BaseException as error:  # noqa: BLE001  (whatever ends a controller is the result)
             result.place = self._place_of(error.__traceback__)
+            # The last line: a wrong syntax is shown with its code, which has lines of its own.
             result.exception = "".join(traceback.format_exception_only(error)).strip()
+            result.exception = result.exception.splitlines()[-1]
+            if isinstance(error, SyntaxError) and error.filename:
+                file = relative_source(error.filename, self._root) or error.filename
+                result.place = f"{file}:{error.lineno}"
+                result.exception = f"{type(error).__name__}: {error.msg}"
         finally:
             sys.settrace(None)
         if self.tape.why_ended is None and self.tape.unrecorded is None:

@@ -19,6 +19,8 @@ from webots_mcp.database.tapes.tape_values import UnrecordedValueError, decode_v
 from webots_mcp.rerun.difference import CommandDifference, Commanded, GivenCommand, differences
 
 Key = tuple[str, str, str]
+Stated = tuple[Key, int]
+"""A question, and the number of packets that were passed over before it in the round."""
 
 _CALLS_AFTER_END: Final = 1000  # of `step`, by a loop that does not end when it returns -1
 _CONSTANT: Final = (
@@ -31,6 +33,10 @@ _CONSTANT: Final = (
     "getBrake", "getKeyboard", "getMouse", "getJoystick", "getDef", "getId", "getTypeName", "has",
     "getUrdf",
 )  # fmt: skip
+_NOT_CONSTANT: Final = ("getNumberOfContactPoints",)
+_CONSUMES: Final = "nextPacket"  # after which a receiver answers about another packet
+_TAKEN_ONCE: Final = ("getKey", "getKeyCode", "getPressedButton", "wwiReceiveText")  # from a queue
+_NONE_LEFT: Final = (-1, None, "")  # what these answer when it is empty
 _HELD: Final = {  # what Webots' library answers from the commands that it was given
     "getTargetPosition": "setPosition", ".target_position": "setPosition",
     "getVelocity": "setVelocity", ".target_velocity": "setVelocity",
@@ -89,8 +95,9 @@ class ReplayedTape:
         self._goes_on = goes_on
         self._coming: Iterator[TapedRound] = tape.rounds()
         self._round: TapedRound | None = None
-        self._answers: dict[Key, list[Any]] = {}
-        self._used: dict[Key, int] = {}
+        self._answers: dict[Stated, list[Any]] = {}
+        self._used: dict[Stated, int] = {}
+        self._passed_over: Counter[str] = Counter()  # packets, by path, by the replayed code
         self._seen: dict[Key, Any] = {}
         self._latest: dict[Key, Any] = {}
         self._replies: dict[tuple[str, str], list[Any]] = {}
@@ -117,6 +124,8 @@ class ReplayedTape:
     def _load(self) -> None:
         """Read what was asked and commanded up to the next step."""
         self._answers, self._used, self._seen, self._replies = {}, {}, {}, {}
+        self._passed_over.clear()
+        passed_over: Counter[str] = Counter()
         self._old.begin_round()
         self._new.begin_round()
         self._round = next(self._coming, None)
@@ -127,7 +136,7 @@ class ReplayedTape:
             if number == NOTES:
                 self._take_note(*value)
             else:
-                self._take(self.tape.calls[number], value)
+                self._take(self.tape.calls[number], value, passed_over)
 
     def _take_note(self, kind: str, content: Any) -> None:
         if kind == "command":
@@ -137,10 +146,11 @@ class ReplayedTape:
         elif kind == "thread":
             self.threads.append(content)
 
-    def _take(self, call: TapedCall, value: Any) -> None:
+    def _take(self, call: TapedCall, value: Any, passed_over: Counter[str]) -> None:
         if call.kind == "command":
             arguments, place, *reply = value
             known = self.tape.places.get(place)
+            passed_over[call.path] += call.name == _CONSUMES
             self._old.add(GivenCommand(call.path, call.owner, call.name, arguments, known))
             if reply:
                 self._replies.setdefault((call.path, call.name), []).append(reply[0])
@@ -150,19 +160,20 @@ class ReplayedTape:
         if call.kind == "seen":
             self._seen[key] = value
         else:
-            self._answers.setdefault(key, []).append(value)
+            self._answers.setdefault((key, passed_over[call.path]), []).append(value)
 
     def step(self, name: str, arguments: Sequence[Any]) -> Any:
         """Compare the round that ends here, and return what the step answered in the old run."""
         if self.why_ended is not None:
             return self._step_after_end()
         over = self._round
-        if over is None or not over.step[0]:
-            return self._end("the old run has no further step")
-        if over.step[:2] != (name, list(arguments)):
-            old = f"{over.step[0]}({', '.join(map(str, over.step[1]))})"
-            new = f"{name}({', '.join(map(str, arguments))})"
-            self.first = [CommandDifference(f"{new} instead of {old}:", None, None, None, None)]
+        given = self._step_arguments(arguments)
+        if over is None or not over.step[0]:  # the old code had ended
+            return self._end("the old code ended")
+        held = self._step_arguments(over.step[1])
+        if (over.step[0], held) != (name, given):
+            before = held if over.step[0] == name else None
+            self.first = [CommandDifference(f"robot.{name}", before, given, None, None)]
         self._compare()
         self.rounds += 1
         if over.end_s < self.time_s - 1e-9:
@@ -172,14 +183,20 @@ class ReplayedTape:
         answer = over.step[2]
         if self.run > self._last_run:
             return self._end("the run ended")
-        if answer == -1 or self._round is None:
+        if answer == -1:
             return self._end("the old run ended")
         is_until = self._until_s is not None and self.run == self._last_run
         if is_until and self.time_s >= (self._until_s or 0.0) - 1e-9:
             return self._end("until")
+        if self._round is None and self.tape.end != "finished":
+            return self._end("the tape ended")
         if self.on_round is not None:
             self.on_round(self.rounds)
         return answer
+
+    def _step_arguments(self, arguments: Sequence[Any]) -> list[Any]:
+        """Return the arguments of a step, which is the basic one where none is given."""
+        return list(arguments) or [int(self._fact("robot", "getBasicTimeStep"))]
 
     def step_never_comes(self) -> None:
         """Note that the controller has ended while the old run went on."""
@@ -237,6 +254,10 @@ class ReplayedTape:
         coded = [self._encode(each) for each in arguments]
         key = (path, name, json.dumps(coded) if coded else "[]")
         found = self._recorded(key, is_own=is_own)
+        if not is_own and found is not None and self._is_not_enabled(path, name):
+            device = path.removeprefix("device:")
+            self._miss(f"{device} is not enabled any more, so the answer of {name}() is unknown")
+            raise ReplayEndedError
         if found is None:
             found = self._derived(key, owner, name, arguments, is_own=is_own)
         if found is None and is_own:  # the bridge counts it as a failure and goes on
@@ -256,19 +277,30 @@ class ReplayedTape:
             self._miss(f"{path.removeprefix('device:')}.{name}(): {error}")
             raise ReplayEndedError from error
 
+    def _is_not_enabled(self, path: str, name: str) -> bool:
+        """Return whether the old code enabled a sensor, and neither the new one nor the bridge."""
+        enable = (path, "enable")
+        if enable not in self._old.holding or enable in self._new.holding:
+            return False
+        is_seen = any(key[0] == path for key in self._seen)
+        return not is_seen and path not in self.named and not name.startswith(_CONSTANT)
+
     def _miss(self, what: str) -> None:
         if self.unrecorded is None:
             self.unrecorded = what
         self._end("unrecorded")
 
     def _recorded(self, key: Key, *, is_own: bool) -> tuple[Any] | None:
-        answers = self._answers.get(key)
+        stated = (key, self._passed_over[key[0]])
+        answers = self._answers.get(stated)
         if is_own and key in self._seen:
             return (self._seen[key],)
         if answers is not None:
-            number = self._used.get(key, 0)
+            number = self._used.get(stated, 0)
             if not is_own:
-                self._used[key] = number + 1
+                self._used[stated] = number + 1
+            if number >= len(answers) and key[1] in _TAKEN_ONCE and answers[-1] not in _NONE_LEFT:
+                return None
             return (answers[min(number, len(answers) - 1)],)
         return (self._seen[key],) if key in self._seen else None
 
@@ -294,19 +326,19 @@ class ReplayedTape:
             for sensed in _SENSED:
                 if (found := self._recorded((path, sensed, "[]"), is_own=True)) is not None:
                     return found
-        held = self._held(path, name)
+        held = self._held(path, name, is_own=is_own)
         if held is not None:
             return held
         fact = head["facts"].get(path, {})
         if name in fact:
             return (fact[name],)
-        if key in self._latest and (is_own or name.startswith(_CONSTANT)):
+        if key in self._latest and (is_own or _is_constant(name)):
             return (self._latest[key],)
         if is_own and name.endswith("SamplingPeriod"):
             return (0,)
         return (_OF_BRIDGE[name],) if is_own and name in _OF_BRIDGE else None
 
-    def _held(self, path: str, name: str) -> tuple[Any] | None:
+    def _held(self, path: str, name: str, *, is_own: bool) -> tuple[Any] | None:
         setter = _HELD.get(name)
         if setter is None:
             return None
@@ -317,7 +349,9 @@ class ReplayedTape:
             is_sensed = any(key[0] == path for key in self._latest)
             is_enabled = path in self.named or (self.tape.head["began_late"] and is_sensed)
             return (int(self._fact("robot", "getBasicTimeStep")) if is_enabled else 0,)
-        defaults = {"setPosition": 0.0, "setVelocity": self._fact(path, "getMaxVelocity")}
+        defaults = {"setVelocity": self._fact(path, "getMaxVelocity")}
+        if is_own:
+            defaults["setPosition"] = 0.0  # the world's file may say otherwise
         return (defaults[setter],) if setter in defaults else None
 
     def _fact(self, path: str, name: str) -> Any:
@@ -333,6 +367,7 @@ class ReplayedTape:
         place = TapedPlace(relative_source(file, self.root) or file, frame.f_lineno)
         coded = [self._encode(each) for each in arguments]
         self._new.add(GivenCommand(path, owner, name, coded, place))
+        self._passed_over[path] += name == _CONSUMES
         replies = self._replies.get((path, name))
         reply = replies.pop(0) if replies else None
         return None if isinstance(reply, dict) else reply
@@ -348,6 +383,10 @@ class ReplayedTape:
             made.__dict__["_path"] = path
             found = self._objects[path] = made
         return found
+
+
+def _is_constant(name: str) -> bool:
+    return name.startswith(_CONSTANT) and name not in _NOT_CONSTANT
 
 
 def path_of_object(value: Any) -> str | None:

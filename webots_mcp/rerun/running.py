@@ -33,7 +33,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.rerun import likely_cause
 from webots_mcp.rerun.deciding_line import TracedLine, find_deciding_line
-from webots_mcp.rerun.likely_cause import Witness, dated_lines
+from webots_mcp.rerun.likely_cause import Witness, dated_lines, outside_lines
 from webots_mcp.rerun.replay_process import ReplayJob, ReplayResult
 
 STALL_S: Final = 60.0  # of wall time without a step, after which a replay is ended
@@ -73,7 +73,7 @@ class Rerun:
     """What came of running new code on an old run.
 
     Attributes:
-        outcome: `equal`, `differs`, `not repeatable` (the old code does not repeat itself),
+        outcome: `equal`, `differs`, `not repeatable` (a version does not repeat itself),
             `not on the tape` (something was asked that the old run did not ask), `ended early`,
             or `timed out`.
         run_id: The run.
@@ -84,11 +84,14 @@ class Rerun:
         first_differences: What differs in the first round that differs.
         deciding_line: The line that decides differently.
         unrecorded: What was asked.
-        likely_causes: Why the old code does not repeat itself.
+        likely_causes: Why a version does not repeat itself; of a difference, chance in new code.
         exception: The exception that ended the new version.
         place: Where that was, or where the unrecorded question was asked.
         began_late: The tape began after the robot was made.
         is_unchanged: The new version is the old one.
+        of_new_code: It is the new version that does not repeat itself.
+        ends_with_tape: The tape ends before the run does: it was full, or its writer was killed.
+        goes_on: The old version ended by itself there, and the new one asked for another step.
         in_earlier_run: The replay ended in an earlier run of the same process.
         rounds_per_s: Rounds replayed in a second of processor time.
     """
@@ -107,6 +110,9 @@ class Rerun:
     place: str | None = None
     began_late: bool = False
     is_unchanged: bool = False
+    of_new_code: bool = False
+    ends_with_tape: bool = False
+    goes_on: bool = False
     in_earlier_run: bool = False
     rounds_per_s: float = 0.0
 
@@ -116,21 +122,28 @@ class Rerun:
         until = f"{self.until_s:.3f} s"
         if self.in_earlier_run:
             until += " of an earlier run of the same process"
+        causes = "; ".join(self.likely_causes)
         if self.outcome == "not repeatable":
-            causes = "; ".join(self.likely_causes) or "not known"
+            whose = "The new code" if self.of_new_code else "Your code"
             return (
-                f"Your code does not repeat itself from {until} on, so nothing can be said about "
-                f"an edit. Likely cause: {causes}"
+                f"{whose} does not repeat itself from {until} on, so nothing can be said about "
+                f"an edit. Likely cause: {causes or 'not known'}"
             )
-        equal = f"equal for {self.rounds:,} rounds until {until}"
+        noun = "round" if self.rounds == 1 else "rounds"
+        equal = f"equal for {self.rounds:,} {noun} until {until}"
         if self.outcome == "equal":
             version = "the unchanged code" if self.is_unchanged else "the new code"
             ended = f"; then it ended by {self.exception} at {self.place}" if self.exception else ""
+            if self.ends_with_tape:
+                ended += "; the tape ends there"
+            if self.goes_on:
+                ended += "; then it goes on, where the recorded code ended"
             return f"{equal}: {version} commands the same to the last digit{ended}"
         if self.outcome == "differs":
             line = self.deciding_line
             decided = f"; decided at {line['place']}" if line else ""
-            return f"{equal}; then {'; '.join(self.first_differences)}{decided}"
+            chance = f"; this may be chance: {causes}" if causes else ""
+            return f"{equal}; then {'; '.join(self.first_differences)}{decided}{chance}"
         place = f" ({self.place})" if self.place else ""
         if self.outcome == "not on the tape":
             return f"{equal}; then the replay ends{place}: {self.unrecorded}"
@@ -159,7 +172,11 @@ def find_taped_run(database: Database, data_dir: Path, run_id: int) -> TapedRun:
             f"Run {run_id} has no tape, so no code can be run on it: its rows lack what was asked "
             f"between them. {HOW_TO_RECORD}."
         )
-    return TapedRun(run_id, open_tape(file), int(row[1]), is_imported=file != own)
+    tape = open_tape(file)
+    number = tape.number_of_run(str(row[2]))
+    # Earlier runs of the session may be deleted, or were not exported.
+    number = int(row[1]) if number is None else number
+    return TapedRun(run_id, tape, number, is_imported=file != own)
 
 
 def require_own_tape(taped: TapedRun, *, trusted: bool) -> None:
@@ -365,8 +382,8 @@ def _environment(head: Mapping[str, Any], data_dir: Path) -> dict[str, str]:
     }
     if head.get("parameters"):
         environment[PARAMETERS_VARIABLE] = str(head["parameters"])
-    if head.get("hash_seed"):
-        environment["PYTHONHASHSEED"] = str(head["hash_seed"])
+    seed = str(head.get("hash_seed") or "random")
+    environment["PYTHONHASHSEED"] = "0" if seed == "random" else seed  # the same for both versions
     return environment
 
 
@@ -407,9 +424,17 @@ def rerun(
         answer.is_unchanged = all(now.get(n) == text for n, text in replays.old_sources.items())
         if answer.outcome == "differs":
             places = tuple(new.differences[0][1:]) if new.differences else (None, None)
-            traces = _trace_both(replays, file, root, new.rounds)
+            again = _trace_both(replays, file, root, new.rounds)
+            known = {(each[0], each[1]) for each in old.witnesses}
+            added = [each for each in new.witnesses if (each[0], each[1]) not in known]
+            answer.likely_causes = [str(Witness(*each)) for each in added]
+            if again[0].differences or again[1].differences != new.differences:
+                return _by_chance(answer, again, (old, new))
+            traces = [[TracedLine(*each) for each in result.lines] for result in again]
             sources = replays.old_sources, new_sources
-            line = find_deciding_line(*traces, *sources, (places[0], places[1]), renamed)
+            line = find_deciding_line(
+                traces[0], traces[1], *sources, (places[0], places[1]), renamed
+            )
             answer.deciding_line = line._asdict() if line else None
         return answer
 
@@ -446,6 +471,8 @@ def _answer(taped: TapedRun, file: Path, result: ReplayResult, of_rounds: int) -
         exception=result.exception,
         place=result.place,
         began_late=bool(taped.tape.head.get("began_late")),
+        ends_with_tape=result.why_ended == "the tape ended",
+        goes_on=result.why_ended == "the old code ended",
         in_earlier_run=result.run < taped.number,
         rounds_per_s=result.rounds / max(result.processor_s, 1e-6),
     )
@@ -464,7 +491,8 @@ def _not_repeated(taped: TapedRun, replays: Replays, old: ReplayResult, file: Pa
         return answer  # a picture: that is no chance
     answer.outcome, answer.first_differences, answer.place = "not repeatable", [], None
     found = [Witness(*each) for each in old.witnesses]
-    texts = [str(each) for each in found if each.round <= old.rounds]
+    texts = [f"it raised {old.exception} at {old.place}, now"] if old.exception else []
+    texts += [str(each) for each in found if each.round <= old.rounds]
     if old.threads:
         texts.append(f"{likely_cause.THREADS} ({old.threads[0]} called Webots)")
     texts += [str(each) for each in dated_lines(replays.old_sources)]
@@ -472,7 +500,21 @@ def _not_repeated(taped: TapedRun, replays: Replays, old: ReplayResult, file: Pa
         texts.append(f"the tape began after the robot was made. {HOW_TO_RECORD}")
     if not texts and _depends_on_hashes(replays):
         texts = [likely_cause.ORDER]
+    texts = texts or [str(each) for each in outside_lines(replays.old_sources)]
     answer.likely_causes = texts
+    return answer
+
+
+def _by_chance(
+    answer: Rerun,
+    again: tuple[ReplayResult, ReplayResult],
+    before: tuple[ReplayResult, ReplayResult],
+) -> Rerun:
+    """Return the answer where a second replay of a version shows something else than the first."""
+    answer.outcome, answer.first_differences = "not repeatable", []
+    answer.of_new_code = not again[0].differences
+    found = before[answer.of_new_code].witnesses
+    answer.likely_causes = [str(Witness(*each)) for each in found]
     return answer
 
 
@@ -487,11 +529,10 @@ def _depends_on_hashes(replays: Replays) -> bool:
 
 def _trace_both(
     replays: Replays, file: Path, root: Path, number: int
-) -> tuple[list[TracedLine], list[TracedLine]]:
+) -> tuple[ReplayResult, ReplayResult]:
     """Trace the old and the new version in a round, in which they differ."""
     versions = ((replays.old_file, replays.old_root), (file, root))
-    traced = [replays.run(*version, traced_round=number).lines for version in versions]
-    old, new = ([TracedLine(*each) for each in lines] for lines in traced)
+    old, new = (replays.run(*version, traced_round=number) for version in versions)
     return old, new
 
 

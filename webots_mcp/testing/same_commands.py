@@ -46,6 +46,8 @@ def assert_same_commands(
             elif found.is_dir():
                 found /= DATABASE_NAME
             taped = find_taped_run(found, found.parent, newest_taped_run(found, found.parent))
+            if Path(run).suffix == ".zip":  # whose tape must not choose the Python that runs it
+                taped = taped._replace(is_imported=True)
         outcome = rerun(taped, Path(file).resolve(), until_s=until_s)
     if outcome.outcome != "equal" or outcome.exception:
         raise AssertionError(outcome.text)

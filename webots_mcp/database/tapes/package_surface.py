@@ -16,7 +16,8 @@ _COMMANDS: Final = (
     "simulationRevert", "world", "save", "wwiSend", "speak", "play", "stop", "loop", "draw", "fill",
     "lay", "exportImage", "moveViewpoint", "loadState", "batterySensorEnable",
     "batterySensorDisable", "movieSt", "animationSt", "restart", "imageNew", "imagePaste",
-    "imageDelete", "nextPacket", "erase",
+    "imageDelete", "nextPacket", "erase", "recognitionEnable", "recognitionDisable", "attach",
+    "detach", "imageSave", "write",
 )  # fmt: skip
 
 

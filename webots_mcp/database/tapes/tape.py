@@ -26,7 +26,7 @@ import zlib
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, BinaryIO, Final, NamedTuple, cast
 
 try:
     import orjson
@@ -41,12 +41,18 @@ TAPE_ENDING: Final = ".tape"
 IMPORTED: Final = "imported"  # in that folder
 MAX_TAPE_BYTES: Final = 256_000_000
 NOTES: Final = 0  # the call whose answers are notes of the bridge, not of Webots' package
+RUN: Final = "run"  # the note of a run: its identity, and its number in the session
 MAGIC: Final = b"webots-mcp tape 1\n"
 _MARK: Final = b"\0BLK"
 _BLOCK: Final = struct.Struct(">4sII")
 _BLOCK_FROM: Final = 48_000  # bytes of lines: about half a millisecond
 _LEVEL: Final = 1  # three times as fast as 6, for a tenth more bytes
-_MOST_BLOCK_BYTES: Final = 512_000_000  # of lines in one block, against files that lie
+_MOST_LINE_BYTES: Final = 16_000_000
+_MOST_BLOCK_BYTES: Final = 2 * _MOST_LINE_BYTES  # of lines in one block, against files that lie
+_HEAD: Final = {  # what a replay reads of it
+    "controller": (str, type(None)), "project": str, "arguments": list, "devices": dict,
+    "facts": dict, "packages": dict, "began_late": bool,
+}  # fmt: skip
 
 
 def tape_file(data_dir: Path, session_uuid: str, *, imported: bool = False) -> Path:
@@ -127,7 +133,10 @@ class TapeWriter:
             return
         texts: list[bytes] = []
         for line in lines:
-            texts.append(_encoded([self._number + len(texts), *line]))
+            text = _encoded([self._number + len(texts), *line])
+            if len(text) > _MOST_LINE_BYTES:
+                raise ValueError(f"a step has {len(text):,} bytes, more than {_MOST_LINE_BYTES:,}")
+            texts.append(text)
         texts.append(b"")
         content = b"\n".join(texts)
         if self._block_start + self._raw_bytes + len(content) > self._max_bytes:
@@ -137,11 +146,16 @@ class TapeWriter:
         self._append(content)
 
     def _append(self, content: bytes) -> None:
-        os.write(self._handle, content)
+        self._write_all(content)
         self._raw.append(content)
         self._raw_bytes += len(content)
         if self._raw_bytes >= _BLOCK_FROM:
             self._pack()
+
+    def _write_all(self, content: bytes) -> None:
+        rest = memoryview(content)
+        while rest:  # a disk that is nearly full takes a part
+            rest = rest[os.write(self._handle, rest) :]
 
     def _pack(self) -> None:
         """Replace the lines that are in no block by a block.
@@ -152,7 +166,7 @@ class TapeWriter:
         packed = zlib.compress(b"".join(self._raw), _LEVEL)
         block = _BLOCK.pack(_MARK, len(packed), zlib.crc32(packed)) + packed
         os.lseek(self._handle, self._block_start, os.SEEK_SET)
-        os.write(self._handle, block)
+        self._write_all(block)
         self._block_start += len(block)
         os.ftruncate(self._handle, self._block_start)
         self._raw, self._raw_bytes = [], 0
@@ -242,19 +256,36 @@ class Tape:
         """Yield the rounds in their order."""
         for line in _lines(self.file):
             kind: str = line[1]
-            if kind == "round":
-                number, end_s, name, arguments, answer, events = line[2:8]
-                yield TapedRound(number, end_s, (name, arguments, answer), events)
-            elif kind == "call":
-                self.calls[line[2]] = TapedCall(*line[3:8])
-            elif kind == "place":
-                self.places[line[2]] = TapedPlace(line[3], line[4])
-            elif kind == "end":
-                self.end = line[2]
+            try:
+                if kind == "round":
+                    number, end_s, name, arguments, answer, events = line[2:8]
+                    found = TapedRound(number, end_s, (name, arguments, answer), events)
+                    if not isinstance(events, list) or not isinstance(arguments, list):
+                        return
+                    yield found
+                elif kind == "call":
+                    self.calls[line[2]] = TapedCall(*line[3:8])
+                elif kind == "place":
+                    self.places[line[2]] = TapedPlace(line[3], line[4])
+                elif kind == "end":
+                    self.end = line[2]
+            except (TypeError, ValueError, IndexError):  # damaged, or made by hand
+                return
+
+    def number_of_run(self, uuid: str) -> int | None:
+        """Return the number of a run in its session, from 0; None where the tape does not know."""
+        name = f'["{RUN}",["{uuid}",'.encode()
+        for text in _texts(self.file):
+            _, is_held, rest = text.partition(name)
+            number = rest.partition(b"]")[0]
+            if is_held and number.isdigit():
+                return int(number)
+        return None
 
     def sources(self) -> dict[str, str]:
         """Return the text of each source file by its path, as it was when it was first used."""
-        return {line[2]: line[3] for line in _lines(self.file, b'"source"')}
+        lines = (each for each in _lines(self.file, b'"source"') if len(each) > 3)
+        return {each[2]: each[3] for each in lines if isinstance(each[3], str)}
 
 
 def open_tape(file: Path) -> Tape:
@@ -269,7 +300,14 @@ def open_tape(file: Path) -> Tape:
         raise InvalidInputError(f"The tape {file} cannot be read: {error.strerror}.") from error
     if first is None or first[1] != "head" or not isinstance(first[2], dict):
         raise InvalidInputError(f"The tape {file} is damaged: it has no head.")
-    return Tape(file, cast("dict[str, Any]", first[2]))
+    return Tape(file, _checked(file, cast("dict[str, Any]", first[2])))
+
+
+def _checked(file: Path, head: dict[str, Any]) -> dict[str, Any]:
+    for name, kind in _HEAD.items():
+        if name in head and not isinstance(head[name], kind):
+            raise InvalidInputError(f"The tape {file} is damaged: {name!r} of its head is wrong.")
+    return head
 
 
 def _lines(file: Path, holding: bytes = b"") -> Generator[list[Any]]:
@@ -287,6 +325,8 @@ def _lines(file: Path, holding: bytes = b"") -> Generator[list[Any]]:
         parts = cast("list[Any]", line)
         if len(parts) < 3 or not isinstance(parts[0], int) or parts[0] <= last:
             continue
+        if parts[0] > last + 1 and not holding:  # a line is lost: what follows would be shifted
+            return
         last = parts[0]
         if not holding or parts[1] == holding.decode().strip('"'):
             yield parts
@@ -307,7 +347,21 @@ def _texts(file: Path) -> Generator[bytes]:
             unpacking = zlib.decompressobj()
             try:
                 lines = unpacking.decompress(packed, _MOST_BLOCK_BYTES)
+                if not unpacking.eof:
+                    return
             except zlib.error:
                 return
             yield from lines.splitlines()
-        yield from (start + tape.read()).splitlines()
+        yield from _plain_lines(tape, start)
+
+
+def _plain_lines(tape: BinaryIO, start: bytes) -> Generator[bytes]:
+    """Yield the lines that are in no block, of which the first bytes were read already."""
+    *whole, rest = start.split(b"\n")
+    yield from whole
+    while text := tape.readline(_MOST_LINE_BYTES + 1):
+        if len(rest) + len(text) > _MOST_LINE_BYTES:
+            return
+        yield rest + text
+        rest = b""
+    yield rest

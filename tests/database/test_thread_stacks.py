@@ -179,7 +179,7 @@ def test_a_loop_that_stays_silent_is_logged_once(tmp_path: Path) -> None:
     bridge.close()
     with closing(sqlite3.connect(tmp_path / "webots.db")) as connection:
         (count,) = connection.execute(
-            "SELECT count(*) FROM log WHERE message LIKE '%test_stacks.py%'"
+            "SELECT count(*) FROM log WHERE message LIKE '%test_thread_stacks.py%'"
         ).fetchone()
     assert count == 1
 

@@ -88,7 +88,7 @@ def test_kinds_that_the_recording_has_no_data_for_are_not_passed_over(
         recorder.publish(row / 10, {"gripper_m": math.sin(row / 20)})
     told = find_events(empty, find_range(empty, Scope()), EventOptions()).verdicts
     assert told.reasons["fall"] == (NO_ATTITUDE,)
-    assert "publish them" in told.reasons["slip"][0]
+    assert "publish the position" in told.reasons["slip"][0]
     assert {"off_target", "degradation", "stuck", "standstill"} <= told.reasons.keys()
 
 

@@ -180,11 +180,11 @@ _SQL: Final = "SQL, by any process"
 _STREAM: Final = "what is complete, by a program of your own"
 WAYS: Final[dict[str, Way]] = {
     "raw sqlite3": Way(_raw, _count_raw, _SQL),
-    "bridge": Way(partial(_bridge, orjson=False), _count_bridge, f"{_SQL}; tools"),
+    "bridge": Way(partial(_bridge, orjson=True), _count_bridge, f"{_SQL}; tools"),
     "bridge and get_command": Way(
-        partial(_bridge, orjson=False, polls=True), _count_bridge, f"{_SQL}; tools; steering"
+        partial(_bridge, orjson=True, polls=True), _count_bridge, f"{_SQL}; tools; steering"
     ),
-    "bridge with orjson": Way(partial(_bridge, orjson=True), _count_bridge, f"{_SQL}; tools"),
+    "bridge without orjson": Way(partial(_bridge, orjson=False), _count_bridge, f"{_SQL}; tools"),
     "JSON lines, flushed": Way(_json_lines, _count_lines, _STREAM),
     "JSON file, anew each step": Way(_json_file, _count_file, "the newest state alone"),
     "MCAP, as by default": Way(partial(_mcap, chunks=True), _count_mcap, _STREAM),
@@ -250,8 +250,8 @@ _LOOP: Final = """\
 In each step of 8 ms, one process sleeps and then records a state of 39 values (740 bytes of
 JSON). The recorders take turns in {blocks} blocks of {steps} steps; the ratio is the median of
 the ratios of neighbouring blocks. "Processor" is the time of the whole process with its threads,
-minus that of a loop that records nothing. The recorders do different work: the bridge also
-stores runs, changes, signals and commands. Rerun writes in its own threads and leaves out texts
+minus that of a loop that records nothing. The bridge encodes with orjson, which is installed with
+it; in a Python without it, it uses `json`. The recorders do different work: the bridge also stores runs, changes, signals and commands. Rerun writes in its own threads and leaves out texts
 here. MCAP compresses 1 MB in the call that fills a chunk. None calls `fsync` in the loop, so a
 power cut may cost the newest states; this was not tried."""
 

@@ -39,7 +39,7 @@ def _driven(
 
 
 @robot(
-    "tower crane", 120, fault="its load begins to swing up at 60 s",
+    "tower crane", 120, fault="its load begins to oscillate with growing amplitude at 60 s",
     check="stays stable", kind="oscillation", names="sway", at_s=60, within_s=8,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
@@ -199,23 +199,23 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
 
 
 @robot(
-    "swarm member that waits", 120, fault="it is told to leave at 50 s and does not until 68 s",
+    "swarm member that waits", 120, fault="it is commanded to leave at 50 s and does not until 68 s",
     check="moves when commanded", kind="stuck", names="stuck", at_s=50,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:
-    told = np.where(((t > 5) & (t < 25)) | ((t >= 50) & (t < 90)), 0.2, 0.0)
-    moves = np.where(faulty & (t >= 50) & (t < 68), 0.0, told)
+    commanded = np.where(((t > 5) & (t < 25)) | ((t >= 50) & (t < 90)), 0.2, 0.0)
+    moves = np.where(faulty & (t >= 50) & (t < 68), 0.0, commanded)
     step = t[1] - t[0]
     return {
         "pose.x": np.cumsum(moves) * step + noise(random, t, 0.002),
         "pose.y": noise(random, t, 0.002),
         "pose.theta": noise(random, t, 0.003),
-        "cmd_vel.linear_m_s": told,
+        "cmd_vel.linear_m_s": commanded,
         "cmd_vel.angular_rad_s": 0.0 * t,
         "neighbours": np.where(t % 30 < 15, 3, 5).astype(int),
         "nearest_m": 0.6 + 0.2 * np.sin(TURN * t / 30) + noise(random, t, 0.01),
         "led": chosen((t % 2 < 1, "green"), otherwise="off"),
-        "role": chosen((told > 0, "follow"), otherwise="beacon"),
+        "role": chosen((commanded > 0, "follow"), otherwise="beacon"),
     }
 
 

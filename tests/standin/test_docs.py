@@ -1,4 +1,4 @@
-"""docs/standin.md lists what the stand-in has, and what it lacks."""
+"""docs/standin.md lists what the stand-in has, and what is missing from it."""
 
 from __future__ import annotations
 
@@ -30,17 +30,19 @@ def test_it_lists_every_device() -> None:
     assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(DEVICES)
 
 
-def test_it_lists_every_class_and_what_each_lacks() -> None:
+def test_it_lists_every_class_and_the_members_missing_from_it() -> None:
     assert names_between("but for the names listed:\n", "\n- ") == HAD
     assert names_between("and fail when used:\n", "\nThe package") == set(MEMBERS) - HAD
     inherits = r"(?:, and those of `Robot`)?"
     listed = dict(re.findall(rf"^- `(\w+)`{inherits}: ((?:`\w+`,?\s+)+)", PAGE, re.M))
     for name in HAD:
-        lacks = lacked(name) - (lacked("Robot") if name == "Supervisor" else set())
-        assert set(re.findall(r"`(\w+)`", listed.get(name, ""))) == lacks, name
+        missing = missing_members(name) - (
+            missing_members("Robot") if name == "Supervisor" else set()
+        )
+        assert set(re.findall(r"`(\w+)`", listed.get(name, ""))) == missing, name
 
 
-def lacked(name: str) -> set[str]:
+def missing_members(name: str) -> set[str]:
     """The members of a class in Webots that the class of the stand-in does not have."""
     had: Any = getattr(controller, name)
     own: dict[str, Any] = {**vars(had)}

@@ -48,14 +48,14 @@ class _SearchSettings(NamedTuple):
     window: int = 4  # blocks: two to four periods
     sign_changes: tuple[int, int] = (3, 12)  # in a window: a sine has 4 to 8, noise of the rows 16
     likely: float = 0.58  # of the signs a sine explains 0.83, and of white noise 0.58 once in 500
-    linked: float = 0.45  # of windows beside such a one
+    linked: float = 0.45  # the same, of a window next to a likely one
     signs_of_sine: float = 0.83
     at_once: int = 16_384  # means, which stay in the cache of a processor
     unthreaded: int = 400  # windows in a product that BLAS does not share between threads
     surrounding: int = 16  # blocks of which the lower quartile is taken
-    same_period: float = 1.25  # ratio of the periods of windows of one swing ...
+    same_period: float = 1.25  # ratio of the periods of two windows of one oscillation ...
     as_loud: float = 3.0  # ... and of their sizes
-    hidden: float = 2.0  # periods, for which bends may hide a swing that goes on
+    hidden: float = 2.0  # periods for which bends may hide an oscillation that goes on
     promising: float = 90.0  # as `DECIDE.enough`, by what the signs tell
 
 
@@ -71,15 +71,15 @@ class _FitSettings(NamedTuple):
     rests: float = 0.75  # of a period, in which the value ...
     quiet: float = 0.3  # ... bends by less than that share of what is usual
     settled: int = 2  # periods, from which the sine is continued to find its ends
-    edge: float = 0.13  # of the period: a sine that begins at 0 shows so much earlier
-    # Of the period: so near the end of what was recorded it reaches up to there.
+    edge: float = 0.13  # of the period by which a sine that begins at 0 shows earlier
+    # Of the period: an end this near to the end of the recording counts as reaching it.
     at_end: float = 0.5
-    piece: float = 5.0  # periods of one phase: over more, a swing may change a little
+    piece: float = 5.0  # periods of one phase: over more, an oscillation may change
     tried: tuple[float, float, float] = (0.94, 1.0, 1.06)  # of the period
     farthest: float = 1.4  # times as far from the middle one the best may be
     unsure: float = 1.1  # times as short the period may be as it seems before it is fitted
-    rounds: int = 2  # after which what is farther off ...
-    outlying: float = 2.5  # ... than so many median residuals, a bend, does not count
+    rounds: int = 2  # of fitting; after them bends do not count
+    outlying: float = 2.5  # median residuals beyond which a value is a bend
     most_noise: float = 0.12  # of the squares of second differences, that is taken for noise
 
 
@@ -98,15 +98,15 @@ class _DecisionSettings(NamedTuple):
     median_to_quartile: float = median / 0.3186
     enough: float = 850.0  # of `evidence`: random courses reach it less than once an hour
     turns_back: float = 0.08  # of the way there a value comes back that does not only go one way
-    many_periods: int = 12  # of which some may be those of a swing within a staircase
+    many_periods: int = 12  # of which some may belong to an oscillation within a staircase
     straight: float = 0.085  # of the sine its harmonics reach where straight pieces make it ...
-    doubt: float = 4.7  # ... beside so many variances that noise makes of them
-    noise_amplitudes: float = 3.0  # a swing is at least so many deviations of the noise high ...
-    mean_amplitudes: float = 12.0  # ... or so many of their means over half the swing
+    doubt: float = 4.7  # ... after subtracting this multiple of the variance due to noise
+    noise_amplitudes: float = 3.0  # minimum amplitude in standard deviations of the noise ...
+    mean_amplitudes: float = 12.0  # ... or in those of a mean over half an oscillation
     same_number: float = 1e-9  # of the value: what adding up floating-point numbers makes of one
     switched_values: int = 3
     most_overlap: float = 0.2  # of the shorter one ...
-    much_slower: float = 4.0  # ... and ratio of periods, where two show one swing
+    much_slower: float = 4.0  # ... and ratio of periods above which two are not one oscillation
     # Ratios of periods and of amplitudes on both sides of a gap.
     alike: tuple[float, float] = (1.15, 1.5)
 

@@ -20,9 +20,9 @@ _PLACES: Final = ("x", "y", "raw_x", "raw_y")
 class _SmoothingSettings(NamedTuple):
     """How positions are smoothed, and when a leg of the path is one."""
 
-    false_legs: float = 0.003  # so many may noise alone make of a robot at rest, on average
-    gap_noise: float = 7.0  # deviations of the position: so far it went at least during a gap
-    finest_leg_m: float = 0.02  # smoothing that makes legs so short is enough
+    false_legs: float = 0.003  # mean number that noise alone makes for a robot at rest
+    gap_noise: float = 7.0  # standard deviations of the position that count as motion during a gap
+    finest_leg_m: float = 0.02  # no more smoothing is needed once legs are this short
     sharpest_arc_rad: float = 2.7  # from leg to leg; who turns farther went back
     longest_smoothing_s: float = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
     parabola_gain: float = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it

@@ -19,7 +19,7 @@ MOST_AROUND: Final = 5
 class _StandstillSettings(NamedTuple):
     """When a robot counts as standing still, and how closely positions are compared."""
 
-    widened_by: float = 5.0  # a place is at least so many deviations of the smoothed position wide
+    widened_by: float = 5.0  # minimum width of a place, in deviations of the smoothed position
     settled_share: float = 0.2  # of the radius: within it of the place is where a standstill begins
     unseen_slope: float = 3.0  # deviations: a speed that is less may be noise alone
     samples: int = 12  # of the shortest standstill: so finely places are compared at first

@@ -27,6 +27,7 @@ from threading import get_ident
 from types import FrameType, ModuleType
 from typing import Any, Final, cast
 
+from webots_mcp.bridge.error_report import describe
 from webots_mcp.contract import PARAMETERS_VARIABLE, VERSION
 from webots_mcp.database.tapes import tape_notes
 from webots_mcp.database.tapes.package_surface import (
@@ -400,9 +401,12 @@ def _facts_of(robot: Any) -> dict[str, dict[str, Any]]:
     facts: dict[str, dict[str, Any]] = {}
     for path, (source, owner) in sources.items():
         for name in _FACTS.get(owner, ()):
+            if not hasattr(type(source), name):  # in another version of Webots' library
+                continue
             try:
                 value = _unwrapped(source, name)(source)
-            except Exception:  # noqa: BLE001  (what it is not, it cannot be asked)
+            except Exception as error:  # noqa: BLE001  (the robot comes first)
+                warn(f"not on the tape: {path}.{name}(), which raised {describe(error)}")
                 continue
             if type(value) in _PLAIN:
                 facts.setdefault(path, {})[name] = value

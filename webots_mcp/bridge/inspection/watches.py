@@ -39,7 +39,7 @@ class WatchedPath:
 
     Attributes:
         key: Its name among the watched values of a state.
-        every: Its value is recorded in one of so many states.
+        every: Its value is recorded in every Nth state.
         waited: States since the last recorded one that had its value, or since it is watched.
         code: The function whose variable the path begins with, where it was found last.
         failing: A state had no value for it, and the log says so.

@@ -1,4 +1,4 @@
-"""What a check is, what it may look at, and what it says."""
+"""What a check is, what it may read, and what it reports."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Check:
             docstring says when it warns and when it fails. It may raise `NotSearchableError` where
             the run lacks what it is about.
         needs: What has to be recorded, for a person.
-        kinds: Of events that it judges: where one could not be looked for, the check is not made.
+        kinds: Of events that it judges: where one could not be searched, the check is not made.
         of_values: It reads values itself: where some were not read, it does not pass.
     """
 

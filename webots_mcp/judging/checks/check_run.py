@@ -58,7 +58,7 @@ from webots_mcp.store.runs import run_info
 CHECK_DEADLINE_S: Final = 8.0
 _OF_EVENTS: Final = 0.7  # of the time
 _MOVES: Final = "the position; a commanded speed, speeds of wheels, or a mode"
-_AIMS: Final = "a target beside its measurement: `arm.target`, `arm.position`"
+_AIMS: Final = "a target next to its measurement: `arm.target`, `arm.position`"
 _TWO: Final = "two positions of the robot, such as gps and odometry"
 UNDERSTOOD: Final = "signals understood"  # never changes what the run comes to
 _JUMP: Final = (jump.JUMP.name,)
@@ -143,10 +143,10 @@ def check_run(
     Args:
         connection: Any.
         run_id: The run.
-        expect: What is expected besides what the run's controller and its project expect.
+        expect: Conditions, in addition to those of the run's controller and its project.
         project: What its project's file says; None for what of it was compiled last.
         found: All events of the whole run, each by itself, where they are known already.
-        deadline_s: What was not looked at by then is said so, and does not pass.
+        deadline_s: A check that was not made by then is reported as not judged.
 
     Raises:
         UnknownRunError, UnknownSignalError: As they say.

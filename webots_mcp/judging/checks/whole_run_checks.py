@@ -32,7 +32,7 @@ from webots_mcp.store.sessions import fetch_session
 _MOST_PARTS: Final = 3  # slow ones that are named
 _LONGEST_MESSAGE: Final = 120
 _MUCH: Final = 0.05  # of the run, or of its rows
-_HABIT: Final = 3  # so many times: its code does it
+_HABIT: Final = 3  # gaps or resets from which on they are the program's habit
 _MOST_UNKNOWN: Final = 5  # names in the evidence
 
 
@@ -169,8 +169,8 @@ def loses_no_rows(run: RunUnderCheck) -> Examined:
     if run.info.end_reason and waiting:
         left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
         return Fault("warn", left)
-    if beside := waiting_rows_note(run.search.connection):
-        return Fault("warn", beside)
+    if waiting := waiting_rows_note(run.search.connection):
+        return Fault("warn", waiting)
     rows = f"all {run.info.row_count} rows {verb}" if run.info.row_count > 1 else "its only row is"
     return run.covered(f"{rows} recorded", lasts_s=0.0)
 

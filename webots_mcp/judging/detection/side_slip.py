@@ -119,7 +119,7 @@ def side_slips(search: Search, wheels: Sequence[RegisteredSignal], usual_m_s: fl
         usual_m_s: How fast it goes per unit of the mean speed of its wheels.
 
     Raises:
-        NotSearchableError: Why that cannot be told.
+        NotSearchableError: If it cannot be determined how far a side rolled; the text says why.
     """
     left, right = wheels_by_side(search, wheels)
     if not left or not right:
@@ -188,7 +188,7 @@ def _slips_in(cells: _WheelCells, usual_m_s: float) -> SideSlips:
     found: list[SideSlip] = []
     factor = _factor_of_turns(turned, left, right, drives)
     mean, apart = ahead / usual_m_s, turned / factor
-    # A position that is measured beside the axle's middle goes ahead when the robot turns.
+    # A position that is not measured at the middle of the axle moves ahead when the robot turns.
     bends = drives & (np.abs(right - left) > _DIFFERS * fastest)
     bends &= np.abs(apart - (right - left)) <= _NEAR * np.abs(right - left)
     if np.count_nonzero(bends) >= _LEAST_CELLS:
@@ -237,7 +237,7 @@ def _along(cells: _WheelCells, drives: Flags) -> tuple[Array, Array, int]:
     A compass counts the other way round (then the third is -1), and headings may begin anywhere.
 
     Raises:
-        NotSearchableError: It does not go where it looks.
+        NotSearchableError: It does not go where it faces.
     """
     mean = (cells.left + cells.right) / 2
     fastest = np.maximum(np.abs(cells.left), np.abs(cells.right))
@@ -252,7 +252,7 @@ def _along(cells: _WheelCells, drives: Flags) -> tuple[Array, Array, int]:
         best = max(best, (share, sense, float(np.angle(total))))
     share, sense, angle = best
     if share < _ALONG:
-        raise NotSearchableError("it does not go where its heading says that it looks")
+        raise NotSearchableError("it does not go where its heading says that it faces")
     along: Any = cells.went * np.exp(-1j * (sense * cells.course + angle))
     return np.asarray(along.real, np.float64), sense * cells.turned, sense
 

@@ -114,7 +114,7 @@ def _slips_of(
     """Where it slipped, how it rolls otherwise, the least of that without a slip; why no side is.
 
     Raises:
-        NotSearchableError: It cannot be told how far it usually goes.
+        NotSearchableError: Its usual distance per turn is unknown.
     """
     if position[0].name.partition(".")[0] in _BY_WHEELS:
         raise NotSearchableError(f"{position[0].name} is counted by the wheels themselves")

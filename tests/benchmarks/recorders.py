@@ -251,7 +251,8 @@ In each step of 8 ms, one process sleeps and then records a state of 39 values (
 JSON). The recorders take turns in {blocks} blocks of {steps} steps; the ratio is the median of
 the ratios of neighbouring blocks. "Processor" is the time of the whole process with its threads,
 minus that of a loop that records nothing. The bridge encodes with orjson, which is installed with
-it; in a Python without it, it uses `json`. The recorders do different work: the bridge also stores runs, changes, signals and commands. Rerun writes in its own threads and leaves out texts
+it; in a Python without orjson it uses `json`. The recorders do different work: the bridge also
+stores runs, changes, signals and commands. Rerun writes in its own threads and leaves out texts
 here. MCAP compresses 1 MB in the call that fills a chunk. None calls `fsync` in the loop, so a
 power cut may cost the newest states; this was not tried."""
 

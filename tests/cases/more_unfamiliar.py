@@ -199,7 +199,7 @@ def _(t: Array, random: Random, faulty: bool) -> Columns:
 
 
 @robot(
-    "swarm member that waits", 120, fault="it is commanded to leave at 50 s and does not until 68 s",
+    "swarm member that waits", 120, fault="commanded to leave at 50 s, it stays until 68 s",
     check="moves when commanded", kind="stuck", names="stuck", at_s=50,
 )  # fmt: skip
 def _(t: Array, random: Random, faulty: bool) -> Columns:

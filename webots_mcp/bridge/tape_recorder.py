@@ -395,7 +395,7 @@ def _devices_of(robot: Any) -> dict[str, Any]:
 
 def _facts_of(robot: Any) -> dict[str, dict[str, Any]]:
     """Return what the robot and its devices are, by path and name of the getter."""
-    sources = {"robot": (robot, "Robot")}
+    sources: dict[str, tuple[object, str]] = {"robot": (robot, "Robot")}
     devices = _devices_of(robot).items()
     sources |= {f"device:{name}": (each, type(each).__name__) for name, each in devices}
     facts: dict[str, dict[str, Any]] = {}

@@ -22,6 +22,8 @@ from webots_mcp.database.connection import connect
 from webots_mcp.database.schema import create_schema
 from webots_mcp.judging.checks.check_run import CHECKS
 from webots_mcp.judging.detection.event_kinds import KINDS
+from webots_mcp.plugins.prove.fact_checks import CHECKS as PROVEN
+from webots_mcp.plugins.prove.fact_checks import NOT_TRIED
 from webots_mcp.questions import all_questions
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.signals.meaning import QUANTITIES, ROLES, SIDES, short_forms, understood_words
@@ -194,6 +196,40 @@ def events(_page: str = "") -> str:
     return "## All kinds\n\n" + _table(["kind", "what it is", "has a duration", "checks"], rows)
 
 
+def proven(_page: str = "") -> str:
+    """Each check of `webots-mcp prove`: what it expects, and what works if that is wrong."""
+    rows = [
+        [f"`{name}`", *(check.__doc__ or "").rstrip(".").split("; otherwise ")]
+        for name, check in PROVEN.items()
+    ]
+    rows += [[f"`{name}`", "not tried", why] for name, why in NOT_TRIED.items()]
+    return "## The checks\n\n" + _table(["check", "expected", "otherwise"], rows)
+
+
+def stand_in(_page: str = "") -> str:
+    """The members of Webots' classes that the stand-in does not have, class by class."""
+    import webots_mcp.standin
+
+    assert webots_mcp.standin.__all__  # It puts its package `controller` on the path.
+    import controller
+    from controller.surface import MEMBERS, Lacking
+
+    had = {each.__name__: each for each in controller.__all__}
+    inherited = {name for name, each in vars(had["Robot"]).items() if isinstance(each, Lacking)}
+    lines: list[str] = []
+    for name in sorted(had):
+        missing = {member for member, each in vars(had[name]).items() if isinstance(each, Lacking)}
+        also = " (and those of `Robot`)" if name == "Supervisor" else ""
+        names = sorted(missing - inherited if also else missing)
+        lines += [f"- `{name}`{also}: {', '.join(f'`{each}`' for each in names) or 'none'}"]
+    others = ", ".join(f"`{name}`" for name in sorted({*MEMBERS} - {*had}))
+    return (
+        "## Missing members\n\nOf the classes that the stand-in has:\n\n"
+        + "\n".join(lines)
+        + f"\n\nThese classes can be imported, and fail when used: {others}.\n"
+    )
+
+
 def meanings(_page: str = "") -> str:
     """What may be declared of a signal, and the words of names that need no declaration."""
     fields = [
@@ -331,6 +367,8 @@ ADDED: Final[dict[str, Callable[[str], str]]] = {
     "docs/tools": lambda _page: subpages("tools"),
     "docs/command-line": lambda _page: subpages("command-line"),
     "docs/database": tables,
+    "docs/standin": stand_in,
+    "docs/webots": proven,
     "docs/python": interface,
 }
 ADDED.update(

@@ -1,7 +1,6 @@
 """Checks of a running Webots, one for each fact that is known from its sources only.
 
-'webots-mcp help webots' names the check of each of its statements. The docstring of a check is
-printed: what the sources say, and after "otherwise" what still works if that is wrong. A check
+The docstring of a check is printed, and listed by the documentation: what the sources say, and after "otherwise" what still works if that is wrong. A check
 returns what it measured, or fails with what it observed. `running_NAME` is called with Webots in
 real time, after the rover has recorded `bench.before`; `streaming_NAME` the same with --stream.
 `check_NAME` starts Webots itself.
@@ -38,7 +37,7 @@ NOT_TRIED: Final = {
     "preferences": "runtime.ini decides here, so that any Webots starts the Python of prove",
     "customData of a PROTO": "the PROTO nodes of prove have no controller that writes it",
     "slots": "the PROTO nodes of prove have none",
-    "scene stream": "it would pause the simulation of whoever asks for it, and is never asked for",
+    "scene stream": "a request for it would pause the simulation, so it is never made",
 }
 _STEP_S: Final = 0.016
 _SAME: Final = 1e-6
@@ -54,14 +53,14 @@ _BOX: Final = 'DEF PROVE_BOX Solid { translation 1 1 0.1 name "prove box" }'
 
 
 def check_installed(bench: Bench) -> str:
-    """version.txt in its home names the release; otherwise set WEBOTS_HOME to its folder."""
+    """Its folder has a version.txt that names the release; otherwise set WEBOTS_HOME to it."""
     found = find_webots()
     require(found.version, f"no version next to the program that {found.found_by} names")
     return f"{found.version}, by {found.found_by}"
 
 
 def check_launch(bench: Bench) -> str:
-    """It takes our options, begins as asked, listens at --port; otherwise start it by hand."""
+    """It takes our options, starts as asked and listens at --port; otherwise start it by hand."""
     began_s = time.monotonic()
     webots = bench.webots()
     took_s, mode = time.monotonic() - began_s, bench.row().state["mode"]
@@ -86,7 +85,7 @@ def running_options(bench: Bench) -> str:
 
 
 def running_python(bench: Bench) -> None:
-    """COMMAND of runtime.ini starts controllers; otherwise doctor says which Python it was."""
+    """COMMAND of runtime.ini starts controllers; otherwise doctor shows which Python it was."""
     used = Path(bench.before.state["python"])
     require(used.resolve() == Path(sys.executable).resolve(), f"the controller ran in {used}")
 
@@ -95,7 +94,7 @@ def running_python(bench: Bench) -> None:
 
 
 def running_output(bench: Bench) -> str:
-    """--stdout and --stderr show what controllers print; otherwise follow the console."""
+    """--stdout and --stderr show what controllers print; otherwise read Webots' console."""
     bench.send("say", text="printed for prove")
 
     def streams() -> list[str]:
@@ -107,7 +106,7 @@ def running_output(bench: Bench) -> str:
 
 
 def running_console(bench: Bench) -> str:
-    """Who asks gets its lines, also without --stream; otherwise start it with --stream."""
+    """It sends its console lines, also without --stream; otherwise start it with --stream."""
     with orders.connected(bench.address(), orders.ANSWER_S) as stream:
         orders.begin_console(stream)
         bench.send("say", text="heard by prove")
@@ -124,7 +123,7 @@ def running_console(bench: Bench) -> str:
 
 
 def running_no_orders(bench: Bench) -> None:
-    """Without --stream a ping is answered and no order; otherwise it is obeyed, as is said."""
+    """Without --stream it answers a ping and obeys no order; otherwise the answer says so."""
     reply = orders.give_order(bench.address(), "pause")
     require(reply.text is None, f"it answered {reply.text!r}")
     require(reply.is_alive, "a ping was not answered")
@@ -135,7 +134,7 @@ def running_no_orders(bench: Bench) -> None:
 
 
 def running_pause(bench: Bench) -> None:
-    """A Supervisor pauses and, by step(0), resumes; otherwise press play in Webots."""
+    """A Supervisor pauses it and, by step(0), resumes it; otherwise press play in Webots."""
     _paused(bench)
     bench.control("resume")
     bench.goes_on("resume was done")
@@ -148,7 +147,7 @@ def _paused(bench: Bench) -> RobotRow:
 
 
 def running_steps(bench: Bench) -> None:
-    """As many rounds as were asked for, then a pause; otherwise the answer says how many."""
+    """It makes the requested steps, then pauses; otherwise the answer has the number made."""
     before = _paused(bench)
     bench.control("step", steps=3)
     _require_rounds(bench, before, 3)
@@ -163,7 +162,7 @@ def _require_rounds(bench: Bench, before: RobotRow, rounds: int) -> None:
 
 
 def running_fast(bench: Bench) -> str:
-    """Fast mode is faster than real time; otherwise time goes on in the old mode."""
+    """Fast mode is faster than real time; otherwise the answer names the actual mode."""
     bench.control("fast")
     bench.until(lambda: bench.row().state["mode"] == 2, "the mode is not fast")
     before, began_s = bench.row(), time.monotonic()
@@ -173,7 +172,7 @@ def running_fast(bench: Bench) -> str:
 
 
 def running_run(bench: Bench) -> None:
-    """A run stops at the very step of its time or condition; otherwise a step later."""
+    """A run stops at the exact step of its time or condition; otherwise one step later."""
     before = _paused(bench)
     bench.ask(control_simulation.webots_run, for_s=20 * _STEP_S)
     _require_rounds(bench, before, 20)
@@ -183,7 +182,7 @@ def running_run(bench: Bench) -> None:
 
 
 def running_breakpoint(bench: Bench) -> None:
-    """A hit pauses at the very step; otherwise a step later."""
+    """A hit pauses at the exact step; otherwise one step later."""
     goal = bench.before.state["rounds"] + 100
     made = bench.ask(set_breakpoints.webots_breakpoint, condition=f"rounds >= {goal}")
     bench.until(lambda: bench.row().state["rounds"] >= goal, "its step never came")
@@ -192,12 +191,12 @@ def running_breakpoint(bench: Bench) -> None:
 
 
 def running_screenshot(bench: Bench) -> str:
-    """The main view is written, also headless; otherwise cameras of robots still see."""
+    """It writes its main view, also without a window; otherwise use the robots' cameras."""
     return _size_of(bench.ask(show_pictures.webots_take_screenshot))
 
 
 def running_camera(bench: Bench) -> str:
-    """Cameras see with --no-rendering; otherwise start it with its window."""
+    """Cameras work with --no-rendering; otherwise start it with its window."""
     return _size_of(bench.ask(show_pictures.webots_get_camera, camera="camera", fresh=True))
 
 
@@ -214,7 +213,7 @@ def _size_of(shown: list[str | ShownPicture]) -> str:
 
 
 def running_field(bench: Bench) -> None:
-    """A field is set with the next step, also in a pause; otherwise the answer says what it is."""
+    """A field is set with the next step, also while paused; otherwise the answer has its value."""
     _paused(bench)
     _set(bench, _PLACE, [-0.3, 0.5, 0.06])
     bench.control("step", steps=2)
@@ -231,7 +230,7 @@ def _value(bench: Bench, path: str) -> Any:
 
 
 def running_nodes(bench: Bench) -> None:
-    """Nodes are added and removed at once, and bad text adds none; otherwise reload."""
+    """Nodes are added and removed at once, and faulty text adds none; otherwise reload."""
     bench.ask(edit_scene.webots_add_node, vrml=_BOX)
     require(_has_box(bench), "a node that was added is not there")
     bench.ask(edit_scene.webots_remove_node, path="PROVE_BOX")
@@ -246,7 +245,7 @@ def _has_box(bench: Bench) -> bool:
 
 
 def running_reset(bench: Bench) -> None:
-    """In the same process time is 0, poses are back, added nodes gone; otherwise reload."""
+    """A reset restores poses and removes added nodes, in the same process; otherwise reload."""
     bench.ask(edit_scene.webots_add_node, vrml=_BOX)
     _set(bench, _PLACE, [1, -1.5, 0.06])
     now = _after_reset(bench)
@@ -265,7 +264,7 @@ def _after_reset(bench: Bench) -> RobotRow:
 
 
 def running_put_back(bench: Bench) -> None:
-    """A reset leaves a field as it was set, and the bridge sets it back; otherwise reload."""
+    """A reset leaves other fields as set, and the bridge restores them; otherwise reload."""
     mass = _value(bench, _MASS)
     _set(bench, _MASS, 2 * mass)
     bench.goes_on("a mass was set")
@@ -277,13 +276,13 @@ def running_put_back(bench: Bench) -> None:
 
 
 def running_motors(bench: Bench) -> None:
-    """Wheels turn on after a reset, since the bridge asks for it; otherwise use on_reload."""
+    """A reset stops wheels, and the bridge starts them again; otherwise use on_reload."""
     begin_rad = _after_reset(bench).state["wheel_rad"]
     bench.until(lambda: bench.row().state["wheel_rad"] != begin_rad, "a wheel stands still")
 
 
 def running_proto(bench: Bench) -> None:
-    """The inside of a PROTO can be read and not be set; otherwise it is said not to be there."""
+    """The inside of a PROTO can be read but not set; otherwise it is reported as missing."""
     path = "SIGN.children[0].geometry.size"
     for then in ("before", "after"):
         size = [round(each, 3) for each in _value(bench, path)]
@@ -296,7 +295,7 @@ def running_proto(bench: Bench) -> None:
 
 
 def running_observer(bench: Bench) -> str:
-    """Poses come with its steps, of robots in a PROTO too; otherwise each is asked for."""
+    """Steps of an observer carry all poses, also in a PROTO; otherwise each is requested."""
 
     def places() -> dict[str, Any]:
         return bench.row(OBSERVER_NAME).state.get("world", {})
@@ -311,7 +310,7 @@ def running_observer(bench: Bench) -> str:
 
 
 def running_observer_time(bench: Bench) -> str:
-    """Answers to its step(0) tell the time; otherwise it makes steps of its own."""
+    """step(0) of an observer reports the time; otherwise it makes steps of its own."""
     begin = bench.row(OBSERVER_NAME)
     end_s = begin.sim_time_s + 2
     bench.until(lambda: bench.row(OBSERVER_NAME).sim_time_s > end_s, "it recorded no 2 s")
@@ -323,7 +322,7 @@ def running_observer_time(bench: Bench) -> str:
 
 
 def running_customData(bench: Bench) -> str:  # noqa: N802 - as Webots writes it
-    """An observer records it of a robot without a bridge; otherwise attach a bridge."""
+    """An observer records the customData of other robots; otherwise attach a bridge."""
     goal = bench.row(SPEAKER).state["seq"] + 20
     bench.until(lambda: bench.row(SPEAKER).state["seq"] > goal, "its messages end")
     state = bench.row(SPEAKER).state
@@ -332,7 +331,7 @@ def running_customData(bench: Bench) -> str:  # noqa: N802 - as Webots writes it
 
 
 def running_hang(bench: Bench) -> str:
-    """A loop that hangs is told with its place, and goes on; otherwise status says silent."""
+    """The threads of a hanging controller go on, so its line is known; otherwise it is silent."""
     bench.send("stall", waits_s=1.0, seconds=_STALL_S)
 
     def place() -> str | None:
@@ -349,7 +348,7 @@ def running_hang(bench: Bench) -> str:
 
 
 def running_reload(bench: Bench) -> None:
-    """Controllers are started anew; otherwise start them by hand."""
+    """A reload restarts controllers; otherwise start them by hand."""
     bench.control("reload", timeout_wall_s=_LOAD_S)
     _began_after(bench, bench.before)
     _require_ended(bench, "reload")
@@ -369,7 +368,7 @@ def _require_ended(bench: Bench, reason: str) -> None:
 
 
 def running_quit(bench: Bench) -> None:
-    """It ends with the status of simulationQuit, after step() was -1; otherwise with another."""
+    """It exits with the status of simulationQuit, after step() was -1; otherwise with another."""
     webots = bench.webots()
     bench.send("leave", waits_s=3.0, status=_STATUS)
     bench.until(lambda: webots.is_over, "it did not end", _LOAD_S)
@@ -378,13 +377,13 @@ def running_quit(bench: Bench) -> None:
 
 
 def running_terminate(bench: Bench) -> None:
-    """SIGTERM, or closing its window, lets it quit: step() is -1; otherwise it is killed."""
+    """SIGTERM, or closing its window, makes step() return -1; otherwise it is killed."""
     bench.end()
     _require_ended(bench, "finished")
 
 
 def running_layout(bench: Bench) -> None:
-    """Headless it leaves the layout of its window alone; otherwise a .wbproj has changed."""
+    """With --headless it saves no window layout; otherwise a .wbproj has changed."""
     bench.end()
     written = [file.name for file in bench.world.parent.glob(".*.wbproj")]
     require(not written, f"it wrote {', '.join(written)}")
@@ -394,7 +393,7 @@ def running_layout(bench: Bench) -> None:
 
 
 def check_port_taken(bench: Bench) -> str:
-    """Where --port is taken it takes one of the next ten; otherwise it says so and ends."""
+    """If --port is taken, it takes one of the next ten; otherwise it ends with a message."""
     port = free_port()
     with socket.create_server(("", port)):
         bench.webots(stream=True, port=port)
@@ -404,7 +403,7 @@ def check_port_taken(bench: Bench) -> str:
 
 
 def streaming_orders(bench: Bench) -> str:
-    """With --stream each order is obeyed and answered in words; otherwise by a Supervisor."""
+    """With --stream it obeys and acknowledges each order; otherwise a Supervisor has to."""
     words = [_obeyed(bench, "pause")]
     bench.stands("the order pause was answered")
     before = bench.row()
@@ -423,7 +422,7 @@ def _obeyed(bench: Bench, order: orders.Order) -> str:
 
 
 def streaming_order_reset(bench: Bench) -> str:
-    """A reset by hand starts controllers anew; otherwise it is seen by time that goes back."""
+    """A reset by hand restarts controllers; otherwise time goes back, which shows it."""
     return _ordered_anew(bench, "reset")
 
 
@@ -434,7 +433,7 @@ def _ordered_anew(bench: Bench, order: orders.Order) -> str:
 
 
 def streaming_order_reload(bench: Bench) -> str:
-    """The order reload starts controllers anew; otherwise a Supervisor reloads."""
+    """The order reload restarts controllers; otherwise a Supervisor reloads."""
     return _ordered_anew(bench, "reload")
 
 
@@ -448,7 +447,7 @@ def streaming_order_load(bench: Bench) -> None:
 
 
 def streaming_by_hand(bench: Bench) -> None:
-    """A pause by hand is told to no controller; an observer ends it; otherwise press play."""
+    """An observer notices and ends a pause by hand; otherwise press play."""
     _obeyed(bench, "pause")
     bench.stands("it was paused from outside")
     bench.control("resume", robot=OBSERVER_NAME)
@@ -456,7 +455,7 @@ def streaming_by_hand(bench: Bench) -> None:
 
 
 def check_begins_paused(bench: Bench) -> None:
-    """--mode=pause starts controllers with the first step; otherwise they begin at once."""
+    """With --mode=pause, controllers start at the first step; otherwise at once."""
     bench.end()
     webots = bench.webots(stream=True, mode="pause")
     bench.until(webots.address_now, "it does not listen", bench.patience_s)

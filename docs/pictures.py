@@ -1,7 +1,7 @@
-"""Makes the pictures of the pages, and the README's conversation, anew: `python -m docs.pictures`.
+"""Makes the pictures and conversations of the pages anew: `python -m docs.pictures`.
 
 Most show the world and the controller of `webots-mcp demo`, up to a breakpoint at a certain step.
-The conversation, its animation and the pictures of the tutorial show the robot of the tutorial.
+The first conversation, its animation and the pictures of the tutorial show the robot of the tutorial.
 `images/drawn.json` says what was drawn by what; a test does the same again and compares.
 """
 
@@ -33,6 +33,7 @@ from webots_mcp.cli import main as webots_mcp
 from webots_mcp.contract import DATABASE_NAME, THROTTLE_VARIABLE
 from webots_mcp.database.connection import connect
 from webots_mcp.plugins.demo import demo_command as demo
+from webots_mcp.database.tapes.tape_wanted import TAPE_VARIABLE
 from webots_mcp.testing import RecordedSimulation
 
 CHECKOUT: Final = Path(__file__).parent.parent
@@ -62,9 +63,21 @@ header {{ background: #2a2e37; color: #8a909c; padding: 6px 14px; font-size: 13p
 pre {{ margin: 0; padding: 14px 18px; font: inherit; white-space: pre-wrap; }}
 img {{ display: block; margin: 0 18px; width: 500px; border-radius: 4px; }}
 </style><header>an assistant, connected to webots-mcp</header><pre>{text}</pre>{picture}"""
+# What a person asks of the demo's robot, with the page that shows the answer; the README has both.
+INSIDE: Final = "What were the variables when it turned?"
+EDITED: Final = "Would my edit have braked earlier?"
+PAGES_OF: Final = {INSIDE: "inspect.md", EDITED: "rerun.md"}
+TURNED: Final = "changed(mode)"  # It begins to turn after some 5 s.
+EDIT: Final = ('"near", 0.35', '"near", 0.5')
+ROVER: Final = Path("controllers/rover/rover.py")
 FIGURES_ARE_THERE: Final = """() => document.querySelector(".figure > svg")
     && [...document.querySelectorAll(".figure > svg")].every(each => each.parentNode.figure)"""
 CONVERSATION: Final = re.compile(r"(?<=<!-- conversation -->\n```text\n).*?(?=^```$)", re.M | re.S)
+
+
+def shown_of(question: str) -> re.Pattern[str]:
+    """The lines of a page that show the conversation about a question."""
+    return re.compile(rf"(?ms)^> {re.escape(question)}\n.*?(?=^```$|^$)")
 
 
 def recorded(folder: Path) -> RecordedSimulation:
@@ -190,6 +203,63 @@ def conversation(data_dir: Path) -> list[str]:
     ]
 
 
+def demo_conversations(folder: Path) -> dict[str, list[str]]:
+    """Ask an MCP server about the demo's robot and an edit of its code; return the lines of each.
+
+    The calls and answers are those of the server. The last lines are written here, with figures of
+    the answers.
+    """
+    for part in ("worlds/arena.wbt", ROVER):
+        (folder / part).parent.mkdir(parents=True)
+        shutil.copyfile(CHECKOUT / "examples" / part, folder / part)
+    data_dir = folder / "mcp_data"
+    simulation = RecordedSimulation(
+        folder / "worlds/arena.wbt", data_dir=data_dir, environment={TAPE_VARIABLE: "1"}
+    )
+    with simulation:
+        simulation.resume()
+        simulation.wait_for(lambda: _has_states(data_dir / DATABASE_NAME), 60.0)
+        with redirect_stdout(StringIO()):
+            _run("breakpoint", TURNED, "--action", "log", "--data-dir", str(data_dir))
+        simulation.reset()
+        simulation.run_for(7.0)
+    code = (folder / ROVER).read_text("utf-8")
+    (folder / ROVER).write_text(code.replace(*EDIT), "utf-8")
+    with closing(connect(data_dir / DATABASE_NAME, "reader")) as connection:
+        event_id, run_id = connection.execute(
+            "SELECT max(id), max(run_id) FROM event WHERE kind = 'inspection' "
+            "AND sim_time_s = (SELECT min(sim_time_s) FROM event WHERE kind = 'inspection')"
+        ).fetchone()
+    turns: tuple[demo.Turn, ...] = (
+        (INSIDE, "webots_inspect_controller", {"event_id": event_id}),
+        (EDITED, "webots_rerun_controller", {"run_id": run_id}),
+    )
+    with redirect_stdout(StringIO()):
+        inspected, rerun = (each["answer"] for each in anyio.run(demo.converse, data_dir, turns))
+    rover = inspected["frames"][0]["variables"]["rover"]
+    seen_m, since_s = rover["distances_m"], rover["mode_since_s"]
+    names = ("mode", "mode_since_s", "turn_sign", "distances_m")
+    values = ", ".join(f"{name} {json.dumps(rover[name])}" for name in names)
+    left, *_, decided = rerun["verdict"].split("; ")
+    at_s, held = rerun["equal_until_s"], rerun["deciding_line"]["new_values"]
+    right_m, limit_m = float(held["right"]), held["self.near.value"]
+    return {
+        INSIDE: [
+            f"> {INSIDE}",
+            f"● {_call(*turns[0])}",
+            f"  └ {inspected['frames'][0]['at']}, main(): rover: {values}",
+            f"● Its right eye saw something at {seen_m[1]:.2f} m, so it turned to the left.",
+        ],
+        EDITED: [
+            f"> {EDITED}",
+            f"● {_call(*turns[1])}",
+            f"  └ {left}; then left wheel motor.setVelocity -3.0 instead of 5.0; … {decided}",
+            f"● Yes, {since_s - at_s:.2f} s earlier: it saw something at {right_m:.3f} m, "
+            f"below your new limit of {limit_m} m.",
+        ],
+    }
+
+
 def _call(_question: str, tool: str, arguments: dict[str, Any]) -> str:
     given = ", ".join(f"{name}={json.dumps(value)}" for name, value in arguments.items())
     return f"{tool}({given})"
@@ -251,6 +321,12 @@ def main() -> int:
             animate(browser, lines, plot, IMAGES)
     said = "\n".join(lines) + "\n"
     README.write_text(CONVERSATION.sub(lambda _: said, README.read_text("utf-8")), "utf-8")
+    with tempfile.TemporaryDirectory() as folder:
+        for question, lines in demo_conversations(Path(folder)).items():
+            said = "\n".join(lines) + "\n"
+            for page in (README, CHECKOUT / "docs" / PAGES_OF[question]):
+                text = shown_of(question).sub(lambda _, said=said: said, page.read_text("utf-8"))
+                page.write_text(text, "utf-8")
     return 0
 
 

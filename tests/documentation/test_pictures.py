@@ -1,4 +1,4 @@
-"""The pictures of the pages and the README's conversation are such as come about today."""
+"""The pictures and conversations of the pages are such as come about today."""
 
 from __future__ import annotations
 
@@ -69,6 +69,15 @@ def test_the_readme_has_the_conversation_of_today(tmp_path: Path) -> None:
     with pictures.stuck_explorer(tmp_path) as data_dir:
         lines = pictures.conversation(data_dir)
     assert form("\n".join(lines) + "\n") == form(shown), f"the README's conversation {ANEW}"
+
+
+def test_the_pages_and_the_readme_have_the_conversations_of_today(tmp_path: Path) -> None:
+    readme = pictures.README.read_text("utf-8")
+    for question, lines in pictures.demo_conversations(tmp_path).items():
+        page = (pictures.CHECKOUT / "docs" / pictures.PAGES_OF[question]).read_text("utf-8")
+        for text in (page, readme):
+            (shown,) = pictures.shown_of(question).findall(text)
+            assert form("\n".join(lines) + "\n") == form(shown), f"the conversation {ANEW}"
 
 
 def test_pictures_are_small_and_each_is_shown() -> None:

@@ -75,10 +75,10 @@ def tools(heading: str | None = None) -> str:
 
 
 def tools_below(heading: str) -> set[str]:
-    """The tools that the tables of docs/tools.md name below a heading."""
+    """The tools that the lists of docs/tools.md name below a heading."""
     text = (DOCS / "tools.md").read_text("utf-8")
     part = text.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
-    rows = re.findall(r"(?m)^\| (`webots_.*?`) \|", part)
+    rows = re.findall(r"(?m)^- (`webots_.*?`) \(", part)
     return {name for row in rows for name in re.findall(r"webots_\w+", row)}
 
 

@@ -1,4 +1,4 @@
-"""The glossary in CONTRIBUTING, and words that are in no name, comment or docstring."""
+"""The glossaries, and words that are in no name, comment or docstring."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 _ROOT = Path(__file__).parents[1]
 _CONTRIBUTING = (_ROOT / "CONTRIBUTING.md").read_text("utf-8")
 _GLOSSARY = _CONTRIBUTING.partition("## Glossary")[2].partition("\n## ")[0]
+_TERMS_OF_USERS = (_ROOT / "docs" / "glossary.md").read_text("utf-8")
 _BRIDGE = _ROOT / "webots_mcp" / "bridge"
 _RETIRED = {"hold", "heart", "pulse", "drops", "trouble", "complain", "say", "turn", "told", "tell",
             "untold", "companion", "standing"}  # fmt: skip
@@ -20,6 +21,7 @@ _WITHOUT_MEANING = re.compile(
 
 def test_each_term_of_the_glossary_has_one_meaning() -> None:
     terms = re.findall(r"^\| ([^|]+) \|", _GLOSSARY, re.MULTILINE)[1:]
+    terms += re.findall(r"^- ([^:]+):", _TERMS_OF_USERS, re.MULTILINE)
     assert len(terms) > 10
     assert len(terms) == len(set(terms))
 

@@ -52,24 +52,20 @@ what recording costs.
 ## Public situations
 
 `tests/cases` rebuilds situations from public reports as recordings, with the answer that an expert
-would give. The rules were made with the first two groups in view. The other groups were labelled
-before the first question about them was asked; then some rules were improved for whole classes of
-misses. In the third group, a right answer earns 2 points, a helpful one 1, none 0 and a false one
--1. The first answers earned {first} of {most} points, and those of today {now}."""
+would give. The rules were made with the first two groups in view. The others were labelled before
+the first question about them; then some rules were improved. In the third group, a right answer
+earns 2 points, a helpful one 1 and a false one -1: {first} of {most} points at first, {now} today."""
 _SIMULATED: Final = """\
 ## All figures
 
-The other recordings are simulated, because only then is the truth known exactly. Their robots,
-noise and faults imitate real ones. The rules were made with other recordings of the same kinds.
-Each figure links to its conditions and tables."""
+The other recordings are simulated, because only then is the truth known exactly. The rules were
+made with other recordings of the same kinds. Each figure links to its conditions and tables."""
 _METHOD: Final = """\
 ## How it is measured
 
 `python -m tests.accuracy` measures everything and writes these pages in an hour or two; no figure
-is written by hand. `python -m tests.accuracy loop` measures one part, and `--effort 0.1` takes a
-tenth of the time. Durations are those of one busy machine, so compare ratios. A share has its 95 %
-interval in parentheses. `python -m tests.cases`, `python -m tests.judging.detection --wrong` and
-`python -m tests.judging.checks` show single cases."""
+is written by hand. `python -m tests.accuracy loop` measures one part. Durations are those of one
+busy machine, so compare ratios. A share has its 95 % interval in parentheses."""
 _RIGHT: Final = 2  # points of a situation that is answered rightly
 
 

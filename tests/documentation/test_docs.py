@@ -50,7 +50,7 @@ def test_the_page_of_the_tools_names_and_counts_every_tool_and_no_other() -> Non
     text = page("tools.md")
     assert set(re.findall(r"\bwebots_[a-z_]+\b", text)) == set(tiers)
     shown: dict[str, str] = {}
-    for tools, listed in re.findall(r"^\| (`webots_.*?`) \| ([a-z, ]+) \|", text, re.MULTILINE):
+    for tools, listed in re.findall(r"^- (`webots_.*?`) \(([a-z, ]+)\)", text, re.MULTILINE):
         named, lists = re.findall(r"webots_\w+", tools), listed.split(", ")
         shown |= zip(named, lists if len(lists) > 1 else lists * len(named), strict=True)
     assert shown == tiers

@@ -24,7 +24,7 @@ def test_the_documentations_examples_work_as_printed(pytester: pytest.Pytester) 
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(code)
     _copy_project(pytester.path)
-    pytester.runpytest_subprocess("-Werror", "-p", "no:cacheprovider").assert_outcomes(passed=6)
+    pytester.runpytest_subprocess("-Werror", "-p", "no:cacheprovider").assert_outcomes(passed=5)
 
 
 @pytest.mark.slow

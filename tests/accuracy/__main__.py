@@ -112,7 +112,10 @@ def page_of(known: dict[str, str]) -> str:
     """The page: the public situations first, then the figure of each part with its page."""
     shown = [part for part in PARTS if part.name in known]
     rows = [
-        (part.question, f"{headline(known[part.name])} [Details](accuracy/{part.name}.md)")
+        (
+            part.question,
+            f"{_first_sentence(headline(known[part.name]))} [Details](accuracy/{part.name}.md)",
+        )
         for part in shown
     ]
     texts = situations(known["cases"]) if "cases" in known else []

@@ -28,7 +28,7 @@ def test_it_lists_every_node() -> None:
 
 
 def test_it_lists_every_device() -> None:
-    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(DEVICES)
+    assert set(re.findall(r"^- `(\w+)`: ", PAGE, re.M)) == set(DEVICES)
 
 
 def test_it_lists_every_class_and_the_site_the_members_missing_from_it() -> None:

@@ -1,7 +1,7 @@
 """Makes the pictures and conversations of the pages anew: `python -m docs.pictures`.
 
 Most show the world and the controller of `webots-mcp demo`, up to a breakpoint at a certain step.
-The first conversation, its animation and the pictures of the tutorial show the robot of the tutorial.
+The first conversation, its animation and the tutorial's pictures show the robot of the tutorial.
 `images/drawn.json` says what was drawn by what; a test does the same again and compares.
 """
 
@@ -32,8 +32,8 @@ from docs import walkthrough
 from webots_mcp.cli import main as webots_mcp
 from webots_mcp.contract import DATABASE_NAME, THROTTLE_VARIABLE
 from webots_mcp.database.connection import connect
-from webots_mcp.plugins.demo import demo_command as demo
 from webots_mcp.database.tapes.tape_wanted import TAPE_VARIABLE
+from webots_mcp.plugins.demo import demo_command as demo
 from webots_mcp.testing import RecordedSimulation
 
 CHECKOUT: Final = Path(__file__).parent.parent

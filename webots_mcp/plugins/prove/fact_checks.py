@@ -1,9 +1,9 @@
 """Checks of a running Webots, one for each fact that is known from its sources only.
 
-The docstring of a check is printed, and listed by the documentation: what the sources say, and after "otherwise" what still works if that is wrong. A check
-returns what it measured, or fails with what it observed. `running_NAME` is called with Webots in
-real time, after the rover has recorded `bench.before`; `streaming_NAME` the same with --stream.
-`check_NAME` starts Webots itself.
+The docstring of a check is printed, and listed by the documentation: what the sources say, and
+after "otherwise" what still works if that is wrong. A check returns what it measured, or fails with
+what it observed. `running_NAME` is called with Webots in real time, after the rover has recorded
+`bench.before`; `streaming_NAME` the same with --stream. `check_NAME` starts Webots itself.
 """
 
 from __future__ import annotations

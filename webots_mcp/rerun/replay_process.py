@@ -53,6 +53,7 @@ class ReplayJob:
         traced_round: The round whose lines are traced.
         break_round: The round at which a debugger begins.
         break_at_s: Simulation time at which a debugger begins.
+        notes_commands: Whether the result has all commands.
     """
 
     tape: str
@@ -68,6 +69,7 @@ class ReplayJob:
     traced_round: int | None = None
     break_round: int | None = None
     break_at_s: float | None = None
+    notes_commands: bool = False
 
     @property
     def debugs(self) -> bool:
@@ -93,6 +95,8 @@ class ReplayResult:
         lines: The traced lines: file, line, values.
         processor_s: Processor time of the controller and the replay.
         timed_out: It was ended by force; `place` is where it was.
+        given: All commands, where they were to be noted: round, path, class, name, arguments and
+            place.
     """
 
     rounds: int = 0
@@ -108,6 +112,7 @@ class ReplayResult:
     lines: list[Any] = field(default_factory=list[Any])
     processor_s: float = 0.0
     timed_out: bool = False
+    given: list[Any] = field(default_factory=list[Any])
 
 
 class _Replay:
@@ -122,6 +127,7 @@ class _Replay:
         self._began_s = time.process_time()
         self._is_debugging = False
         self.tape.on_round = self._begin_round
+        self.tape.given = [] if job.notes_commands else None
 
     def run(self) -> None:
         """Run the controller to its end, and write the result."""
@@ -243,6 +249,7 @@ class _Replay:
         result.unrecorded, result.why_ended = tape.unrecorded, tape.why_ended
         result.witnesses = [tuple(each) for each in self._witnesses.found.values()]
         result.threads, result.lines = tape.threads, [tuple(each) for each in self._tracer.lines]
+        result.given = tape.given or []
         result.processor_s = time.process_time() - self._began_s
         file = Path(self._job.result)
         aside = file.with_suffix(".part")

@@ -300,8 +300,7 @@ class ReplayedTape:
         enable = (path, "enable")
         if enable not in self._old.holding or enable in self._new.holding:
             return False
-        is_seen = any(key[0] == path for key in self._seen)
-        return not is_seen and path not in self.named and not name.startswith(_CONSTANT)
+        return path not in self.named and not name.startswith(_CONSTANT)
 
     def _miss(self, what: str) -> None:
         if self.unrecorded is None:

@@ -20,6 +20,7 @@ from webots_mcp.contract import DATA_DIR_VARIABLE, PARAMETERS_VARIABLE
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
 from webots_mcp.database.tapes.source_files import (
+    files_near,
     read_sources,
     relative_source,
     root_of,
@@ -486,7 +487,7 @@ def rerun(
 
 def _sources_now(file: Path, root: Path, old: Mapping[str, str]) -> dict[str, str]:
     """Return the files of the new version: those next to it, and those the old one imported."""
-    texts = read_sources(file, root, set())
+    texts = read_sources([file, *files_near(file, root)], root, set())
     for name in old.keys() - texts.keys():
         if (root / name).is_file():
             texts[name] = (root / name).read_text("utf-8", "surrogateescape")

@@ -38,7 +38,7 @@ from webots_mcp.rerun import likely_cause
 from webots_mcp.rerun.deciding_line import TracedLine, find_deciding_line
 from webots_mcp.rerun.likely_cause import Witness, dated_lines, outside_lines
 from webots_mcp.rerun.recorded_rows import make_tape, with_commands
-from webots_mcp.rerun.replay_process import ReplayJob, ReplayResult
+from webots_mcp.rerun.replay_process import ReplayJob, ReplayResult, result_of_stack
 
 STALL_S: Final = 60.0  # of wall time without a step, after which a replay is ended
 LIMIT_S: Final = 3600.0  # of wall time, for each replay
@@ -354,6 +354,8 @@ class Replays:
         try:
             return ReplayResult(**json.loads((folder / "result.json").read_text("utf-8")))
         except FileNotFoundError:
+            if (ended := result_of_stack(folder, root)) is not None:
+                return ended
             said = output[-_MOST_OUTPUT_CHARACTERS:].strip() or "it printed nothing"
             raise InvalidInputError(f"{file} could not be replayed: {said}") from None
 

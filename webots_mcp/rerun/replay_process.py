@@ -41,6 +41,7 @@ PROGRESS: Final = struct.Struct("<qdq")  # rounds, simulation time, run
 PROGRESS_FILE: Final = "progress"  # next to the result, for a replay that cannot write one
 STACK_FILE: Final = "stack.txt"  # of one that was ended while C code held the interpreter
 _GRACE_S: Final = 5.0
+_EDITORS_DEBUGGER: Final = "pydevd"  # of debugpy, which VS Code runs; a person may look for long
 
 
 @dataclass
@@ -185,7 +186,7 @@ class _Replay:
         sys.argv = [job.file, *head["arguments"]]
         os.chdir(job.folder)
         self._witnesses.begin()
-        if not job.debugs:
+        if not job.debugs and _EDITORS_DEBUGGER not in sys.modules:
             folder = Path(job.result).parent
             self._progress = _shared_memory(folder / PROGRESS_FILE)
             stack = (folder / STACK_FILE).open("w")

@@ -93,6 +93,7 @@ class TapeRecorder:
         own_modules: Modules of Webots' package and of this one that have called.
         file: The tape; None until a bridge has opened it.
         why_not: Why nothing is recorded any more; None while it is.
+        is_stepping: Whether a step is under way.
     """
 
     def __init__(self, *, images: bool) -> None:
@@ -102,6 +103,7 @@ class TapeRecorder:
         self.why_not: str | None = None
         self.events: list[Any] = []
         self.own_modules: set[str] = set()
+        self.is_stepping = False
         self._definitions: list[list[Any]] = []
         self._waiting: list[list[Any]] = []
         self._writer: TapeWriter | None = None
@@ -534,13 +536,20 @@ def _marked(replaced: Any, original: Any) -> Any:
 
 
 def _replaced_step(tape: TapeRecorder, name: str, original: Any) -> Any:
-    """Return a step that ends a round. The bridge's own exchanges with Webots do not."""
+    """Return a step that ends a round.
+
+    The bridge's own exchanges with Webots do not, nor a step that is part of a `Driver`'s one.
+    """
 
     def step(robot: Any, *args: Any, **kwargs: Any) -> Any:
         frame = caller_frame(1)
-        answer = original(robot, *args, **kwargs)
+        is_part, tape.is_stepping = tape.is_stepping, True
+        try:
+            answer = original(robot, *args, **kwargs)
+        finally:
+            tape.is_stepping = is_part
         is_exchange = frame.f_code.co_name in ("exchange", "advance") and tape.is_own(frame)
-        if not is_exchange:
+        if not is_exchange and not is_part:
             tape.stepped(robot, name, (*args, *kwargs.values()), answer)
         return answer
 

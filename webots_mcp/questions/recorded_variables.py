@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.inspection.attribute_paths import AttributePath, parse_path
 from webots_mcp.database.secret_names import LEFT_OUT, SecretNames
+from webots_mcp.database.variable_paths import AttributePath, parse_path
 from webots_mcp.errors import InvalidInputError
 
 _MOST_NAMED: Final = 8

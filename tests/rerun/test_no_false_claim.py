@@ -121,8 +121,9 @@ def test_a_sensor_that_is_enabled_besides_is_no_difference(tmp_path: Path) -> No
     assert rerun_of(tmp_path, controller).outcome == "equal"
 
 
-def test_a_sensor_that_is_not_enabled_any_more_is_not_answered(tmp_path: Path) -> None:
-    plain = AVOID.replace("MCPBridge.attach(robot)", "MCPBridge(robot)")
+@pytest.mark.parametrize("bridge", ["MCPBridge(robot)", "MCPBridge.attach(robot)"])
+def test_a_sensor_that_is_not_enabled_any_more_is_not_answered(tmp_path: Path, bridge: str) -> None:
+    plain = AVOID.replace("MCPBridge.attach(robot)", bridge)
     controller = recorded(tmp_path, plain, 0.5)
     controller.write_text(plain.replace("    eye.enable(step_ms)\n", "    pass\n"), "utf-8")
     found = rerun_of(tmp_path, controller)

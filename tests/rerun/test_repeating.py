@@ -10,6 +10,7 @@ import pytest
 from tests.rerun.taping import (
     AVOID,
     EXAMPLES,
+    WORLD,
     data_dir_of,
     project,
     record,
@@ -20,7 +21,7 @@ from tests.rerun.taping import (
 )
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.rerun.running import current_file, find_taped_run, rerun
+from webots_mcp.rerun.running import current_file, find_taped_run, newest_taped_run, rerun
 
 FIVE = [
     ("", "arena.wbt"),
@@ -62,8 +63,9 @@ def test_a_controller_that_is_attached_repeats_its_run(tmp_path: Path) -> None:
 
 def test_a_run_without_a_tape_says_how_to_record_one(tmp_path: Path) -> None:
     recorded(tmp_path, tape="")
+    data_dir = data_dir_of(tmp_path)
     with pytest.raises(NothingRecordedError, match="WEBOTS_MCP_TAPE=1") as raised:
-        taped_run(tmp_path)
+        newest_taped_run(data_dir / DATABASE_NAME, data_dir)
     assert "--tape" in str(raised.value)
 
 
@@ -85,6 +87,11 @@ def test_the_tape_has_code_devices_and_ends_as_the_controller_did(tmp_path: Path
         ("import datetime; SPEED = 4 + datetime.datetime.now().microsecond / 1e6", "wall clock"),
         ("SPEED = 3 + hash('speed') % 1000 / 500", "the order of a set"),
         ("import numpy as np; SPEED = 4 + np.random.rand()", "random numbers without a seed"),
+        (
+            "import datetime, random; datetime.date(2026, 1, 1).strftime('%Y'); "
+            "SPEED = random.uniform(4, 6)",
+            "Likely cause: random numbers without a seed",
+        ),
         ("import uuid; SPEED = 4 + uuid.uuid4().int % 100 / 100", "random numbers"),
     ],
 )
@@ -197,3 +204,57 @@ def test_a_killed_controller_can_be_replayed(tmp_path: Path) -> None:
     answer = rerun(taped, controller, until_s=2.0)
     assert answer.outcome == "equal"
     assert answer.rounds == 125
+
+
+SEARCHES_FOLDERS = """\
+import sys
+import threading
+
+from math import inf
+
+from controller import Robot
+
+from webots_mcp import MCPBridge
+
+robot = Robot()
+bridge = MCPBridge.attach(robot)
+searched = []
+
+
+def note(event, arguments):
+    if event in ("os.listdir", "os.scandir", "os.walk", "glob.glob"):
+        if threading.current_thread() is threading.main_thread():
+            searched.append(str(arguments[0]))
+
+
+sys.addaudithook(note)
+step_ms = int(robot.getBasicTimeStep())
+motors = [robot.getDevice(f"{side} wheel motor") for side in ("left", "right")]
+for motor in motors:
+    motor.setPosition(inf)
+for number in range(60):
+    robot.step(step_ms)
+    if number == 30:
+        import late
+    motors[0].setVelocity(1.0)
+open("searched.txt", "w").write(chr(10).join(each for each in searched if "rover" in each))
+"""
+
+
+def test_the_loop_searches_no_folder_and_the_tape_has_what_is_near_and_imported(
+    tmp_path: Path,
+) -> None:
+    controller = project(tmp_path, SEARCHES_FOLDERS)
+    (controller.parent / "late.py").write_text("GAIN = 2\n", "utf-8")
+    (controller.parent / "parts").mkdir()
+    (controller.parent / "parts" / "near.py").write_text("GAIN = 3\n", "utf-8")
+    record(tmp_path / "worlds" / WORLD.name, data_dir_of(tmp_path), 0.9)
+    (tape,) = tapes(tmp_path)
+    assert {name.rpartition("/")[2] for name in tape.sources()} == {
+        "rover.py",
+        "late.py",
+        "near.py",
+    }
+    searched = (controller.parent / "searched.txt").read_text("utf-8").splitlines()
+    assert len(searched) <= 1  # by the import itself
+    assert rerun_of(tmp_path, controller).outcome == "equal"

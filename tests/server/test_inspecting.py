@@ -27,6 +27,12 @@ async def test_events_lead_to_the_variables_of_a_hit(connect: Connect, driver: D
         assert answer["frames"][0]["function"] == "run"
         assert answer["summary"].startswith(f"At {answer['at_s']:.12g} s (breakpoint: mode")
         assert "variables" in answer["frames"][0]
+        speed = await ask(client, "webots_inspect_controller", path="self.speed", event_id=event_id)
+        assert (speed["path"], speed["value"]) == ("self.speed", 1.0)
+        assert (speed["line"], speed["event_id"]) == (answer["frames"][0]["at"], event_id)
+        assert "frames" not in speed
+        error = await fail(client, "webots_inspect_controller", path="self.sped", event_id=event_id)
+        assert "'sped' of self was not recorded; recorded of it: " in error
 
 
 async def test_now_a_path_and_a_watch(connect: Connect, driver: Driver) -> None:
@@ -46,8 +52,8 @@ async def test_now_a_path_and_a_watch(connect: Connect, driver: Driver) -> None:
         )
         error = await fail(client, "webots_inspect_controller", path="self.sped")
         assert "Driver has no 'sped'" in error
-        error = await fail(client, "webots_inspect_controller", path="self.speed", event_id=1)
-        assert "leave path out" in error
+        error = await fail(client, "webots_inspect_controller", path="self.speed", run_id=1)
+        assert "Give event_id" in error
 
 
 async def test_of_a_recording_without_inspections_it_says_when_there_are_any(

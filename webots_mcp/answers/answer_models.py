@@ -548,6 +548,7 @@ class RerunAnswer(Answer):
     exception: str | None = said("Exception that ended the new code.")
     place: str | None = said("File and line at which the replay ended.")
     file: str | None = said("Controller that was run.")
+    basis: str | None = said("What the answer rests on, where the run has no tape.")
 
 
 class ComparisonAnswer(NotedAnswer):

@@ -99,8 +99,8 @@ class ControllerVariables:
             InvalidInputError: A parameter is invalid, or inspection is switched off.
             CommandRefusedError: The path cannot be followed, or too many are watched.
         """
-        from webots_mcp.bridge.inspection.attribute_paths import parse_path
         from webots_mcp.bridge.inspection.watches import MOST_EVERY, Watches
+        from webots_mcp.database.variable_paths import parse_path
 
         path = parse_path(params.get("path"), self.inspector.secrets())
         stop, every = (

@@ -38,7 +38,13 @@ from webots_mcp.database.tapes.package_surface import (
     describe_package,
     kind_of_member,
 )
-from webots_mcp.database.tapes.source_files import read_sources, relative_source, root_of
+from webots_mcp.database.tapes.source_files import (
+    files_imported,
+    files_near,
+    read_sources,
+    relative_source,
+    root_of,
+)
 from webots_mcp.database.tapes.tape import MAX_TAPE_BYTES, NOTES, RUN, TapeWriter, tape_file
 from webots_mcp.database.tapes.tape_values import encode_value
 from webots_mcp.errors import warn
@@ -87,6 +93,7 @@ class TapeRecorder:
         own_modules: Modules of Webots' package and of this one that have called.
         file: The tape; None until a bridge has opened it.
         why_not: Why nothing is recorded any more; None while it is.
+        is_stepping: Whether a step is under way.
     """
 
     def __init__(self, *, images: bool) -> None:
@@ -96,6 +103,7 @@ class TapeRecorder:
         self.why_not: str | None = None
         self.events: list[Any] = []
         self.own_modules: set[str] = set()
+        self.is_stepping = False
         self._definitions: list[list[Any]] = []
         self._waiting: list[list[Any]] = []
         self._writer: TapeWriter | None = None
@@ -115,7 +123,9 @@ class TapeRecorder:
         main = _main_file()
         self._root = root_of(main) if main else Path.cwd()
         self._known_sources: set[str] = set()
-        self._modules = 0  # that were loaded when the sources were read
+        self._modules: set[str] = set()  # that were loaded when the sources were read
+        self._module_count = 0
+        self._near: list[dict[str, str]] = []  # texts that a thread has read
 
     # -- in each call ----------------------------------------------------------------------------
 
@@ -211,19 +221,35 @@ class TapeRecorder:
             if len(self._waiting) > MAX_WAITING_LINES:
                 self._stop("no bridge was made, so there is no recording that it belongs to")
             return
-        if len(sys.modules) != self._modules:
+        if len(sys.modules) != self._module_count or self._near:
             lines = [*self._new_sources(), *lines]
         self._writer.write(lines)
         if not self._writer.is_open:
             self._stop(f"it has reached {MAX_TAPE_BYTES:,} bytes")
 
     def _new_sources(self) -> list[list[Any]]:
-        self._modules = len(sys.modules)
-        controller = _main_file()
-        if controller is None:
-            return []
-        texts = read_sources(controller, self._root, self._known_sources)
+        """Return lines with the modules that were imported since, and with what a thread has read.
+
+        The folder of the controller may be large: it is not searched in the control loop.
+        """
+        self._module_count = len(sys.modules)
+        loaded = set(sys.modules)
+        new, self._modules = loaded - self._modules, loaded
+        texts = read_sources(files_imported(sorted(new)), self._root, self._known_sources)
+        while self._near:
+            for name, text in self._near.pop().items():
+                if name not in self._known_sources:
+                    self._known_sources.add(name)
+                    texts[name] = text
         return [["source", *each] for each in texts.items()]
+
+    def _read_near(self, controller: Path) -> None:
+        """Read the files next to the controller, in a thread of its own."""
+        try:
+            near = files_near(controller, self._root)
+            self._near.append(read_sources(near, self._root, set()))
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            warn(f"not on the tape: the files next to the controller, {describe(error)}")
 
     def _note_thread(self) -> None:
         if not self._has_threads:
@@ -315,8 +341,13 @@ class TapeRecorder:
             waiting, self._waiting = self._waiting, []
             self._writer = TapeWriter(file)
             self._writer.write([["head", head]])
-            for each in (*self._new_sources(), *waiting):
+            own = read_sources([controller] if controller else [], self._root, self._known_sources)
+            sources = [["source", *each] for each in own.items()] + self._new_sources()
+            for each in (*sources, *waiting):
                 self._writer.write([each])
+            if controller is not None:
+                read = threading.Thread(target=self._read_near, args=(controller,), daemon=True)
+                read.start()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._stop(f"{type(error).__name__}: {error}")
             return
@@ -350,6 +381,7 @@ class TapeRecorder:
         """End the tape, with what was asked and commanded after the last step."""
         if self._writer is not None and self._writer.is_open:
             try:
+                self._writer.write(self._new_sources())
                 if self.why_not is None and self.events:
                     last = ["round", self._rounds, None, "", [], None, self.events]
                     self._writer.write([*self._definitions, last])
@@ -504,13 +536,20 @@ def _marked(replaced: Any, original: Any) -> Any:
 
 
 def _replaced_step(tape: TapeRecorder, name: str, original: Any) -> Any:
-    """Return a step that ends a round. The bridge's own exchanges with Webots do not."""
+    """Return a step that ends a round.
+
+    The bridge's own exchanges with Webots do not, nor a step that is part of a `Driver`'s one.
+    """
 
     def step(robot: Any, *args: Any, **kwargs: Any) -> Any:
         frame = caller_frame(1)
-        answer = original(robot, *args, **kwargs)
+        is_part, tape.is_stepping = tape.is_stepping, True
+        try:
+            answer = original(robot, *args, **kwargs)
+        finally:
+            tape.is_stepping = is_part
         is_exchange = frame.f_code.co_name in ("exchange", "advance") and tape.is_own(frame)
-        if not is_exchange:
+        if not is_exchange and not is_part:
             tape.stepped(robot, name, (*args, *kwargs.values()), answer)
         return answer
 

@@ -16,6 +16,7 @@ from webots_mcp.answers.shortening import cut_text, shorten
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.arguments import Id, RobotName, RunId, TimeoutS
 from webots_mcp.questions.declaration import READS, SETS, Caller, question
+from webots_mcp.questions.recorded_variables import find_recorded
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.inspections import Inspection, inspection_at, inspections_of
 from webots_mcp.store.recording import RecordingAccess, RobotView
@@ -60,18 +61,18 @@ async def webots_inspect_controller(
 ) -> InspectionAnswer:
     """Show the controller's own variables: which line it executed and what its variables held.
 
-    Without arguments it asks the running or paused controller; `path` asks for one variable. With
-    `event_id` or `run_id` it shows what was recorded at breakpoint hits, violations, errors and
-    hangs. It runs no code of the controller and changes nothing. To record a variable as a signal
-    use webots_watch.
+    Without arguments it asks the running or paused controller. With `event_id` or `run_id` it shows
+    what was recorded at breakpoint hits, violations, errors and hangs. `path` asks for one
+    variable, now or at an event. It runs no code of the controller and changes nothing. To record a
+    variable as a signal use webots_watch.
     """
-    if path is not None and (event_id is not None or run_id is not None):
+    if path is not None and event_id is None and run_id is not None:
         raise InvalidInputError(
-            "path asks the running controller, not the recording. To see what was recorded, give "
-            "event_id or run_id and leave path out"
+            f"path {path!r} needs an event, because a run has variables of several. Give event_id "
+            "and leave run_id out, or leave path out to list the events"
         )
     if event_id is not None:
-        return await to_thread.run_sync(_recorded, recording, robot, event_id)
+        return await to_thread.run_sync(_recorded, recording, robot, event_id, path)
     live = run_id is None and not recording.read_only
     if live and await to_thread.run_sync(_is_live, recording, robot):
         return await _now(recording, caller, path, robot, timeout_wall_s)
@@ -111,7 +112,9 @@ async def webots_watch(
 # -- as recorded -----------------------------------------------------------------------------------
 
 
-def _recorded(recording: RecordingAccess, robot: str | None, event_id: int) -> InspectionAnswer:
+def _recorded(
+    recording: RecordingAccess, robot: str | None, event_id: int, path: str | None
+) -> InspectionAnswer:
     with recording.view(robot) as view:
         found = inspection_at(view.connection, event_id)
         if found is None:
@@ -121,7 +124,11 @@ def _recorded(recording: RecordingAccess, robot: str | None, event_id: int) -> I
             raise InvalidInputError(
                 f"event {event_id} has no variables of the controller: {known if ids else _NOTHING}"
             )
-        return _answer(view, found, [])
+        answer = _answer(view, found, [])
+    if path is not None:
+        at = find_recorded(path, found.frames)
+        answer.path, answer.value, answer.line, answer.frames = *at, None
+    return answer
 
 
 def _newest(recording: RecordingAccess, robot: str | None, run_id: int | None) -> InspectionAnswer:

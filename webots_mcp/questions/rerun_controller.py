@@ -18,7 +18,7 @@ from webots_mcp.rerun.running import (
     TapedRun,
     current_file,
     find_taped_run,
-    newest_taped_run,
+    newest_run,
     require_own,
     require_own_tape,
     rerun,
@@ -64,8 +64,9 @@ def webots_rerun_controller(
 
     Replays the run's tape without a simulator: first the recorded code, which must repeat itself,
     then the new one. Answers at which simulation time a command first differs, and which line
-    decided; nothing is known after that. Needs a run recorded with `webots-mcp launch --tape`. The
-    script runs with all its side effects. To compare two recorded runs use webots_compare_runs.
+    decided; nothing is known after that. Needs a run recorded with `webots-mcp launch --tape`, or
+    one whose rows hold each step and all that the code reads. The script runs with all its side
+    effects. To compare two recorded runs use webots_compare_runs.
     """
     require_rerun(recording, caller, file)
     taped = taped_run(recording, run_id)
@@ -87,6 +88,7 @@ def webots_rerun_controller(
         exception=found.exception,
         place=found.place,
         file=found.file,
+        basis=found.basis,
         hint=_hint(found.began_late),
     )
 
@@ -118,13 +120,13 @@ def require_rerun(recording: RecordingAccess, caller: Caller, file: str | None) 
 
 
 def taped_run(recording: RecordingAccess, run_id: int | None) -> TapedRun:
-    """Return a run that has a tape, by default the newest one.
+    """Return a run and its tape, or one made of its rows; by default the newest one with a tape.
 
     Raises:
-        NothingRecordedError: It has none, or no run has.
+        NothingRecordedError: It has no tape, and its rows do not suffice.
     """
     place = (recording.database, recording.data_dir)
-    return find_taped_run(*place, newest_taped_run(*place) if run_id is None else run_id)
+    return find_taped_run(*place, newest_run(*place) if run_id is None else run_id)
 
 
 def file_of(taped: TapedRun, file: str | None, recording: RecordingAccess) -> Path:

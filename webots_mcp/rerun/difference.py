@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple, cast
 from webots_mcp.database.tapes.tape import TapedPlace
 
 MOST_SHOWN: Final = 8
+HELD: Final = "held"  # the note of what motors and LEDs were set to, on a tape made of rows
 _HOLDING: Final = frozenset({"Motor", "LED", "Brake", "Pen", "VacuumGripper", "Connector", "Skin"})
 _SENSORS_HOLD: Final = ("enable", "disable")
 _OPPOSITES: Final = {
@@ -154,3 +155,52 @@ def _equal(one: Any, other: Any) -> bool:
     if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
         return math.isnan(other)
     return one == other
+
+
+# -- a tape that was made of rows ------------------------------------------------------------------
+
+
+class HeldByRows:
+    """What motors and LEDs were set to when a row was recorded, against what the code sets.
+
+    A row that the bridge recorded has what holds at the end of a round. One that the controller
+    published in the middle of a round has any value of that round.
+    """
+
+    def __init__(self) -> None:
+        self._expected: list[tuple[tuple[str, str], Any]] = []
+        self._is_published = False
+        self._at_first: dict[tuple[str, str], Any] = {}
+        self._in_round: dict[tuple[str, str], list[GivenCommand]] = {}
+        self._before: dict[tuple[str, str], list[GivenCommand]] = {}
+
+    def expect(self, held: list[Any], is_published: bool) -> None:
+        """Take what a row of this round has: path, setter and value of each."""
+        self._expected = [((path, setter), value) for path, setter, value in held]
+        self._is_published = is_published
+
+    def commanded(self, command: GivenCommand) -> None:
+        """Note a command of this round."""
+        self._in_round.setdefault((command.path, command.name), []).append(command)
+
+    def compare(self, new: Commanded) -> list[CommandDifference]:
+        """Return how the row of this round differs from what the code has set."""
+        found: list[CommandDifference] = []
+        for key, value in self._expected:
+            is_known = key in self._at_first
+            at_first = self._at_first.setdefault(key, value)
+            command = new.holding.get(key)
+            if command is None:  # never set by the code: as the world's file says
+                if is_known and not _equal(at_first, value):
+                    named = f"{key[0].removeprefix('device:')}.{key[1]}"
+                    found.append(CommandDifference(named, [value], None, None, None))
+                continue
+            allowed = [command, *(self._in_round.get(key, ()) if self._is_published else ())]
+            if self._is_published:
+                allowed += self._before.get(key, ())
+            if not any(_equal(each.arguments[:1], [value]) for each in allowed):
+                given = (_name_of(command), [value], command.arguments, None, command.place)
+                found.append(CommandDifference(*given))
+        self._before = {key: [each] for key, each in new.holding.items()}
+        self._expected, self._in_round = [], {}
+        return found[:MOST_SHOWN]

@@ -33,6 +33,9 @@ _NUMPY_DRAWS: Final = (
     "rand", "randn", "random", "normal", "uniform", "randint", "choice", "shuffle", "permutation",
     "standard_normal", "random_sample",
 )  # fmt: skip
+_CONVERT: Final = {"localtime": 1, "gmtime": 1, "ctime": 1, "strftime": 2}
+"""Number of arguments with which a function of `time` converts a time and asks no clock."""
+_NEVER: Final = 1000
 _DATETIME: Final = (".now()", ".utcnow()", ".today()")
 RANDOM, CLOCK, THREADS, ORDER = (
     "random numbers without a seed", "the wall clock", "another thread",
@@ -110,9 +113,11 @@ class Witnesses:
                 setattr(module, name, self._watched(original, shown, name, cause))
 
     def _watched(self, original: Any, shown: str, name: str, cause: str) -> Any:
+        converts = _CONVERT.get(name, _NEVER)
+
         @functools.wraps(original)
         def call(*args: Any, **kwargs: Any) -> Any:
-            if shown not in self._seeded and cause not in self.found:
+            if len(args) < converts and shown not in self._seeded and cause not in self.found:
                 self._note(cause, f"{shown}.{name}", caller_frame(1))
             return original(*args, **kwargs)
 

@@ -6,10 +6,14 @@ database, which is thrown away.
 
 from __future__ import annotations
 
+import faulthandler
 import json
+import mmap
 import os
 import pdb
+import re
 import runpy
+import struct
 import sys
 import threading
 import time
@@ -17,7 +21,7 @@ import traceback
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 from webots_mcp.database import location
 from webots_mcp.database.tapes import tape_notes
@@ -33,6 +37,11 @@ _frames_of_threads: Final = sys._current_frames  # pyright: ignore[reportPrivate
 PACKAGES_FOLDER: Final = Path(__file__).parent / "lib"
 _NOT_DEBUGGED: Final = ("webots_mcp*", "controller*", "vehicle*", "bdb", "pdb")  # modules
 TIMED_OUT: Final = 3  # exit code
+PROGRESS: Final = struct.Struct("<qdq")  # rounds, simulation time, run
+PROGRESS_FILE: Final = "progress"  # next to the result, for a replay that cannot write one
+STACK_FILE: Final = "stack.txt"  # of one that was ended while C code held the interpreter
+_GRACE_S: Final = 5.0
+_EDITORS_DEBUGGER: Final = "pydevd"  # of debugpy, which VS Code runs; a person may look for long
 
 
 @dataclass
@@ -53,6 +62,7 @@ class ReplayJob:
         traced_round: The round whose lines are traced.
         break_round: The round at which a debugger begins.
         break_at_s: Simulation time at which a debugger begins.
+        notes_commands: Whether the result has all commands.
     """
 
     tape: str
@@ -68,6 +78,7 @@ class ReplayJob:
     traced_round: int | None = None
     break_round: int | None = None
     break_at_s: float | None = None
+    notes_commands: bool = False
 
     @property
     def debugs(self) -> bool:
@@ -93,6 +104,8 @@ class ReplayResult:
         lines: The traced lines: file, line, values.
         processor_s: Processor time of the controller and the replay.
         timed_out: It was ended by force; `place` is where it was.
+        given: All commands, where they were to be noted: round, path, class, name, arguments and
+            place.
     """
 
     rounds: int = 0
@@ -108,6 +121,7 @@ class ReplayResult:
     lines: list[Any] = field(default_factory=list[Any])
     processor_s: float = 0.0
     timed_out: bool = False
+    given: list[Any] = field(default_factory=list[Any])
 
 
 class _Replay:
@@ -121,7 +135,9 @@ class _Replay:
         self._tracer = RoundTracer(self._root, -1 if job.traced_round is None else job.traced_round)
         self._began_s = time.process_time()
         self._is_debugging = False
+        self._progress = bytearray(PROGRESS.size)
         self.tape.on_round = self._begin_round
+        self.tape.given = [] if job.notes_commands else None
 
     def run(self) -> None:
         """Run the controller to its end, and write the result."""
@@ -170,11 +186,15 @@ class _Replay:
         sys.argv = [job.file, *head["arguments"]]
         os.chdir(job.folder)
         self._witnesses.begin()
-        if not job.debugs:
-            threading.Thread(target=self._end_in_time, daemon=True).start()
+        if not job.debugs and _EDITORS_DEBUGGER not in sys.modules:
+            folder = Path(job.result).parent
+            self._progress = _shared_memory(folder / PROGRESS_FILE)
+            stack = (folder / STACK_FILE).open("w")
+            threading.Thread(target=self._end_in_time, args=(stack,), daemon=True).start()
 
     def _begin_round(self, number: int) -> None:
-        job = self._job
+        job, tape = self._job, self.tape
+        PROGRESS.pack_into(self._progress, 0, tape.rounds, tape.time_s, tape.run)
         if job.traced_round is not None:
             self._tracer.begin_round(number)
             if number > job.traced_round:
@@ -211,12 +231,18 @@ class _Replay:
             found = found.tb_next
         return place
 
-    def _end_in_time(self) -> None:
-        """End the process when its time is over: a controller may loop without a step."""
+    def _end_in_time(self, stack: TextIO) -> None:
+        """End the process when its time is over: a controller may loop without a step.
+
+        Where C code holds the interpreter, this thread does not run either: then `faulthandler`,
+        which needs no interpreter, writes the stack and ends the process.
+        """
         pause, rounds = threading.Event(), -1
         ends_s = time.monotonic() + self._job.limit_s
         while self.tape.rounds > rounds and time.monotonic() < ends_s:
             rounds = self.tape.rounds
+            in_s = 2 * self._job.stall_s + _GRACE_S
+            faulthandler.dump_traceback_later(in_s, exit=True, file=stack)
             pause.wait(min(self._job.stall_s, max(ends_s - time.monotonic(), 0.0)))
         result = ReplayResult(timed_out=True)
         main = _frames_of_threads().get(threading.main_thread().ident or 0)
@@ -225,6 +251,7 @@ class _Replay:
         if main is not None:
             file = relative_source(main.f_code.co_filename, self._root)
             result.place = f"{file}:{main.f_lineno}"
+        faulthandler.cancel_dump_traceback_later()
         self.write(result)
         os._exit(TIMED_OUT)
 
@@ -243,11 +270,40 @@ class _Replay:
         result.unrecorded, result.why_ended = tape.unrecorded, tape.why_ended
         result.witnesses = [tuple(each) for each in self._witnesses.found.values()]
         result.threads, result.lines = tape.threads, [tuple(each) for each in self._tracer.lines]
+        result.given = tape.given or []
         result.processor_s = time.process_time() - self._began_s
         file = Path(self._job.result)
         aside = file.with_suffix(".part")
         aside.write_text(json.dumps(asdict(result)), "utf-8")
         aside.replace(file)
+
+
+def _shared_memory(file: Path) -> Any:
+    """Return memory that is also a file, so that it outlives the process."""
+    file.write_bytes(bytes(PROGRESS.size))
+    with file.open("r+b") as opened:
+        return mmap.mmap(opened.fileno(), PROGRESS.size)
+
+
+def result_of_stack(folder: Path, root: Path) -> ReplayResult | None:
+    """Return the result of a replay that `faulthandler` ended; None of any other.
+
+    Args:
+        folder: That of its result.
+        root: The folder of the project.
+    """
+    try:
+        stack = (folder / STACK_FILE).read_text("utf-8", "replace")
+        rounds, time_s, run = PROGRESS.unpack((folder / PROGRESS_FILE).read_bytes())
+    except (OSError, struct.error):
+        return None
+    if not stack:
+        return None
+    main = stack.rpartition("Thread 0x")[2]  # comes last, its innermost call first
+    places = re.findall(r'File "(.+)", line (\d+) in', main)
+    own = ((relative_source(file, root), line) for file, line in places)
+    place = next((f"{file}:{line}" for file, line in own if file is not None), None)
+    return ReplayResult(rounds=rounds, time_s=time_s, run=run, place=place, timed_out=True)
 
 
 def main(arguments: list[str]) -> int:

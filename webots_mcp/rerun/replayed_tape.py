@@ -16,7 +16,14 @@ from typing import Any, Final, cast
 from webots_mcp.database.tapes.source_files import relative_source
 from webots_mcp.database.tapes.tape import NOTES, Tape, TapedCall, TapedPlace, TapedRound
 from webots_mcp.database.tapes.tape_values import UnrecordedValueError, decode_value, encode_value
-from webots_mcp.rerun.difference import CommandDifference, Commanded, GivenCommand, differences
+from webots_mcp.rerun.difference import (
+    HELD,
+    CommandDifference,
+    Commanded,
+    GivenCommand,
+    HeldByRows,
+    differences,
+)
 
 Key = tuple[str, str, str]
 Stated = tuple[Key, int]
@@ -77,6 +84,8 @@ class ReplayedTape:
         unnamed: Number of objects without a name that were made, by class.
         threads: Names of other threads that called Webots' package in the old run.
         on_round: Called with the number of each round before it begins.
+        given: Of each command of the replayed code: round, path, class, name, arguments and place.
+            None where they are not needed.
     """
 
     def __init__(
@@ -117,6 +126,8 @@ class ReplayedTape:
         self.why_ended: str | None = None
         self.threads: list[str] = []
         self.on_round: Callable[[int], None] | None = None
+        self.given: list[list[Any]] | None = None
+        self._rows = HeldByRows() if tape.head.get("rests_on_rows") is True else None
         self._load()
 
     # -- rounds ----------------------------------------------------------------------------------
@@ -145,6 +156,8 @@ class ReplayedTape:
             self._parameters |= content
         elif kind == "thread":
             self.threads.append(content)
+        elif kind == HELD and self._rows is not None:
+            self._rows.expect(*content)
 
     def _take(self, call: TapedCall, value: Any, passed_over: Counter[str]) -> None:
         if call.kind == "command":
@@ -206,14 +219,16 @@ class ReplayedTape:
     def finish(self) -> None:
         """Compare what was commanded after the last step, when the controller has ended."""
         is_last = self._round is not None and not self._round.step[0]
-        if is_last and self.why_ended == "the old run ended" and not self.first:
+        if is_last and self.why_ended == "the old run ended" and not self.first and not self._rows:
             self.first = differences(self._old, self._new)
 
     def _compare(self) -> None:
         if self.rounds == 0 and self.tape.head.get("began_late"):
             self._old.holding = self._new.holding | self._old.holding
             self._old.once = self._new.once
-        if not self.first:
+        if self._rows is not None:
+            self.first = self.first or self._rows.compare(self._new)
+        elif not self.first:
             self.first = differences(self._old, self._new)
         if self.first and not self._goes_on:
             self._end("difference")
@@ -264,7 +279,10 @@ class ReplayedTape:
             raise LookupError(f"a replay does not know {path}.{name}()")
         if found is None:
             shown = f"{path.removeprefix('device:')}.{name}({', '.join(map(repr, arguments))})"
-            self._miss(f"{shown.replace('..', '.')} was not asked in this round of the old run")
+            why = "was not asked in this round of the old run"
+            if self.tape.head.get("rests_on_rows"):
+                why = "is not in the recorded rows; a tape has it"
+            self._miss(f"{shown.replace('..', '.')} {why}")
             raise ReplayEndedError
         (value,) = found
         if isinstance(value, dict) and "$raised" in value:
@@ -282,8 +300,7 @@ class ReplayedTape:
         enable = (path, "enable")
         if enable not in self._old.holding or enable in self._new.holding:
             return False
-        is_seen = any(key[0] == path for key in self._seen)
-        return not is_seen and path not in self.named and not name.startswith(_CONSTANT)
+        return path not in self.named and not name.startswith(_CONSTANT)
 
     def _miss(self, what: str) -> None:
         if self.unrecorded is None:
@@ -366,7 +383,12 @@ class ReplayedTape:
         file = frame.f_code.co_filename
         place = TapedPlace(relative_source(file, self.root) or file, frame.f_lineno)
         coded = [self._encode(each) for each in arguments]
-        self._new.add(GivenCommand(path, owner, name, coded, place))
+        given = GivenCommand(path, owner, name, coded, place)
+        self._new.add(given)
+        if self._rows is not None:
+            self._rows.commanded(given)
+        if self.given is not None:
+            self.given.append([self.rounds, *given[:4], list(place)])
         self._passed_over[path] += name == _CONSUMES
         replies = self._replies.get((path, name))
         reply = replies.pop(0) if replies else None

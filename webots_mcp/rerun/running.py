@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import weakref
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field
@@ -18,6 +20,7 @@ from webots_mcp.contract import DATA_DIR_VARIABLE, PARAMETERS_VARIABLE
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database
 from webots_mcp.database.tapes.source_files import (
+    files_near,
     read_sources,
     relative_source,
     root_of,
@@ -34,7 +37,8 @@ from webots_mcp.errors import (
 from webots_mcp.rerun import likely_cause
 from webots_mcp.rerun.deciding_line import TracedLine, find_deciding_line
 from webots_mcp.rerun.likely_cause import Witness, dated_lines, outside_lines
-from webots_mcp.rerun.replay_process import ReplayJob, ReplayResult
+from webots_mcp.rerun.recorded_rows import make_tape, with_commands
+from webots_mcp.rerun.replay_process import ReplayJob, ReplayResult, result_of_stack
 
 STALL_S: Final = 60.0  # of wall time without a step, after which a replay is ended
 LIMIT_S: Final = 3600.0  # of wall time, for each replay
@@ -52,6 +56,14 @@ _OF_RUN: Final = (
 )
 
 
+class MadeFolder:
+    """A folder for a tape that is made; it is removed when nobody uses it any more."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="webots-mcp-rows-"))
+        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+
 class TapedRun(NamedTuple):
     """A run that has a tape.
 
@@ -60,12 +72,16 @@ class TapedRun(NamedTuple):
         tape: The tape of its session.
         number: The run's number in the session, from 0.
         is_imported: The tape, and so the recorded code, came from elsewhere.
+        basis: What it rests on, where it was made of recorded rows; None of a recorded tape.
+        folder: Holds a tape that was made, as long as this exists.
     """
 
     run_id: int
     tape: Tape
     number: int
     is_imported: bool = False
+    basis: str | None = None
+    folder: MadeFolder | None = None
 
 
 @dataclass
@@ -94,6 +110,7 @@ class Rerun:
         goes_on: The old version ended by itself there, and the new one asked for another step.
         in_earlier_run: The replay ended in an earlier run of the same process.
         rounds_per_s: Rounds replayed in a second of processor time.
+        basis: What it rests on, where the run has no tape.
     """
 
     outcome: str
@@ -115,10 +132,14 @@ class Rerun:
     goes_on: bool = False
     in_earlier_run: bool = False
     rounds_per_s: float = 0.0
+    basis: str | None = None
 
     @property
     def text(self) -> str:
         """The outcome in a sentence."""
+        return f"{self._outcome_text()} ({self.basis})" if self.basis else self._outcome_text()
+
+    def _outcome_text(self) -> str:
         until = f"{self.until_s:.3f} s"
         if self.in_earlier_run:
             until += " of an earlier run of the same process"
@@ -134,7 +155,7 @@ class Rerun:
         if self.outcome == "equal":
             version = "the unchanged code" if self.is_unchanged else "the new code"
             ended = f"; then it ended by {self.exception} at {self.place}" if self.exception else ""
-            if self.ends_with_tape:
+            if self.ends_with_tape and not self.basis:
                 ended += "; the tape ends there"
             if self.goes_on:
                 ended += "; then it goes on, where the recorded code ended"
@@ -154,11 +175,12 @@ class Rerun:
 
 
 def find_taped_run(database: Database, data_dir: Path, run_id: int) -> TapedRun:
-    """Return the tape of a run.
+    """Return the tape of a run; where it has none, one that is made of its rows.
 
     Raises:
         UnknownRunError: There is no such run.
-        NothingRecordedError: It has no tape; the text says how to record one.
+        NothingRecordedError: It has no tape, and its rows do not suffice; the text says what is
+            missing, and how to record a tape.
         InvalidInputError: The tape is damaged.
     """
     with closing(connect(database, "reader")) as connection:
@@ -168,10 +190,12 @@ def find_taped_run(database: Database, data_dir: Path, run_id: int) -> TapedRun:
     own, imported = tape_files(data_dir, str(row[0]))
     file = own if own.is_file() else imported
     if not file.is_file():
-        raise NothingRecordedError(
-            f"Run {run_id} has no tape, so no code can be run on it: its rows lack what was asked "
-            f"between them. {HOW_TO_RECORD}."
-        )
+        folder = MadeFolder()
+        try:
+            made = make_tape(database, data_dir, run_id, folder.path)
+        except NothingRecordedError as error:
+            raise NothingRecordedError(f"{error} {HOW_TO_RECORD}.") from None
+        return TapedRun(run_id, made.tape, 0, basis=made.basis, folder=folder)
     tape = open_tape(file)
     number = tape.number_of_run(str(row[2]))
     # Earlier runs of the session may be deleted, or were not exported.
@@ -208,6 +232,22 @@ def newest_taped_run(database: Database, data_dir: Path) -> int:
             if any(each.is_file() for each in tape_files(data_dir, str(uuid))):
                 return int(run_id)
     raise NothingRecordedError(f"No run has a tape. {HOW_TO_RECORD}.")
+
+
+def newest_run(database: Database, data_dir: Path) -> int:
+    """Return the newest run that has a tape, else the newest one, whose rows may suffice.
+
+    Raises:
+        NothingRecordedError: No run is recorded.
+    """
+    try:
+        return newest_taped_run(database, data_dir)
+    except NothingRecordedError:
+        with closing(connect(database, "reader")) as connection:
+            (newest,) = connection.execute("SELECT max(id) FROM run").fetchone()
+        if newest is None:
+            raise
+        return int(newest)
 
 
 def current_file(taped: TapedRun) -> Path:
@@ -314,6 +354,8 @@ class Replays:
         try:
             return ReplayResult(**json.loads((folder / "result.json").read_text("utf-8")))
         except FileNotFoundError:
+            if (ended := result_of_stack(folder, root)) is not None:
+                return ended
             said = output[-_MOST_OUTPUT_CHARACTERS:].strip() or "it printed nothing"
             raise InvalidInputError(f"{file} could not be replayed: {said}") from None
 
@@ -410,6 +452,12 @@ def rerun(
     Raises:
         WebotsMCPError: There is no tape, or it does not hold the old version.
     """
+    if taped.basis is not None:
+        with Replays(taped, until_s, limit_s, stall_s) as replays:
+            noted = replays.run(replays.old_file, replays.old_root, notes_commands=True)
+            if (failed := _not_repeated(taped, replays, noted, file)) is not None:
+                return failed
+        taped = taped._replace(tape=with_commands(taped.tape, noted.given))
     with Replays(taped, until_s, limit_s, stall_s) as replays:
         old = replays.run(replays.old_file, replays.old_root)
         if (failed := _not_repeated(taped, replays, old, file)) is not None:
@@ -441,7 +489,7 @@ def rerun(
 
 def _sources_now(file: Path, root: Path, old: Mapping[str, str]) -> dict[str, str]:
     """Return the files of the new version: those next to it, and those the old one imported."""
-    texts = read_sources(file, root, set())
+    texts = read_sources([file, *files_near(file, root)], root, set())
     for name in old.keys() - texts.keys():
         if (root / name).is_file():
             texts[name] = (root / name).read_text("utf-8", "surrogateescape")
@@ -475,6 +523,7 @@ def _answer(taped: TapedRun, file: Path, result: ReplayResult, of_rounds: int) -
         goes_on=result.why_ended == "the old code ended",
         in_earlier_run=result.run < taped.number,
         rounds_per_s=result.rounds / max(result.processor_s, 1e-6),
+        basis=taped.basis,
     )
 
 
@@ -487,8 +536,9 @@ def _not_repeated(taped: TapedRun, replays: Replays, old: ReplayResult, file: Pa
     if answer.outcome == "timed out":
         answer.place = f"the recorded code, at {old.place}; give a time with until"
         return answer
-    if "not recorded" in (old.unrecorded or ""):
-        return answer  # a picture: that is no chance
+    if "not recorded" in (old.unrecorded or "") or (taped.basis and old.unrecorded):
+        return answer  # a picture, or what no row has: that is no chance
+    differing = answer.first_differences if taped.basis else []
     answer.outcome, answer.first_differences, answer.place = "not repeatable", [], None
     found = [Witness(*each) for each in old.witnesses]
     texts = [f"it raised {old.exception} at {old.place}, now"] if old.exception else []
@@ -496,6 +546,7 @@ def _not_repeated(taped: TapedRun, replays: Replays, old: ReplayResult, file: Pa
     if old.threads:
         texts.append(f"{likely_cause.THREADS} ({old.threads[0]} called Webots)")
     texts += [str(each) for each in dated_lines(replays.old_sources)]
+    texts += [f"it sets {each}, which the rows have" for each in differing if not texts]
     if answer.began_late:
         texts.append(f"the tape began after the robot was made. {HOW_TO_RECORD}")
     if not texts and _depends_on_hashes(replays):

@@ -20,9 +20,10 @@ import numpy as np
 import pytest
 
 from tests.bridge.inspection import hostile
-from webots_mcp.bridge.inspection.attribute_paths import PathEndsError, follow, parse_path
+from webots_mcp.bridge.inspection.attribute_paths import PathEndsError, follow
 from webots_mcp.bridge.inspection.values import Renderer, signal_value
 from webots_mcp.database.secret_names import LEFT_OUT, SecretNames
+from webots_mcp.database.variable_paths import parse_path
 
 NO_SECRETS = SecretNames()
 Loose: Any = namedtuple("Loose", "x y")  # pyright: ignore[reportUntypedNamedTuple]

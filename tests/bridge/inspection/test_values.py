@@ -17,9 +17,10 @@ import pytest
 
 from tests.bridge.inspection import hostile
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.bridge.inspection.attribute_paths import PathEndsError, follow, parse_path
+from webots_mcp.bridge.inspection.attribute_paths import PathEndsError, follow
 from webots_mcp.bridge.inspection.values import MOST_CHARACTERS, Renderer, signal_value
 from webots_mcp.database.secret_names import LEFT_OUT, SecretNames
+from webots_mcp.database.variable_paths import parse_path
 from webots_mcp.errors import InvalidInputError
 
 NO_SECRETS = SecretNames()

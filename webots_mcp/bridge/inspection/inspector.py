@@ -15,11 +15,9 @@ from typing import Any, Final
 
 from webots_mcp.bridge.error_report import ErrorReport, cut
 from webots_mcp.bridge.inspection.attribute_paths import (
-    AttributePath,
     PathEndsError,
     find_root,
     follow,
-    parse_path,
 )
 from webots_mcp.bridge.inspection.frames import (
     OwnFrame,
@@ -33,6 +31,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import INSPECTION_EVENT
 from webots_mcp.database.secret_names import SecretNames, read_secret_names
+from webots_mcp.database.variable_paths import AttributePath, parse_path
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 MOST_INSPECTIONS: Final = 20  # of one cause in a run

@@ -15,7 +15,6 @@ from typing import Any, Final, cast
 
 from webots_mcp.bridge.error_report import describe
 from webots_mcp.bridge.inspection.attribute_paths import (
-    AttributePath,
     PathEndsError,
     find_root,
     follow,
@@ -25,6 +24,7 @@ from webots_mcp.bridge.inspection.objects import class_of, name_of
 from webots_mcp.bridge.inspection.values import signal_value
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.contract import WATCHED
+from webots_mcp.database.variable_paths import AttributePath
 from webots_mcp.errors import CommandRefusedError
 
 MOST_WATCHED: Final = 20

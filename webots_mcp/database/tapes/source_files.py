@@ -6,7 +6,7 @@ import functools
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -40,26 +40,40 @@ def _relative(file: str, root: str) -> str | None:
     return None if _FOREIGN.intersection(relative.parts) else relative.as_posix()
 
 
-def own_sources(controller: Path, root: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the Python files next to a controller and those of the project that are imported."""
-    loaded = [getattr(each, "__file__", None) for each in tuple(sys.modules.values())]
-    near = sorted(controller.parent.rglob("*.py"))
+def files_near(controller: Path, root: Path) -> Iterator[Path]:
+    """Yield the Python files next to a controller; a large folder takes a while."""
     if controller.parent == root:  # of no project: its folder may hold anything
-        near = sorted(controller.parent.glob("*.py"))
-    imported = sorted(Path(each) for each in loaded if isinstance(each, str))
-    for file in dict.fromkeys([controller, *near, *imported]):
-        name = relative_source(file, root)
-        if name is not None and file.suffix == ".py" and file.is_file():
-            yield name, file
+        yield from sorted(controller.parent.glob("*.py"))
+        return
+    for folder, folders, names in os.walk(controller.parent):
+        folders[:] = sorted(set(folders) - _FOREIGN)
+        yield from (Path(folder, name) for name in sorted(names) if name.endswith(".py"))
 
 
-def read_sources(controller: Path, root: Path, known: set[str]) -> dict[str, str]:
-    """Return the text of the project's files that are not known yet, and add them to `known`."""
+def files_imported(modules: Iterable[str]) -> Iterator[Path]:
+    """Yield the files of modules that are loaded, by their names."""
+    for name in modules:
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if isinstance(file, str):
+            yield Path(file)
+
+
+def read_sources(files: Iterable[Path], root: Path, known: set[str]) -> dict[str, str]:
+    """Return the text of those files that are the project's and not known yet.
+
+    Args:
+        files: Any files.
+        root: The folder of the project.
+        known: Paths from there; those that are read are added.
+    """
     texts: dict[str, str] = {}
     size = 0
-    for name, file in own_sources(controller, root):
-        if name in known or len(known) >= MOST_SOURCE_FILES:
+    for file in files:
+        name = relative_source(file, root)
+        if name is None or file.suffix != ".py" or name in known:
             continue
+        if len(known) >= MOST_SOURCE_FILES:
+            break
         try:
             content = file.read_bytes()
         except OSError:

@@ -31,7 +31,7 @@ _GROUP_BUDGET_TOKENS: Final = 200
 def fitting_events(
     found: Found, limit: int, budget_tokens: int, view: RobotView, *, time_of_day: bool = False
 ) -> tuple[Events, AnswerTable | None]:
-    """At most `limit` of what was found, and as much of it as fits the budget."""
+    """Return at most `limit` of what was found, and as much of it as fits the budget."""
     while True:
         told = found.page(view.connection, limit)
         made = events_table(told.events, view, time_of_day=time_of_day)

@@ -627,7 +627,7 @@ def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str
 
 
 def _is(row: Mapping[str, Any], outcome: bool) -> bool:
-    """Whether a figure, or its spread, is different in any group, or in none."""
+    """Return whether a figure, or its spread, is different in any group, or in none."""
     flat: list[Any] = []
     for value in (row.get("different"), row.get("deviation_different")):
         flat += value if isinstance(value, list) else [value]

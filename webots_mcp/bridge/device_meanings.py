@@ -151,7 +151,7 @@ def _of_one_number(quantity: Quantity, unit: str | None) -> Any:
 
 
 def _of_gps(name: str, device: Any) -> Iterator[DeclaredMeaning]:
-    """Where it is and how high; latitude and longitude are no position in metres."""
+    """Yield where it is and how high; latitude and longitude are no position in metres."""
     system = _ask(device, "getCoordinateSystem")
     if system is None:
         return
@@ -163,7 +163,7 @@ def _of_gps(name: str, device: Any) -> Iterator[DeclaredMeaning]:
 
 
 def _in_nue(said: Iterator[DeclaredMeaning]) -> Iterator[DeclaredMeaning]:
-    """What a GPS says in a world whose y axis points up."""
+    """Yield what a GPS says in a world whose y axis points up."""
     quantities: dict[Quantity | None, Quantity] = {"y": "height", "height": "y"}
     is_local = False
     for each in said:
@@ -173,7 +173,7 @@ def _in_nue(said: Iterator[DeclaredMeaning]) -> Iterator[DeclaredMeaning]:
 
 
 def _up_axis(robot: Any, devices: dict[str, Any]) -> int:
-    """The axis of the world that points up, where a GPS makes that a question."""
+    """Return the axis of the world that points up, where a GPS makes that a question."""
     if not any(type(each).__name__ == "GPS" for each in devices.values()):
         return 2
     try:
@@ -204,7 +204,7 @@ def _of_objects(name: str, _: Any) -> Iterator[DeclaredMeaning]:
 
 
 def _of_camera(name: str, camera: Any) -> Iterator[DeclaredMeaning]:
-    """What it recognises. Which object is the nearest one may change from row to row."""
+    """Yield what it recognises. Which object is the nearest one may change from row to row."""
     if _ask(camera, "hasRecognition") is False:
         return
     yield from _of_objects(name, camera)
@@ -221,7 +221,7 @@ def _of_radar(name: str, radar: Any) -> Iterator[DeclaredMeaning]:
 
 
 def _of_gripper(name: str, _: Any) -> Iterator[DeclaredMeaning]:
-    """A connector or a vacuum gripper: whether it holds, and whether something is there."""
+    """Yield a connector or a vacuum gripper: whether it holds, and whether something is there."""
     for switch in ("locked", "on"):
         yield DeclaredMeaning(f"actuators.{name}.{switch}", "flag", "commanded")
     yield _measured(f"actuators.{name}.presence", "flag")

@@ -280,7 +280,7 @@ class CommandHelp(NamedTuple):
 
 
 def described() -> dict[str, CommandHelp]:
-    """Every command by its name."""
+    """Return every command by its name."""
     from webots_mcp.cli.commands import COMMANDS
 
     app = app_for([], shows_all=True)

@@ -164,7 +164,7 @@ _DESCRIBE_TYPED: Final = "webots-mcp signals --describe"
 
 
 def _description_as_typed(call: str) -> str:
-    """The command that describes a signal, for the call of the tool."""
+    """Return the command that describes a signal, for the call of the tool."""
     keywords: Any = cast("Any", ast.parse(call, mode="eval").body).keywords
     said = {each.arg: ast.literal_eval(each.value) for each in keywords}
     (name,) = said.pop("signals")

@@ -229,7 +229,7 @@ def signals(
 
 
 def _fields_of(words: tuple[str, ...]) -> dict[str, Any]:
-    """What is said of a signal, of texts FIELD=VALUE; only limits are numbers."""
+    """Return what is said of a signal, of texts FIELD=VALUE; only limits are numbers."""
     from webots_mcp.cli.options import settings_of
     from webots_mcp.signals.meaning import MEANING_FIELDS
 

@@ -260,7 +260,7 @@ def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[tuple[float, 
 
 
 def _ordered(values: Sequence[Any]) -> list[Any]:
-    """Each value once, numbers before texts."""
+    """Return each value once, numbers before texts."""
     each = {repr(value): value for value in values}
     numbers = [value for value in each.values() if isinstance(value, (int, float))]
     return sorted(numbers) + sorted(

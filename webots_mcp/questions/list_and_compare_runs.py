@@ -445,7 +445,7 @@ def _runs_and_code(group: Group) -> str:
 def _undecided(
     measures: Sequence[Measure], differences: Sequence[Difference]
 ) -> dict[str, str] | None:
-    """Why `different` is null, by the names of the figures that share a reason."""
+    """Return why `different` is null, by the names of the figures that share a reason."""
     names: dict[str, list[str]] = {}
     figures: list[Measure | Difference] = [*measures, *differences]
     for each in figures:
@@ -457,7 +457,7 @@ def _undecided(
 
 
 def _differs(difference: Difference) -> bool:
-    """Whether mean or deviation of any group differs from the first, or it was asked for."""
+    """Return whether mean or deviation of any group differs from the first, or it was asked for."""
     if difference.asked:
         return True
     first, *others = difference.deviation

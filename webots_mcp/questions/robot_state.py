@@ -443,7 +443,7 @@ def _has_sensor_word(key: str) -> bool:
 
 
 def _paths(value: Any, path: str = "") -> Iterator[str]:
-    """The path of each member at any depth, and of the first items of arrays."""
+    """Yield the path of each member at any depth, and of the first items of arrays."""
     yield path
     if isinstance(value, dict):
         for key, member in cast("dict[str, Any]", value).items():

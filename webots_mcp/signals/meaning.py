@@ -668,7 +668,7 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
 def _motion_in(
     name: str, base: str, said: frozenset[str], unit: str | None, names: frozenset[str]
 ) -> Quantity | None:
-    """Which speed it is, of robot, wheel, motor or joint; None where it is no speed."""
+    """Return which speed it is, of robot, wheel, motor or joint; None where it is no speed."""
     is_rate = unit in ("rad/s", "deg/s", "rpm")
     is_speed = bool(said & {"speed", "velocity"}) or unit in ("m/s", "cm/s", "mm/s", "km/h")
     if not (
@@ -705,7 +705,7 @@ def _motion_in(
 
 
 def _has_other_side(name: str, side: str, names: frozenset[str]) -> bool:
-    """Whether a signal of the other side has the same words otherwise."""
+    """Return whether a signal of the other side has the same words otherwise."""
     other = {"left": "right", "right": "left"}
     own = tuple(other.get(word, word) for word in words_in(name))
     return any(words_in(each) == own for each in names if each != name)

@@ -116,7 +116,7 @@ def with_dots(name: str) -> str:
 
 
 def flatten(state: dict[str, Any]) -> dict[str, Value]:
-    """Every number, flag, text and null of a state, by its dotted name.
+    """Return every number, flag, text and null of a state, by its dotted name.
 
     Arrays of more than 16 items become `name.count`, `.min`, `.max`, `.mean` and `.argmin` (of
     their numbers; `count` and `argmin` of all items). Where two values share a name (a key that
@@ -146,7 +146,7 @@ def _reduce(name: str, array: list[Any], values: dict[str, Value]) -> None:
 
 
 def reduce_array(array: list[Any]) -> tuple[Value, ...]:
-    """An array as one value per reduction."""
+    """Return an array as one value per reduction."""
     numbers = [item for item in array if type(item) is float or type(item) is int]
     low = min(numbers, default=None)
     return (
@@ -168,7 +168,7 @@ def mean_of(numbers: Collection[int | float]) -> float | None:
 
 
 def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
-    """The names of a robot's x and y, among those of its numbers; None without any.
+    """Return the names of a robot's x and y, among those of its numbers; None without any.
 
     In metres, unless the names have another unit: see `units.metres_in`.
     """
@@ -176,7 +176,7 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
 
 
 def positions_in(numeric: Collection[str]) -> list[tuple[str, str]]:
-    """The names that may be a robot's x and y, the best ones first.
+    """Return the names that may be a robot's x and y, the best ones first.
 
     It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:
@@ -244,18 +244,18 @@ def find_targets(name: str, names: Iterable[str]) -> tuple[str | None, str | Non
 
 @lru_cache(maxsize=_KEPT)
 def _subject_words(name: str) -> frozenset[str]:
-    """The words of all parts of a name, one of several being the same as one alone."""
+    """Return the words of all parts of a name, one of several being the same as one alone."""
     return frozenset(word.rstrip("s") for word in _branch_words(name))
 
 
 def is_seen_speed(name: str) -> bool:
-    """Whether it is the speed of a body as an observer sees it, which no command set."""
+    """Return whether it is the speed of a body as an observer sees it, which no command set."""
     branch, _, rest = name.partition(".")
     return branch in (WORLD, SOLIDS) and rest.endswith(f".{SEEN_SPEED}")
 
 
 def find_mode(texts: Collection[str]) -> str | None:
-    """The name of what a robot is doing, among those of its texts; None without any."""
+    """Return the name of what a robot is doing, among those of its texts; None without any."""
     return next(iter(modes_in(texts)), None)
 
 
@@ -295,18 +295,18 @@ def _place_first(pair: tuple[str, tuple[str, str]]) -> tuple[bool, tuple[str, st
 
 
 def listed(names: Collection[str], most: int = 10) -> str:
-    """The first of several names, and how many more there are."""
+    """Return the first of several names, and how many more there are."""
     more = len(names) - most
     return ", ".join(list(names)[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def counted(count: int, what: str) -> str:
-    """How many there are: `1 row`, `2 rows`."""
+    """Return how many there are: `1 row`, `2 rows`."""
     return f"{count} {what}" + "s" * (count != 1)
 
 
 def spelled_out(text: str) -> str:
-    """A text without what a terminal obeys or what turns the direction of writing.
+    """Return a text without what a terminal obeys or what turns the direction of writing.
 
     Control characters other than tabs and the ends of lines, and Unicode's marks of direction, are
     spelled as JSON spells them.
@@ -404,7 +404,7 @@ def _likeness(name: str, other: str) -> float:
 
 @lru_cache(maxsize=_KEPT)
 def unit_in(name: str) -> str | None:
-    """The unit that the last part of a name has, or else one before it; None without any."""
+    """Return the unit that the last part of a name has, or else one before it; None without any."""
     units = (_unit_of(part) for part in reversed(name.split(".")))
     return next(filter(None, units), None)
 

@@ -54,7 +54,7 @@ class Declaration(NamedTuple):
     unit: str | None = None
 
     def as_row(self) -> dict[str, Any]:
-        """What its row in the table `parameter` holds, where texts stand for JSON."""
+        """Return what its row in the table `parameter` holds, where texts stand for JSON."""
         choices = None if self.choices is None else json.dumps(self.choices, ensure_ascii=False)
         default = json.dumps(self.default, ensure_ascii=False)
         return {**self._asdict(), "default": default, "choices": choices}
@@ -67,7 +67,7 @@ class Declaration(NamedTuple):
         return cls(name, kind, json.loads(default), low, high, listed, doc, unit)
 
     def checked(self, value: object) -> Value:
-        """The value as the parameter holds it: a float parameter takes 3 as 3.0.
+        """Return the value as the parameter holds it: a float parameter takes 3 as 3.0.
 
         Raises:
             InvalidInputError: It is of another type, out of bounds or none of the choices.
@@ -109,7 +109,7 @@ def declare(
     doc: object = "",
     unit: object = None,
 ) -> Declaration:
-    """A declaration, checked as a whole.
+    """Return a declaration, checked as a whole.
 
     Raises:
         TypeError: The name, the default or another argument is of a type that it cannot have.
@@ -170,7 +170,7 @@ def as_plain(value: Any) -> object:
 
 
 def _as_kind(kind: str, value: object) -> Value | None:
-    """The value as one of that kind; None where it is none."""
+    """Return the value as one of that kind; None where it is none."""
     if kind == "bool" or isinstance(value, bool):
         return value if kind == "bool" and isinstance(value, bool) else None
     if kind == "str" or isinstance(value, str):
@@ -208,7 +208,7 @@ def _require_name(name: object) -> None:
 
 
 def _bound(name: object, kind: str, bound: object, none: float) -> float | None:
-    """A bound; None for none, as which infinity on its side counts."""
+    """Return a bound; None for none, as which infinity on its side counts."""
     plain = as_plain(bound)
     if plain is None:
         return None
@@ -255,7 +255,7 @@ def _unit(name: object, unit: object) -> str | None:
 
 
 def _shown(value: object) -> str:
-    """A value as an error names it; its own words may fail, or be long."""
+    """Return a value as an error names it; its own words may fail, or be long."""
     try:
         text = repr(value)[:_SHOWN]
     except Exception as error:  # noqa: BLE001  (an object of the user's, or an integer too long)

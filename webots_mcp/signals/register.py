@@ -94,7 +94,7 @@ class Place(NamedTuple):
 
 
 def places(state: dict[str, Any]) -> dict[str, Place]:
-    """Where each leaf of a state stands; the same names as `flatten`, but slower."""
+    """Return where each leaf of a state stands; the same names as `flatten`, but slower."""
     found: dict[str, Place] = {}
     for key, value in state.items():
         _locate(key, f"$.{_step(key)}", value, found)
@@ -128,7 +128,7 @@ def is_reachable(name: str) -> bool:
 
 
 def kind_of(name: str, value: Value, *, ends_pose: bool = False) -> Kind:
-    """What a single value says about its signal; an angle also by the signal's name.
+    """Return what a single value says about its signal; an angle also by the signal's name.
 
     Args:
         name: Of the signal.
@@ -146,14 +146,14 @@ def kind_of(name: str, value: Value, *, ends_pose: bool = False) -> Kind:
 
 
 def turn_of(name: str, kind: Kind) -> float | None:
-    """A whole turn of an angle: 2 pi, or 360 where the name says degrees; else None."""
+    """Return a whole turn of an angle: 2 pi, or 360 where the name says degrees; else None."""
     if kind == "angle":
         return math.tau
     return 360.0 if kind == "num" and angle_unit(name) == "deg" else None
 
 
 def ends_pose(name: str, names: Container[str]) -> bool:
-    """Whether it is the last of three, four or six items of a pose or of odometry.
+    """Return whether it is the last of three, four or six items of a pose or of odometry.
 
     There the yaw stands, if anywhere: `[x, y, yaw]`, `[x, y, z, yaw]`, `[x, y, z, roll, pitch,
     yaw]`.
@@ -163,7 +163,7 @@ def ends_pose(name: str, names: Container[str]) -> bool:
 
 
 def widen(known: Kind, seen: Kind) -> Kind:
-    """The kind of a signal that was `known` when a value of kind `seen` comes."""
+    """Return the kind of a signal that was `known` when a value of kind `seen` comes."""
     if known == seen or seen == "null":
         return known
     if known == "null":
@@ -172,7 +172,7 @@ def widen(known: Kind, seen: Kind) -> Kind:
 
 
 def unit_of(name: str, kind: Kind) -> str | None:
-    """The unit, where a part of the name ends in one (`speed_m_s`, `distance_m.left`)."""
+    """Return the unit, where a part of the name ends in one (`speed_m_s`, `distance_m.left`)."""
     if kind == "angle":
         return "rad"
     if kind != "num" or name.rpartition(".")[2] in ("count", "argmin"):
@@ -202,7 +202,7 @@ def decide_roles(
     choices: Container[str] = (),
     position: tuple[str, str] | None = None,
 ) -> dict[str, str]:
-    """The role of each signal of a robot that has one.
+    """Return the role of each signal of a robot that has one.
 
     Args:
         kinds: Of all names that the robot has published.
@@ -324,7 +324,7 @@ def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
 
 @lru_cache(maxsize=_KEPT)
 def _motions_of(name: str) -> tuple[str, ...]:
-    """What a number may tell by its name."""
+    """Return what a number may tell by its name."""
     if is_seen_speed(name):
         return ()
     words = in_snake_case(name)
@@ -345,12 +345,12 @@ def _shortest(name: str) -> tuple[int, str]:
 
 
 def pair_in(roles: Container[str]) -> str | None:
-    """The place in line of the first position of which both x and y are there."""
+    """Return the place in line of the first position of which both x and y are there."""
     return next((place for place in PLACES if f"x{place}" in roles and f"y{place}" in roles), None)
 
 
 def first_in(role: str, roles: Container[str]) -> str | None:
-    """The first in line for a role, of those that are there."""
+    """Return the first in line for a role, of those that are there."""
     return next((f"{role}{place}" for place in PLACES if f"{role}{place}" in roles), None)
 
 
@@ -389,7 +389,7 @@ class Changes(NamedTuple):
 def find_changes(
     connection: sqlite3.Connection, robot_id: int, seen: Mapping[str, Seen]
 ) -> Changes:
-    """What the register of a robot lacks once these values are recorded.
+    """Return what the register of a robot lacks once these values are recorded.
 
     Names beyond `MAX_SIGNALS` of a robot stay out. Of each name the kind is widened; which roles
     the names have is decided anew.
@@ -544,7 +544,7 @@ class StateChanges:
         self._count = 0
 
     def compare(self, state: Mapping[Any, Any]) -> list[tuple[Any, object, object]]:
-        """The (key, before, after) of each change since the last call; usually none."""
+        """Return the (key, before, after) of each change since the last call; usually none."""
         changed: list[tuple[Any, object, object]] = []
         last = self._last
         if len(state) > MOST_KEYS:

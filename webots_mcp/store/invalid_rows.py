@@ -81,7 +81,7 @@ class InvalidValues:
         self._met[f"{table} {row}: {column} holds no valid {kind}"] = None
 
     def described(self) -> list[str]:
-        """The first few, and how many more there are."""
+        """Return the first few, and how many more there are."""
         more = len(self._met) - _SHOWN
         return [*list(self._met)[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
@@ -101,13 +101,13 @@ def past_invalid_rows() -> Generator[InvalidValues]:
 
 
 def left_out_so_far() -> list[str]:
-    """What readers that were opened inside `past_invalid_rows` have left out until now."""
+    """Return what readers that were opened inside `past_invalid_rows` have left out until now."""
     invalid = _reading.get()
     return invalid.described() if invalid is not None else []
 
 
 def is_past_invalid_rows() -> bool:
-    """Whether this is inside `past_invalid_rows`."""
+    """Return whether this is inside `past_invalid_rows`."""
     return _reading.get() is not None
 
 
@@ -178,7 +178,7 @@ def _view(connection: sqlite3.Connection, table: str) -> str:
 
 
 def _check(table: str, name: str, kind: str) -> tuple[str, str]:
-    """An SQL condition that a valid value meets, and what such a value is called."""
+    """Return an SQL condition that a valid value meets, and what such a value is called."""
     place = f"{table}.{name}"
     if place in _OBJECTS or place in _SHAPES:
         what = "texts" if place in _OF_TEXTS else _SHAPES.get(place, "object")

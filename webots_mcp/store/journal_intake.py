@@ -193,7 +193,7 @@ def kept_journals(database: Path) -> dict[str, str]:
 
 
 def has_news(database: Path) -> bool:
-    """Whether a journal next to a database has bytes that this process has not taken in."""
+    """Return whether a journal next to a database has bytes that this process has not taken in."""
     for path in (path for parts in journal_parts(database).values() for path in parts):
         with suppress(OSError):
             status, place = path.stat(), _places.get(path)
@@ -203,7 +203,7 @@ def has_news(database: Path) -> bool:
 
 
 def journals_behind(connection: sqlite3.Connection, database: Path) -> list[str]:
-    """The journals of which rows are not in the database, although there was time."""
+    """Return the journals of which rows are not in the database, although there was time."""
     behind: list[str] = []
     kept = kept_journals(database)
     for uuid, parts in journal_parts(database).items():
@@ -409,7 +409,7 @@ class _Reading:
         return connection.execute(_KNOWN, (self.uuid,)).fetchone()
 
     def _begin(self, session_state: _JournalState, entry: WaitingEntry) -> dict[str, Any] | None:
-        """The values of the run of an entry that none has begun, if its line was lost."""
+        """Return the values of the run of an entry that none has begun, if its line was lost."""
         lost = session_state.lost_runs.get(entry.run or "", session_state.lost_runs.get(""))
         if lost is None or isinstance(entry.values, dict) or not entry.run:
             return None
@@ -528,7 +528,7 @@ class _Reading:
 def _described(
     header: Mapping[str, Any], uuid: str, modified_s: float
 ) -> tuple[str, dict[str, Any], list[str]]:
-    """The robot's name and the values of the session, from the first line of a journal.
+    """Return the robot's name and the values of the session, from the first line of a journal.
 
     Args:
         header: What that line says.
@@ -597,13 +597,13 @@ def _sha256(file: str, started_s: float) -> str | None:
 
 
 def _until(lines: Sequence[_Line], number: int) -> Sequence[_Line]:
-    """The lines up to the last entry of no higher number."""
+    """Return the lines up to the last entry of no higher number."""
     ends = [i for i, each in enumerate(lines, 1) if each.entry and each.entry.number <= number]
     return lines[: ends[-1]]
 
 
 def _skip(file: BinaryIO, offset: int, number: int) -> int:
-    """The byte after the last entry of no higher number, from that byte on."""
+    """Return the byte after the last entry of no higher number, from that byte on."""
     file.seek(offset)
     at = offset
     while number and (line := file.readline(LONGEST_LINE_BYTES)).endswith(b"\n"):
@@ -640,7 +640,7 @@ def _too_long(start: bytes, size: int, end: int) -> _Line:
 
 
 def _line(line: bytes, end: int) -> _Line:
-    """What a line says: an entry, or why it is none."""
+    """Return what a line says: an entry, or why it is none."""
     line = line.removeprefix(codecs.BOM_UTF8)
     text = line.decode("utf-8", "replace")
     if not text.strip():
@@ -700,7 +700,7 @@ def _fitted(letter: str, value: object) -> Any:
 
 
 def _is_text(value: str) -> bool:
-    """Whether it can be stored: half a character cannot."""
+    """Return whether it can be stored: half a character cannot."""
     try:
         value.encode()
     except UnicodeEncodeError:
@@ -709,7 +709,7 @@ def _is_text(value: str) -> bool:
 
 
 def _checked(kind: Kind, values: Any) -> tuple[dict[str, Any], str]:
-    """The values of an entry by their names, and what does not fit and is null instead.
+    """Return the values of an entry by their names, and what does not fit and is null instead.
 
     Raises:
         ValueError: One does not fit that there is no row without, or there are too many.
@@ -752,7 +752,7 @@ def _fit(fields: Iterable[str], values: Mapping[str, Any]) -> tuple[dict[str, An
 
 
 def _shown(value: object) -> str:
-    """A value of any size, as far as a person reads it."""
+    """Return a value of any size, as far as a person reads it."""
     if isinstance(value, (dict, list)):
         return "an object" if isinstance(value, dict) else "an array"
     if isinstance(value, int) and not -(10**30) < value < 10**30:  # Python writes no longer ones
@@ -826,7 +826,7 @@ def _path(name: str) -> tuple[list[str], str]:
 
 
 def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any]:
-    """The values as the statement of that kind takes them."""
+    """Return the values as the statement of that kind takes them."""
     if kind in _NAMED:
         return _UNGIVEN | given | {"dropped": given.get("dropped") or 0}
     if kind == "log":

@@ -104,7 +104,7 @@ _COLUMNS: Final = columns_of(LogLine)
 
 
 def _news_of(source: str, cursor: str, columns: str, text: str) -> str:
-    """The rows after a cursor of one robot or all, with the time and the text of each."""
+    """Return the rows after a cursor of one robot or all, with the time and the text of each."""
     return (
         f"SELECT {cursor}, {columns}, {text} FROM {source} WHERE {cursor} > :after "
         f"AND (:robot_id IS NULL OR r.id = :robot_id) ORDER BY {cursor} DESC LIMIT :limit"
@@ -180,7 +180,7 @@ class LogFilter:
 
 
 def window_of(scope: Scope, newest_s: float) -> LogWindow:
-    """The window that was asked for in simulation time; without any bound the whole run.
+    """Return the window that was asked for in simulation time; without any bound the whole run.
 
     Args:
         scope: Its `last_s` counts back from the newest row, which is included.
@@ -193,7 +193,7 @@ def window_of(scope: Scope, newest_s: float) -> LogWindow:
 
 
 def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
-    """The newest lines that match, oldest first; with a limit of -1 all of them."""
+    """Return the newest lines that match, oldest first; with a limit of -1 all of them."""
     order = "id" if asked.run_id is None else "sim_time_s DESC, id"
     query = f"SELECT {_COLUMNS} {_rows_of(connection, asked)} ORDER BY {order} DESC LIMIT :limit"
     rows = connection.execute(query, {**_values(asked), "limit": limit}).fetchall()
@@ -211,7 +211,7 @@ def waiting_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) 
 
 
 def count_lines(connection: sqlite3.Connection, asked: LogFilter) -> int:
-    """How many lines match; `COUNT_LIMIT` stands for that many or more."""
+    """Return how many lines match; `COUNT_LIMIT` stands for that many or more."""
     query = f"SELECT count(*) FROM (SELECT 1 {_rows_of(connection, asked)} LIMIT {COUNT_LIMIT})"
     return int(connection.execute(query, _values(asked)).fetchone()[0])
 
@@ -383,11 +383,11 @@ class ConsoleRows:
                 self._write(connection, line, runs)
 
     def may_go_on(self, connection: sqlite3.Connection) -> bool:
-        """Whether lines wait and a run has begun for them."""
+        """Return whether lines wait and a run has begun for them."""
         return self.waits and bool(self._fitting(self._runs(connection)))
 
     def _runs(self, connection: sqlite3.Connection) -> list[_Run]:
-        """The newest runs of this Webots, the newest of them first."""
+        """Return the newest runs of this Webots, the newest of them first."""
         since_s = self._started_s - _CONSOLE.early_s
         query = (
             "SELECT id, robot_id, controller FROM session WHERE instance = ? "
@@ -509,7 +509,7 @@ class _Recorded:
                 texts.lines.add(other.strip())
 
     def take(self, line: Said) -> bool:
-        """Whether a bridge recorded this line; it is then met no more.
+        """Return whether a bridge recorded this line; it is then met no more.
 
         One that begins with the name of a robot or controller that records is looked for without
         it, in what that robot's bridge recorded.
@@ -536,7 +536,7 @@ class _OfRobot:
         self.logged = _Texts(_CONSOLE.logged_texts)
 
     def take(self, text: str) -> bool:
-        """Whether it recorded this text."""
+        """Return whether it recorded this text."""
         return self.lines.take(text) or self.logged.take(text) or self._take_handled(text)
 
     def _take_handled(self, text: str) -> bool:
@@ -585,7 +585,7 @@ def _of_named(line: Said, runs: list[_Run]) -> tuple[Said, list[_Run]]:
 
 
 def _is_called(run: _Run, name: str) -> bool:
-    """Whether that is the run's robot or its controller, which Webots names in the line."""
+    """Return whether that is the run's robot or its controller, which Webots names in the line."""
     return name in (run.robot, run.controller and PurePath(run.controller).stem)
 
 

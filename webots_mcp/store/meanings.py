@@ -93,7 +93,7 @@ def with_stated(
 
 
 def _stated(signal: RegisteredSignal, stated: tuple[StatedMeaning, ...]) -> RegisteredSignal:
-    """The signal with what was stated of it: its unit is the one that was stated."""
+    """Return the signal with what was stated of it: its unit is the one that was stated."""
     found = replace(signal, stated=stated)
     return replace(found, unit=found.stated_unit or signal.unit)
 

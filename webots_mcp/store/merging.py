@@ -552,7 +552,7 @@ def _is_packed(path: Path) -> bool:
 
 
 def is_bundle(file: Path) -> bool:
-    """Whether a file is one, or says that it is: a damaged one is reported as such."""
+    """Return whether a file is one, or says that it is: a damaged one is reported as such."""
     return file.suffix.lower() == ".zip" or zipfile.is_zipfile(file)
 
 
@@ -721,7 +721,7 @@ def _ingest_state_ids(connection: sqlite3.Connection, values: dict[str, Any], ro
 
 
 def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
-    """A chunk of ids that are so much greater."""
+    """Return a chunk of ids that are so much greater."""
     numbers = decode(EncodedChunk(*packed), rows).numbers.tolist()
     ids = [int(number) + shift for number in numbers]
     return *statistics_of(decoded_of(ids)), *encode(ids)

@@ -43,7 +43,7 @@ def _id() -> Any:
 def _to(
     table: str, comment: str | None = None, *, nullable: bool = False, on_delete: str | None = None
 ) -> Any:
-    """A reference to another table's id; what cannot be without it goes with it."""
+    """Return a reference to another table's id; what cannot be without it goes with it."""
     on_delete = on_delete or ("SET NULL" if nullable else "CASCADE")
     key = ForeignKey(f"{table}.id", ondelete=on_delete)
     return Field(default=None, sa_column=Column(Integer, key, nullable=nullable, comment=comment))

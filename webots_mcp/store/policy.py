@@ -106,7 +106,7 @@ class Policy:
         return replace(self, agreed=agreed)
 
     def holds_for(self, transport: str) -> bool:
-        """Whether it binds who asks that way: `stdio` and `http` are assistants'."""
+        """Return whether it binds who asks that way: `stdio` and `http` are assistants'."""
         everyone = self.allow.get("holds_for", _HOLDS_FOR[0]) == _HOLDS_FOR[0]
         return everyone or transport in ("stdio", "http")
 
@@ -271,7 +271,7 @@ def _is_within(value: object, rule: Any) -> bool:
 
 
 def line_of(text: str, key: str, inside: str | None = None) -> int:
-    """Where a key of the table stands, or within it a name or a text; from 1."""
+    """Return where a key of the table stands, or within it a name or a text; from 1."""
     lines, table, found = text.splitlines(), "", 1
     parts = [re.escape(key)] + ([re.escape(inside)] if inside else [])
     for number, line in enumerate(lines, 1):
@@ -316,7 +316,7 @@ def is_named(policies: Iterable[Policy], action: str) -> bool:
 
 
 def read_policy(file: Path) -> Policy | None:
-    """What a project's file allows; None where it has no such table.
+    """Return what a project's file allows; None where it has no such table.
 
     Raises:
         NotAllowedError: It is invalid: which line, and why.
@@ -343,7 +343,7 @@ def read_policy(file: Path) -> Policy | None:
 
 
 def _faults(allow: Any) -> Iterator[tuple[str, str]]:
-    """What is wrong with the table: its key, and why."""
+    """Yield what is wrong with the table: its key, and why."""
     if not isinstance(allow, dict):
         yield ALLOW, "allow must be a table: [allow]"
         return

@@ -106,7 +106,7 @@ def read_project(file: Path) -> ProjectFile:
 
 
 def _signals_in(file: Path, text: str, table: Any) -> list[DescribedSignal]:
-    """The entries of the table [signals]; a table of tables is of the robot of that name."""
+    """Return the entries of the table [signals]; a table of tables is of the robot of that name."""
     if not isinstance(table, dict):
         raise InvalidInputError(
             f"{file}, line {_signal_line(text)}: signals must be a table: [signals]"
@@ -137,7 +137,7 @@ def _is_table(value: Any) -> bool:
 
 
 def _signal_line(text: str, signal: str = "") -> int:
-    """The first line of the table, or behind it the first one that has the signal's name."""
+    """Return the first line of the table, or behind it the first one that has the signal's name."""
     lines = text.splitlines()
     starts = (at for at, line in enumerate(lines) if re.match(r"\s*\[?\s*signals\b", line))
     start = next(starts, 0)
@@ -147,7 +147,7 @@ def _signal_line(text: str, signal: str = "") -> int:
 
 
 def load_toml(file: Path) -> tuple[str, dict[str, Any]]:
-    """The text of a file, and what it says.
+    """Return the text of a file, and what it says.
 
     Raises:
         InvalidInputError: It cannot be read, or is not TOML.

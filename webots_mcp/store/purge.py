@@ -293,7 +293,7 @@ class _Purge:
             )
 
     def _chunks(self, step: Going, portion: Portion) -> Iterator[Purged]:
-        """The chunks of a group, which no reader sees any more."""
+        """Yield the chunks of a group, which no reader sees any more."""
         # Readers skip a group that is not complete. If this process ends now, the maker of chunks
         # deletes the rest.
         if not self._execute(
@@ -326,7 +326,7 @@ class _Purge:
             yield from self._delete("image", found)
 
     def _by_key(self, step: Going) -> Iterator[Purged]:
-        """A run, or commands of a robot."""
+        """Yield a run, or commands of a robot."""
         keys = [(step.owner_id, step.owner_id)]
         if step.table == "command":
             before = {"robot_id": step.owner_id, "before_s": step.newest_s, "limit": step.rows}
@@ -411,11 +411,11 @@ class _Purge:
         return row[0] if row else None
 
     def _execute(self, statement: str, *values: object) -> int:
-        """How many rows a short statement of its own changed; 0 where it was locked."""
+        """Return how many rows a short statement of its own changed; 0 where it was locked."""
         return self._unless_locked(lambda: self._connection.execute(statement, values).rowcount)
 
     def _unless_locked(self, write: Callable[[], int]) -> int:
-        """How many were written; 0 where another holds the write lock."""
+        """Return how many were written; 0 where another holds the write lock."""
         try:
             written = write()
         except sqlite3.OperationalError as error:

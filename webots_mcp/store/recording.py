@@ -111,7 +111,7 @@ class RobotView:
         return self.robot.session
 
     def header(self) -> dict[str, Any]:
-        """The fields that every answer begins with."""
+        """Return the fields that every answer begins with."""
         sim_time_s, wall_time_s = self._newest_times()
         return {
             "robot": self.robot.name,
@@ -162,12 +162,12 @@ class RobotView:
         return None, None
 
     def age_s(self, wall_time_s: float) -> float:
-        """How long ago that was, to 10 ms; of what is over an hour old, to the second."""
+        """Return how long ago that was, to 10 ms; of what is over an hour old, to the second."""
         age_s = max(self.now_s - wall_time_s, 0.0)
         return round(age_s, 2) if age_s <= LONG_AGO_S else round(age_s)
 
     def require_run(self) -> RunRecord:
-        """The run; see `subject.require_run`."""
+        """Return the run; see `subject.require_run`."""
         return require_run(self.robot, self.run)
 
     @property
@@ -372,7 +372,7 @@ class RecordingAccess:
 def view_robot(
     connection: sqlite3.Connection, robot: str | None, run_id: int | None = None
 ) -> RobotView:
-    """A view over an open connection; see `RecordingAccess.view`."""
+    """Return a view over an open connection; see `RecordingAccess.view`."""
     now_s = time.time()
     try:
         chosen, run = choose(connection, robot, run_id, now_s)
@@ -385,7 +385,7 @@ def view_robot(
 def view_of(
     connection: sqlite3.Connection, robot: RobotRecord, now_s: float, run: RunRecord | None = None
 ) -> RobotView:
-    """A view of a robot that is already known, and of that run or its newest one."""
+    """Return a view of a robot that is already known, and of that run or its newest one."""
     current = current_run(connection, robot.id)
     run = run or current
     if run is None or run == current:
@@ -453,12 +453,12 @@ def waiting_rows_note(connection: sqlite3.Connection) -> str:
 
 
 def name_of(database: Database) -> str:
-    """The database as a person knows it."""
+    """Return the database as a person knows it."""
     return "(in memory)" if isinstance(database, MemoryDatabase) else str(database)
 
 
 def _explain(error: Exception, database: Database) -> str:
-    """What a person can do about it."""
+    """Return what a person can do about it."""
     text, name = text_of(error), name_of(database)
     if is_busy(error):
         return (
@@ -559,7 +559,7 @@ class Job:
 
 
 def is_over_a_value(error: Exception) -> bool:
-    """Whether work on rows failed over what no bridge writes, not over the file."""
+    """Return whether work on rows failed over what no bridge writes, not over the file."""
     if is_damage(error):
         return False
     return isinstance(error, _UNSTORABLE) or is_about_a_value(error)

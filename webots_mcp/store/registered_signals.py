@@ -118,7 +118,7 @@ class RegisteredSignal:
 
 
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, RegisteredSignal]:
-    """The signals of a robot in the register, by name."""
+    """Return the signals of a robot in the register, by name."""
     rows = connection.execute(
         "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
         "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id",
@@ -134,14 +134,14 @@ def _registered(signal: RegisteredSignal) -> RegisteredSignal:
 
 
 def stored_roles(known: dict[str, RegisteredSignal]) -> dict[str, str]:
-    """The roles of signals that have one, by their names."""
+    """Return the roles of signals that have one, by their names."""
     return {name: signal.role for name, signal in known.items() if signal.role is not None}
 
 
 def roles_of(
     known: dict[str, RegisteredSignal], position: tuple[str, str] | None = None
 ) -> dict[str, str]:
-    """The roles that these signals have among each other; see `decide_roles`."""
+    """Return the roles that these signals have among each other; see `decide_roles`."""
     kinds: dict[str, Kind] = {name: signal.kind for name, signal in known.items()}
     choices = {name for name, signal in known.items() if signal.is_choice}
     return decide_roles(kinds, choices, position)
@@ -175,7 +175,7 @@ def may_widen(signal: RegisteredSignal | None, values: Iterable[object]) -> bool
 
 
 def seen_in(columns: StateColumns, names: Iterable[str]) -> dict[str, Seen]:
-    """What rows tell of some signals; without those whose values stand nowhere."""
+    """Return what rows tell of some signals; without those whose values stand nowhere."""
     found: dict[str, Seen] = {}
     for name in names:
         row = next(row for row, value in enumerate(columns.values[name]) if value is not ABSENT)
@@ -232,7 +232,7 @@ def seen_with(
 
 
 def cleaned(signal: RegisteredSignal, values: Sequence[Any]) -> list[Value]:
-    """Every value of the type that the signal's kind promises."""
+    """Return every value of the type that the signal's kind promises."""
     if signal.kind == "bool":
         return [None if value is None else value in (1, True) for value in values]
     if signal.kind == "text":

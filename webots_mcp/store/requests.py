@@ -353,7 +353,7 @@ def note_answer(
 def newest_requests(
     connection: sqlite3.Connection, limit: int, *, refused: bool = False
 ) -> list[dict[str, Any]]:
-    """The newest requests, newest first, with the commands that they have sent."""
+    """Return the newest requests, newest first, with the commands that they have sent."""
     cursor = connection.execute(
         "SELECT id, wall_time_s, sim_time_s, run_id, client, client_version, transport, tool, "
         "arguments, rule, outcome, (SELECT json_group_array(json_array(id, action, status)) FROM "

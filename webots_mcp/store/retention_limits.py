@@ -64,7 +64,7 @@ class Limit:
     def is_exceeded(
         self, *, size_bytes: float, rows: float, age_s: float = 0, times: float = 1
     ) -> bool:
-        """Whether one of these is more than so many times its limit."""
+        """Return whether one of these is more than so many times its limit."""
         found = ((size_bytes, self.size_bytes), (rows, self.rows), (age_s, self.age_s))
         return any(limit is not None and value > times * limit for value, limit in found)
 
@@ -170,7 +170,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, StoredLimit]:
 
 
 def in_force(connection: sqlite3.Connection, asked: Asked | None = None) -> Retention:
-    """The limits of a database; with `asked` as they would be after `set_limits`."""
+    """Return the limits of a database; with `asked` as they would be after `set_limits`."""
     values: dict[str, Any] = {
         name: setting.value for name, setting in read_settings(connection).items()
     }
@@ -214,7 +214,7 @@ def ask(connection: sqlite3.Connection, asked: Asked) -> list[str]:
 
 
 def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
-    """What was asked for and does not hold: what does, who set it, and how to change it."""
+    """Return what was asked for and does not hold: what does, who set it, and how to change it."""
     settings = read_settings(connection)
     found: list[str] = []
     for name, value in asked.items():
@@ -230,7 +230,7 @@ def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
 
 
 def described(connection: sqlite3.Connection) -> dict[str, str]:
-    """Each limit in force as a person reads it, with who set it and when."""
+    """Return each limit in force as a person reads it, with who set it and when."""
     settings, retention = read_settings(connection), in_force(connection)
     return {
         f"{kind}s": _said(settings[name])
@@ -255,12 +255,12 @@ def _text(value: Limit | float) -> str:
 
 
 def option_of(kind: str) -> str:
-    """The option of the command line that limits a kind of row."""
+    """Return the option of the command line that limits a kind of row."""
     return "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s"
 
 
 def parse_limit(text: str, default: Limit) -> Limit:
-    """A limit from its parts, separated by commas; what is not named has no limit.
+    """Return a limit from its parts, separated by commas; what is not named has no limit.
 
     Args:
         text: Sizes (kB, MB, GB), ages (min, h, d, w) and rows; or `all`, without any limit.
@@ -298,7 +298,7 @@ def _parse_part(part: str, text: str) -> tuple[str, float]:
 
 
 def limit_text(limit: Limit) -> str:
-    """A limit as `parse_limit` reads it; a size is rounded."""
+    """Return a limit as `parse_limit` reads it; a size is rounded."""
     parts = [size_text(limit.size_bytes)] if limit.size_bytes is not None else []
     parts += [f"{limit.age_s:g}s"] if limit.age_s is not None else []
     parts += [f"{limit.rows}rows"] if limit.rows is not None else []
@@ -306,7 +306,7 @@ def limit_text(limit: Limit) -> str:
 
 
 def size_text(size_bytes: float) -> str:
-    """A size as a person reads it, in the units that `parse_limit` takes."""
+    """Return a size as a person reads it, in the units that `parse_limit` takes."""
     for unit in ("B", "kB", "MB"):
         if size_bytes < 1000:
             return f"{size_bytes:.0f} {unit}" if unit == "B" else f"{size_bytes:.1f} {unit}"

@@ -54,7 +54,7 @@ class WorldSeen:
 
 
 def list_robots(connection: sqlite3.Connection, now_s: float) -> list[RobotRecord]:
-    """Every robot ever seen, in the order in which they first appeared."""
+    """Return every robot ever seen, in the order in which they first appeared."""
     return [
         _robot(connection, row, now_s)
         for row in connection.execute(
@@ -65,7 +65,7 @@ def list_robots(connection: sqlite3.Connection, now_s: float) -> list[RobotRecor
 
 
 def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
-    """The name of the robot of that id.
+    """Return the name of the robot of that id.
 
     Raises:
         NothingRecordedError: Its row is not there, or cannot be read.
@@ -111,7 +111,7 @@ def console_trouble(connection: sqlite3.Connection) -> str | None:
 
 
 def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> RobotRecord:
-    """The robot of that name; without a name the only live one, else the only one ever seen.
+    """Return the robot of that name; without a name the only live one, else the only one ever seen.
 
     An observer is meant without a name only where there is no other robot.
 
@@ -179,7 +179,7 @@ def _robot(
 def live_observer(
     connection: sqlite3.Connection, session: SessionRecord | None, now_s: float
 ) -> RobotRecord | None:
-    """The observer of a session's simulation; without a session the only one that lives."""
+    """Return the observer of a session's simulation; without a session the only one that lives."""
     robots = [robot for robot in list_robots(connection, now_s) if robot.live]
     found = [robot for robot in robots if robot.kind == OBSERVER and robot.session is not None]
     if session is not None:
@@ -189,7 +189,7 @@ def live_observer(
 
 
 def world_seen(connection: sqlite3.Connection, run: RunRecord) -> WorldSeen | None:
-    """What an observer saw while that run lasted, last of all; None where none was there."""
+    """Return what an observer saw while that run lasted, last of all; None where none was there."""
     values = {
         "session": run.session_id,
         "first": run.started_wall_time_s,

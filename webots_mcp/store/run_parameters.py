@@ -93,7 +93,7 @@ RunParameters = Mapping[str, RunParameter]
 
 
 def declared_by(connection: sqlite3.Connection, session_id: int) -> dict[str, Declared]:
-    """The parameters that the controller of a session declares, in its order."""
+    """Return the parameters that the controller of a session declares, in its order."""
     return {
         row[0]: _declared(row)
         for row in connection.execute(
@@ -107,7 +107,7 @@ def declared_by(connection: sqlite3.Connection, session_id: int) -> dict[str, De
 def parameters_of(
     connection: sqlite3.Connection, run_ids: Iterable[int]
 ) -> dict[int, dict[str, RunParameter]]:
-    """What the parameters were in each of these runs."""
+    """Return what the parameters were in each of these runs."""
     found: dict[int, dict[str, RunParameter]] = {run_id: {} for run_id in run_ids}
     for run_id, name, sim_time_s, value, *rest in connection.execute(
         "SELECT run_id, name, sim_time_s, value, is_default, set_by, command_id "
@@ -120,7 +120,7 @@ def parameters_of(
 
 
 def described(connection: sqlite3.Connection, run: RunRecord) -> list[dict[str, Any]]:
-    """Each parameter of a run, under `COLUMNS`: its last value, and how it is declared now.
+    """Return each parameter of a run, under `COLUMNS`: its last value, and how it is declared now.
 
     What a controller does not declare any more, or a later one declared, has only its values.
     """
@@ -158,7 +158,7 @@ def _ordered(had: RunParameters, unlike: Sequence[str]) -> list[str]:
 
 
 def kinds_of(connection: sqlite3.Connection) -> dict[str, str]:
-    """The kinds of all parameters by name, each as it was declared last."""
+    """Return the kinds of all parameters by name, each as it was declared last."""
     return dict(connection.execute("SELECT name, kind FROM parameter ORDER BY id").fetchall())
 
 

@@ -69,7 +69,7 @@ _LIMITS: Final = RowLimits()
 
 
 def columns_of(row: type[Any]) -> str:
-    """What to select so that a row is the arguments of this dataclass."""
+    """Return what to select so that a row is the arguments of this dataclass."""
     return ", ".join(field.name for field in fields(row))
 
 
@@ -105,7 +105,7 @@ class StateRecord:
     replaced: str | None
 
     def value(self) -> dict[str, Any]:
-        """The published dict, with "nan", "inf" and the like where JSON has to say null."""
+        """Return the published dict, with "nan", "inf" and the like where JSON has to say null."""
         value = cast("dict[str, Any]", _decoded(self, self.data))
         for path, kind in self.replaced_paths().items():
             put_back(value, path.split("."), kind)
@@ -129,12 +129,12 @@ class EventRecord:
     data: str | None
 
     def details(self) -> Any:
-        """What was noticed, decoded; None where nothing was added."""
+        """Return what was noticed, decoded; None where nothing was added."""
         return _decoded(self, self.data) if self.data else None
 
 
 def _decoded(row: StateRecord | EventRecord, text: str) -> Any:
-    """The value of JSON text of a row; a MalformedRowError says which row has none."""
+    """Return the value of JSON text of a row; a MalformedRowError says which row has none."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -176,7 +176,7 @@ _EVENT_COLUMNS: Final = columns_of(EventRecord)
 
 
 def current_run(connection: sqlite3.Connection, robot_id: int) -> RunRecord | None:
-    """The robot's newest run, going on or not."""
+    """Return the robot's newest run, going on or not."""
     row = connection.execute(
         f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1", (robot_id,)
     ).fetchone()
@@ -186,7 +186,7 @@ def current_run(connection: sqlite3.Connection, robot_id: int) -> RunRecord | No
 def fetch_run(
     connection: sqlite3.Connection, run_id: int, robot_id: int | None = None
 ) -> RunRecord:
-    """The run of that id.
+    """Return the run of that id.
 
     Args:
         connection: An open database.
@@ -203,7 +203,7 @@ def fetch_run(
 
 
 def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[RunRecord]:
-    """All runs of the robot, oldest first."""
+    """Return all runs of the robot, oldest first."""
     return [
         RunRecord(*row)
         for row in connection.execute(
@@ -213,7 +213,7 @@ def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[RunRecord]:
 
 
 def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
-    """How many runs of the robot were recorded."""
+    """Return how many runs of the robot were recorded."""
     return int(
         connection.execute("SELECT count(*) FROM run WHERE robot_id = ?", (robot_id,)).fetchone()[0]
     )
@@ -249,7 +249,7 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
 
 
 def newest_state(connection: sqlite3.Connection, run_id: int) -> StateRecord | None:
-    """The latest row of a run; None where retention has deleted it."""
+    """Return the latest row of a run; None where retention has deleted it."""
     state = _state_up_to(connection, run_id, _LATER_THAN_ANY)
     if state is None or state.id > 0:
         return state
@@ -260,7 +260,7 @@ def newest_state(connection: sqlite3.Connection, run_id: int) -> StateRecord | N
 
 
 def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> StateRecord | None:
-    """The latest row of a run up to that simulation time."""
+    """Return the latest row of a run up to that simulation time."""
     return _state_up_to(connection, run_id, sim_time_s)
 
 
@@ -310,7 +310,7 @@ def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | No
 
 
 def select(value: Any, path: str) -> Any:
-    """The part of a state at a dotted path; `""` is all of it.
+    """Return the part of a state at a dotted path; `""` is all of it.
 
     Raises:
         InvalidInputError: Nothing is there; the text names the part that is missing.
@@ -323,7 +323,7 @@ def select(value: Any, path: str) -> Any:
 
 
 def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
-    """The key or index that the path starts with, and how many of its parts that takes.
+    """Return the key or index that the path starts with, and how many of its parts that takes.
 
     A key may itself hold dots, so the longest one that fits is taken.
     """
@@ -392,7 +392,7 @@ def count_dropped(connection: sqlite3.Connection, run: RunRecord, of_session: in
 
 
 def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[EventRecord]:
-    """The latest events of a run, oldest first; with a limit of -1 all of them."""
+    """Return the latest events of a run, oldest first; with a limit of -1 all of them."""
     rows = connection.execute(
         f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC "
         "LIMIT ?",
@@ -420,7 +420,7 @@ class StoredImage:
     size_bytes: int
 
     def file(self, data_dir: Path) -> Path:
-        """The file itself; see `inside` for the errors."""
+        """Return the file itself; see `inside` for the errors."""
         return inside(data_dir, self.path)
 
 
@@ -428,7 +428,7 @@ _COLUMNS: Final = columns_of(StoredImage)
 
 
 def inside(data_dir: Path, path: str) -> Path:
-    """The file at a recorded path.
+    """Return the file at a recorded path.
 
     Raises:
         InvalidInputError: The path leads out of the data folder, or to no regular file.
@@ -518,7 +518,7 @@ def camera_frames(
 
 
 def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | None:
-    """The newest picture of a run, of whatever kind."""
+    """Return the newest picture of a run, of whatever kind."""
     row = connection.execute(
         f"SELECT {_COLUMNS} FROM image WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1",
         (run_id,),
@@ -529,7 +529,7 @@ def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | N
 def count_kept_frames(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> int:
-    """How many camera frames a kept stretch has, from its start to its end."""
+    """Return how many camera frames a kept stretch has, from its start to its end."""
     return int(
         connection.execute(
             f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
@@ -540,7 +540,7 @@ def count_kept_frames(
 
 
 def cameras(connection: sqlite3.Connection, robot_id: int) -> dict[int, str]:
-    """The cameras whose frames there are, by run of the robot, the newest run first."""
+    """Return the cameras whose frames there are, by run of the robot, the newest run first."""
     return dict(
         connection.execute(
             f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} "

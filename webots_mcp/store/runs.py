@@ -206,7 +206,7 @@ def annotate_run(
 
 
 def pace(duration_s: float, wall_s: float) -> float | None:
-    """The real-time factor; None where the wall time is too short: under a second."""
+    """Return the real-time factor; None where the wall time is too short: under a second."""
     return duration_s / wall_s if wall_s >= 1 else None
 
 

@@ -245,7 +245,7 @@ def _run_history(
 
 
 def _unread(frame: Frame) -> Iterator[str]:
-    """What the frame could not read, but for what `cut_at_s` says."""
+    """Return what the frame could not read, but for what `cut_at_s` says."""
     return (str(each) for each in frame.unread if each.end_s < (frame.cut_at_s or math.inf))
 
 
@@ -356,7 +356,7 @@ def query_rows(
     after_id: int = 0,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> StatePage:
-    """The rows of a range with the values of some signals, at most `limit` of them.
+    """Return the rows of a range with the values of some signals, at most `limit` of them.
 
     Args:
         connection: Any.

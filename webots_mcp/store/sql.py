@@ -242,7 +242,7 @@ class Budget:
         return reading_texts(connection, self._text)
 
     def take(self, row: Iterable[object]) -> tuple[Cell, ...]:
-        """The values of a row as an answer has them; they are paid for."""
+        """Return the values of a row as an answer has them; they are paid for."""
         cells = tuple(self._shown(value) for value in row)
         self.left -= sum(len(str(cell).encode("utf-8", "replace")) + 1 for cell in cells)
         return cells
@@ -279,7 +279,7 @@ def fetch_rows(
 
 
 def too_slow(deadline_s: float) -> str:
-    """What to do about a statement that gave no row in time."""
+    """Return what to do about a statement that gave no row in time."""
     return (
         f"no row within {deadline_s:g} s; narrow it by run_id and sim_time_s (there is an index), "
         "use robot_statistics for long ranges, and end every recursion"
@@ -348,12 +348,12 @@ class Statement:
     deadline_s: float
 
     def encoded(self) -> bytes:
-        """The request as the process takes it."""
+        """Return the request as the process takes it."""
         return json.dumps(asdict(self), ensure_ascii=False).encode()  # what is no text fails here
 
 
 def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = None) -> SqlResult:
-    """What the process answered; one that ended itself before it could answer took too long.
+    """Return what the process answered; one that ended itself before it could answer took too long.
 
     Args:
         answer: What it wrote to stdout.
@@ -423,7 +423,7 @@ def _ask(asked: Statement) -> SqlResult:
 
 
 def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
-    """The columns of each table and view of ours; those of a person are not looked into."""
+    """Return the columns of each table and view of ours; those of a person are not looked into."""
     return {
         name: [
             column

@@ -177,14 +177,14 @@ def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
 
 
 def find_trial_set(connection: sqlite3.Connection, plan: str | None = None) -> int | None:
-    """The newest set with exactly this plan; without one the newest of all."""
+    """Return the newest set with exactly this plan; without one the newest of all."""
     return connection.execute(
         "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)", (plan,)
     ).fetchone()[0]
 
 
 def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetRecord:
-    """The set of that id.
+    """Return the set of that id.
 
     Raises:
         InvalidInputError: There is none.
@@ -211,7 +211,7 @@ def is_at_work(connection: sqlite3.Connection, found: TrialSetRecord) -> bool:
 
 
 def next_trial(connection: sqlite3.Connection, set_id: int) -> TrialRecord | None:
-    """The trial that is to be run next, or was begun; None where all are over."""
+    """Return the trial that is to be run next, or was begun; None where all are over."""
     row = connection.execute(
         f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? "
         "AND status IN ('running', 'waiting') ORDER BY status = 'waiting', number LIMIT 1",
@@ -237,7 +237,7 @@ def borrow_parameters(
 
 
 def trials_of(connection: sqlite3.Connection, set_id: int) -> list[TrialRecord]:
-    """The trials of a set, in order.
+    """Return the trials of a set, in order.
 
     Raises:
         InvalidInputError: There is no such set.
@@ -326,7 +326,7 @@ def spelled(values: Mapping[str, Any]) -> str:
 
 
 def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[int]]:
-    """The runs that have a score by their parameters in one line, the best set first.
+    """Return the runs that have a score by their parameters in one line, the best set first.
 
     Raises:
         InvalidInputError: There is no such set.
@@ -348,17 +348,17 @@ def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[i
 
 
 def best_of(plan: Mapping[str, Any]) -> Best:
-    """Which scores of a stored plan are the best."""
+    """Return which scores of a stored plan are the best."""
     return "lowest" if plan.get("best") == "lowest" else "highest"
 
 
 def count_planned(plan: Mapping[str, Any], trials: Sequence[TrialRecord]) -> int:
-    """How many trials a set has in the end; those of a search are entered as it goes on."""
+    """Return how many trials a set has in the end; those of a search are entered as it goes on."""
     return max(len(trials), int(plan.get("sets") or 0) * int(plan.get("repeats") or 1))
 
 
 def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:
-    """How many trials of a set are over, of how many, and a word."""
+    """Return how many trials of a set are over, of how many, and a word."""
     over, of, last = connection.execute(
         "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial "
         "WHERE trial_set_id = t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) "
@@ -369,7 +369,7 @@ def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, flo
 
 
 def ranking_of(trials: list[TrialRecord], best: Best) -> Ranking:
-    """The parameter sets of the trials that are over, the best first."""
+    """Return the parameter sets of the trials that are over, the best first."""
     return rank(
         [
             Outcome(each.values, each.score, each.error, pruned=each.status == "pruned")

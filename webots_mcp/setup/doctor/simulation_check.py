@@ -65,7 +65,7 @@ _LIMITS: Final = WatchLimits()
 
 @check("Simulation", needs_recording=True, well="no robot has been recorded yet")
 def simulation(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether time moves, and why it does not.
+    """Check whether time moves, and why it does not.
 
     Of the robots that stand silent in the same simulation one is watched for them all.
     """

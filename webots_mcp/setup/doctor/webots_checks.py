@@ -51,7 +51,7 @@ _SHOWN_CHARACTERS: Final = 300
 
 @check("Webots")
 def installed(_: Examined) -> Iterator[Diagnosis]:
-    """Which Webots there are."""
+    """Report which Webots there are."""
     try:
         find_webots()
     except CommandRefusedError as error:
@@ -71,7 +71,7 @@ def installed(_: Examined) -> Iterator[Diagnosis]:
 
 @check("Running Webots", well="no Webots runs on this machine")
 def running(subject: Examined) -> Iterator[Diagnosis]:
-    """Which of them run, and whether they can be steered from outside."""
+    """Report which of them run, and whether they can be steered from outside."""
     for each in subject.running_webots:
         world = f", {each.world.name}" if each.world else ""
         seen = f"port {each.port} (process {each.pid}{world}, mode {each.mode or 'of its own'})"
@@ -87,7 +87,7 @@ def running(subject: Examined) -> Iterator[Diagnosis]:
 
 @check("WSL", well="this is not WSL: Webots, controllers and server are on one side")
 def sides(subject: Examined) -> Iterator[Diagnosis]:
-    """What there is in WSL and what on Windows, and whether they meet."""
+    """Report what there is in WSL and what on Windows, and whether they meet."""
     if not is_wsl():
         return
     here = installations()
@@ -106,7 +106,7 @@ def sides(subject: Examined) -> Iterator[Diagnosis]:
 
 @check("Clients")
 def clients(subject: Examined) -> Iterator[Diagnosis]:
-    """Each file that is there, and whether its server can start on this recording."""
+    """Report each file that is there, and whether its server can start on this recording."""
     known = [*clients_of(subject.project), claude_desktop()]
     findings = [each for client in known for each in _servers_of(subject, client)]
     yield from findings
@@ -117,7 +117,7 @@ def clients(subject: Examined) -> Iterator[Diagnosis]:
 
 
 def _servers_of(subject: Examined, client: Client) -> Iterator[Diagnosis]:
-    """What a file says of our server: nothing where it names only others."""
+    """Report what a file says of our server: nothing where it names only others."""
     if not client.file.exists():
         return
     try:
@@ -179,7 +179,7 @@ def _other_place(subject: Examined, arguments: list[str]) -> str | None:
 
 @check("Server", starts_process=True)
 def server(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether a server starts, names its tools and answers."""
+    """Check whether a server starts, names its tools and answers."""
     if subject.file is None:
         yield unclear("a recording in memory belongs to one process")
         return

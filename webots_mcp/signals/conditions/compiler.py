@@ -93,7 +93,7 @@ class Condition:
         return Evaluator(Compiler(self.scanned, self.tree, plain), plain)
 
     def describe_unknown(self, known: Collection[str]) -> list[str]:
-        """A sentence for each of its signals, and the position, not among the known ones."""
+        """Return a sentence for each of its signals, and the position, not among the known ones."""
         unknown = [name for name in self.signals if name not in known]
         return [
             *(f"No signal {name!r} is published. {self._instead(name, known)}" for name in unknown),
@@ -169,7 +169,7 @@ class Evaluator:
         return values | dict(zip(names, place or (None, None), strict=True)) if names else values
 
     def missing_names(self, state: State) -> set[str]:
-        """What the condition reads and a state has no value of: signals, and `POSITION`."""
+        """Return what the condition reads and a state has no value of: signals, and `POSITION`."""
         state = self._as_dict(state)
         lacking = {name for name, read in self._readers.items() if read(state) is None}
         if self._position is not None and self._position.read(state) is None:
@@ -177,7 +177,7 @@ class Evaluator:
         return lacking
 
     def names_in(self, state: State) -> list[str]:
-        """The names of all values of a state, null or not."""
+        """Return the names of all values of a state, null or not."""
         return list(flatten(self._plain(self._as_dict(state))))
 
     def _as_dict(self, state: State) -> dict[Any, Any]:
@@ -314,7 +314,7 @@ class Compiler(Nodes):
                 code.line(f"raise {code.refer_to(fail)}({left}, {right}) from None")
 
     def _lasting(self, node: ast.Tuple) -> str:
-        """A pair whose comma is a `for`; no other comma stands outside a call."""
+        """Return a pair whose comma is a `for`; no other comma stands outside a call."""
         places = self._durations_between(node)
         if not places:
             self._refuse(
@@ -334,7 +334,7 @@ class Compiler(Nodes):
         return self._keep(Changed(self._code.function(lambda: self._value(value))))
 
     def _flag(self, node: ast.expr) -> str:
-        """A signal by itself: a flag that is true, or a number other than 0."""
+        """Return a signal by itself: a flag that is true, or a number other than 0."""
         value = self._text_refused(node, "{} is not a condition; compare it, as in mode == 'turn'")
         return f"({value} is not None and {value} != 0)"
 
@@ -352,7 +352,7 @@ class Compiler(Nodes):
     # -- values --------------------------------------------------------------------------------
 
     def _value(self, node: ast.expr) -> str:
-        """A number, a flag, a text or None."""
+        """Return a number, a flag, a text or None."""
         if isinstance(node, ast.Name) and node.id in FLAGS:
             return str(FLAGS[node.id])
         if isinstance(node, ast.Constant):

@@ -132,12 +132,12 @@ class Violated:
             each.forget()
 
     def values(self, state: State) -> dict[str, Value]:
-        """The signals of both conditions as they are in a state."""
+        """Return the signals of both conditions as they are in a state."""
         during = {} if self._during is None else self._during.values(state)
         return during | self._expected.values(state)
 
     def names_in(self, state: Any) -> list[str]:
-        """The names of all values of a state."""
+        """Return the names of all values of a state."""
         return self._expected.names_in(state)
 
 

@@ -79,14 +79,14 @@ class SignalList:
 
 
 def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, RegisteredSignal]:
-    """Every signal of the subject's robot: the registered, and those in rows in no chunk."""
+    """Return every signal of the subject's robot: the registered, and those in rows in no chunk."""
     return _signals_in(connection, subject.robot_id, [subject.run_id])
 
 
 def known_signals(
     connection: sqlite3.Connection, time_range: TimeRange
 ) -> dict[str, RegisteredSignal]:
-    """Every signal of a range's robot: the registered, and those in rows in no chunk."""
+    """Return every signal of a range's robot: the registered, and those in rows in no chunk."""
     runs = [segment.run_id for segment in time_range.segments]
     return _signals_in(connection, time_range.robot_id, runs)
 
@@ -169,7 +169,7 @@ def other_form(
 def resolve_signals(
     known: dict[str, RegisteredSignal], names: Sequence[str]
 ) -> list[RegisteredSignal]:
-    """The signals that the names mean, in the order of the names.
+    """Return the signals that the names mean, in the order of the names.
 
     A name may hold `*` (any characters, also dots). The name of a branch means all below it:
     `pose` is `pose.*`.
@@ -194,7 +194,7 @@ def resolve_signals(
 def signals_of(
     connection: sqlite3.Connection, time_range: TimeRange, names: Sequence[str]
 ) -> list[RegisteredSignal]:
-    """The signals of the range's robot that the names mean.
+    """Return the signals of the range's robot that the names mean.
 
     Raises:
         UnknownSignalError, InvalidInputError: See `resolve_signals`.
@@ -203,7 +203,7 @@ def signals_of(
 
 
 def one_signal(known: dict[str, RegisteredSignal], name: str) -> RegisteredSignal:
-    """The one signal that a name means.
+    """Return the one signal that a name means.
 
     Raises:
         UnknownSignalError: There is none.

@@ -152,12 +152,12 @@ class Frame:
         return tuple(self._source.unread)
 
     def unread_of(self, name: str) -> tuple[Unread, ...]:
-        """The same, without what concerns other signals alone."""
+        """Return the same, without what concerns other signals alone."""
         found = self._source.unread.items()
         return tuple(part for part, of in found if of == name or not isinstance(of, str))
 
     def was_read(self, name: str | None = None) -> Flags:
-        """Which rows lie in no part that could not be read, of the values asked for so far.
+        """Return which rows lie in no part that could not be read, of the values asked for so far.
 
         Args:
             name: Of which signal, where the damage of others does not matter.
@@ -178,7 +178,7 @@ class Frame:
         return len(self) < self._source.rows
 
     def parts(self, column: Column) -> Iterator[tuple[int, Decoded]]:
-        """The values of each chunk with the place of its first row, in no order.
+        """Return the values of each chunk with the place of its first row, in no order.
 
         Only of a frame that is as stored. Chunks without the signal are left out.
         """
@@ -218,7 +218,7 @@ class Frame:
         return self._decoded(STATE_IDS).numbers.astype(np.intp)
 
     def numbers(self, name: str) -> Array:
-        """The number of a signal in each row: NaN where it has none; flags are 0 and 1."""
+        """Return the number of a signal in each row: NaN where it has none; flags are 0 and 1."""
         return self._decoded(name).numbers
 
     def usable(self, name: str) -> tuple[Array, Array]:
@@ -230,7 +230,7 @@ class Frame:
         return self._decoded(name)
 
     def coded(self, name: str) -> Coded:
-        """The values of a signal, whatever they are, as codes."""
+        """Return the values of a signal, whatever they are, as codes."""
         return self._coded(name, numbers=True)
 
     def texts(self, name: str) -> Coded:
@@ -243,12 +243,12 @@ class Frame:
         return np.ones(len(self), np.bool_) if codes is None else codes != IS_ABSENT
 
     def values(self, name: str) -> list[Value]:
-        """The values as Python has them; slow, for a few rows. What was replaced is None."""
+        """Return the values as Python has them; slow, for a few rows. What was replaced is None."""
         codes, labels = self.coded(name)
         return [labels[code] for code in codes.tolist()]
 
     def values_at(self, name: str, rows: Indexes) -> list[Value]:
-        """The values in some rows, in order, of which each chunk is opened once."""
+        """Return the values in some rows, in order, of which each chunk is opened once."""
         edges = self._edges
         chunks = np.searchsorted(edges, rows, "right") - 1
         found: list[Value] = []
@@ -259,7 +259,7 @@ class Frame:
         return found
 
     def replaced(self, name: str) -> Counter[str]:
-        """How often each value that JSON cannot hold (nan, inf, ...) stood there."""
+        """Return how often each value that JSON cannot hold (nan, inf, ...) stood there."""
         zones, found = self.zone_map(name), Counter[str]()
         for span in zones.spans(zones.held_count > zones.value_count):
             values = self.rows(*span)._decoded(name)
@@ -314,7 +314,7 @@ class Frame:
         return np.minimum(np.maximum(found - self._start, 0), len(self))
 
     def rows(self, start: int, stop: int) -> Frame:
-        """Some of its rows by their places; only the chunks that they touch are opened."""
+        """Return some of its rows by their places; only the chunks that they touch are opened."""
         start, stop = max(0, start), min(len(self), stop)
         part = Frame(self._source, self._start + start, self._start + max(start, stop))
         if "times" in self.__dict__:
@@ -337,7 +337,7 @@ class Frame:
         return edges, table[:, least], table[:, greatest]
 
     def _decoded(self, column: Column) -> Decoded:
-        """All values; those of several chunks share their labels."""
+        """Return all values; those of several chunks share their labels."""
         if (part := self._part_of_whole(column)) is not None:
             return part
         key = ("values", column, self._start, self._stop)
@@ -378,7 +378,7 @@ class Frame:
         return Decoded(numbers, codes, labels)
 
     def _part_of_whole(self, column: Column) -> Decoded | None:
-        """The numbers out of those of all rows of a frame, where they are known already.
+        """Return the numbers out of those of all rows of a frame, where they are known already.
 
         Of another frame than its own they have to be whole: what could not be read may lie in rows
         that only the other one has.
@@ -533,7 +533,7 @@ def _source_of(
 def _observed_pose(
     connection: sqlite3.Connection, segment: Segment, columns: StateColumns, deadline: Deadline
 ) -> Derived:
-    """The pose of the robot by an observer, where its run has none of its own."""
+    """Return the pose of the robot by an observer, where its run has none of its own."""
     found = find_observed(connection, segment.run_id, columns)
     if found is None:
         return {}
@@ -542,7 +542,7 @@ def _observed_pose(
 
 
 def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> float | None:
-    """Where the deadline cut a segment, if it did; what is behind it is noted as unread."""
+    """Return where the deadline cut a segment, if it did; what is behind it is noted as unread."""
     if cut_at_s is None or cut_at_s >= segment.end_s:
         return None
     reached_s = max(cut_at_s, segment.start_s)
@@ -551,7 +551,7 @@ def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> 
 
 
 def deleted_part(connection: sqlite3.Connection, segment: Segment) -> Unread | None:
-    """The part of a segment whose rows and chunks retention has deleted."""
+    """Return the part of a segment whose rows and chunks retention has deleted."""
     # Where a run begins, and where what is left of it does: what is oldest goes first.
     row = connection.execute(
         "SELECT started_sim_time_s, (SELECT min(start_sim_time_s) FROM row_group "
@@ -567,7 +567,7 @@ def deleted_part(connection: sqlite3.Connection, segment: Segment) -> Unread | N
 
 
 def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame | None:
-    """The rows of a segment that only kept stretches have; None where there are none.
+    """Return the rows of a segment that only kept stretches have; None where there are none.
 
     Of a segment that is at full rate itself none: `read_frame` has them among the others.
     """
@@ -585,7 +585,7 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
 
 
 def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Frame:
-    """The rows of a source that lie in a segment, in order."""
+    """Return the rows of a source that lie in a segment, in order."""
     source.bounds = 0, source.rows
     whole = Frame(source, 0, source.rows, cut_at_s)
     if not source.is_in_order and source.order is None:

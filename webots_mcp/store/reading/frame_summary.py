@@ -124,7 +124,7 @@ def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None
 
 
 def _summary_of_zone_map(frame: Frame, name: str) -> Summary:
-    """The same from chunks; only those with the ends and the extremes are opened.
+    """Return the same from chunks; only those with the ends and the extremes are opened.
 
     The squares are combined by the formula of T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms
     for computing the sample variance", The American Statistician 37 (1983): each chunk's own plus
@@ -205,7 +205,7 @@ def weights_of_chunks(frame: Frame, zones: ZoneMap) -> tuple[Array, Flags]:
 def _time_of(
     frame: Frame, name: str, zones: ZoneMap, place: int, value: float | None, *, last: bool = False
 ) -> float:
-    """When a chunk first had a value, or any; or its last one."""
+    """Return when a chunk first had a value, or any; or its last one."""
     start = int(zones.first_row[place])
     times, numbers = frame.rows(start, start + int(zones.row_count[place])).usable(name)
     rows = np.flatnonzero(numbers == value) if value is not None else np.arange(len(times))
@@ -219,7 +219,7 @@ def frame_around(connection: sqlite3.Connection, segment: Segment, deadline: Dea
 
 
 def rows_around(run: Frame, segment: Segment) -> Frame:
-    """The same of a frame that has all rows of the run."""
+    """Return the same of a frame that has all rows of the run."""
     start, stop = run.places([segment.start_s, segment.end_s]).tolist()
     return run.rows(start - _ROWS_AROUND, stop + _ROWS_AROUND)
 
@@ -260,7 +260,7 @@ class BucketFigures(NamedTuple):
 
 
 def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buckets:
-    """At most so many buckets for the rows of a frame; a row is one where they are as few.
+    """Return at most so many buckets for the rows of a frame; a row is one where they are as few.
 
     Args:
         frame: Whose rows.
@@ -283,12 +283,12 @@ def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buck
 
 
 def _number(time_s: float, step_s: float) -> int:
-    """Which bucket holds a time."""
+    """Return which bucket holds a time."""
     return math.floor(time_s / step_s + _DUST)
 
 
 def _step(first_s: float, last_s: float, max_points: int, least_s: float) -> float:
-    """The shortest round bucket length that needs no more buckets."""
+    """Return the shortest round bucket length that needs no more buckets."""
     for step_s in _round_steps(max(least_s, (last_s - first_s) / max_points / 10, 1e-9)):
         if step_s >= least_s and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
             return step_s
@@ -304,7 +304,7 @@ def _round_steps(at_least_s: float) -> Iterator[float]:
 def cells_of(
     frame: Frame, signal: RegisteredSignal, buckets: Buckets, kept: Frame | None
 ) -> BucketFigures:
-    """What a signal comes to in each bucket.
+    """Return what a signal comes to in each bucket.
 
     Args:
         frame: The rows.
@@ -386,7 +386,7 @@ def _in_order(some: Sequence[_Parts]) -> _Parts:
 
 
 def _of_rows(frame: Frame, start: int, numbers: Array) -> _Parts:
-    """Each row that has a usable number."""
+    """Return each row that has a usable number."""
     rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
     held = numbers if len(rows) == len(numbers) else numbers[rows]
     ones = np.ones(len(rows))
@@ -428,7 +428,7 @@ def _weighted_means(parts: _Parts, starts: Indexes) -> Array:
 
 
 def _circular_means(parts: _Parts, starts: Indexes, turn: float, low: Array) -> Array:
-    """The direction of the resultant vector; NaN where the vectors cancel out.
+    """Return the direction of the resultant vector; NaN where the vectors cancel out.
 
     K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.2.1.
     """
@@ -497,7 +497,7 @@ def change_points(
     frame: Frame | None = None,
     since: bool = True,
 ) -> ChangePoints:
-    """The change points of signals in a segment, at any length of it.
+    """Return the change points of signals in a segment, at any length of it.
 
     Args:
         connection: Any.
@@ -541,7 +541,7 @@ def change_points(
 def _in_force(
     before: Frame, signal: RegisteredSignal, at_begin: Point | None, *, since: bool
 ) -> Point | None:
-    """The point of the value in force when a segment begins; None where it is not found.
+    """Return the point of the value in force when a segment begins; None where it is not found.
 
     Args:
         before: The rows before the segment.
@@ -563,7 +563,7 @@ def _in_force(
 
 
 def _is_hidden(before: Frame, signal: RegisteredSignal, time_s: float) -> bool:
-    """Whether the row before a time is one whose value could not be read."""
+    """Return whether the row before a time is one whose value could not be read."""
     row = int(before.places([time_s])[0])
     return row > 0 and not before.rows(row - 1, row).was_read(signal.name).all()
 
@@ -582,7 +582,7 @@ def _first_of_last_equal(frame: Frame, signal: RegisteredSignal, value: str | bo
 
 
 def _points_in(frame: Frame, signal: RegisteredSignal) -> list[Point]:
-    """The first value of a frame, and each that is unlike the one before."""
+    """Return the first value of a frame, and each that is unlike the one before."""
     values, codes = _valued(frame, signal)
     times = frame.times
     if frame.unread:
@@ -594,7 +594,7 @@ def _points_in(frame: Frame, signal: RegisteredSignal) -> list[Point]:
 
 
 def _valued(frame: Frame, signal: RegisteredSignal) -> tuple[list[str | bool | None], Indexes]:
-    """The values of a signal as its kind has them, and of each row which one it has."""
+    """Return the values of a signal as its kind has them, and of each row which one it has."""
     codes, labels = frame.coded(signal.name)
     of_label = [_value(signal, label) for label in labels]
     values = list(dict.fromkeys(of_label))
@@ -658,10 +658,10 @@ def time_by_value(points: Sequence[Point], start_s: float, end_s: float) -> dict
 
 
 def longest_values(points: Sequence[Point], start_s: float, end_s: float) -> dict[str, float]:
-    """The same for at most 20 values: a text that is no mode has too many."""
+    """Return the same for at most 20 values: a text that is no mode has too many."""
     return dict(list(time_by_value(points, start_s, end_s).items())[:MOST_VALUES])
 
 
 def spelled(value: str | bool | None) -> str:
-    """A value as a name: true, false, null, or the text."""
+    """Return a value as a name: true, false, null, or the text."""
     return value if isinstance(value, str) else {True: "true", False: "false", None: "null"}[value]

@@ -65,7 +65,7 @@ _LONGEST_SHOWN: Final = 80
 
 
 def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
-    """The time of a run's newest row before a time; None where there is none."""
+    """Return the time of a run's newest row before a time; None where there is none."""
     if (run := frame_of_purged(connection, run_id)) is not None:
         place = int(run.places([sim_time_s])[0])
         return float(run.rows(place - 1, place).times[0]) if place else None
@@ -77,7 +77,7 @@ def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -
 
 
 def _row_from(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
-    """The time of a run's oldest row from a time on; None where there is none."""
+    """Return the time of a run's oldest row from a time on; None where there is none."""
     if (run := frame_of_purged(connection, run_id)) is not None:
         place = int(run.places([sim_time_s])[0])
         return float(run.rows(place, place + 1).times[0]) if place < len(run) else None
@@ -156,12 +156,12 @@ def hit_notes(
 
 
 def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
-    """How many of the published states a run's rows are, in a sentence."""
+    """Return how many of the published states a run's rows are, in a sentence."""
     return unrecorded(connection, run_id) or "every publish() call is a row, so nothing was missed"
 
 
 def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
-    """What of the published states is not in a run's rows; None where all of them are."""
+    """Return what of the published states is not in a run's rows; None where all of them are."""
     row = connection.execute(
         "SELECT s.throttle_interval, EXISTS (SELECT 1 FROM event WHERE run_id = r.id "
         "AND kind = 'dropped') FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?",
@@ -316,7 +316,7 @@ def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, flo
 
 
 def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
-    """All rows of a run; None without any."""
+    """Return all rows of a run; None without any."""
     bounds = recorded_bounds(connection, run_id)
     if bounds is None:
         return None
@@ -325,7 +325,7 @@ def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
 
 
 def _rated(connection: sqlite3.Connection, segment: Segment) -> Segment:
-    """The segment, which knows whether it is kept at full rate.
+    """Return the segment, which knows whether it is kept at full rate.
 
     It is where it holds nothing but rows of one stretch, and not too many of them.
     """
@@ -340,7 +340,7 @@ def _rated(connection: sqlite3.Connection, segment: Segment) -> Segment:
 
 
 def _has_rows(connection: sqlite3.Connection, run_id: int, span: tuple[float, float]) -> bool:
-    """Whether a row lies in [start, end), be it that it is left in a chunk alone."""
+    """Return whether a row lies in [start, end), be it that it is left in a chunk alone."""
     if span[0] >= span[1] or rows_in("state", connection, run_id, span, 1):
         return span[0] < span[1]
     return len(read_frame(connection, Segment(run_id, *span), Deadline())) > 0
@@ -381,7 +381,7 @@ def _in_simulation_time(
 
 
 def _rate_notes(connection: sqlite3.Connection, segment: Segment) -> list[str]:
-    """Where more than what the throttle lets through is a row."""
+    """Return where more than what the throttle lets through is a row."""
     span = (segment.run_id, segment.start_s, segment.end_s)
     kept = kept_notes(connection, *span)
     if segment.full_rate:
@@ -446,7 +446,7 @@ def _in_wall_time(
 def _cut(
     connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
 ) -> Segment | None:
-    """The part of a run from its first to its last row in [wall_start_s, wall_end_s)."""
+    """Return the part of a run from its first to its last row in [wall_start_s, wall_end_s)."""
     recorded = recorded_bounds(connection, run_id)
     if recorded is None:
         return None
@@ -517,6 +517,6 @@ def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None
 def find_subject(
     connection: sqlite3.Connection, robot: str | None = None, run_id: int | None = None
 ) -> Subject:
-    """The subject of a question; see `choose` and `require_run`."""
+    """Return the subject of a question; see `choose` and `require_run`."""
     chosen, run = choose(connection, robot, run_id, time.time())
     return Subject(chosen.id, chosen.name, require_run(chosen, run).id)

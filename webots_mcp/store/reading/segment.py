@@ -41,7 +41,7 @@ _IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 
 
 def shown_time(time_s: float) -> float:
-    """A simulation time as answers show it: to the millisecond."""
+    """Return a simulation time as answers show it: to the millisecond."""
     return round(time_s, _DECIMALS)
 
 
@@ -57,7 +57,7 @@ def moment_of(time_s: float) -> float:
 
 
 def just_after(time_s: float) -> float:
-    """The end of a half-open range that holds `time_s` as its last moment."""
+    """Return the end of a half-open range that holds `time_s` as its last moment."""
     return math.nextafter(time_s, math.inf)
 
 
@@ -231,7 +231,7 @@ def full_rate_segments(
 
 
 def newest_kept(connection: sqlite3.Connection, run_id: int) -> FullRateSegment | None:
-    """The stretch of a run that begins last."""
+    """Return the stretch of a run that begins last."""
     row = connection.execute(_FULL_RATE_SEGMENTS, (run_id, -math.inf, math.inf, 1)).fetchone()
     return row and _as_written(connection, run_id, FullRateSegment(*row))
 
@@ -271,7 +271,7 @@ def full_rate_parts(
 def kept_notes(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[str]:
-    """Which parts of a range are kept at full rate, and why."""
+    """Return which parts of a range are kept at full rate, and why."""
     found = full_rate_parts(connection, run_id, start_s, end_s)
     if not found:
         return []
@@ -283,7 +283,7 @@ def kept_notes(
 def rows_in(
     table: str, connection: sqlite3.Connection, run_id: int, span: tuple[float, float], most: int
 ) -> int:
-    """How many rows of a run lie in [start, end), counted no further than matters.
+    """Return how many rows of a run lie in [start, end), counted no further than matters.
 
     Args:
         table: `state` or `kept_state`.
@@ -327,7 +327,7 @@ def choose(
 
 
 def require_run(robot: RobotRecord, run: RunRecord | None) -> RunRecord:
-    """The run.
+    """Return the run.
 
     Raises:
         NothingRecordedError: The robot's controller has begun none.

@@ -386,7 +386,7 @@ class _Reading:
         return place._replace(faults=_NO_FAULTS)
 
     def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
-        """Return the ids of session and robot, the last entry's number, the newest state and run."""
+        """Return the ids of session and robot, number of the last entry, newest state, run."""
         connection = self.connection
         # Bridges recover their own rows. Journals have no monotonic clock.
         if connection.execute(

@@ -1,4 +1,4 @@
-"""What the values of signals tell of their meaning, where nothing else does."""
+"""Derive the meaning of signals from their values, if nothing else states it."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from webots_mcp.signals.meaning import Meaning, meaning_by_behaviour
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal
 
-_PARTS: Final = 4  # of a run, whose rows are read
-_ROWS: Final = 512  # of each part
+_PARTS: Final = 4  # rows of a run that are read
+_ROWS: Final = 512  # rows of each part
 
 
 def with_behaviour(
     meanings: Mapping[str, Meaning], known: Mapping[str, RegisteredSignal], frame: Frame
 ) -> dict[str, Meaning]:
-    """Return the meanings with what some values of each number of unknown meaning tell.
+    """Return the meanings, completed by the behaviour of each number of unknown meaning.
 
     Args:
-        meanings: As declared, known from devices or named.
+        meanings: The meanings as declared, known from devices or named.
         known: The signals.
         frame: The rows of a run.
     """
@@ -44,7 +44,10 @@ def _unknown(
 
 
 def _told_by(frame: Frame, name: str) -> Meaning:
-    """What parts of the run tell together: the first that tells something, if no other differs."""
+    """Return the meaning that parts of the run show.
+
+    Theirs if they agree, else that of all values.
+    """
     starts = range(0, len(frame), max(_ROWS, -(-len(frame) // _PARTS)))
     parts = [frame.rows(start, start + _ROWS).usable(name)[1].tolist() for start in starts]
     told = [meaning_by_behaviour(part) for part in parts if part]

@@ -76,7 +76,7 @@ def room_tokens(
 
     Args:
         asked: The most rows or points that were asked for.
-        beside: What stands beside the rows and the header; where it is long, rows have less room.
+        beside: What the answer holds next to rows and header; if it is long, rows have less space.
         usual_tokens: The most, where it was not said how many rows.
     """
     if is_for_a_person():

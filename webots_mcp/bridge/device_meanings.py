@@ -15,7 +15,7 @@ from webots_mcp.bridge.lidar_summary import SECTORS
 from webots_mcp.bridge.scene_nodes import world_up_axis
 from webots_mcp.signals.meaning import LONGEST_NAME, DeclaredMeaning, Quantity
 
-_MOST_MOTORS: Final = 64  # that are looked up in the scene: each takes about ten requests
+_MOST_MOTORS: Final = 64  # that are searched in the scene: each takes about ten requests
 _AXLE: Final = 0.9  # of an axle's direction lies across the robot
 _PARTNER: Final = 0.25  # by this share of its distance from the middle a wheel's partner may differ
 _MOST_LEVELS: Final = 4  # of nodes within a bounding object

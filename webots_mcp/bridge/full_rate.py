@@ -52,7 +52,7 @@ class _MemoryBytes:
 
 
 class KeptSegment:
-    """A segment of a run of which every call is kept.
+    """A segment of a run of which every call is recorded.
 
     Attributes:
         end_s: Simulation time of its end, which is in the future while it is being recorded.

@@ -281,7 +281,7 @@ class MCPBridge:
         that overlap become one; at most 600 s of a run are kept.
 
         Args:
-            reason: Why they are kept; it is stored with the stretch.
+            reason: Why they are kept; it is stored with the segment.
         """
         try:
             self._session.full_rate.keep(text_of(reason))

@@ -87,7 +87,7 @@ _FOR_GOOD: Final = (
     ForeignDatabaseError, ForkedProcessError, SchemaTooNewError, SchemaTooOldError,
 )  # fmt: skip
 
-_LOST: Final = ("no such table", "FOREIGN KEY")  # in SQLite's error where a table or a row is gone
+_LOST: Final = ("no such table", "FOREIGN KEY")  # in SQLite's error if a table or a row was removed
 
 Result = TypeVar("Result")
 
@@ -454,7 +454,7 @@ class Recorder:
     def _put(self, row: Row) -> None:
         """Let a row wait in memory, without the connection lock."""
         self._backlog.put(row)
-        if self.off is not None:  # the bridge was closed meanwhile, and no other call looks at it
+        if self.off is not None:  # the bridge was closed meanwhile, and no other call checks it
             self._backlog.drop_rows_in_memory(self.off)
 
     def _keep(self, row: Row) -> None:

@@ -1,8 +1,8 @@
 """The console commands.
 
 The commands are a table in `commands`; what one needs is imported inside it, so that each answers
-at once. Our own errors end it with one line on stderr and exit code 2,
-what the system refuses (a full disk) or lacks (a package) with 1, Ctrl-C and SIGTERM with 130, 143.
+at once. Errors of webots-mcp end it with one line on stderr and exit code 2, refusals of the system
+(a full disk) and missing packages with 1, Ctrl-C and SIGTERM with 130 and 143.
 """
 
 from __future__ import annotations

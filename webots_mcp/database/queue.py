@@ -56,7 +56,7 @@ FINISH: Final = (
     "UPDATE command SET status = :status, finished_wall_time_s = :now, "
     f"finished_sim_time_s = :sim_time, result = :result, error = :error {_OF_CLAIMER}"
 )
-# The process that asked for the reload is gone; that this one runs is the proof that it worked.
+# The process that requested the reload has ended; that this one runs proves that it worked.
 CONFIRM_RELOAD: Final = (
     "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
     "finished_sim_time_s = :sim_time, result = json_object('run_id', :run, 'mode', :mode, "

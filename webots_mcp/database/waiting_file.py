@@ -309,11 +309,11 @@ class WaitingFile:
     """The entries of one session that wait next to its database, written by that session.
 
     The file is made with the first entry and stays locked while it is open: a file that is not
-    locked belongs to a process that is gone. All calls come from one thread at a time.
+    locked belongs to a process that has ended. All calls come from one thread at a time.
 
     Args:
         path: See `waiting_path`.
-        describe_session: Who records, as `adopt` enters it into a database that does not know.
+        describe_session: The recording process, as `adopt` enters it into a database without it.
     """
 
     def __init__(self, path: Path, describe_session: Callable[[], dict[str, Any]]) -> None:
@@ -355,7 +355,9 @@ class WaitingFile:
         if file is None:
             return
         if remove:
-            file.truncate(len(self._header))  # who finds it before it is gone finds nothing in it
+            file.truncate(
+                len(self._header)
+            )  # a process that finds it before its deletion finds nothing in it
         file.close()
         if remove:
             with contextlib.suppress(OSError):

@@ -79,7 +79,7 @@ class Room:
     Attributes:
         points: How many buckets a curve is made of.
         panels: How many panels are readable below each other.
-        lanes: How many rows of modes and flags have room below the panels.
+        lanes: Number of rows of modes and flags that fit below the panels.
         rows: The same with the rows of events.
     """
 
@@ -161,7 +161,7 @@ class Canvas:
     ) -> None:  # fmt: skip
         """Add a text in one line; `y` is where its letters stand.
 
-        No text turns the direction of what stands beside it, nor breaks the XML.
+        No text changes the direction of its surroundings or breaks the XML.
         """
         text = spelled_out(text)
         self._texts.append(text)
@@ -238,7 +238,7 @@ def _missing_fonts(texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def _is_foreign(character: str) -> bool:
-    """Return whether a font may lack a character: not ASCII, and no space, control or accent."""
+    """Return whether a font may not have a character: not ASCII, no space, control or accent."""
     unseen = ("Cc", "Cf", "Zs", "Zl", "Zp", "Mn", "Me")
     return not character.isascii() and unicodedata.category(character) not in unseen
 

@@ -463,7 +463,7 @@ class _TrajectoryPainter:
     def _line(
         self, frame: AxesBox, stretches: Any, colour: str, width: float, **style: Any
     ) -> None:
-        """One line, broken between the stretches."""
+        """One line, broken between the segments."""
         drawn = [np.array(thinned(each))[:, 1:] for each in stretches if len(each) > 1]
         if drawn:
             d = "".join(line_through(frame.px(each[:, 0]), frame.py(each[:, 1])) for each in drawn)

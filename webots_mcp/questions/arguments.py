@@ -21,7 +21,7 @@ from webots_mcp import contract
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90
-FOR_A_PERSON: Final = "person"  # the context of a validation: whoever waits can press Ctrl-C
+FOR_A_PERSON: Final = "person"  # the context of a validation: a person who waits can press Ctrl-C
 LONGEST_NAME: Final = 200
 _CURSOR: Final = "Cursor of the previous answer, to continue it."
 

@@ -20,7 +20,7 @@ from webots_mcp.setup.doctor import Checked, diagnose, subject_of, worst
 from webots_mcp.store.recording import RecordingAccess
 
 _LONGEST_TEXT: Final = 320
-_BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
+_BUDGET_TOKENS: Final = 1_250  # further checks are only named
 
 
 @question("Diagnose the set-up", READS, tier="core")

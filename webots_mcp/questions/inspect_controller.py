@@ -168,7 +168,7 @@ def _answer(view: RobotView, found: Inspection, others: list[list[Any]]) -> Insp
 
 
 def _fitting(frames: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
-    """Return the frames, shortened where they are long; the innermost ones keep their room."""
+    """Return the frames, shortened if they are long; the innermost ones keep their length."""
     shown = shorten(frames, RESULT_BUDGET_TOKENS).value
     return cast("list[dict[str, Any]]", shown) if isinstance(shown, list) else frames[:1]
 

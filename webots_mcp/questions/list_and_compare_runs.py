@@ -483,7 +483,7 @@ def _medians(spreads: Sequence[Spread | None]) -> list[float | None]:
 
 
 def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None] | None:
-    """Return the least and the greatest of each group; None where each group is one run."""
+    """Return the minimum and the maximum of each group; None where each group is one run."""
     if all(each is None or each.low == each.high for each in spreads):
         return None
     return [None if each is None else figures([each.low, each.high]) for each in spreads]

@@ -1,4 +1,4 @@
-"""Watching a robot for a while, or looking back: what was recorded in that window."""
+"""Watch a robot for a while, or report what was recorded in a past window."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _found(connection: sqlite3.Connection, view: RobotView, wall_start_s: float)
 
 
 def _unlooked(verdicts: Verdicts) -> Verdicts:
-    """With the kinds that were not asked for because there is no row to look at."""
+    """Add the kinds that were not searched because there is no row."""
     others = [each.name for each in asked_kinds(EventOptions()) if each.name not in _ROWLESS.kinds]
     why = dict.fromkeys(others, ("no row was recorded in that time",))
     return replace(verdicts, reasons=verdicts.reasons | why)

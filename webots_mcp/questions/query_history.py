@@ -225,7 +225,7 @@ def _series(
         if tokens <= budget_tokens or points == 1:
             break
         points = max(1, int(points * 0.9 * budget_tokens / tokens))
-    # Told once for all runs: the names would take more room than the values.
+    # Reported once for all runs: the names would take more space than the values.
     dropped = (_drop_signals(run, budget_tokens // len(runs)) for run in runs)
     left_out = [*dict.fromkeys(name for names in dropped for name in names)]
     where = f"run {runs[0].run_id}" if len(runs) == 1 else "one run or more"

@@ -92,7 +92,7 @@ class StateSizes:
         events_tokens: Budget of the events.
         page: Members, items or characters of a page, unless a limit is given.
         names: Names in a hint.
-        margin_tokens: Budget that is kept for hints.
+        margin_tokens: Budget that is reserved for hints.
         replaced: Replaced values.
         devices: Devices that the state does not name.
         error_characters: Characters of an error or a reason.
@@ -374,7 +374,7 @@ def _dropped(view: RobotView, of_session: int) -> int:
 
 
 def _kept(view: RobotView) -> str | None:
-    """Return which seconds of the run were kept last at full rate, and why."""
+    """Return the last full-rate segment of the run, and its reason."""
     newest = newest_kept(view.connection, view.run.id) if view.run else None
     if newest is None or view.run is None:
         return None

@@ -48,8 +48,8 @@ _UNITS: Final = {  # as people write them, and as names are understood
 LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is declared for
 _LONGEST_UNIT: Final = 20  # characters
 _BAD_UNIT: Final = "signal {!r}: unit must be a text of up to {} characters, such as 'm/s', not {}"
-_REMEMBERED: Final = 4096  # names whose words are kept
-_ROBOTS_REMEMBERED: Final = 16  # lists of names whose meanings are kept
+_REMEMBERED: Final = 4096  # names whose words are cached
+_ROBOTS_REMEMBERED: Final = 16  # lists of names whose meanings are cached
 
 # -- the words of names ------------------------------------------------------------------------
 
@@ -98,7 +98,7 @@ INPUTS: Final = frozenset((  # what a person moves by hand
     "keyboard", "key", "button", "input",
 ))  # fmt: skip
 _HEADINGS: Final = frozenset(("heading", "yaw"))
-_OF_HEADINGS: Final = frozenset((  # who measures a heading, and what else may stand beside it
+_OF_HEADINGS: Final = frozenset((  # what measures a heading, and words next to it
     "compass", "gyro", "gyroscope", "imu", "gps", "gnss", "odometry", "estimate", "estimated",
     "fused", "ekf", "true", "robot", "body", "base", "raw", "rad", "deg", "value", "angle",
 )) | _MEASURED | _TARGET | _COMMAND  # fmt: skip
@@ -325,7 +325,7 @@ def _array_reduced_to(name: str, names: frozenset[str]) -> str | None:
 
 
 def _of_reduction(name: str, array: str, names: Iterable[str]) -> Meaning:
-    """What sums up an array: the least, the greatest and the mean are values of its quantity."""
+    """Return the meaning of a reduction: minimum, maximum and mean have the array's quantity."""
     last = name.rpartition(".")[2]
     if last in ("count", "argmin"):
         why = "how many items an array has" if last == "count" else "which item is the least"

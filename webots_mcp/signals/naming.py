@@ -336,7 +336,7 @@ def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]
 def misfit_of_parameters(
     given: Iterable[str], known: Sequence[str] | None, required: Iterable[str], action: str
 ) -> str | None:
-    """Return the error of parameters that an action does not take, or that it lacks.
+    """Return the error for parameters that an action does not take, or that are missing.
 
     Args:
         given: The names that were given.

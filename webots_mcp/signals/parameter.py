@@ -37,8 +37,8 @@ class Declaration(NamedTuple):
 
     Attributes:
         kind: `float`, `int`, `bool` or `str`.
-        low: The least value; None without a bound. Only numbers have bounds.
-        high: The greatest value; None without a bound.
+        low: The minimum; None without a bound. Only numbers have bounds.
+        high: The maximum; None without a bound.
         choices: All values that it may have; None where it may have others.
         doc: What it does.
         unit: Of a number.

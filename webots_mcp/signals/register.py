@@ -185,14 +185,14 @@ def unit_of(name: str, kind: Kind) -> str | None:
 # The outcome stands in `signal.role`, where tools, views and pools read it:
 #
 #     x, y, z           position; z where it has one
-#     yaw               where the robot looks
+#     yaw               where the robot faces
 #     mode              what it is doing: a text, or a whole number with few different values
 #     commanded_speed   how fast it shall be
 #     speed             how fast it is; the name leaves open whether it is commanded or measured
 #     wheel             how fast one of its several wheels or driving motors turns
 #     commanded_wheel   how fast one of them shall turn
 #
-# The robot's other names decide as well: `pose.0` is x only beside `pose.1`. Where several signals
+# The robot's other names decide as well: `pose.0` is x only next to `pose.1`. Where several signals
 # fit, a run may have the second alone, as its code was another: so each has a place in line, `x`
 # before `x2` (with `y2`, `z2`) up to `x9`, and the first that is there counts.
 
@@ -258,7 +258,7 @@ def _apart(pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
 def _height(known: Mapping[str, Kind], x: str, *, first: bool) -> str | None:
     """The third of the position's numbers, or an altitude next to it; for the first at the top too.
 
-    The third of a pose or odometry of three is where it looks.
+    The third of a pose or odometry of three is its heading.
     """
     branch, _, axis = x.rpartition(".")
     third = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
@@ -389,7 +389,7 @@ class Changes(NamedTuple):
 def find_changes(
     connection: sqlite3.Connection, robot_id: int, seen: Mapping[str, Seen]
 ) -> Changes:
-    """Return what the register of a robot lacks once these values are recorded.
+    """Return what is missing in the register of a robot once these values are recorded.
 
     Names beyond `MAX_SIGNALS` of a robot stay out. Of each name the kind is widened; which roles
     the names have is decided anew.
@@ -447,13 +447,13 @@ def write_changes(connection: sqlite3.Connection, robot_id: int, changes: Change
     connection.executemany(statement, changed)
 
 
-# What a recorder looks at in each state: names that are new, and changes of what the robot does.
+# What a recorder checks in each state: names that are new, and changes of what the robot does.
 
 
 class SignalNames:
     """What the register has of this session's names.
 
-    A state is looked at where its keys at the top or the number of its values are new, and in the
+    A state is checked if its keys at the top or the number of its values are new, and in the
     2nd, 4th, 8th, ... row of the session: what was null at first may have a value by then.
     """
 

@@ -261,7 +261,7 @@ class Observer:
             return False
         try:
             self._observe()
-        except Exception as error:  # noqa: BLE001  (it still steers, and looks again later)
+        except Exception as error:  # noqa: BLE001  (it still steers, and tries again later)
             self.bridge.failed(error)
         self.bridge.get_command()
         return True

@@ -215,12 +215,12 @@ class Controller(ControllerEndpoint):
 
     @property
     def awaits_quit(self) -> bool:
-        """Return whether it is connected and was not told to quit yet."""
+        """Return whether it is connected and was not ordered to quit yet."""
         return self.connection is not None and not self.was_told
 
     @property
     def is_leaving(self) -> bool:
-        """Return whether it was told to quit, or has disconnected, and still runs."""
+        """Return whether it was ordered to quit, or has disconnected, and still runs."""
         is_going = self.was_told or self.has_left
         return is_going and (self.is_running or self.connection is not None)
 

@@ -471,7 +471,7 @@ class ChunkProgress(NamedTuple):
         end_s: Simulation time of the last of them; -inf before the first chunk.
         last_state_id: Its id; rows with the same time are ordered by id.
         max_state_id: Rows up to that place with greater ids arrived late and are in no chunk.
-        max_in_groups: The greatest id of a row that is in a chunk.
+        max_in_groups: The highest id of a row that is in a chunk.
     """
 
     end_s: float

@@ -474,7 +474,7 @@ def _no_workers(address: str, when: str) -> str:
 def _call(*arguments: Any) -> Callable[[str], Any]:
     """Return a function that calls a function by its name with these arguments.
 
-    The scheduler unpickles what it passes on, and may lack this package. Only a worker resolves
+    The scheduler unpickles what it passes on, and may not have this package. Only a worker resolves
     the name.
     """
     toolz: Any = import_module("toolz")  # A dependency of Dask.

@@ -2,7 +2,7 @@
 
 The runs are written into a temporary recording with the same ids, which is merged like any other:
 by UUIDs, each run completely or not at all. Fetching can therefore be killed at any time, and
-repeated. A run that lacks rows comes as one whose rows were purged.
+repeated. A run with missing rows arrives as one whose rows were purged.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class _Fetcher:
         """Store the number of missing rows of each run, and drop runs that are still shipped.
 
         Returns:
-            The runs that lack rows.
+            The runs with missing rows.
         """
         lacking: list[int] = []
         uuids = {run.run_id: run.uuid for run in runs}
@@ -244,7 +244,9 @@ class _Copy:
 
     def __init__(self, pool: Pool, recording_uuid: str, small: sqlite3.Connection) -> None:
         self._pool, self._recording_uuid, self._small = pool, recording_uuid, small
-        small.execute("PRAGMA foreign_keys=OFF")  # A pool may lack rows that others refer to.
+        small.execute(
+            "PRAGMA foreign_keys=OFF"
+        )  # Rows that others refer to may be missing in a pool.
 
     def context(self, run_ids: Collection[int]) -> None:
         """Copy the runs, their robots and signals, and what belongs to their sessions."""

@@ -36,7 +36,7 @@ _NO_PROJECT: Final = (
 
 @check("Controllers")
 def controllers(subject: Examined) -> Iterator[Diagnosis]:
-    """Report which record, which lack the two lines, and whose Python lacks the package."""
+    """Report which record, which need the two lines, and whose Python needs the package."""
     project = find_project(subject.project)
     if project is None:
         yield unclear(_NO_PROJECT)
@@ -118,7 +118,7 @@ def supervisor(subject: Examined) -> Iterator[Diagnosis]:
 
 
 def _of_project(project: Path) -> Iterator[Diagnosis]:
-    """Report which of its robots lack a supervisor's rights, by its code, else by its worlds."""
+    """Report which of its robots have no supervisor's rights, by its code, else by its worlds."""
     known = controllers_of(project)
     for each in known:
         if each.is_python and is_plain_robot(each.file):
@@ -133,7 +133,7 @@ def _of_project(project: Path) -> Iterator[Diagnosis]:
 
 
 def _of_robot(view: RobotView) -> Diagnosis:
-    """Return what a robot that records now lacks."""
+    """Return what is missing for a robot that records now."""
     name = view.robot.name
     observer = live_observer(view.connection, view.session, view.now_s)
     if observer is not None:

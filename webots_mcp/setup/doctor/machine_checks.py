@@ -202,7 +202,7 @@ def _is_in(path: str, point: str) -> bool:
 
 @check("Free space", well=_IN_MEMORY)
 def free_space(subject: Examined) -> Iterator[Diagnosis]:
-    """Check whether there is room for what will be recorded."""
+    """Check whether there is space for what will be recorded."""
     if subject.file is None:
         return
     folder = next(folder for folder in subject.file.parents if folder.exists())

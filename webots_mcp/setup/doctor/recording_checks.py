@@ -1,4 +1,4 @@
-"""Checks of a recording: whether it can be read, who writes to it, and what waits in it.
+"""Check a recording: whether it can be read, which processes write to it, and what waits in it.
 
 Each check names the robot or the file that it is about.
 """

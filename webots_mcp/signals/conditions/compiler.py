@@ -42,7 +42,7 @@ from webots_mcp.signals.naming import NO_POSITION, Value, find_position, flatten
 POSITION: Final = "the position"  # what a displacement reads, whatever its signals are called
 _MOST_OFFERED: Final = 3
 MAX_DURATION_S: Final = 3600.0
-_MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a place that is so many times as old
+_MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a position that is N times as old
 
 Number: TypeAlias = "int | float"
 

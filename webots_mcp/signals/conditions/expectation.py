@@ -27,7 +27,7 @@ class Expectation:
         name: As it is reported.
         expected: What shall hold.
         during: Only while this holds; None: always.
-        within_s: It shall hold once, so many seconds after the run began at the latest; None: in
+        within_s: It must hold once, at most N seconds after the run began; None: in
             each state.
     """
 

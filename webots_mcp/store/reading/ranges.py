@@ -1,4 +1,4 @@
-"""The one place where it is defined what a question is about: robot, run and stretch of time.
+"""Define what a question is about: robot, run and time range. No other module does.
 
 A `Scope` says what was asked for, a `TimeRange` what that is in a recording. A range is half-open,
 [start, end), and given in one of three ways:

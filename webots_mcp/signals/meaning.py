@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Final, Literal, NamedTuple, get_args
@@ -136,9 +137,6 @@ ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint p
 _NO_SENSOR: Final = frozenset[Quantity | None]((
     None, "colour", "count", "flag", "mode", "text", "time",
 ))  # fmt: skip
-_NEARLY_A_TURN: Final = 0.9  # of a turn, that an angle leaps where its scale ends
-_FEW_LEVELS: Final = 8  # different values of something that is quantised
-_LEAST_VALUES: Final = 20  # of fewer values nothing follows
 _CHOICES: Final[dict[str, tuple[str, ...]]] = {
     "quantity": QUANTITIES, "role": ROLES, "side": SIDES,
 }  # fmt: skip
@@ -155,6 +153,24 @@ _OF_SPEEDS: Final = frozenset((
     "m", "mm", "cm", "s", "km", "h", "ps", "mps", "setpoint", "desired", "reference", "body",
     "gps", "base", "odometry",
 ))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class BehaviourRules:
+    """What the values of an unknown signal must show before a meaning follows.
+
+    Attributes:
+        turn_share: Share of a turn that an angle jumps at the end of its scale.
+        levels: Different values up to which a signal counts as quantised.
+        values: Number of values from which something follows.
+    """
+
+    turn_share: float = 0.9
+    levels: int = 8
+    values: int = 20
+
+
+_BEHAVIOUR: Final = BehaviourRules()
 
 
 @lru_cache(maxsize=_REMEMBERED)
@@ -368,7 +384,7 @@ def meaning_by_behaviour(values: Sequence[float]) -> Meaning:
         A meaning of the source `behaviour`, on which a warning may rest; else an unknown one. What
         is constant or quantised has no quantity.
     """
-    if len(values) < _LEAST_VALUES:
+    if len(values) < _BEHAVIOUR.values:
         return UNKNOWN
     levels = set(values)
     if len(levels) == 1:
@@ -380,16 +396,21 @@ def meaning_by_behaviour(values: Sequence[float]) -> Meaning:
     is_whole = all(value == int(value) for value in values)
     falls = [after for before, after in pairwise(values) if after < before]
     falls_to_start = not falls or max(falls) <= min(levels) + 1
-    if is_whole and falls_to_start and len(rises) > len(steps) / 2 and len(levels) > _FEW_LEVELS:
+    if (
+        is_whole
+        and falls_to_start
+        and len(rises) > len(steps) / 2
+        and len(levels) > _BEHAVIOUR.levels
+    ):
         return _behaves("count", "its whole numbers only rise, or begin again")
     for turn, unit in ((math.tau, "rad"), (360.0, "deg")):
         fits = max(map(abs, values)) <= turn * 1.01 and max(values) - min(values) <= turn * 1.01
-        leaps = [step for step in steps if abs(step) >= _NEARLY_A_TURN * turn]
-        others = [abs(step) for step in steps if abs(step) < _NEARLY_A_TURN * turn]
+        leaps = [step for step in steps if abs(step) >= _BEHAVIOUR.turn_share * turn]
+        others = [abs(step) for step in steps if abs(step) < _BEHAVIOUR.turn_share * turn]
         if fits and leaps and others and max(others) < turn / 4:
             angle = _behaves("heading", "it leaps by a full turn, as an angle does")
             return angle._replace(unit=unit)
-    if len(levels) <= _FEW_LEVELS:
+    if len(levels) <= _BEHAVIOUR.levels:
         return _behaves(None, f"it has only {len(levels)} different values")
     return UNKNOWN
 

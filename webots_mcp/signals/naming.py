@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
 from typing import Any, Final, Literal, TypeAlias
@@ -31,7 +32,6 @@ _UNITS: Final = {
     "km_h": "km/h", "kmh": "km/h", "rpm": "rpm", "ms": "ms", "s": "s", "hz": "Hz", "v": "V",
     "a": "A", "w": "W", "nm": "N·m", "n": "N", "kg": "kg", "percent": "%", "bytes": "B",
 }  # fmt: skip
-_LONGEST_UNIT: Final = 3  # words: m_per_s
 _ANGLES: Final = ("yaw", "heading", "theta", "bearing", "roll", "pitch")
 _ANGLES_IF_UNIT: Final = (*_ANGLES, "course")  # a course without a unit may be of anything
 _KEPT: Final = 4096  # names whose units are remembered
@@ -96,8 +96,24 @@ NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x
 _OBEYED: Final = re.compile(
     r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f]|\r(?!\n)"
 )
-_LONGEST_PLACE: Final = 7  # digits of the place of an item
-_LONGEST_COMPARED: Final = 100  # characters of a name
+
+
+@dataclass(frozen=True)
+class NameLimits:
+    """Limits of how much of a name is read.
+
+    Attributes:
+        unit_words: Words of a unit, as in m_per_s.
+        index_digits: Digits of the index of an item.
+        compared_characters: Length up to which names are compared for similarity.
+    """
+
+    unit_words: int = 3
+    index_digits: int = 7
+    compared_characters: int = 100
+
+
+_NAME_LIMITS: Final = NameLimits()
 
 
 def array_item(name: str) -> tuple[str, int] | None:
@@ -106,7 +122,7 @@ def array_item(name: str) -> tuple[str, int] | None:
     `scan.12` is item 12 of `scan`, and so is `scan[12]`: see `with_dots`.
     """
     array, _, last = name.rpartition(".")
-    is_place = last.isascii() and last.isdigit() and len(last) <= _LONGEST_PLACE
+    is_place = last.isascii() and last.isdigit() and len(last) <= _NAME_LIMITS.index_digits
     return (array, int(last)) if array and is_place else None
 
 
@@ -326,7 +342,7 @@ def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]
     harmless = [each for each in names if not is_destructive(each)]
     if same := [each for each in harmless if _groups_of(each) & _groups_of(action)]:
         return same
-    spelled = action[:_LONGEST_COMPARED]
+    spelled = action[: _NAME_LIMITS.compared_characters]
     nearest = get_close_matches(spelled, names, 1)
     if is_destructive(action) or not nearest or is_destructive(nearest[0]):
         return []
@@ -389,8 +405,10 @@ def nearest_first(name: str, known: Iterable[str]) -> list[str]:
     Alike is who has the same letters, whatever their case, as a whole or in the last part of a
     dotted name: `front` is near `sensors.front`.
     """
-    wanted = name[:_LONGEST_COMPARED].lower()
-    return sorted(known, key=lambda each: -_likeness(wanted, each[:_LONGEST_COMPARED].lower()))
+    wanted = name[: _NAME_LIMITS.compared_characters].lower()
+    return sorted(
+        known, key=lambda each: -_likeness(wanted, each[: _NAME_LIMITS.compared_characters].lower())
+    )
 
 
 def _likeness(name: str, other: str) -> float:
@@ -458,7 +476,7 @@ def _unit_of(part: str) -> str | None:
     """
     words = words_of(part)
     for end in range(len(words), 0, -1):
-        for start in range(max(0, end - _LONGEST_UNIT), end):
+        for start in range(max(0, end - _NAME_LIMITS.unit_words), end):
             unit = "_".join(words[start:end])
             if unit in _UNITS and (len(unit) > 1 or part.lower().endswith(f"_{unit}")):
                 return _UNITS[unit] if words.count("per") == unit.count("per") else None

@@ -15,6 +15,7 @@ import re
 import sqlite3
 import time
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, cast
@@ -39,8 +40,6 @@ from webots_mcp.signals.naming import (
 
 
 Kind = Literal["num", "bool", "text", "angle", "null"]
-MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
-MAX_YAW_RAD: Final = 3.2  # the last item of a pose that goes beyond is no yaw
 
 _END_OF_POSE: Final = re.compile(r"(^|[._])(?:pose|odom|odometry)\.([235])$")
 PLACES: Final = ("", *(str(place) for place in range(2, 10)))  # in line for a role
@@ -79,6 +78,22 @@ _MOST_SHAPES: Final = 64  # keys made of ids or times would make every state a n
 MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode
 _LONGEST_TEXT: Final = 1000  # characters; a longer text is not a mode either
 _UNSEEN: Final = object()
+
+
+@dataclass(frozen=True)
+class AngleRanges:
+    """Values that show whether a signal is an angle in radians.
+
+    Attributes:
+        angle_rad: Maximum of an angle; larger values are in degrees, or turns were counted.
+        yaw_rad: Maximum of the last item of a pose; with larger values it is no yaw.
+    """
+
+    angle_rad: float = 6.3
+    yaw_rad: float = 3.2
+
+
+_ANGLE_RANGES: Final = AngleRanges()
 
 
 class Place(NamedTuple):
@@ -141,7 +156,13 @@ def kind_of(name: str, value: Value, *, ends_pose: bool = False) -> Kind:
         return "bool"
     if isinstance(value, str):
         return "text"
-    limit = MAX_YAW_RAD if ends_pose else MAX_ANGLE_RAD if angle_unit(name) == "rad" else -1.0
+    limit = (
+        _ANGLE_RANGES.yaw_rad
+        if ends_pose
+        else _ANGLE_RANGES.angle_rad
+        if angle_unit(name) == "rad"
+        else -1.0
+    )
     return "angle" if abs(value) <= limit else "num"
 
 

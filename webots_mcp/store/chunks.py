@@ -35,9 +35,6 @@ IS_NUMBER: Final = 0  # codes
 IS_ABSENT: Final = 1
 FIRST_LABEL: Final = 2  # codes from this one on are indexes of labels
 
-_LEVEL: Final = 4  # pcodec level: a quarter of the time of its default, for 2 % more bytes
-_CODES_LEVEL: Final = 1
-_CHECKSUM_BYTES: Final = 4  # CRC-32, so that no decompressor is given damaged bytes
 EXACT_INTEGERS: Final = 2**53  # beyond it, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NUMBERS: Final = frozenset({int, float})
@@ -58,6 +55,24 @@ _FEW: Final = 0.25  # maximum number of groups between two of them: they are que
 _SEEN: Final = ("signal", "row_group", "chunk", "watermark")
 _COPIED: Final = ("robot", "session", "run", *_SEEN)
 _UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may reuse the inode of a deleted one
+
+
+@dataclass(frozen=True)
+class ChunkCompression:
+    """How chunks are compressed.
+
+    Attributes:
+        numbers_level: Level of pcodec: a quarter of the time of its default, for 2 % more bytes.
+        codes_level: Level of zlib for codes.
+        checksum_bytes: Size of a CRC-32, so that no decompressor is given damaged bytes.
+    """
+
+    numbers_level: int = 4
+    codes_level: int = 1
+    checksum_bytes: int = 4
+
+
+_COMPRESSION: Final = ChunkCompression()
 
 
 class Absent:
@@ -145,7 +160,7 @@ def pack(values: Decoded) -> EncodedChunk:
     width = np.uint8 if len(listed) + FIRST_LABEL < 2**8 else np.uint16
     return EncodedChunk(
         *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
-        zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
+        zlib.compress(values.codes.astype(width).tobytes(), _COMPRESSION.codes_level),
         json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
     )
 
@@ -283,10 +298,10 @@ def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
         # No row holds a number.
         return "none", None
     codec = _INTEGERS if is_whole else _FLOATS
-    config = _pcodec("pcodec").ChunkConfig(compression_level=_LEVEL)
+    config = _pcodec("pcodec").ChunkConfig(compression_level=_COMPRESSION.numbers_level)
     numbers = numbers.astype(np.int64) if is_whole else numbers
     packed = bytes(_pcodec().simple_compress(numbers, config))
-    return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
+    return codec, zlib.crc32(packed).to_bytes(_COMPRESSION.checksum_bytes, "little") + packed
 
 
 def _decompress(encoded: EncodedChunk, into: Array) -> None:
@@ -296,8 +311,10 @@ def _decompress(encoded: EncodedChunk, into: Array) -> None:
         )
     if encoded.numbers is None:
         raise DamagedChunkError("damaged: its numbers are missing")
-    packed = encoded.numbers[_CHECKSUM_BYTES:]
-    if zlib.crc32(packed) != int.from_bytes(encoded.numbers[:_CHECKSUM_BYTES], "little"):
+    packed = encoded.numbers[_COMPRESSION.checksum_bytes :]
+    if zlib.crc32(packed) != int.from_bytes(
+        encoded.numbers[: _COMPRESSION.checksum_bytes], "little"
+    ):
         raise DamagedChunkError("damaged: its bytes do not match their checksum")
     whole: Any = into if encoded.codec == _FLOATS else np.empty(len(into), np.int64)
     progress = _pcodec().simple_decompress_into(packed, whole)

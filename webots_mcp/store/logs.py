@@ -100,9 +100,6 @@ class LogLine:
     logger: str | None
 
 
-_COLUMNS: Final = columns_of(LogLine)
-
-
 def _news_of(source: str, cursor: str, columns: str, text: str) -> str:
     """Return the query for rows after a cursor, of one robot or all, with time and text of each."""
     return (
@@ -125,7 +122,6 @@ def _cut(text: str) -> str:
     return f"substr({text}, 1, {_CONSOLE.followed_characters})"
 
 
-_OUTCOME: Final = _cut("coalesce(t.error, t.result)")
 _SAID: Final = f"iif(t.source IN {OF_CONSOLE}, t.source || ': ', '') || {_cut('t.message')}"
 # By kind of news: the cursor that it moves, and the rows after that cursor.
 _NEWS: Final = {
@@ -139,7 +135,7 @@ _NEWS: Final = {
         _SETTLED_S,
         _SETTLED_S,
         "t.finished_sim_time_s",
-        f"concat_text({_ASKED}, t.status, {_OUTCOME})",
+        f"concat_text({_ASKED}, t.status, {_cut('coalesce(t.error, t.result)')})",
     ),
 }
 
@@ -195,7 +191,10 @@ def window_of(scope: Scope, newest_s: float) -> LogWindow:
 def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
     """Return the newest matching lines, oldest first; a limit of -1 returns all of them."""
     order = "id" if asked.run_id is None else "sim_time_s DESC, id"
-    query = f"SELECT {_COLUMNS} {_rows_of(connection, asked)} ORDER BY {order} DESC LIMIT :limit"
+    query = (
+        f"SELECT {columns_of(LogLine)} {_rows_of(connection, asked)} "
+        f"ORDER BY {order} DESC LIMIT :limit"
+    )
     rows = connection.execute(query, {**_values(asked), "limit": limit}).fetchall()
     return [LogLine(*row) for row in reversed(rows)]
 

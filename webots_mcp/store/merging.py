@@ -15,6 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Generator, Sequence
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, get_args
 
@@ -69,18 +70,12 @@ _RESULT: Final = ", ".join(
     ("status", "score", "ended_by", "ended_sim_time_s", "error", "started_wall_time_s",
      "finished_wall_time_s")
 )  # fmt: skip
-_PIECE_BYTES: Final = 1_000_000
-# Identical rows shrink to a fiftieth of their size; an archive that unpacks to far more is hostile.
-_MOST_TIMES: Final = 100
-_HARMLESS_BYTES: Final = 100_000_000
 _LINK: Final = 0o120000  # mask of the file type in Unix, as archives store it
 END_SESSIONS: Final = (  # with the last of their runs that is here
     "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run "
     "WHERE session_id = session.id), end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
 )
 _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
-# Maximum distance between the first and last row id of a run; a real recording has no more.
-_MOST_IDS: Final = 2**40
 _NEWEST_HERE: Final = "SELECT coalesce(max(id), 0) FROM main.state"
 _RESERVED_HERE: Final = "SELECT coalesce(max(reserved_state_id), 0) FROM main.recording"
 _GROUP: Final = (
@@ -90,6 +85,28 @@ _GROUP: Final = (
 )
 _PACKED: Final = "codec, numbers, codes, labels"
 _VALUES: Final = f"{', '.join(Statistics._fields)}, {_PACKED}"
+
+
+@dataclass(frozen=True)
+class BundleLimits:
+    """Limits of what is unpacked and copied; an archive beyond them is hostile.
+
+    Attributes:
+        piece_bytes: Bytes that are copied at a time.
+        times: Factor by which an archive may grow; identical rows shrink to a fiftieth of their
+            size.
+        harmless_bytes: Size up to which any archive is unpacked.
+        ids: Maximum distance between the first and last row id of a run; a real recording has no
+            more.
+    """
+
+    piece_bytes: int = 1_000_000
+    times: int = 100
+    harmless_bytes: int = 100_000_000
+    ids: int = 2**40
+
+
+_BUNDLE: Final = BundleLimits()
 
 
 def merge(
@@ -552,7 +569,7 @@ def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
             is_compressed = each.suffix.lower() in (*PICTURES, TAPE_ENDING)
             entry.compress_type = zipfile.ZIP_STORED if is_compressed else zipfile.ZIP_DEFLATED
             with each.open("rb") as source, archive.open(entry, "w") as target:
-                while piece := source.read(_PIECE_BYTES):
+                while piece := source.read(_BUNDLE.piece_bytes):
                     target.write(piece)
                     packed += len(piece)
                     if progress is not None:
@@ -604,7 +621,7 @@ def unpack(file: Path, folder: Path) -> None:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, target.open("wb") as sink:
                     target.chmod(PRIVATE_FILE)
-                    shutil.copyfileobj(source, sink, _PIECE_BYTES)
+                    shutil.copyfileobj(source, sink, _BUNDLE.piece_bytes)
         aside.replace(folder / DATABASE_NAME)
     except _DAMAGED as error:
         raise InvalidInputError(f"{file} is damaged or not a ZIP archive: {error}.") from error
@@ -627,7 +644,7 @@ def _require_ours(file: Path, archive: zipfile.ZipFile) -> None:
     if len(set(names)) < len(names):
         raise InvalidInputError(f"{file} holds a name twice, which no bundle does")
     size = sum(entry.file_size for entry in entries)
-    if size > max(_HARMLESS_BYTES, _MOST_TIMES * file.stat().st_size):
+    if size > max(_BUNDLE.harmless_bytes, _BUNDLE.times * file.stat().st_size):
         raise InvalidInputError(
             f"{file} would unpack to {size:,} bytes, which no bundle of its size does"
         )
@@ -754,7 +771,7 @@ def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
     ).fetchone()
     if first is None:
         return 0
-    if last - first > _MOST_IDS:
+    if last - first > _BUNDLE.ids:
         raise InvalidInputError(
             f"the ids of run {there}'s state rows reach from {first} to {last}, which no bridge "
             "gives: the recording is damaged"

@@ -172,7 +172,6 @@ _NEWEST_STATE: Final = (
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1)) "
     "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
 ).format(columns=_STATE_COLUMNS, kept=_STATE_COLUMNS.partition(", ")[2])
-_EVENT_COLUMNS: Final = columns_of(EventRecord)
 
 
 def current_run(connection: sqlite3.Connection, robot_id: int) -> RunRecord | None:
@@ -396,8 +395,8 @@ def count_dropped(connection: sqlite3.Connection, run: RunRecord, of_session: in
 def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[EventRecord]:
     """Return the latest events of a run, oldest first; a limit of -1 returns all of them."""
     rows = connection.execute(
-        f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC "
-        "LIMIT ?",
+        f"SELECT {columns_of(EventRecord)} FROM event WHERE run_id = ? "
+        "ORDER BY sim_time_s DESC, id DESC LIMIT ?",
         (run_id, limit),
     ).fetchall()
     return [EventRecord(*row) for row in reversed(rows)]
@@ -424,9 +423,6 @@ class StoredImage:
     def file(self, data_dir: Path) -> Path:
         """Return the file itself; see `inside` for the errors."""
         return inside(data_dir, self.path)
-
-
-_COLUMNS: Final = columns_of(StoredImage)
 
 
 def inside(data_dir: Path, path: str) -> Path:
@@ -507,7 +503,7 @@ def camera_frames(
     order = "sim_time_s DESC" if at_s is None else "abs(sim_time_s - :at_s)"
     values = {"run_id": run_id, "device": device, "kind": None, "at_s": at_s, "count": 1}
     frames_query = (
-        f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
+        f"SELECT {columns_of(StoredImage)} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
         "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
         "ORDER BY {order}, id DESC LIMIT :count"
     )
@@ -522,7 +518,8 @@ def camera_frames(
 def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | None:
     """Return the newest picture of a run of any kind."""
     row = connection.execute(
-        f"SELECT {_COLUMNS} FROM image WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1",
+        f"SELECT {columns_of(StoredImage)} FROM image WHERE run_id = ? "
+        "ORDER BY sim_time_s DESC, id DESC LIMIT 1",
         (run_id,),
     ).fetchone()
     return StoredImage(*row) if row else None

@@ -11,6 +11,7 @@ import sqlite3
 from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, TypeVar, cast
 
@@ -38,15 +39,12 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.reading.observed_pose import Derived
 from webots_mcp.store.reading.unread import Unread
 
-MOST_CACHED_BYTES: Final = 160_000_000  # size of the arrays that one frame caches
 _OF_ITEMS: Final = (
     "SELECT id, json_extract(data, ?), json_array_length(data, ?) FROM {} "
     "WHERE run_id = ? AND id BETWEEN ? AND ? AND json_valid(data)"
 )
 _ITEMS: Final = _OF_ITEMS.format("state")
 _KEPT_ITEMS: Final = _OF_ITEMS.format("kept_state")
-_FEW_COLUMNS: Final = 4  # of a short run are read one by one
-_MOST_GROUP_ROWS: Final = 2**20  # far more than any process puts into a group
 _NAMES: Final[dict[Column, str]] = {
     SIM_TIMES: "simulation times",
     WALL_TIMES: "wall times",
@@ -55,6 +53,24 @@ _NAMES: Final[dict[Column, str]] = {
 
 Column = str | int  # the name of a signal, or a number for other chunks (SIM_TIMES, ...)
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SourceLimits:
+    """Limits of reading the values of a frame.
+
+    Attributes:
+        cached_bytes: Size of the arrays that one frame caches.
+        few_columns: Columns of a short run that are read one by one.
+        group_rows: Rows of a group; far more than any process puts into one.
+    """
+
+    cached_bytes: int = 160_000_000
+    few_columns: int = 4
+    group_rows: int = 2**20
+
+
+_SOURCE: Final = SourceLimits()
 
 
 class FrameSource:
@@ -117,7 +133,7 @@ class FrameSource:
     def _sound(self, groups: Array) -> Array:
         """Return the groups whose row says something possible; the others are noted as unread."""
         counts, starts_s, ends_s = groups[:, 3], groups[:, 1], groups[:, 2]
-        sound = (counts >= 1) & (counts <= _MOST_GROUP_ROWS) & (starts_s <= ends_s)
+        sound = (counts >= 1) & (counts <= _SOURCE.group_rows) & (starts_s <= ends_s)
         for _, start_s, end_s, *_ in groups[~sound].tolist():
             self.note(Unread(start_s, end_s, "its row group is damaged"), None)
         return groups[sound]
@@ -264,7 +280,7 @@ class FrameSource:
     ) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
         """Yield what `values_in` does; of a short run all chunks are read once many are wanted."""
         self._columns_read += 1
-        if len(self._ids_of_groups) > 1 or self._columns_read <= _FEW_COLUMNS:
+        if len(self._ids_of_groups) > 1 or self._columns_read <= _SOURCE.few_columns:
             yield from values_in(self.connection, self.run_id, signal_id, wanted, targets)
             return
         chunk = self._chunks_of_one_group.get(signal_id)
@@ -425,7 +441,7 @@ class FrameSource:
 
 
 class _ArrayCache:
-    """Arrays by key, up to `MOST_CACHED_BYTES`; the least recently used are dropped.
+    """Arrays by key, up to `_SOURCE.cached_bytes`; the least recently used are dropped.
 
     Each is stored with what could not be read for it.
     """
@@ -448,7 +464,7 @@ class _ArrayCache:
         size = _bytes_of(made)
         self._made[key] = made, notes, size
         self._bytes += size
-        while self._bytes > MOST_CACHED_BYTES and len(self._made) > 1:
+        while self._bytes > _SOURCE.cached_bytes and len(self._made) > 1:
             _, (_, _, freed) = self._made.popitem(last=False)
             self._bytes -= freed
 

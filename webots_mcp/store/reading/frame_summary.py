@@ -41,12 +41,27 @@ from webots_mcp.store.registered_signals import RegisteredSignal
 _MAY_TURN: Final = frozenset((None, *ANGLES))  # quantities whose values may be angles
 # frames with at most this many values are read completely; more have at least 100 chunks
 FULL_ROWS: Final = 120_000
-_ROWS_AROUND: Final = 20  # rows before and after a segment that show the usual interval
-_DUST: Final = 1e-9  # of a bucket's length: tolerance for rounding at bucket edges
 MOST_VALUES: Final = 20
-# rows that are searched before a row, then each time more before those
-_FIRST_ROWS_BACK: Final = 1024
-_MORE_BACK: Final = 4
+
+
+@dataclass(frozen=True)
+class SummaryReading:
+    """How much is read around a place, and the tolerance of bucket edges.
+
+    Attributes:
+        rows_around: Rows before and after a segment that show the usual interval.
+        edge_share: Tolerance for rounding at bucket edges, as a share of the bucket's length.
+        first_rows_back: Rows that are searched before a row at first.
+        growth: Factor by which each further search is longer.
+    """
+
+    rows_around: int = 20
+    edge_share: float = 1e-9
+    first_rows_back: int = 1024
+    growth: int = 4
+
+
+_READING: Final = SummaryReading()
 
 
 def reads_values(frame: Frame, signal: RegisteredSignal) -> bool:
@@ -223,7 +238,7 @@ def frame_around(connection: sqlite3.Connection, segment: Segment, deadline: Dea
 def rows_around(run: Frame, segment: Segment) -> Frame:
     """Return a part of a frame with some rows around it."""
     start, stop = run.places([segment.start_s, segment.end_s]).tolist()
-    return run.rows(start - _ROWS_AROUND, stop + _ROWS_AROUND)
+    return run.rows(start - _READING.rows_around, stop + _READING.rows_around)
 
 
 def rhythm_in(frame: Frame) -> Rhythm:
@@ -276,7 +291,7 @@ def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buck
     numbers: Array = np.arange(
         _number(first_s, step_s), _number(last_s, step_s) + 2, dtype=np.float64
     )
-    borders_s: Array = (numbers - _DUST) * step_s
+    borders_s: Array = (numbers - _READING.edge_share) * step_s
     edges = frame.places(borders_s)
     edges[0], edges[-1] = 0, rows
     starts_s: Array = np.round(numbers[:-1] * step_s, 9)
@@ -285,7 +300,7 @@ def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buck
 
 def _number(time_s: float, step_s: float) -> int:
     """Return the number of the bucket that holds a time."""
-    return math.floor(time_s / step_s + _DUST)
+    return math.floor(time_s / step_s + _READING.edge_share)
 
 
 def _step(first_s: float, last_s: float, max_points: int, least_s: float) -> float:
@@ -573,14 +588,14 @@ def _is_hidden(before: Frame, signal: RegisteredSignal, time_s: float) -> bool:
 
 def _first_of_last_equal(frame: Frame, signal: RegisteredSignal, value: str | bool | None) -> int:
     """Return the first of the last rows that all have this value, or the number of rows."""
-    stop, rows = len(frame), _FIRST_ROWS_BACK
+    stop, rows = len(frame), _READING.first_rows_back
     while stop > 0:
         start = max(0, stop - rows)
         values, codes = _valued(frame.rows(start, stop), signal)
         unlike = np.flatnonzero(codes != (values.index(value) if value in values else -1))
         if len(unlike):
             return start + int(unlike[-1]) + 1
-        stop, rows = start, rows * _MORE_BACK
+        stop, rows = start, rows * _READING.growth
     return 0
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, median, np
@@ -26,9 +27,22 @@ Derived = Mapping[str, Callable[[Array], Decoded]]
 MARGIN_S: Final = 1.0  # rows of the observer before and after the requested time
 _ANGLES: Final = ("heading_rad", "roll_rad", "pitch_rad")
 _PARTS: Final = ("x_m", "y_m", "z_m", *_ANGLES)
-# between two rows of an observer; N times its interval if it records less often
-_LONGEST_GAP_S: Final = 1.0
-_GAP_INTERVALS: Final = 3.0
+
+
+@dataclass(frozen=True)
+class ObservedGaps:
+    """How far apart the rows of an observer may be.
+
+    Attributes:
+        longest_s: Simulation time between two rows between which poses are interpolated.
+        intervals: The same in usual intervals, for an observer that records less often.
+    """
+
+    longest_s: float = 1.0
+    intervals: float = 3.0
+
+
+_GAPS: Final = ObservedGaps()
 
 
 class ObservedRobot(NamedTuple):
@@ -167,7 +181,7 @@ def _between(seen_s: Array, values: Array, times: Array, *, turns: bool) -> Arra
     if not len(seen_s):
         return np.full(len(times), np.nan)
     usual_s = median(np.diff(seen_s)) if len(seen_s) > 1 else 0.0
-    longest_s = max(_LONGEST_GAP_S, _GAP_INTERVALS * usual_s)
+    longest_s = max(_GAPS.longest_s, _GAPS.intervals * usual_s)
     if turns:
         values = np.unwrap(values)
     found: Array = np.interp(times, seen_s, values)

@@ -44,8 +44,6 @@ from webots_mcp.store.reading.segment import (
     shown_time,
 )
 
-_MOST_HITS: Final = 1000
-_LEAST_ROWS_PER_HIT: Final = 200  # a share below 0.5 % of the rows hardly moves a mean
 # What was stored just before a bound and is shown with its time; commands belong to no run, only to
 # their robot.
 _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
@@ -62,7 +60,24 @@ _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
 )
 USE_EVERY_ROW: Final = "; ask for such a segment alone to use every row"
 MOST_RUNS: Final = 1000  # number of runs in one range of wall time
-_LONGEST_SHOWN: Final = 80
+
+
+@dataclass(frozen=True)
+class NoteLimits:
+    """When and how a range is annotated.
+
+    Attributes:
+        hits: Hits of a breakpoint up to which they are counted.
+        rows_per_hit: Rows for each hit above which hits hardly move a mean (below 0.5 %).
+        shown_characters: Length at which an error cuts a time.
+    """
+
+    hits: int = 1000
+    rows_per_hit: int = 200
+    shown_characters: int = 80
+
+
+_NOTES: Final = NoteLimits()
 
 
 def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
@@ -135,7 +150,7 @@ def hit_notes(
         is None
     ):
         return
-    values = {"run": run_id, "start": start_s, "end": end_s, "most": _MOST_HITS}
+    values = {"run": run_id, "start": start_s, "end": end_s, "most": _NOTES.hits}
     # The number of rows that a breakpoint's hit added to a throttled recording, and the number of
     # all rows, each counted no further than necessary.
     (hits,) = connection.execute(
@@ -144,7 +159,7 @@ def hit_notes(
         "GROUP BY sim_time_s LIMIT :most)",
         values,
     ).fetchone()
-    most = _LEAST_ROWS_PER_HIT * hits
+    most = _NOTES.rows_per_hit * hits
     rows = rows_in("state", connection, run_id, (start_s, end_s), most)
     if (run := frame_of_purged(connection, run_id)) is not None:
         first, last = run.places([start_s, end_s]).tolist()
@@ -498,7 +513,8 @@ def _iso_seconds(text: str) -> float:
         return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
     except (ValueError, OverflowError, OSError) as error:
         raise InvalidRangeError(
-            f"{text[:_LONGEST_SHOWN]!r} is not a time. Give Unix seconds or ISO 8601 such as "
+            f"{text[: _NOTES.shown_characters]!r} is not a time. "
+            "Give Unix seconds or ISO 8601 such as "
             "2026-05-04T13:30:00+02:00."
         ) from error
 

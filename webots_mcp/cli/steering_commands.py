@@ -379,8 +379,8 @@ def _request_row(request: dict[str, Any]) -> list[Any]:
     commands = "; ".join(f"{number} {action} {status}" for number, action, status in
                          request["commands"])  # fmt: skip
     when = clock_text(request["wall_time_s"])
-    told = [request["id"], when, request["sim_time_s"], by, request["tool"]]
-    return [*told, request["arguments"] or None, outcome, commands or None]
+    reported = [request["id"], when, request["sim_time_s"], by, request["tool"]]
+    return [*reported, request["arguments"] or None, outcome, commands or None]
 
 
 # -- trials of a plan file, each in a simulator of its own -----------------------------------------

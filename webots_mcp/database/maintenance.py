@@ -261,7 +261,7 @@ class Maintainer(threading.Thread):
 
 
 def held_log(database: Database) -> str | None:
-    """Describe a log that is so long that a reader must hold it; None for a shorter one."""
+    """Describe a log whose length shows that a reader holds it; None for a shorter one."""
     if isinstance(database, MemoryDatabase):
         return None
     import shutil  # which a controller loads only here, in the maintainer's thread

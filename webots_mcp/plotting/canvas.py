@@ -276,7 +276,7 @@ def _em(character: str) -> float:
 
 
 def short(name: str) -> str:
-    """Return a name that fits a legend, in one line: of a long one the end, which tells more."""
+    """Return a name that fits a legend, in one line: of a long one the end, which says more."""
     line = " ".join(spelled_out(name).split())
     return line if len(line) <= _LONGEST_NAME else f"…{line[1 - _LONGEST_NAME :]}"
 

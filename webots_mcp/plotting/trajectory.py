@@ -398,7 +398,7 @@ class _TrajectoryPainter:
         return theme.ink if self._alone else line_style(index, theme).colour
 
     def _obstacles(self, frame: AxesBox) -> None:
-        """Outlines where sizes are known, squares elsewhere; a page tells their names."""
+        """Outlines where sizes are known, squares elsewhere; a page shows their names."""
         for each in self._standing:
             x, y = float(frame.px(each.x)), float(frame.py(each.y))
             d = f"M{x - 4:.1f} {y - 4:.1f}h8v8h-8Z"

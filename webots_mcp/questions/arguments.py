@@ -45,7 +45,7 @@ def _as_wait(value: float, info: ValidationInfo) -> float:
 
 
 # Bounds that only an absurd value meets stay out of the schemas, which every client carries along:
-# `CheckedTool` leaves the lengths of texts out, a validator has the others. The bounds beside a
+# `CheckedTool` leaves the lengths of texts out, a validator has the others. The bounds next to a
 # validator stand before it: behind it pydantic does not know JSON Schema's words.
 Id = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
 _Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]

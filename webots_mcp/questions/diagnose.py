@@ -42,7 +42,7 @@ def webots_diagnose_setup(recording: RecordingAccess) -> DiagnosisAnswer:
 
 def _failed(checked: Sequence[Checked]) -> list[dict[str, str]]:
     """Return what is wrong before what might be."""
-    told: list[dict[str, str]] = []
+    reported: list[dict[str, str]] = []
     left = _BUDGET_TOKENS
     for verdict in ("wrong", "warning"):
         for check, finding in checked:
@@ -51,8 +51,8 @@ def _failed(checked: Sequence[Checked]) -> list[dict[str, str]]:
                 texts = {"seen": finding.seen, "fix": finding.fix or ""}
                 cut = {name: cut_text(text, _LONGEST_TEXT) for name, text in texts.items() if text}
                 left -= sum(map(tokens_in, cut.values()))
-                told.append(head | (cut if left > 0 else {}))
-    return told
+                reported.append(head | (cut if left > 0 else {}))
+    return reported
 
 
 def _by_reason(checked: Sequence[Checked]) -> dict[str, str]:

@@ -191,17 +191,17 @@ def webots_get_full_state(
                 f"offset is possible only with a list, a text or a branch, and {path!r:.80} is a "
                 "single value. Leave offset out."
             )
-        beside: dict[str, Any] = view.header()
+        others: dict[str, Any] = view.header()
         if not (path or offset):
-            beside |= {"replaced": _some_replaced(view.state.replaced_paths())}
-            beside |= {"events": _events(view), "recorder": _health(view)}
+            others |= {"replaced": _some_replaced(view.state.replaced_paths())}
+            others |= {"events": _events(view), "recorder": _health(view)}
         most_tokens = ANSWER_TOKENS if limit is None else LARGE_ANSWER_TOKENS
-        told = {
-            name: each.model_dump() if name == "events" else each for name, each in beside.items()
+        reported = {
+            name: each.model_dump() if name == "events" else each for name, each in others.items()
         }
-        left_tokens = most_tokens - _SIZES.margin_tokens - tokens_of(told)
+        left_tokens = most_tokens - _SIZES.margin_tokens - tokens_of(reported)
         return FullStateAnswer(
-            **_page(part, path, offset, limit or _SIZES.page, left_tokens), **beside
+            **_page(part, path, offset, limit or _SIZES.page, left_tokens), **others
         )
 
 

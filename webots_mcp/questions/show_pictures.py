@@ -130,8 +130,8 @@ def _show_recorded(
             picture, shown = _sheet(recording, found)
         else:
             picture, shown = _single(recording, view, found[0])
-        told = _told_of(view, found) | shown | _far_off(at_s, found)
-        return [_caption(view.header() | told), picture]
+        reported = _told_of(view, found) | shown | _far_off(at_s, found)
+        return [_caption(view.header() | reported), picture]
 
 
 def _far_off(at_s: float | None, found: list[StoredImage]) -> dict[str, Any]:

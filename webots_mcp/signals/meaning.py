@@ -2,7 +2,8 @@
 
 A meaning is declared by a person, known from the device that was read, or read from the name. The
 words of names are compared as whole words, in their singular and common short forms; no part of a
-name is matched as a bare text. What none of these tells has an unknown meaning, and is not judged.
+name is matched as a bare text. A signal without any of these has an unknown meaning, and is not
+judged.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -192,7 +193,7 @@ def words_in(name: str) -> tuple[str, ...]:
 
 @lru_cache(maxsize=_REMEMBERED)
 def side_in(name: str) -> str | None:
-    """Return the side that a name tells, such as `left` or `front right`; None without one."""
+    """Return the side in a name, such as `left` or `front right`; None without one."""
     words = words_in(name)
     side = next((_SIDES[word] for word in words if word in _SIDES), None)
     end = next((_ENDS[word] for word in words if word in _ENDS), None)
@@ -543,7 +544,7 @@ def meaning_stated(name: str, stated: Sequence[StatedMeaning], named: Meaning) -
     Args:
         name: The signal.
         stated: What is said of it, the strongest first.
-        named: What its name tells.
+        named: The meaning of its name.
     """
     meaning = named
     for each in reversed(stated):

@@ -327,15 +327,15 @@ def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
     by_motion: dict[str, list[str]] = {each: [] for each in _MOTIONS}
     names = frozenset(numbers)
     for name in sorted(names, key=_shortest):
-        told = _motions_of(name)
-        meaning = meaning_by_name(name, "num", next(iter(told), None), names)
+        reported = _motions_of(name)
+        meaning = meaning_by_name(name, "num", next(iter(reported), None), names)
         if meaning.role == "limit":
             continue
         if meaning.quantity == "speed":
             by_motion["commanded_speed" if meaning.sets else "speed"].append(name)
         elif meaning.quantity == "wheel speed":
             by_motion["commanded_wheel" if meaning.sets else "wheel"].append(name)
-        elif "wheel" in told and meaning.quantity == "motor speed":
+        elif "wheel" in reported and meaning.quantity == "motor speed":
             by_motion["wheel"].append(name)
     _line_up(roles, "commanded_speed", by_motion["commanded_speed"])
     _line_up(roles, "speed", by_motion["speed"])
@@ -511,7 +511,7 @@ class SignalNames:
     def _take(self, text: str) -> None:
         state = cast("dict[str, Any]", json.loads(text))
         values, now_s = flatten(state), time.time()
-        told = dict[str, tuple[Kind, bool]]()
+        reported = dict[str, tuple[Kind, bool]]()
         room = MAX_SIGNALS - len(self._known)
         for name, value in values.items():
             is_new = name not in self._known
@@ -522,10 +522,10 @@ class SignalNames:
             is_whole = is_whole and (value is None or type(value) is int)
             if is_new or (kind, is_whole) != before:
                 room -= is_new
-                told[name] = kind, is_whole
-        found = places(_part_with(told, state))
-        self._waiting |= {name: Seen(*found[name], *each, now_s) for name, each in told.items()}
-        self._known |= told
+                reported[name] = kind, is_whole
+        found = places(_part_with(reported, state))
+        self._waiting |= {name: Seen(*found[name], *each, now_s) for name, each in reported.items()}
+        self._known |= reported
 
     def _enter(self, enter: Callable[[dict[str, Seen]], bool]) -> None:
         some = dict(islice(self._waiting.items(), ADDED_AT_ONCE))

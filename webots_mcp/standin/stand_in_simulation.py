@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class LoopTimes:
+class SimulationTimes:
     """Times of the simulation's loop, in seconds of wall time.
 
     Attributes:
@@ -54,7 +54,7 @@ class LoopTimes:
     max_lag_s: float = 0.1
 
 
-_TIMES: Final = LoopTimes()
+_TIMES: Final = SimulationTimes()
 
 
 class ConsoleRecorder(Protocol):

@@ -247,7 +247,7 @@ class _Cancellation:
         return self._worker.status.name in ("closing", "closed", "failed")
 
     def as_dask_says(self) -> Exception:
-        """Return the exception that tells Dask to run the task elsewhere, or to end it."""
+        """Return the exception that makes Dask run the task elsewhere, or end it."""
         from distributed import Reschedule
 
         return Reschedule() if self._closes else StoppedError()
@@ -462,7 +462,7 @@ def _other_pythons(client: Any) -> list[str]:
     """Return notes on workers with another minor version of Python, which may change scores."""
     here, workers = python_version(), client.get_versions()["workers"]
     minor = here.split(".")[:2]
-    pythons = {each: str(told["host"]["python"]) for each, told in workers.items()}
+    pythons = {each: str(info["host"]["python"]) for each, info in workers.items()}
     others = {each: said for each, said in pythons.items() if said.split(".")[:2] != minor}
     if not others:
         return []
@@ -477,8 +477,8 @@ def _simulators_of(client: Any, address: str) -> dict[str, int]:
     except Exception as error:
         raise CommandRefusedError(_LOST.format(address)) from error
     found = {
-        each: min(int(told["resources"].get(RESOURCE, 0)), told["nthreads"])
-        for each, told in workers.items()
+        each: min(int(info["resources"].get(RESOURCE, 0)), info["nthreads"])
+        for each, info in workers.items()
     }
     return {each: number for each, number in found.items() if number}
 

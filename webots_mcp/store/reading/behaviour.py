@@ -50,10 +50,10 @@ def _told_by(frame: Frame, name: str) -> Meaning:
     """
     starts = range(0, len(frame), max(_ROWS, -(-len(frame) // _PARTS)))
     parts = [frame.rows(start, start + _ROWS).usable(name)[1].tolist() for start in starts]
-    told = [meaning_by_behaviour(part) for part in parts if part]
-    kinds = {each.why for each in told}
+    reported = [meaning_by_behaviour(part) for part in parts if part]
+    kinds = {each.why for each in reported}
     if len(kinds) == 1:
-        return told[0]
+        return reported[0]
     joined = meaning_by_behaviour([value for part in parts for value in part])
-    angles = [each for each in told if each.quantity == "heading"]
+    angles = [each for each in reported if each.quantity == "heading"]
     return angles[0] if angles and joined.quantity in (None, "heading") else joined

@@ -11,6 +11,7 @@ import re
 import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
@@ -20,9 +21,23 @@ from webots_mcp.cli.terminal import print_json
 from webots_mcp.contract import bundled
 from webots_mcp.errors import InvalidInputError
 
-MAX_WIDTH: Final = 100
-MAX_SEE_ALSO: Final = 5
 _INDEX: Final = "index"
+
+
+@dataclass(frozen=True)
+class HelpLayout:
+    """The layout of help pages.
+
+    Attributes:
+        width: Maximum characters of a line.
+        see_also: Related topics that are named.
+    """
+
+    width: int = 100
+    see_also: int = 5
+
+
+_LAYOUT: Final = HelpLayout()
 
 
 class Section(NamedTuple):
@@ -63,7 +78,7 @@ def help_(
         return _print_help_of(topic[0])
     if not found:
         raise InvalidInputError(_nothing_about(" ".join(topic)))
-    best, others = found[0], [each.topic for each in found[1 : MAX_SEE_ALSO + 1]]
+    best, others = found[0], [each.topic for each in found[1 : _LAYOUT.see_also + 1]]
     text = with_topics_for_links(best.text)
     if as_json:
         return print_json({"topic": best.topic, "text": text, "see_also": others})
@@ -236,5 +251,5 @@ def _print_markdown(text: str) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    width = min(shutil.get_terminal_size().columns, _LAYOUT.width)
     Console(width=width).print(Markdown(text, hyperlinks=False))

@@ -50,8 +50,6 @@ _UNITS: Final = {  # as people write them, and as names are understood
 LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is declared for
 _LONGEST_UNIT: Final = 20  # characters
 _BAD_UNIT: Final = "signal {!r}: unit must be a text of up to {} characters, such as 'm/s', not {}"
-_REMEMBERED: Final = 4096  # names whose words are cached
-_ROBOTS_REMEMBERED: Final = 16  # lists of names whose meanings are cached
 
 # -- the words of names ------------------------------------------------------------------------
 
@@ -157,6 +155,22 @@ _OF_SPEEDS: Final = frozenset((
 
 
 @dataclass(frozen=True)
+class RememberedMeanings:
+    """Sizes of caches.
+
+    Attributes:
+        names: Names whose words are cached.
+        robots: Lists of names whose meanings are cached.
+    """
+
+    names: int = 4096
+    robots: int = 16
+
+
+_CACHE: Final = RememberedMeanings()
+
+
+@dataclass(frozen=True)
 class BehaviourRules:
     """What the values of an unknown signal must show before a meaning follows.
 
@@ -174,7 +188,7 @@ class BehaviourRules:
 _BEHAVIOUR: Final = BehaviourRules()
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=_CACHE.names)
 def words_in(name: str) -> tuple[str, ...]:
     """Return the words of a dotted name in their long, singular form: `motorsCmd.0`, motor command.
 
@@ -191,7 +205,7 @@ def words_in(name: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=_CACHE.names)
 def side_in(name: str) -> str | None:
     """Return the side in a name, such as `left` or `front right`; None without one."""
     words = words_in(name)
@@ -366,7 +380,7 @@ def meanings_by_name(
     return dict(_meanings_of_all(asked))
 
 
-@lru_cache(maxsize=_ROBOTS_REMEMBERED)  # a question about many runs asks of the same names
+@lru_cache(maxsize=_CACHE.robots)  # a question about many runs asks of the same names
 def _meanings_of_all(asked: tuple[tuple[str, str, str | None], ...]) -> dict[str, Meaning]:
     names = frozenset(name for name, _, _ in asked)
     return {name: meaning_by_name(name, kind, role, names) for name, kind, role in asked}
@@ -610,7 +624,7 @@ def targets_in(meanings: Mapping[str, Meaning]) -> list[tuple[str, str]]:
     return list(found.items())
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=_CACHE.names)
 def _subject_of(name: str) -> tuple[frozenset[str], tuple[str, ...]]:
     """The words of a name without those of its role and quantity, and its numbers of items."""
     words = (word for part in name.split(".") for word in words_of(part))
@@ -628,7 +642,7 @@ def _named(quantity: Quantity, role: Role | None, name: str, why: str) -> Meanin
     return Meaning(quantity, role, unit, side=side_in(name), source="named", why=why)
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=_CACHE.names)
 def is_asked_for(name: str) -> bool:
     """Return whether a name is of a command, a target or an input: of nothing measured."""
     words = frozenset(words_in(name))

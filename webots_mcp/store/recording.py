@@ -73,17 +73,31 @@ GETTING_STARTED: Final = (
     "elsewhere, start the server with --data-dir or --database."
 )
 
-_MOST_IDLE: Final = 8  # connections: each may hold 2 MB of pages
 _ENDED: Final = {
     "crashed": "its controller crashed or was killed",
     "finished": "its controller finished",
     "superseded": "another bridge took its robot over",
 }
-_RENEW_EVERY_S: Final = 3.0
 _UNSTORABLE: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
     MalformedRowError,
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ConnectionLimits:
+    """Connections and leases that a process keeps.
+
+    Attributes:
+        idle: Idle connections, each of which may hold 2 MB of pages.
+        renew_every_s: Wall time between two renewals of a lease.
+    """
+
+    idle: int = 8
+    renew_every_s: float = 3.0
+
+
+_CONNECTIONS: Final = ConnectionLimits()
 
 
 @dataclass(frozen=True)
@@ -216,7 +230,7 @@ class OpenReaders:
         except BaseException:
             connection.close()
             raise
-        is_enough = len(idle) >= _MOST_IDLE
+        is_enough = len(idle) >= _CONNECTIONS.idle
         if known is None or is_enough or isinstance(connection, FrozenConnection):
             connection.close()
         else:
@@ -549,7 +563,7 @@ class Job:
             thread.join()
 
     def _renew(self, over: threading.Event) -> None:
-        while not over.wait(_RENEW_EVERY_S):
+        while not over.wait(_CONNECTIONS.renew_every_s):
             with suppress(LeaseLostError):  # the worker notices when it writes
                 self._renew_now()
 

@@ -27,8 +27,6 @@ _BLOCK_IDS: Final = {
     "event": 512,
     "image": 16,
 }  # ids that are deleted together
-_SAMPLE: Final = 100  # rows of mean size, from which the size of a block is estimated
-_COMMAND_BYTES: Final = 400
 
 # A damaged time (after the year 5000) must not keep the rows around it.
 _WALL_TIME: Final = (
@@ -45,6 +43,22 @@ OLD_COMMANDS: Final = (
     f"WHERE robot_id = c.robot_id AND {KEPT} "
     "AND c.created_wall_time_s BETWEEN started_wall_time_s AND last_wall_time_s)"
 )
+
+
+@dataclass(frozen=True)
+class SizeEstimates:
+    """How the sizes of rows are estimated.
+
+    Attributes:
+        rows: Rows of mean size, from which the size of a block is estimated.
+        command_bytes: Size of a command.
+    """
+
+    rows: int = 100
+    command_bytes: int = 400
+
+
+_ESTIMATES: Final = SizeEstimates()
 
 
 class RetainedRun(NamedTuple):
@@ -286,7 +300,9 @@ def _portion(connection: sqlite3.Connection, table: str, row: Sequence[Any]) -> 
     size_bytes = float(payloads)
     if table != "image":
         (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
-        row_bytes = disk_bytes([round(payloads / rows)] * _SAMPLE, page_bytes) / _SAMPLE
+        row_bytes = (
+            disk_bytes([round(payloads / rows)] * _ESTIMATES.rows, page_bytes) / _ESTIMATES.rows
+        )
         size_bytes = rows * (row_bytes + INDEX_BYTES)
     return Portion(table, run_id, 0, first_id, last_id, rows, size_bytes, newest_s)
 
@@ -431,7 +447,7 @@ class _Planner:
         values = {"robot_id": robot_id, "before_s": before_s}
         query = f"SELECT count(*) {OLD_COMMANDS}"
         if rows := int(self._connection.execute(query, values).fetchone()[0]):
-            yield Going("command", robot_id, rows, rows * _COMMAND_BYTES, before_s)
+            yield Going("command", robot_id, rows, rows * _ESTIMATES.command_bytes, before_s)
 
 
 def _going(portion: Portion) -> Going:

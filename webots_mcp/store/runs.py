@@ -19,8 +19,6 @@ from webots_mcp.store.run_parameters import HAD_VALUES, as_filter, notable_param
 from webots_mcp.store.run_rows import OWN_MS, STEP_WAIT_MS, fetch_run
 
 MOST_RUNS: Final = 200
-MAX_LABEL: Final = 100
-MAX_NOTE: Final = 4000
 
 _RUNS: Final = (
     "SELECT r.id, b.name, r.session_id, s.controller, s.controller_sha256, s.git_commit, r.world, "
@@ -41,6 +39,22 @@ _WHAT: Final = (
     "start_reason", "end_reason", "label", "note", "purged_rows",
     "own_ms", "step_wait_ms", "row_count",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class AnnotationLimits:
+    """Limits of what a person writes about a run, in characters.
+
+    Attributes:
+        label: Maximum length of a label.
+        note: Maximum length of a note.
+    """
+
+    label: int = 100
+    note: int = 4000
+
+
+_ANNOTATION: Final = AnnotationLimits()
 
 
 @dataclass(frozen=True)
@@ -189,7 +203,10 @@ def annotate_run(
         raise InvalidInputError(
             "Nothing to store. Give a label, a note or both, for example label='baseline'."
         )
-    for name, text, longest in (("label", label, MAX_LABEL), ("note", note, MAX_NOTE)):
+    for name, text, longest in (
+        ("label", label, _ANNOTATION.label),
+        ("note", note, _ANNOTATION.note),
+    ):
         if text is not None and len(text) > longest:
             raise InvalidInputError(
                 f"The {name} has {len(text)} characters, and at most {longest} are kept. "

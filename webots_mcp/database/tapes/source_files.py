@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,11 +15,25 @@ from webots_mcp.contract import PROJECT_DATA_FOLDER
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import InvalidInputError
 
-MOST_SOURCE_BYTES: Final = 4_000_000
-MOST_SOURCE_FILES: Final = 500
 _FOREIGN: Final = frozenset(
     {"site-packages", "dist-packages", ".venv", "venv", "__pycache__", PROJECT_DATA_FOLDER}
 )
+
+
+@dataclass(frozen=True)
+class SourceFileLimits:
+    """Limits of the source files that a tape holds.
+
+    Attributes:
+        bytes: Total size.
+        files: Number of files.
+    """
+
+    bytes: int = 4_000_000
+    files: int = 500
+
+
+_LIMITS: Final = SourceFileLimits()
 
 
 def root_of(controller: Path) -> Path:
@@ -58,14 +73,14 @@ def read_sources(controller: Path, root: Path, known: set[str]) -> dict[str, str
     texts: dict[str, str] = {}
     size = 0
     for name, file in own_sources(controller, root):
-        if name in known or len(known) >= MOST_SOURCE_FILES:
+        if name in known or len(known) >= _LIMITS.files:
             continue
         try:
             content = file.read_bytes()
         except OSError:
             continue
         size += len(content)
-        if size > MOST_SOURCE_BYTES:
+        if size > _LIMITS.bytes:
             break
         known.add(name)
         texts[name] = content.decode("utf-8", "surrogateescape")

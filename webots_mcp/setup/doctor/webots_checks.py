@@ -10,6 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from http import HTTPStatus
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -45,8 +46,22 @@ if TYPE_CHECKING:
 
 
 _INIT: Final = "run 'webots-mcp init' in the project"
-_TIMEOUT_S: Final = 30.0
-_SHOWN_CHARACTERS: Final = 300
+
+
+@dataclass(frozen=True)
+class ProbeLimits:
+    """Limits of a command that is run as a check.
+
+    Attributes:
+        timeout_s: Wall time.
+        shown_characters: Length at which its output is cut.
+    """
+
+    timeout_s: float = 30.0
+    shown_characters: int = 300
+
+
+_PROBE: Final = ProbeLimits()
 
 
 @check("Webots")
@@ -193,7 +208,7 @@ def server(subject: Examined) -> Iterator[Diagnosis]:
         except Exception as error:  # noqa: BLE001  (it is reported)
             complaints.seek(0)
             wrote = complaints.read().strip().splitlines()
-            last = f"; it wrote: {wrote[-1][:_SHOWN_CHARACTERS]}" if wrote else ""
+            last = f"; it wrote: {wrote[-1][: _PROBE.shown_characters]}" if wrote else ""
             yield wrong(
                 f"'{' '.join(line)}' did not answer: {_why(error)}{last}",
                 "run the same command in a shell, see what it prints, and install webots-mcp again "
@@ -202,7 +217,7 @@ def server(subject: Examined) -> Iterator[Diagnosis]:
             return
     started = f"started over stdio, {tools} tools that only read"  # by --read-only
     if refused:
-        seen = f"{started}, and answers: {refused[:_SHOWN_CHARACTERS]}"
+        seen = f"{started}, and answers: {refused[: _PROBE.shown_characters]}"
         yield warning(seen, "mend the recording: see Database and Schema")
     else:
         yield ok(f"{started}, one answer, {time.monotonic() - started_s:.1f} s in all")
@@ -216,7 +231,7 @@ async def _converse(line: list[str], complaints: TextIO) -> tuple[int, str]:
 
     command, *arguments = line
     parameters = StdioServerParameters(command=command, args=arguments, env=dict(os.environ))
-    with anyio.fail_after(_TIMEOUT_S):
+    with anyio.fail_after(_PROBE.timeout_s):
         async with Client(stdio_client(parameters, complaints)) as client:
             tools = (await client.list_tools()).tools
             answer = await client.call_tool("webots_list_robots", {})
@@ -230,5 +245,5 @@ def _why(error: BaseException) -> str:
     if parts:
         return _why(parts[0])
     if isinstance(error, TimeoutError):
-        return f"nothing came within {_TIMEOUT_S:g} s"
-    return f"{error or type(error).__name__}"[:_SHOWN_CHARACTERS]
+        return f"nothing came within {_PROBE.timeout_s:g} s"
+    return f"{error or type(error).__name__}"[: _PROBE.shown_characters]

@@ -40,9 +40,6 @@ from webots_mcp.signals.conditions.syntax import (
 from webots_mcp.signals.naming import NO_POSITION, Value, find_position, flatten, nearest_first
 
 POSITION: Final = "the position"  # what a displacement reads, whatever its signals are called
-_MOST_OFFERED: Final = 3
-MAX_DURATION_S: Final = 3600.0
-_MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a position that is N times as old
 
 Number: TypeAlias = "int | float"
 
@@ -57,6 +54,24 @@ _NO_COMPARISON: Final = (ast.LShift, ast.RShift, ast.BitAnd, ast.BitOr, ast.BitX
 _COMPARE: Final = (
     "compare with < <= > >= == or !=; instead of `in` write mode == 'a' or mode == 'b'"
 )
+
+
+@dataclass(frozen=True)
+class CompilerLimits:
+    """Limits of conditions.
+
+    Attributes:
+        offered: Similar names that an error offers.
+        duration_s: Maximum of a duration.
+        times_as_old: Age of the position that a displacement takes, as a factor.
+    """
+
+    offered: int = 3
+    duration_s: float = 3600.0
+    times_as_old: float = 2.0
+
+
+_LIMITS: Final = CompilerLimits()
 
 
 def _as_it_is(value: Any) -> Any:
@@ -205,7 +220,7 @@ def parse_condition(text: str) -> Condition:
 def _nearest(name: str, known: Collection[str]) -> str:
     if not known:
         return "Nothing is published yet"
-    near = ", ".join(nearest_first(name, known)[:_MOST_OFFERED])
+    near = ", ".join(nearest_first(name, known)[: _LIMITS.offered])
     return f"The nearest of {len(known)} signals: {near}"
 
 
@@ -461,9 +476,9 @@ class Compiler(Nodes):
         if type(value) not in (int, float):
             self._refuse(node, f"`{of}` takes a plain number of seconds, such as 0.5")
         seconds = cast("int | float", value)
-        if not 0 < seconds <= MAX_DURATION_S:
-            self._refuse(node, f"seconds must be above 0 and at most {MAX_DURATION_S:g}")
-        self.remembers_s += _MOST_TIMES_AS_OLD * seconds
+        if not 0 < seconds <= _LIMITS.duration_s:
+            self._refuse(node, f"seconds must be above 0 and at most {_LIMITS.duration_s:g}")
+        self.remembers_s += _LIMITS.times_as_old * seconds
         return float(seconds)
 
     def _unknown_function(self, node: ast.Call) -> str:

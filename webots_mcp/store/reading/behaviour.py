@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.signals.meaning import Meaning, meaning_by_behaviour
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal
 
-_PARTS: Final = 4  # rows of a run that are read
-_ROWS: Final = 512  # rows of each part
+
+@dataclass(frozen=True)
+class BehaviourSample:
+    """The rows of a run that show the behaviour of a signal.
+
+    Attributes:
+        parts: Number of parts of a run.
+        rows: Rows of each part.
+    """
+
+    parts: int = 4
+    rows: int = 512
+
+
+_SAMPLE: Final = BehaviourSample()
 
 
 def with_behaviour(
@@ -48,8 +62,8 @@ def _told_by(frame: Frame, name: str) -> Meaning:
 
     Theirs if they agree, else that of all values.
     """
-    starts = range(0, len(frame), max(_ROWS, -(-len(frame) // _PARTS)))
-    parts = [frame.rows(start, start + _ROWS).usable(name)[1].tolist() for start in starts]
+    starts = range(0, len(frame), max(_SAMPLE.rows, -(-len(frame) // _SAMPLE.parts)))
+    parts = [frame.rows(start, start + _SAMPLE.rows).usable(name)[1].tolist() for start in starts]
     reported = [meaning_by_behaviour(part) for part in parts if part]
     kinds = {each.why for each in reported}
     if len(kinds) == 1:

@@ -20,16 +20,12 @@ from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.robots import RobotRecord, resolve_robot, robot_name
 from webots_mcp.store.run_rows import RunRecord, current_run, fetch_run
 
-_DECIMALS: Final = 3
 HAS_LOST_ROWS: Final = (  # for a run `r`: rows were deleted whose chunks are deleted, too
     "r.purged_rows > coalesce((SELECT sum(row_count - stored_row_count) FROM row_group "
     "WHERE run_id = r.id AND is_complete = 1), 0)"
 )
 QUESTION_DEADLINE_S: Final = 2.0
-_STEPS_PER_CHECK: Final = 20_000  # instructions of SQLite's virtual machine: about 0.5 ms
-MOST_FULL_RATE_SEGMENTS: Final = 200  # newest segments of a range that are checked
 MOST_ROWS: Final = 30_000  # rows of a range that is answered from each call
-_NAMED: Final = 2
 _IS_NUMBER: Final = "IN ('real', 'integer')"
 _FULL_RATE_SEGMENTS: Final = (
     "SELECT start_sim_time_s, end_sim_time_s, CAST(reason AS TEXT), wall_time_s FROM kept_stretch "
@@ -40,15 +36,36 @@ _FULL_RATE_SEGMENTS: Final = (
 _IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 
 
+@dataclass(frozen=True)
+class SegmentReading:
+    """How segments are read and named.
+
+    Attributes:
+        decimals: Decimals of a shown time in seconds.
+        steps_per_check: Instructions of SQLite's virtual machine between two checks of a deadline:
+            about 0.5 ms.
+        full_rate_segments: Newest segments of a range that are checked.
+        named: Segments that a note names.
+    """
+
+    decimals: int = 3
+    steps_per_check: int = 20_000
+    full_rate_segments: int = 200
+    named: int = 2
+
+
+_READING: Final = SegmentReading()
+
+
 def shown_time(time_s: float) -> float:
     """Return a simulation time as answers show it, rounded to the millisecond."""
-    return round(time_s, _DECIMALS)
+    return round(time_s, _READING.decimals)
 
 
 def moment_of(time_s: float) -> float:
     """Return the earliest time that is shown like this one: the real place of a bound."""
     shown_s = shown_time(time_s)
-    moment_s = shown_s - 0.5 / 10**_DECIMALS
+    moment_s = shown_s - 0.5 / 10**_READING.decimals
     while shown_time(moment_s) < shown_s:
         moment_s = math.nextafter(moment_s, math.inf)
     while shown_time(before_s := math.nextafter(moment_s, -math.inf)) >= shown_s:
@@ -131,7 +148,7 @@ class Deadline:
     @contextlib.contextmanager
     def interrupting(self, connection: sqlite3.Connection) -> Generator[None]:
         """Interrupt the connection's statements once the time is over."""
-        connection.set_progress_handler(lambda: self.passed, _STEPS_PER_CHECK)
+        connection.set_progress_handler(lambda: self.passed, _READING.steps_per_check)
         try:
             yield
         finally:
@@ -220,7 +237,7 @@ def full_rate_segments(
 ) -> list[FullRateSegment]:
     """Return the full-rate segments that overlap [start_s, end_s) of a run, as far as written."""
     rows = connection.execute(
-        _FULL_RATE_SEGMENTS, (run_id, start_s, end_s, MOST_FULL_RATE_SEGMENTS)
+        _FULL_RATE_SEGMENTS, (run_id, start_s, end_s, _READING.full_rate_segments)
     ).fetchall()
     return [_as_written(connection, run_id, FullRateSegment(*row)) for row in reversed(rows)]
 
@@ -273,8 +290,11 @@ def kept_notes(
     found = full_rate_parts(connection, run_id, start_s, end_s)
     if not found:
         return []
-    named = [f"{each.start_s:.3f}-{each.end_s:.3f} s ({each.reason})" for each in found[-_NAMED:]]
-    more = f", and {len(found) - _NAMED} before" if len(found) > _NAMED else ""
+    named = [
+        f"{each.start_s:.3f}-{each.end_s:.3f} s ({each.reason})"
+        for each in found[-_READING.named :]
+    ]
+    more = f", and {len(found) - _READING.named} before" if len(found) > _READING.named else ""
     return [f"run {run_id} is kept at full rate: {', '.join(named)}{more}"]
 
 

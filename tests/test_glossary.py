@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tokenize
+from collections.abc import Iterator
 from pathlib import Path
 
 _ROOT = Path(__file__).parents[1]
@@ -17,6 +19,15 @@ _PLAIN = ("bridge", "steering", "signals/conditions", "setup", "simulator")
 _WITHOUT_MEANING = re.compile(
     r"\b(told|tells|beside|nobody|somebody|whoever|heard|hears)\b", re.IGNORECASE
 )
+# Private words for what engineers call otherwise, in folders that do without them.
+_PRIVATE = re.compile(
+    r"\b(so many|so long|told|tells|swings?|swung|stretch(es)?|creeps?|(is|are) gone|mends?|"
+    r"twitch|alike|whoever)\b"
+)
+_REWRITTEN = (
+    "answers", "bridge", "cli", "database", "plotting", "plugins/cluster", "plugins/pool",
+    "questions", "server", "setup", "signals", "simulator", "standin", "steering", "store",
+)  # fmt: skip
 
 
 def test_each_term_of_the_glossary_has_one_meaning() -> None:
@@ -42,6 +53,27 @@ def test_words_without_a_technical_meaning_are_in_no_plain_package() -> None:
         assert modules, package
         for module in modules:
             assert not _WITHOUT_MEANING.findall(module.read_text("utf-8")), module
+
+
+def test_private_words_are_in_no_comment_or_docstring() -> None:
+    assert _PRIVATE.search("# the least of so many rows")
+    for folder in _REWRITTEN:
+        modules = list((_ROOT / "webots_mcp" / folder).rglob("*.py"))
+        assert modules, folder
+        for module in modules:
+            for text in _texts(module):
+                assert not _PRIVATE.search(text), f"{module}: {text}"
+
+
+def _texts(file: Path) -> Iterator[str]:
+    """The comments and the texts that stand alone, such as docstrings."""
+    with file.open("rb") as source:
+        for token in tokenize.tokenize(source.readline):
+            if token.type == tokenize.COMMENT:
+                yield token.string
+    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            yield str(node.value.value)
 
 
 def _names(file: Path) -> set[str]:

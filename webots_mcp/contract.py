@@ -151,7 +151,7 @@ RunEnd = Literal[
 
 
 def find_log_level(level: object) -> LogLevel | None:
-    """The level of a name, in either case, or of a number of `logging`.
+    """Return the level of a name, in either case, or of a number of `logging`.
 
     Returns:
         None for what is neither. A number between two levels is the lower one; less than 10 is
@@ -210,7 +210,7 @@ def _simulator_of(url: str) -> str:
 
 
 def is_extern(environment: Mapping[str, str]) -> bool:
-    """Whether Webots did not start the controller, and so will not start its successor.
+    """Return whether Webots did not start the controller, and so will not start its successor.
 
     The variables are tested in the order in which Webots' library reads them.
     """
@@ -219,7 +219,7 @@ def is_extern(environment: Mapping[str, str]) -> bool:
 
 
 def new_uuid() -> str:
-    """A random UUID (version 4, RFC 9562), which names a row among those of all machines.
+    """Return a random UUID (version 4, RFC 9562), which names a row among those of all machines.
 
     By hand, because `import uuid` takes 3 ms of the time in which a controller starts.
     """
@@ -231,7 +231,7 @@ def new_uuid() -> str:
 
 
 def bundled(name: str) -> Path:
-    """The folder `name` (examples): in the package, or in a checkout next to it.
+    """Return the folder `name` (examples): in the package, or in a checkout next to it.
 
     Raises:
         FileNotFoundError: It is in neither place; the installation is broken.

@@ -107,7 +107,7 @@ def filed(file: Path) -> Recording:
 @pytest.fixture
 def retry_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No waiting between tries, so that the tests need no sleep."""
-    monkeypatch.setattr(recorder, "_RETRY_INTERVAL_S", 0.0)
+    monkeypatch.setattr(recorder, "_PATIENCE", recorder.RecorderPatience(retry_s=0.0))
 
 
 @pytest.fixture

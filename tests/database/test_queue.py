@@ -19,12 +19,12 @@ from webots_mcp.database.queue import (
     CLAIM,
     MAX_PARAMS_BYTES,
     CommandQueue,
-    _while_busy,
     any_unfinished,
     fetch_command,
     find_command,
     list_commands,
 )
+from webots_mcp.database.transactions import repeat_while_busy
 from webots_mcp.errors import InvalidInputError
 
 
@@ -240,12 +240,12 @@ def test_a_statement_is_sent_three_times_while_the_database_is_busy_and_else_onc
             return other.execute(f"INSERT INTO {table} VALUES (1)")
 
         with pytest.raises(sqlite3.OperationalError, match="locked"):
-            _while_busy(lambda: insert("t", released_at=0))
+            repeat_while_busy(lambda: insert("t", released_at=0))
         assert sent == ["t"] * 3
         sent.clear()
         with pytest.raises(sqlite3.OperationalError, match="no such table"):
-            _while_busy(lambda: insert("missing", released_at=0))
+            repeat_while_busy(lambda: insert("missing", released_at=0))
         assert sent == ["missing"]
         sent.clear()
-        assert _while_busy(lambda: insert("t", released_at=3)).rowcount == 1
+        assert repeat_while_busy(lambda: insert("t", released_at=3)).rowcount == 1
         assert sent == ["t"] * 3

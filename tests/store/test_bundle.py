@@ -20,7 +20,7 @@ from webots_mcp.database.connection import connect
 from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import DatabaseError, InvalidInputError
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.merging import is_bundle, merge, settled, unpacked, write_bundle
+from webots_mcp.store.merging import BundleLimits, is_bundle, merge, settled, unpacked, write_bundle
 from webots_mcp.store.trial_sets import TrialResult, create_trial_set, finish_trial, trials_of
 
 OF_RUN = ("state", "kept_stretch", "kept_state", "log", "event", "image", "parameter_value")
@@ -261,7 +261,7 @@ def test_what_is_no_part_of_a_bundle_is_not_unpacked(
     said: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("webots_mcp.store.merging._HARMLESS_BYTES", 1_000_000)
+    monkeypatch.setattr("webots_mcp.store.merging._BUNDLE", BundleLimits(harmless_bytes=1_000_000))
     with pytest.raises(InvalidInputError, match=said):
         here.ingest(changed(there.bundled(1), change))
     assert not here.database.exists()

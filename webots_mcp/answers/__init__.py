@@ -1,4 +1,4 @@
-"""What answers look like: their models, and the tables that fit them into a number of tokens.
+"""Define answers: their models, and the tables that fit them into a number of tokens.
 
 Questions and steering build their answers with these modules, which read through `store` and
 `judging`. Nothing here declares a tool or sends a command.

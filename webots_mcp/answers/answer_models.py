@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 @dataclass(frozen=True)
 class ShownPicture:
-    """A picture beside the data: an encoded file.
+    """A picture next to the data: an encoded file.
 
     Attributes:
         format: Of the data, as in `image/png`.
@@ -69,7 +69,7 @@ class Answer(AnswerPart):
 
     @property
     def pictures(self) -> list[ShownPicture]:
-        """What is shown beside the data, by clients that show both."""
+        """What clients show next to the data, if they show both."""
         return self._pictures
 
 
@@ -552,7 +552,7 @@ class RerunAnswer(Answer):
 
 
 class ComparisonAnswer(NotedAnswer):
-    """Runs beside each other; the first group is the reference."""
+    """Runs side by side; the first group is the reference."""
 
     verdict: str | None = said("Where the two runs diverge, with first_difference.")
     different_before: dict[str, list[Any]] | None = said(

@@ -32,12 +32,12 @@ DETAIL_BUDGET_TOKENS: Final = 120
 ANSWER_TOKENS: Final = 2_000
 LARGE_ANSWER_TOKENS: Final = 10_000  # where it was said how much: clients warn of longer answers
 BUDGET_TOKENS: Final = 1_100  # of rows; summary, header, notes and verdicts have the rest
-_BESIDE_TOKENS: Final = ANSWER_TOKENS - BUDGET_TOKENS
+_OTHERS_TOKENS: Final = ANSWER_TOKENS - BUDGET_TOKENS
 _HEADER_TOKENS: Final = 220  # with a summary and a hint
 _FOR_A_PERSON_TOKENS: Final = 10_000_000
 LONGEST_NAME: Final = 80
 _MOST_NOTES: Final = 5
-MOST_RUNS: Final = 5  # of which one answer tells
+MOST_RUNS: Final = 5  # that one answer describes
 
 
 _AT_LENGTH: Final = (ShorteningLimits(items=2000, text=20_000, keys=1000, depth=20),)
@@ -69,22 +69,22 @@ def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
         return {**storage(connection)}
 
 
-def room_tokens(
-    asked: int | None = None, beside: Any = None, usual_tokens: int = BUDGET_TOKENS
+def row_budget_tokens(
+    asked: int | None = None, others: Any = None, usual_tokens: int = BUDGET_TOKENS
 ) -> int:
     """Return the token budget for rows; it is larger if a limit was given, or for a person.
 
     Args:
         asked: The most rows or points that were asked for.
-        beside: What stands beside the rows and the header; where it is long, rows have less room.
+        others: What the answer holds next to rows and header; if it is long, rows have less space.
         usual_tokens: The most, where it was not said how many rows.
     """
     if is_for_a_person():
         return _FOR_A_PERSON_TOKENS
-    least_beside = _HEADER_TOKENS + tokens_of(beside)
+    least_others = _HEADER_TOKENS + tokens_of(others)
     if asked is None:
-        return min(usual_tokens, ANSWER_TOKENS - least_beside)
-    return LARGE_ANSWER_TOKENS - max(_BESIDE_TOKENS, least_beside)
+        return min(usual_tokens, ANSWER_TOKENS - least_others)
+    return LARGE_ANSWER_TOKENS - max(_OTHERS_TOKENS, least_others)
 
 
 def detailed(value: Any, budget_tokens: int = DETAIL_BUDGET_TOKENS) -> Any:
@@ -124,7 +124,7 @@ def short_name(name: str | None) -> str | None:
 
 def fitting(items: Sequence[_T], budget_tokens: int | None = None) -> list[_T]:
     """Return the first items whose JSON fits the budget, at least one."""
-    left = room_tokens() if budget_tokens is None else budget_tokens
+    left = row_budget_tokens() if budget_tokens is None else budget_tokens
     kept: list[_T] = []
     for item in items:
         left -= tokens_of(item)
@@ -153,11 +153,11 @@ def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> AnswerTable 
     values = [[row[index] for row in full.rows] for index in range(len(full.columns))]
     kept = [i for i, column in enumerate(values) if not i or len({*map(compact_json, column)}) > 1]
     shared = {name: values[i][0] for i, name in enumerate(full.columns) if i not in kept}
-    told = AnswerTable(
+    reported = AnswerTable(
         columns=[full.columns[i] for i in kept], rows=[[row[i] for i in kept] for row in full.rows]
     )
-    told.in_every_row = shared or None
-    return told
+    reported.in_every_row = shared or None
+    return reported
 
 
 def notes_of(notes: Sequence[str]) -> list[str] | None:

@@ -31,14 +31,14 @@ _GROUP_BUDGET_TOKENS: Final = 200
 def fitting_events(
     found: Found, limit: int, budget_tokens: int, view: RobotView, *, time_of_day: bool = False
 ) -> tuple[Events, AnswerTable | None]:
-    """At most `limit` of what was found, and as much of it as fits the budget."""
+    """Return at most `limit` of what was found, and as much of it as fits the budget."""
     while True:
-        told = found.page(view.connection, limit)
-        made = events_table(told.events, view, time_of_day=time_of_day)
-        tokens = tokens_of([made.rows if made else [], not_shown_of(told), told.cursor])
+        reported = found.page(view.connection, limit)
+        made = events_table(reported.events, view, time_of_day=time_of_day)
+        tokens = tokens_of([made.rows if made else [], not_shown_of(reported), reported.cursor])
         if tokens <= budget_tokens or limit <= 1:
-            return told, made
-        shown_now = len(told.events)
+            return reported, made
+        shown_now = len(reported.events)
         limit = max(1, min(shown_now - 1, int(shown_now * budget_tokens / tokens)))
 
 
@@ -67,7 +67,7 @@ def verdicts_of(verdicts: Verdicts, *, in_short: bool = False) -> KindVerdicts:
     )
 
 
-def not_shown_of(told: Events) -> dict[str, str] | None:
+def not_shown_of(reported: Events) -> dict[str, str] | None:
     """Return how many of each kind are not shown, and from when to when they are.
 
     Of log lines the newest are shown, so an error that many warnings follow is named here.
@@ -75,7 +75,7 @@ def not_shown_of(told: Events) -> dict[str, str] | None:
     return {
         kind: f"{each.count} {each.span}"
         + f", errors among them: {each.errors}" * bool(each.errors)
-        for kind, each in told.left_out.items()
+        for kind, each in reported.left_out.items()
     } or None
 
 

@@ -372,7 +372,7 @@ def _noted(
     *,
     with_ordinary: bool,
 ) -> list[str]:
-    """Return what was noted: errors and failed commands first, and the rest if there is room."""
+    """Return what was noted: errors and failed commands first, and the rest if it fits."""
     logs = [row for row in rows if row.get("kind") == "log"]
     errors = sum(
         {"critical": 1, "error": 1}.get(str(row.get("name")), 0) * _times(row) for row in logs
@@ -472,7 +472,7 @@ def _(answer: CheckAnswer) -> str:
 
 
 def _in_brackets(names: Sequence[str], count: int) -> str:
-    """Name two of so many, of which some may not be shown."""
+    """Name two of N items, some of which may not be shown."""
     if not names:
         return ""
     left = count - len(names[:2])
@@ -627,7 +627,7 @@ def _too_few(answer: ComparisonAnswer, rows: Sequence[Mapping[str, Any]]) -> str
 
 
 def _is(row: Mapping[str, Any], outcome: bool) -> bool:
-    """Whether a figure, or its spread, is different in any group, or in none."""
+    """Return whether a figure, or its spread, is different in any group, or in none."""
     flat: list[Any] = []
     for value in (row.get("different"), row.get("deviation_different")):
         flat += value if isinstance(value, list) else [value]

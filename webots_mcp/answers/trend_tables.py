@@ -113,7 +113,7 @@ def _not_shown(run: RunTrends, numbers: int, states: int) -> str | None:
     all_states = sum(bool(state.changes) for state in run.states)
     counts = (("numbers", numbers, _changed(run)), ("texts and flags", states, all_states))
     others = [
-        f"{all_of - told} of {all_of} {what}" for what, told, all_of in counts if told < all_of
+        f"{all_of - given} of {all_of} {what}" for what, given, all_of in counts if given < all_of
     ]
     return ", ".join(others) or None
 

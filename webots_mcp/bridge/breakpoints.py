@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge.controller_variables import ControllerVariables
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from webots_mcp.signals.conditions.expectation import Expectation, Violated
 
 MOST_EVENTS: Final = 1000  # of one breakpoint in one run, lest a flickering condition fill the disk
-_UNPUBLISHED_S: Final = 1.0  # simulation time after which an unpublished signal is reported
-_MOST_ERROR_CHARACTERS: Final = 1000
 
 
 # Condition, action, hits; of an expectation its name, what is expected, and during what.
@@ -38,6 +37,22 @@ _KEEPING: Final = ("pause", "keep")  # after a pause, a person wants to see what
 _CANNOT_PAUSE: Final = (
     "the robot is not a Supervisor: set its field `supervisor` to TRUE in the world file"
 )
+
+
+@dataclass(frozen=True)
+class BreakpointErrors:
+    """When and how errors of breakpoints are reported.
+
+    Attributes:
+        unpublished_s: Simulation time after which an unpublished signal is reported.
+        error_characters: Length at which an error is cut.
+    """
+
+    unpublished_s: float = 1.0
+    error_characters: int = 1000
+
+
+_ERRORS: Final = BreakpointErrors()
 
 
 class ArmedBreakpoint:
@@ -333,7 +348,7 @@ class Breakpoints:
         self._journal.log("warning", "bridge", f"{each.called} is off: {why}")
 
     def _disable(self, number: int, why: str) -> None:
-        text = storable(cut(why, _MOST_ERROR_CHARACTERS))
+        text = storable(cut(why, _ERRORS.error_characters))
         self._off[number] = text
         self._recorder.record("breakpoint failed", None, (text, number))
 
@@ -344,7 +359,7 @@ class Breakpoints:
             each.asked_since_s = now_s
         values = each.evaluator.values(state)
         each.unseen = frozenset(name for name in each.unseen if values.get(name) is None)
-        if each.unseen and now_s - each.asked_since_s >= _UNPUBLISHED_S:
+        if each.unseen and now_s - each.asked_since_s >= _ERRORS.unpublished_s:
             each.unseen = frozenset()
             known = each.evaluator.names_in(state)
             for text in each.condition.describe_unknown(known):

@@ -32,6 +32,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import compress, islice
 from json.encoder import encode_basestring
 from operator import not_
@@ -48,14 +49,8 @@ from webots_mcp.bridge.conversion import (
 
 MAX_DEPTH: Final = 20
 CONTAINER_ITEMS: Final = 10  # a dict or list takes as long as ten of its items, and counts as such
-MAX_TEXT_BYTES: Final = 100_000  # of one text, as JSON
-MAX_TEXTS_BYTES: Final = 300_000  # of all texts of a row
-# Of all keys of a row. 20,000 items of 28 bytes, all texts and all keys are 1,000,000 bytes.
-MAX_KEYS_BYTES: Final = 140_000
 MAX_KEY_CHARACTERS: Final = 200
-MAX_BLOB_BYTES: Final = 1024
 MAX_NAMED: Final = 1000  # paths in `replaced`
-MAX_PATHS_CHARACTERS: Final = 50_000
 KEYS_OF_CUT_STATE: Final = 1000
 # For all objects of a row together, since reading them runs code of unknown cost. It is processor
 # time, because by the wall clock another process that runs in between would cost values.
@@ -64,11 +59,36 @@ TOO_LARGE: Final = "too large"
 TOO_DEEP: Final = "too deep"
 BYTES_AS_TEXT: Final = "unsupported: bytes"
 TEXT_WITH_SURROGATES: Final = "unsupported: str"
-_LONGEST_ESCAPE: Final = 6  # bytes of JSON for one character, as in \u0000
-_MAX_KEY_BITS: Final = 1000  # the text of a longer integer takes long to make
 
 # Where a value is. It is a linked list, since most places are never named and need no text.
 _Path: TypeAlias = "tuple[_Path | None, str | int]"
+
+
+@dataclass(frozen=True)
+class CleanedSizes:
+    """Limits of what a state may hold, so that a row stays below 1,000,000 bytes.
+
+    Attributes:
+        text_bytes: Size of one text as JSON.
+        texts_bytes: Size of all texts of a row.
+        keys_bytes: Size of all keys of a row. 20,000 items of 28 bytes, all texts and all keys are
+            1,000,000 bytes.
+        blob_bytes: Size of bytes that are stored as text.
+        paths_characters: Characters of all paths in `replaced`.
+        escape_bytes: Bytes of JSON for one character, as in \u0000.
+        key_bits: Size of an integer as a key; the text of a longer one takes long to make.
+    """
+
+    text_bytes: int = 100_000
+    texts_bytes: int = 300_000
+    keys_bytes: int = 140_000
+    blob_bytes: int = 1024
+    paths_characters: int = 50_000
+    escape_bytes: int = 6
+    key_bits: int = 1000
+
+
+_SIZES: Final = CleanedSizes()
 
 
 class _Unfilled(NamedTuple):
@@ -93,9 +113,9 @@ class Cleaner:
         self.replaced: dict[str, str] = {}
         self.unnamed = 0
         self._items_left = MAX_ITEMS
-        self._texts_bytes_left = MAX_TEXTS_BYTES
-        self._keys_bytes_left = MAX_KEYS_BYTES
-        self._paths_characters_left = MAX_PATHS_CHARACTERS
+        self._texts_bytes_left = _SIZES.texts_bytes
+        self._keys_bytes_left = _SIZES.keys_bytes
+        self._paths_characters_left = _SIZES.paths_characters
         self._objects_until_s = time.thread_time() + OBJECTS_BUDGET_S
         self._unfilled: deque[_Unfilled] = deque()
 
@@ -152,10 +172,10 @@ class Cleaner:
     def _clean_text(self, value: str, path: _Path) -> str:
         if isinstance(value, enum.Enum):
             value = str(value.value)
-        most_bytes = min(MAX_TEXT_BYTES, self._texts_bytes_left)
+        most_bytes = min(_SIZES.text_bytes, self._texts_bytes_left)
         text = _without_surrogates(value[:most_bytes])
         if (size_bytes := _json_bytes(text)) > most_bytes:
-            text = text[: most_bytes // _LONGEST_ESCAPE]
+            text = text[: most_bytes // _SIZES.escape_bytes]
             size_bytes = _json_bytes(text)
         self._texts_bytes_left -= size_bytes
         if text != value:
@@ -163,7 +183,7 @@ class Cleaner:
         return text
 
     def _encode_bytes(self, value: memoryview, path: _Path) -> str:
-        if value.nbytes > MAX_BLOB_BYTES:
+        if value.nbytes > _SIZES.blob_bytes:
             raise TooLargeError
         import base64  # only here: few states hold bytes
 
@@ -325,7 +345,7 @@ def key_text(key: object) -> str:
     if isinstance(key, str):
         return str.__str__(key)  # an enum's own text is another one
     if isinstance(key, int):
-        if key.bit_length() > _MAX_KEY_BITS:
+        if key.bit_length() > _SIZES.key_bits:
             raise TooLargeError
         return int.__repr__(key)
     is_group = issubclass(type(key), (tuple, frozenset))

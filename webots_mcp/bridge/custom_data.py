@@ -63,7 +63,7 @@ class CustomDataLimits:
 
 
 _LIMITS: Final = CustomDataLimits()
-# Strings, which stay as they are, and what C prints of numbers that JSON lacks.
+# Strings, which stay as they are, and what C prints for numbers that JSON does not have.
 _C_NUMBERS: Final = re.compile(
     r'"(?:\\.|[^"\\])*"?|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
 )

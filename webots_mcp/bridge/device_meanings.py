@@ -9,21 +9,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.bridge.lidar_summary import SECTORS
 from webots_mcp.bridge.scene_nodes import world_up_axis
 from webots_mcp.signals.meaning import LONGEST_NAME, DeclaredMeaning, Quantity
 
-_MOST_MOTORS: Final = 64  # that are looked up in the scene: each takes about ten requests
-_AXLE: Final = 0.9  # of an axle's direction lies across the robot
-_PARTNER: Final = 0.25  # by this share of its distance from the middle a wheel's partner may differ
-_MOST_LEVELS: Final = 4  # of nodes within a bounding object
 _ROUND: Final = ("Cylinder", "Sphere", "Capsule")
 _WGS84: Final = 1  # GPS.WGS84: degrees, not metres
 
 Described = tuple[DeclaredMeaning, str]
 """The meaning of a signal, and the device that it comes from, in words."""
+
+
+@dataclass(frozen=True)
+class WheelRules:
+    """Limits for finding the wheels of a robot, in units of what they compare.
+
+    Attributes:
+        motors: Motors that are searched in the scene; each takes about ten requests.
+        across_share: Share of an axle's direction that must lie across the robot.
+        partner_share: Share of its distance from the middle by which a wheel's partner may differ.
+        levels: Levels of nodes that are searched within a bounding object.
+    """
+
+    motors: int = 64
+    across_share: float = 0.9
+    partner_share: float = 0.25
+    levels: int = 4
+
+
+_RULES: Final = WheelRules()
 
 
 class _Limits(NamedTuple):
@@ -151,7 +168,7 @@ def _of_one_number(quantity: Quantity, unit: str | None) -> Any:
 
 
 def _of_gps(name: str, device: Any) -> Iterator[DeclaredMeaning]:
-    """Where it is and how high; latitude and longitude are no position in metres."""
+    """Yield where it is and how high; latitude and longitude are no position in metres."""
     system = _ask(device, "getCoordinateSystem")
     if system is None:
         return
@@ -163,7 +180,7 @@ def _of_gps(name: str, device: Any) -> Iterator[DeclaredMeaning]:
 
 
 def _in_nue(said: Iterator[DeclaredMeaning]) -> Iterator[DeclaredMeaning]:
-    """What a GPS says in a world whose y axis points up."""
+    """Yield what a GPS says in a world whose y axis points up."""
     quantities: dict[Quantity | None, Quantity] = {"y": "height", "height": "y"}
     is_local = False
     for each in said:
@@ -173,7 +190,7 @@ def _in_nue(said: Iterator[DeclaredMeaning]) -> Iterator[DeclaredMeaning]:
 
 
 def _up_axis(robot: Any, devices: dict[str, Any]) -> int:
-    """The axis of the world that points up, where a GPS makes that a question."""
+    """Return the axis of the world that points up, where a GPS makes that a question."""
     if not any(type(each).__name__ == "GPS" for each in devices.values()):
         return 2
     try:
@@ -204,7 +221,7 @@ def _of_objects(name: str, _: Any) -> Iterator[DeclaredMeaning]:
 
 
 def _of_camera(name: str, camera: Any) -> Iterator[DeclaredMeaning]:
-    """What it recognises. Which object is the nearest one may change from row to row."""
+    """Yield what it recognises. Which object is the nearest one may change from row to row."""
     if _ask(camera, "hasRecognition") is False:
         return
     yield from _of_objects(name, camera)
@@ -221,7 +238,7 @@ def _of_radar(name: str, radar: Any) -> Iterator[DeclaredMeaning]:
 
 
 def _of_gripper(name: str, _: Any) -> Iterator[DeclaredMeaning]:
-    """A connector or a vacuum gripper: whether it holds, and whether something is there."""
+    """Yield a connector or a vacuum gripper: whether it holds, and whether something is there."""
     for switch in ("locked", "on"):
         yield DeclaredMeaning(f"actuators.{name}.{switch}", "flag", "commanded")
     yield _measured(f"actuators.{name}.presence", "flag")
@@ -337,7 +354,7 @@ class _Wheel(NamedTuple):
 
     def is_partner_of(self, other: _Wheel) -> bool:
         """Return whether it lies at the same place on the other side."""
-        reach = _PARTNER * max(abs(self.y), abs(other.y))
+        reach = _RULES.partner_share * max(abs(self.y), abs(other.y))
         return (
             self.y * other.y < 0
             and abs(abs(self.y) - abs(other.y)) <= reach
@@ -351,7 +368,7 @@ def _moved_by(robot: Any, motors: dict[str, Any]) -> dict[str, _MovedBody]:
     own = _ask(robot, "getSelf")
     moved_by_motor: dict[str, _MovedBody] = {}
     wheels: dict[str, _Wheel] = {}
-    for name, motor in list(motors.items())[:_MOST_MOTORS]:
+    for name, motor in list(motors.items())[: _RULES.motors]:
         node = _ask(robot, "getFromDevice", getattr(motor, "_tag", None))
         joint = _ask(node, "getParentNode")
         kinds = (_ask(joint, "getTypeName"), _ask(joint, "getBaseTypeName"))
@@ -387,7 +404,7 @@ def _wheel_on(own: Any, joint: Any) -> _Wheel | None:
     orientation = own.getOrientation()
     axle = _inverse(orientation, _turned(joint.getParentNode().getOrientation(), axis))
     length = math.hypot(*axle)
-    if not length or not abs(axle[1]) >= _AXLE * length:  # also where it is NaN
+    if not length or not abs(axle[1]) >= _RULES.across_share * length:  # also where it is NaN
         return None
     if not _is_round(end.getField("boundingObject").getSFNode()):
         return None
@@ -398,7 +415,7 @@ def _wheel_on(own: Any, joint: Any) -> _Wheel | None:
 
 def _is_round(node: Any) -> bool:
     """Return whether a bounding object is a cylinder, a sphere or a capsule."""
-    for _ in range(_MOST_LEVELS):
+    for _ in range(_RULES.levels):
         kind = node.getTypeName()
         if kind in _ROUND:
             return True

@@ -8,15 +8,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.picture_files import image_of
 from webots_mcp.bridge.pixel_canvas import BLACK, GREY, WHITE, PixelCanvas, colour
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
-_MOST_NAMED: Final = 10  # devices, in an error
-_SHADES: Final = 256
-_SHORTEST_WIDTH_PX: Final = 160  # of a small image, which is magnified
+
+@dataclass(frozen=True)
+class DevicePictures:
+    """How the values of a device become a picture.
+
+    Attributes:
+        named: Devices that an error names.
+        shades: Grey levels.
+        width_px: Width to which a small image is magnified.
+    """
+
+    named: int = 10
+    shades: int = 256
+    width_px: int = 160
+
+
+_SIZES: Final = DevicePictures()
 
 
 class Picture(NamedTuple):
@@ -73,7 +88,7 @@ def find_pictured(robot: Any, name: str) -> Any:
         return pictured[enabled[0]]
     if not asked:
         raise CommandRefusedError("this robot has no camera, range finder or lidar")
-    shown = ", ".join(f"{each!r} ({_kind(pictured[each])})" for each in asked[:_MOST_NAMED])
+    shown = ", ".join(f"{each!r} ({_kind(pictured[each])})" for each in asked[: _SIZES.named])
     raise CommandRefusedError(
         f"disabled: {shown}; call robot.getDevice({asked[0]!r}).enable(time_step) in the "
         "controller, and ask again after its next step"
@@ -82,7 +97,7 @@ def find_pictured(robot: Any, name: str) -> Any:
 
 def _no_such(name: str, device: Any, pictured: dict[str, Any]) -> str:
     what = f"{name!r} is a {_kind(device)}" if device is not None else f"no device {name!r}"
-    known = [f"{each!r} ({_kind(pictured[each])})" for each in pictured][:_MOST_NAMED]
+    known = [f"{each!r} ({_kind(pictured[each])})" for each in pictured][: _SIZES.named]
     return f"{what}; devices with pictures: {', '.join(known) or 'none on this robot'}"
 
 
@@ -99,11 +114,11 @@ def draw_depths(device: Any) -> tuple[PixelCanvas, str]:
     ranges, width, height = _ranges_of(device), device.getWidth(), device.getHeight()
     near_m, far_m = device.getMinRange(), device.getMaxRange()
     step = math.ceil(max(width, height) / 320)  # at most 320 pixels per side
-    grown = max(1, _SHORTEST_WIDTH_PX // width) if step == 1 else 1
+    grown = max(1, _SIZES.width_px // width) if step == 1 else 1
     rows = [ranges[i : i + width : step] for i in range(0, len(ranges), width * step)]
-    shown = max(_SHORTEST_WIDTH_PX, grown * len(rows[0]))
+    shown = max(_SIZES.width_px, grown * len(rows[0]))
     canvas = PixelCanvas(shown, grown * len(rows))
-    shades, per_m = _shades(), (_SHADES - 1) / max(far_m - near_m, 1e-9)
+    shades, per_m = _shades(), (_SIZES.shades - 1) / max(far_m - near_m, 1e-9)
     for number, row in enumerate(rows):
         pixels = [_shade_of(shades, (each - near_m) * per_m) for each in row]
         wide = [pixel for pixel in pixels for _ in range(grown)]
@@ -170,8 +185,8 @@ def _shades() -> list[int]:
     ramp = ((220, 30, 30), (250, 220, 40), (40, 190, 80), (30, 60, 200))  # near to far
     parts = len(ramp) - 1
     shades: list[int] = []
-    for number in range(_SHADES):
-        part, share = divmod(number * parts / _SHADES, 1)
+    for number in range(_SIZES.shades):
+        part, share = divmod(number * parts / _SIZES.shades, 1)
         low, high = ramp[int(part)], ramp[int(part) + 1]
         mixed = [round(a + share * (b - a)) for a, b in zip(low, high, strict=True)]
         shades.append(colour(*mixed))
@@ -179,7 +194,7 @@ def _shades() -> list[int]:
 
 
 def _shade_of(shades: list[int], place: float) -> int:
-    return shades[int(min(max(place, 0), _SHADES - 1))] if math.isfinite(place) else BLACK
+    return shades[int(min(max(place, 0), _SIZES.shades - 1))] if math.isfinite(place) else BLACK
 
 
 def _round_number(length_m: float) -> float:

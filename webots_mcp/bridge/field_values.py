@@ -9,16 +9,32 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.errors import InvalidInputError
 
 MOST_ENTRIES: Final = 200  # of a field that are set at once: each is a request to Webots
 MOST_CHARACTERS: Final = 10_000  # of one text
-_LARGEST_FLOAT: Final = 3.4028234e38  # beyond it Webots refuses a number
-_TOLERANCE: Final = 1e-6  # relative: Webots may store a value in single precision
 # Fields that name programs that Webots runs: it searches each in its folder of the project.
 _PROGRAMS: Final = ("controller", "window", "remoteControl", "physics")
+
+
+@dataclass(frozen=True)
+class FieldPrecision:
+    """Webots' precision of numbers in fields.
+
+    Attributes:
+        largest: Largest number that Webots accepts.
+        tolerance: Relative difference that counts as equal: Webots may store a value in single
+            precision.
+    """
+
+    largest: float = 3.4028234e38
+    tolerance: float = 1e-6
+
+
+_PRECISION: Final = FieldPrecision()
 
 
 def checked(path: str, type_name: str, value: object) -> Any:
@@ -132,7 +148,7 @@ def _int32(value: object) -> int:
 def _float(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise _RefusedError
-    if not abs(value) <= _LARGEST_FLOAT:  # NaN as well
+    if not abs(value) <= _PRECISION.largest:  # NaN as well
         raise _RefusedError
     return float(value)
 
@@ -209,7 +225,7 @@ def _distance(type_name: str, one: Any, other: Any) -> float:
     apart = math.dist(a, b)
     if type_name == "SFRotation":  # a quaternion and its negative are one rotation
         apart = min(apart, math.dist(a, [-part for part in b]))
-    return apart if apart > _TOLERANCE * max(1.0, *map(abs, a)) else 0.0
+    return apart if apart > _PRECISION.tolerance * max(1.0, *map(abs, a)) else 0.0
 
 
 def _as_vector(type_name: str, value: Any) -> list[float]:

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections import deque
+from dataclasses import dataclass
 from itertools import islice
 from typing import Final
 
@@ -28,8 +29,22 @@ from webots_mcp.bridge.state_copies import StateCopier
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import KEEP_AFTER_S, new_uuid
 
-MOST_KEPT_S: Final = 600.0  # of one run; a condition that flickers would keep all of it
-_MOST_REASONS: Final = 10  # of one segment that are stored
+
+@dataclass(frozen=True)
+class FullRateLimits:
+    """Limits of full-rate segments.
+
+    Attributes:
+        run_s: Simulation time of one run at full rate; a condition that flickers would keep all of
+            it.
+        reasons: Reasons of one segment that are stored.
+    """
+
+    run_s: float = 600.0
+    reasons: int = 10
+
+
+_LIMITS: Final = FullRateLimits()
 
 
 class _WritingLimits:
@@ -52,7 +67,7 @@ class _MemoryBytes:
 
 
 class KeptSegment:
-    """A segment of a run of which every call is kept.
+    """A segment of a run of which every call is recorded.
 
     Attributes:
         end_s: Simulation time of its end, which is in the future while it is being recorded.
@@ -77,7 +92,7 @@ class KeptSegment:
         text = storable(cut(reason, 200))
         # An exception is also logged, as "error: " and the same text.
         is_known = any(f": {text}".endswith(f": {known}") for known in self.reasons)
-        if not is_known and len(self.reasons) < _MOST_REASONS:
+        if not is_known and len(self.reasons) < _LIMITS.reasons:
             self.reasons.append(text)
 
 
@@ -117,7 +132,7 @@ class FullRateRecorder:
         self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
         self._segment: KeptSegment | None = None
         self._going_on = False
-        self._asked: deque[tuple[CurrentRun, str]] = deque(maxlen=_MOST_REASONS)
+        self._asked: deque[tuple[CurrentRun, str]] = deque(maxlen=_LIMITS.reasons)
         self._unwritten: deque[tuple[CurrentRun, RingRow]] = deque()
         self._unwritten_frames: deque[tuple[KeptSegment, HeldFrame]] = deque()
         self._lock = threading.RLock()  # of all that is held: any thread may publish
@@ -219,7 +234,7 @@ class FullRateRecorder:
         """Why nothing can be kept."""
         if not self.enabled:
             return "the bridge holds nothing to keep: keep_last_s is 0"
-        return f"{MOST_KEPT_S:g} s of this run are kept at full rate already, which is the limit"
+        return f"{_LIMITS.run_s:g} s of this run are kept at full rate already, which is the limit"
 
     def write_all(self) -> None:
         """Write all requested segments now: the loop is about to stop, so no call would follow."""
@@ -267,7 +282,7 @@ class FullRateRecorder:
             self.keep(self._asked.popleft()[1])
 
     def _may_keep(self) -> bool:
-        if self._kept_s < MOST_KEPT_S:
+        if self._kept_s < _LIMITS.run_s:
             return True
         if self._kept_s < float("inf"):
             self._kept_s = float("inf")  # so that the warning is logged once per run

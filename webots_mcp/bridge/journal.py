@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.bridge.cleaning import BYTES_AS_TEXT, TEXT_WITH_SURROGATES, TOO_LARGE
@@ -15,11 +16,26 @@ from webots_mcp.contract import HEARTBEAT_INTERVAL_S
 from webots_mcp.database.heartbeat import LoopStatus
 from webots_mcp.database.pauses import PAUSED
 
-MOST_LOG_CHARACTERS: Final = 10_000
-_MOST_LOGGER_CHARACTERS: Final = 200
 _NOT_LOST: Final = ("nan", "inf", "-inf", BYTES_AS_TEXT, TEXT_WITH_SURROGATES)
-_MOST_LOST_PATHS: Final = 20
 _LEVELS: Final = {"stdout": "info", "stderr": "warning"}
+
+
+@dataclass(frozen=True)
+class JournalLogLimits:
+    """Lengths of what a bridge without a database logs into its journal.
+
+    Attributes:
+        message_characters: Length at which a message is cut.
+        logger_characters: Length at which the name of a logger is cut.
+        lost_paths: Paths that a line about lost values names.
+    """
+
+    message_characters: int = 10_000
+    logger_characters: int = 200
+    lost_paths: int = 20
+
+
+_LOG_LIMITS: Final = JournalLogLimits()
 
 
 class Journal:
@@ -42,15 +58,15 @@ class Journal:
 
     def log(self, level: str, source: str, message: str, logger: str | None = None) -> None:
         """Record a log line, cut to 10,000 characters."""
-        text = storable(cut(message, MOST_LOG_CHARACTERS))
-        name = None if logger is None else storable(cut(logger, _MOST_LOGGER_CHARACTERS))
+        text = storable(cut(message, _LOG_LIMITS.message_characters))
+        name = None if logger is None else storable(cut(logger, _LOG_LIMITS.logger_characters))
         row = (self._clock.sim_time_s, time.time(), level, source, text, name)
         self._recorder.record("log", self._clock.run, row)
 
     def output(self, stream: str, lines: Sequence[str]) -> None:
         """Record what was printed on `stdout` or `stderr`."""
         level, clock, now = _LEVELS[stream], self._clock, time.time()
-        texts = [storable(cut(line, MOST_LOG_CHARACTERS)) for line in lines]
+        texts = [storable(cut(line, _LOG_LIMITS.message_characters)) for line in lines]
         rows = [(clock.sim_time_s, now, level, "controller", text, stream) for text in texts]
         self._recorder.record_together("log", clock.run, rows)
 
@@ -65,7 +81,7 @@ class Journal:
     def _log_lost(self, replaced: dict[str, str]) -> None:
         """Log each path whose value is not in the row, once; the row's column names all of them."""
         for path, kind in replaced.items():
-            if kind in _NOT_LOST or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
+            if kind in _NOT_LOST or path in self._lost or len(self._lost) >= _LOG_LIMITS.lost_paths:
                 continue
             self._lost.add(path)
             what = "could not be stored whole" if kind == TOO_LARGE else "could not be stored"

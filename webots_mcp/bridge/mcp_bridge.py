@@ -281,7 +281,7 @@ class MCPBridge:
         that overlap become one; at most 600 s of a run are kept.
 
         Args:
-            reason: Why they are kept; it is stored with the stretch.
+            reason: Why they are kept; it is stored with the segment.
         """
         try:
             self._session.full_rate.keep(text_of(reason))
@@ -295,10 +295,10 @@ class MCPBridge:
 
         With `publish` the camera's newest image is taken at that rate, scaled down to 160 pixels at
         most (each n-th of a row, each n-th row), and held in memory: the last 78 frames of all
-        cameras, up to 8 MB. One is also taken at the step of a breakpoint's hit. In a kept stretch
-        they become PNG files, one with each call (about a millisecond), which exist as long as the
-        stretch. A frame that could not be taken is counted in `stats()`; a camera's second such
-        frame is logged. Nothing is taken where `keep_last_s` is 0.
+        cameras, up to 8 MB. One is also taken at the step of a breakpoint's hit. In a
+        full-rate segment they become PNG files, one with each call (about a millisecond), which
+        exist as long as the segment. A frame that could not be taken is counted in `stats()`; a
+        camera's second such frame is logged. Nothing is taken if `keep_last_s` is 0.
 
         Args:
             camera: A Webots `Camera`; it may be enabled later.

@@ -12,14 +12,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final, cast
 
 from webots_mcp.bridge.cleaning import replace_non_finite
 from webots_mcp.bridge.plain_values import NotPlainError
 
 _KINDS: Final = frozenset(("nan", "inf", "-inf"))
-_MAX_PATHS: Final = 64
-_MAX_PATH_CHARACTERS: Final = 500
+
+
+@dataclass(frozen=True)
+class KnownPathLimits:
+    """Limits of the paths that are remembered.
+
+    Attributes:
+        paths: Number of paths.
+        characters: Length of a path.
+    """
+
+    paths: int = 64
+    characters: int = 500
+
+
+_LIMITS: Final = KnownPathLimits()
 
 
 class _PathTree:
@@ -50,9 +65,9 @@ def remember_non_finite(state: object, replaced: dict[str, str]) -> None:
     if not replaced or state.__class__ is not dict or not _KINDS.issuperset(replaced.values()):
         return  # a state with other replacements has to be cleaned anyway
     found = list(_find_non_finite(cast("dict[object, object]", state), (), 0))
-    if len(found) > _MAX_PATHS:
+    if len(found) > _LIMITS.paths:
         return
-    if _path_count + len(found) > _MAX_PATHS:
+    if _path_count + len(found) > _LIMITS.paths:
         _paths, _path_count = _PathTree(""), 0
     for keys in found:
         tree = _paths
@@ -88,7 +103,7 @@ def _find_non_finite(
         if type(key) is not str:
             continue
         path_characters = characters + len(key) + 1
-        if path_characters > _MAX_PATH_CHARACTERS:
+        if path_characters > _LIMITS.characters:
             continue
         kind: Any = value.__class__
         if kind is dict:
@@ -142,7 +157,7 @@ def _name(replaced: dict[str, str], names: list[tuple[str, str]]) -> None:
         NotPlainError: If there are many, or two places have one path, which the cleaner counts.
     """
     expected = len(replaced) + len(names)
-    if expected > _MAX_PATHS:
+    if expected > _LIMITS.paths:
         raise NotPlainError
     replaced.update(names)
     if len(replaced) != expected:

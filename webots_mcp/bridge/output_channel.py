@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.bridge.printed_lines import PrintedLines
@@ -18,11 +19,25 @@ from webots_mcp.bridge.redirection import Redirection
 from webots_mcp.errors import warn
 
 POLLS: Final = os.name == "posix"  # Windows has no select() for pipes
-_CHUNK_BYTES: Final = 4096  # PIPE_BUF: a writable pipe accepts this much without blocking
-_MOST_UNFORWARDED_BYTES: Final = 1 << 16  # further data is left in the pipe
 _PATIENCE_S: Final = 0.02  # how long a print waits for the thread that is recording
 
 Record = Callable[[str, Sequence[str]], object]
+
+
+@dataclass(frozen=True)
+class ChannelLimits:
+    """Sizes and times of forwarding what a controller prints.
+
+    Attributes:
+        chunk_bytes: PIPE_BUF: a writable pipe accepts this much without blocking.
+        unforwarded_bytes: Size from which further data is left in the pipe.
+    """
+
+    chunk_bytes: int = 4096
+    unforwarded_bytes: int = 1 << 16
+
+
+_CHANNEL: Final = ChannelLimits()
 
 
 class OutputChannel:
@@ -107,7 +122,7 @@ class OutputChannel:
         while not (self._pump() if POLLS else self._forward_blocking()):
             self._record_in_thread()
             if POLLS:
-                full = len(self._unforwarded) >= _MOST_UNFORWARDED_BYTES
+                full = len(self._unforwarded) >= _CHANNEL.unforwarded_bytes
                 destination = [ends.destination] if self._unforwarded else []
                 _wait_for([] if full else [ends.read_end], destination)
         with self._lock:
@@ -126,10 +141,10 @@ class OutputChannel:
         with self._lock:
             while not self._ended:
                 self._forward()
-                if len(self._unforwarded) >= _MOST_UNFORWARDED_BYTES:
+                if len(self._unforwarded) >= _CHANNEL.unforwarded_bytes:
                     return False
                 try:
-                    data = os.read(self._redirection.read_end, _MOST_UNFORWARDED_BYTES)
+                    data = os.read(self._redirection.read_end, _CHANNEL.unforwarded_bytes)
                 except BlockingIOError:
                     return False
                 self._unforwarded += data
@@ -143,7 +158,7 @@ class OutputChannel:
         destination = self._redirection.destination
         while self._unforwarded and (not POLLS or _wait_for([], [destination], 0)):
             try:
-                written = os.write(destination, self._unforwarded[:_CHUNK_BYTES])
+                written = os.write(destination, self._unforwarded[: _CHANNEL.chunk_bytes])
             except BlockingIOError:
                 return
             except OSError as error:
@@ -158,7 +173,7 @@ class OutputChannel:
     def _forward_blocking(self) -> bool:
         """Wait for data and forward it, where a pipe cannot be polled; True at its end."""
         # Outside of the lock: this read blocks, and a print needs the lock meanwhile.
-        data = os.read(self._redirection.read_end, _MOST_UNFORWARDED_BYTES)
+        data = os.read(self._redirection.read_end, _CHANNEL.unforwarded_bytes)
         with self._lock:
             self._lines.take(data)
             self._unforwarded += data

@@ -21,6 +21,7 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import get_ident
@@ -73,12 +74,8 @@ from webots_mcp.errors import (
 from webots_mcp.signals.register import Seen, find_changes, write_changes
 
 _CLOSED: Final = "the bridge is closed"
-_LOCK_PATIENCE_S: Final = 0.001  # how long to wait for another thread of this process
-_WRITER_PATIENCE_S: Final = 0.001  # and for another writer, whose commit takes 50 us
 # Windows may sleep for 15 ms where less was asked for.
 _BETWEEN_TRIES_S: Final = 0.0 if sys.platform == "win32" else 0.0001
-_CATCH_UP_S: Final = 0.002  # per call: writing waiting rows must not stall the loop
-_RETRY_INTERVAL_S: Final = 1.0
 _INSERT_STATE: Final = STATEMENTS["state"]
 _GO_ON: Final = "UPDATE run SET end_reason = NULL, ended_wall_time_s = NULL WHERE id = ?"
 
@@ -87,12 +84,32 @@ _FOR_GOOD: Final = (
     ForeignDatabaseError, ForkedProcessError, SchemaTooNewError, SchemaTooOldError,
 )  # fmt: skip
 
-_LOST: Final = ("no such table", "FOREIGN KEY")  # in SQLite's error where a table or a row is gone
+_LOST: Final = ("no such table", "FOREIGN KEY")  # in SQLite's error if a table or a row was removed
 
 Result = TypeVar("Result")
 
 _of_parents: list[sqlite3.Connection | None] = []
 _HOLDER: Final = "holder"
+
+
+@dataclass(frozen=True)
+class RecorderPatience:
+    """How long a call of the recorder may wait, in seconds.
+
+    Attributes:
+        lock_s: For another thread of this process.
+        writer_s: For another writer, whose commit takes 50 us.
+        catch_up_s: For writing waiting rows in one call, which must not delay the loop.
+        retry_s: Between two attempts after an error.
+    """
+
+    lock_s: float = 0.001
+    writer_s: float = 0.001
+    catch_up_s: float = 0.002
+    retry_s: float = 1.0
+
+
+_PATIENCE: Final = RecorderPatience()
 
 
 class Recorder:
@@ -174,7 +191,7 @@ class Recorder:
         if self._closing is not None and self._closing != get_ident():
             self._drop(1, _CLOSED)
             return None
-        if not self._lock.acquire(this_call(), _LOCK_PATIENCE_S):
+        if not self._lock.acquire(this_call(), _PATIENCE.lock_s):
             self._put(Row(kind, run, values))
             return None
         try:
@@ -206,7 +223,7 @@ class Recorder:
     def record_together(self, kind: Kind, run: CurrentRun, rows: Sequence[tuple[Any, ...]]) -> None:
         """Write rows of one kind in one transaction, or keep them until they can be written."""
         self.last_use_s = time.monotonic()
-        if not self._lock.acquire(this_call(), _LOCK_PATIENCE_S):
+        if not self._lock.acquire(this_call(), _PATIENCE.lock_s):
             for values in rows:
                 self._put(Row(kind, run, values))
             return
@@ -415,7 +432,7 @@ class Recorder:
         return not self._backlog.waits
 
     def _take_in_waiting(self) -> None:
-        until_s, run = time.monotonic() + _CATCH_UP_S, self.run
+        until_s, run = time.monotonic() + _PATIENCE.catch_up_s, self.run
         while self._backlog.waits and (entries := self._backlog.next_entries()):
             taken = ingest(self._opened, self._ids.session_id, entries)
             self._backlog.forget(taken.number)
@@ -454,7 +471,7 @@ class Recorder:
     def _put(self, row: Row) -> None:
         """Let a row wait in memory, without the connection lock."""
         self._backlog.put(row)
-        if self.off is not None:  # the bridge was closed meanwhile, and no other call looks at it
+        if self.off is not None:  # the bridge was closed meanwhile, and no other call checks it
             self._backlog.drop_rows_in_memory(self.off)
 
     def _keep(self, row: Row) -> None:
@@ -528,7 +545,7 @@ class Recorder:
             self._give_up(str(error))
         except Exception as error:  # noqa: BLE001  (see `is_busy`)
             self._backlog.why = why = text_of(error)
-            self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
+            self._retry_at_s = time.monotonic() + _PATIENCE.retry_s
             if is_damage(error):
                 return self._replace_damaged(why)
             if not is_busy(error):
@@ -590,7 +607,7 @@ class Recorder:
         self._backlog.why = text = text_of(error)
         if is_busy(error):
             return  # another writer has the lock for the moment: the next call tries again
-        self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
+        self._retry_at_s = time.monotonic() + _PATIENCE.retry_s
         if is_damage(error):
             self._replace_files(text)
         elif (
@@ -667,7 +684,7 @@ class Recorder:
 
 def _patiently(act: Callable[[], Result]) -> Result:
     """Call `act`, and again for a millisecond while another writer has the lock."""
-    until_s = time.monotonic() + _WRITER_PATIENCE_S
+    until_s = time.monotonic() + _PATIENCE.writer_s
     while True:
         try:
             return act()

@@ -4,10 +4,24 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass
 from typing import Final
 
-_PIPE_BYTES: Final = 1 << 20  # a print blocks only once the pipe is full
-_MOST_SELECTABLE: Final = 1024  # FD_SETSIZE: select() cannot watch a higher descriptor
+
+@dataclass(frozen=True)
+class PipeLimits:
+    """Limits of pipes.
+
+    Attributes:
+        bytes: Size of a pipe; a print blocks only once the pipe is full.
+        descriptors: FD_SETSIZE: select() cannot watch a higher descriptor.
+    """
+
+    bytes: int = 1 << 20
+    descriptors: int = 1024
+
+
+_PIPE: Final = PipeLimits()
 
 
 class Redirection:
@@ -29,7 +43,7 @@ class Redirection:
         self._descriptor = descriptor
         self.destination = os.dup(descriptor)
         self.read_end, write_end = os.pipe()
-        if max(self.read_end, self.destination) >= _MOST_SELECTABLE:
+        if max(self.read_end, self.destination) >= _PIPE.descriptors:
             os.close(write_end)
             self.close()
             raise OSError("too many files are open")
@@ -61,6 +75,6 @@ def _enlarge(pipe: int) -> None:
         import fcntl
 
         try:
-            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE.bytes)
         except OSError:  # the user's limit for pipes is reached: the default size remains
             return

@@ -27,7 +27,7 @@ class Goal(NamedTuple):
     Attributes:
         until: Run until it holds; None for no condition.
         prune: End as `pruned` where it holds first: the outcome is decided; None for no condition.
-        for_s: Run for so many seconds of simulation time; None for no limit.
+        for_s: Seconds of simulation time to run for; None for no limit.
         reset: Reset the world first; `for_s` counts from there.
         pace: The simulation mode to run in; None for the mode that it ran in last.
         parameters: Values to set first, or at the reset where there is one.
@@ -148,7 +148,7 @@ class Watch:
 
     Args:
         clock: Has the simulation time and the run.
-        tolerance_s: Summed floating-point steps may fall short of a time by so much.
+        tolerance_s: Amount by which summed floating-point steps may fall short of a time.
 
     Attributes:
         stepping: The id of the running `step` command; None also once it was cancelled.

@@ -11,6 +11,7 @@ import json
 import re
 import time
 from collections.abc import Generator
+from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.bridge.claimed_commands import ClaimedCommand, Progress
@@ -37,13 +38,28 @@ from webots_mcp.bridge.scene_paths import PathTarget, find, find_node
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
-_LONGEST_NODE: Final = 50_000  # characters of a node that is added
-_LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
-_LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
 _REQUIRED: Final = ("WorldInfo", "Viewpoint")  # nodes without which Webots has no world
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
 _WORD: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 _SEE_CONSOLE: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
+
+
+@dataclass(frozen=True)
+class SceneChangeLimits:
+    """Limits of a change of the scene tree.
+
+    Attributes:
+        node_characters: Maximum length of a node that is added.
+        shown_characters: Length at which an answer cuts a value.
+        step_s: Wall time until the next round of the loop.
+    """
+
+    node_characters: int = 50_000
+    shown_characters: int = 1_000
+    step_s: float = 3.0
+
+
+_LIMITS: Final = SceneChangeLimits()
 
 
 class SceneChanges:
@@ -158,7 +174,7 @@ class SceneChanges:
     def _until_stepped(self) -> Generator[None, None, bool]:
         """Wait for a step of the simulation; False if simulation time stands still."""
         clock, from_step = self._clock, self._clock.steps_seen
-        until_s = time.monotonic() + _LONGEST_STEP_S
+        until_s = time.monotonic() + _LIMITS.step_s
         while clock.steps_seen == from_step:
             yield
             stands = self._simulation.paused or time.monotonic() > until_s
@@ -170,7 +186,7 @@ class SceneChanges:
 def _shown(value: Any) -> Any:
     """Return a value, or the beginning of its text if that is long."""
     text = json.dumps(value, ensure_ascii=False)
-    return value if len(text) <= _LONGEST_SHOWN else cut(text, _LONGEST_SHOWN)
+    return value if len(text) <= _LIMITS.shown_characters else cut(text, _LIMITS.shown_characters)
 
 
 def _edit(target: PathTarget, before: Any, value: Any) -> FieldEdit:
@@ -235,7 +251,11 @@ def _require_one_node(text: object) -> str:
         InvalidInputError: If it is not the text of one node.
     """
     what = 'give vrml as one node of a world file, such as DEF BOX Solid { name "box" }'
-    if not isinstance(text, str) or len(text) > _LONGEST_NODE or not _ONE_NODE.match(text):
+    if (
+        not isinstance(text, str)
+        or len(text) > _LIMITS.node_characters
+        or not _ONE_NODE.match(text)
+    ):
         raise InvalidInputError(f"{what}; got {text!r:.100}")
     words = [word for word in _WORD.findall(text) if not word.startswith("#")]
     for field, value in itertools.pairwise(words):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.scene_nodes import (
@@ -24,9 +25,6 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.naming import nearest_first
 
 MOST_SEARCHED: Final = 1000  # nodes, for a name
-_MOST_NAMED: Final = 20
-_LONGEST_PATH: Final = 500
-_SLICE_S: Final = 0.005  # the time that reading may take in one round of the controller's loop
 _HEAD: Final = re.compile(
     r"\s*/?(?:root\s*[./]\s*(?=children))?(?:(?:DEF|USE)\s+)?"
     r'(?:"(?P<quoted>[^"]+)"|(?P<plain>[^."\[/][^.\[/]*))'
@@ -37,17 +35,35 @@ _STEP: Final = re.compile(
 _EXAMPLES: Final = "write a path such as ROVER.translation, BALL.children[0].appearance or #12.name"
 
 
+@dataclass(frozen=True)
+class SceneSearchLimits:
+    """Limits of searching the scene tree.
+
+    Attributes:
+        named: Nodes or fields that an error names.
+        path_characters: Maximum length of a path.
+        slice_s: Time that reading may take in one round of the controller's loop.
+    """
+
+    named: int = 20
+    path_characters: int = 500
+    slice_s: float = 0.005
+
+
+_SEARCH: Final = SceneSearchLimits()
+
+
 class Pace:
     """Interrupts a long reading of the scene, so that the controller's loop continues meanwhile."""
 
     def __init__(self) -> None:
-        self._until_s = time.monotonic() + _SLICE_S
+        self._until_s = time.monotonic() + _SEARCH.slice_s
 
     def rest(self) -> Generator[None]:
         """Wait for the next round if the time of this one is used up."""
         if time.monotonic() > self._until_s:
             yield
-            self._until_s = time.monotonic() + _SLICE_S
+            self._until_s = time.monotonic() + _SEARCH.slice_s
 
 
 class PathTarget(NamedTuple):
@@ -114,7 +130,7 @@ def parse(path: object) -> tuple[str, list[str | int]]:
     Raises:
         InvalidInputError: If it is not a path.
     """
-    if not isinstance(path, str) or not path.strip() or len(path) > _LONGEST_PATH:
+    if not isinstance(path, str) or not path.strip() or len(path) > _SEARCH.path_characters:
         raise InvalidInputError(f"{path!r:.80} is not a path of the scene tree: {_EXAMPLES}")
     head = _HEAD.match(path)
     position, steps = (head.end() if head else 0), list[str | int]()
@@ -198,7 +214,7 @@ def _at_the_top(root: Any, index: int) -> SceneNode:
 
 
 def _listed(several: Sequence[SceneNode]) -> str:
-    shown = ", ".join(f"#{each.id} {each.type_name}" for each in several[:_MOST_NAMED])
+    shown = ", ".join(f"#{each.id} {each.type_name}" for each in several[: _SEARCH.named])
     return f"{shown}; give the number of one of them"
 
 
@@ -292,13 +308,13 @@ def _entries_of(target: PathTarget) -> str:
         return "none"
     if target.type_name != "MFNode":
         return f"{count}: 0 to {count - 1}"
-    shown = [f"[{i}] {label(field.getMFNode(i))}" for i in range(min(count, _MOST_NAMED))]
+    shown = [f"[{i}] {label(field.getMFNode(i))}" for i in range(min(count, _SEARCH.named))]
     return f"{count}: {some(shown, count)}"
 
 
 def some(names: Sequence[str], total: int | None = None) -> str:
     """Return a text with the first names and the number of further ones."""
     total = len(names) if total is None else total
-    shown = names[:_MOST_NAMED]
+    shown = names[: _SEARCH.named]
     more = f" and {total - len(shown)} more" if total > len(shown) else ""
     return f"{', '.join(shown) or 'nothing'}{more}"

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
@@ -18,15 +19,30 @@ from webots_mcp.database.thread_stacks import STEPPING
 from webots_mcp.errors import CommandRefusedError
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
-_LONGEST_WAIT_S: Final = 0.1  # for the moment at which a step is due
-_PROMPT_S: Final = 0.002  # of wall time that a step takes which was due when it was asked for
 _INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers
 QUIT: Final = -1
 _VEHICLE: Final = "vehicle"  # the package
 _GUARD: Final = "_webots_mcp_guard"  # of a robot; None of its class
 _METER: Final = "_webots_mcp_meter"  # likewise
 _MARK: Final = "_webots_mcp_asks"  # of a method
-_EPSILON_S: Final = 1e-9
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """Times of waiting for a step, in seconds.
+
+    Attributes:
+        longest_wait_s: For the moment at which a step is due.
+        prompt_s: Wall time that a due step takes.
+        epsilon_s: Tolerance for rounding.
+    """
+
+    longest_wait_s: float = 0.1
+    prompt_s: float = 0.002
+    epsilon_s: float = 1e-9
+
+
+_TIMES: Final = StepTimes()
 
 
 class Simulation:
@@ -122,14 +138,14 @@ class Simulation:
         but before it, and asks for the mode right before the step.
         """
         step_s, now_s = self.basic_time_step_s, time.monotonic()
-        time.sleep(min(max(self._next_step_s - now_s, 0.0), step_s, _LONGEST_WAIT_S))
+        time.sleep(min(max(self._next_step_s - now_s, 0.0), step_s, _TIMES.longest_wait_s))
         if not self.pump() or self.paused:
             return False
         self._mode_set = None
         if self._gate.advance(max(round(step_s * 1000), 1)) == QUIT:
             self.end()
             return False
-        self._next_step_s = max(self._next_step_s, time.monotonic() - _PROMPT_S) + step_s
+        self._next_step_s = max(self._next_step_s, time.monotonic() - _TIMES.prompt_s) + step_s
         return True
 
     @contextmanager
@@ -464,10 +480,10 @@ class Clock:
         self.sim_time_s = now
         if after_step:
             self.stepped_s = now
-        if now > before + _EPSILON_S:
+        if now > before + _TIMES.epsilon_s:
             self.moved_s = time.monotonic()
             self.steps_seen += max(round((now - before) / self.step_s), 1) if self.step_s else 1
-        if now >= before - _EPSILON_S and not self._is_awaited_reset(now, after_step):
+        if now >= before - _TIMES.epsilon_s and not self._is_awaited_reset(now, after_step):
             return False
         self._reset_from_s = None
         self.ended_sim_time_s = before
@@ -508,9 +524,9 @@ class Clock:
     def _is_awaited_reset(self, now_s: float, after_step: bool) -> bool:
         if self._reset_from_s is None:
             return False
-        if self._reset_from_s < self._simulation.basic_time_step_s - _EPSILON_S:
-            return now_s > self._reset_from_s + _EPSILON_S
-        return after_step and now_s <= self._reset_from_s + _EPSILON_S
+        if self._reset_from_s < self._simulation.basic_time_step_s - _TIMES.epsilon_s:
+            return now_s > self._reset_from_s + _TIMES.epsilon_s
+        return after_step and now_s <= self._reset_from_s + _TIMES.epsilon_s
 
 
 # -- runs and simulation time ----------------------------------------------------------------------

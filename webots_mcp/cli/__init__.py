@@ -1,8 +1,8 @@
 """The console commands.
 
 The commands are a table in `commands`; what one needs is imported inside it, so that each answers
-at once. Our own errors end it with one line on stderr and exit code 2,
-what the system refuses (a full disk) or lacks (a package) with 1, Ctrl-C and SIGTERM with 130, 143.
+at once. Errors of webots-mcp end it with one line on stderr and exit code 2, refusals of the system
+(a full disk) and missing packages with 1, Ctrl-C and SIGTERM with 130 and 143.
 """
 
 from __future__ import annotations
@@ -48,23 +48,23 @@ _HELP_OF_DISPLAY: Final = (
 
 
 def names() -> list[str]:
-    """Of all commands."""
+    """Return the names of all commands."""
     from webots_mcp.cli import commands
 
     return sorted(commands.COMMANDS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code."""
+    """Run a command and return its exit code."""
     given = _take_global_options(list(sys.argv[1:] if argv is None else argv))
     try:
         return _run(given, is_process=argv is None)
-    except NotAllowedError as error:  # which quotes a line of a file as it stands there
+    except NotAllowedError as error:  # quotes a line of a file exactly as it is written there
         return _fail(EXIT_BAD_INPUT, str(error), given)
     except WebotsMCPError as error:
         answer = getattr(error, "answer", {})
         return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given, answer)
-    except UnicodeEncodeError as error:  # bytes of the command line that are no text
+    except UnicodeEncodeError as error:  # arguments that are not valid text
         no_text = error.object[error.start : error.end]
         said = f"{no_text!r} cannot be written as {error.encoding}: {error.reason}"
         return _fail(EXIT_BAD_INPUT, said, given)
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(EXIT_SYSTEM, _explain_missing(error), given)
     except KeyboardInterrupt as interrupt:
         return _end(*ended_by(interrupt))
-    except BrokenPipeError:  # the reader of a pipe has seen enough
+    except BrokenPipeError:  # the reader of a pipe has closed it
         _discard_output()
     except OSError as error:
         return _fail(EXIT_SYSTEM, str(error), given)
@@ -82,7 +82,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _take_global_options(given: list[str]) -> list[str]:
-    """Set how answers are shown; returns the rest, with the command's name of today."""
+    """Apply the global options.
+
+    Return the remaining arguments, with current names for former ones.
+    """
     from webots_mcp.cli.commands import FORMER_NAMES
     from webots_mcp.cli.terminal import Display, note_recording, set_display
 
@@ -99,7 +102,7 @@ def _take_global_options(given: list[str]) -> list[str]:
 
 
 def _run(argv: Sequence[str], *, is_process: bool) -> int:
-    """Call the command that was given; without one, show which there are."""
+    """Call the given command; without one, list the commands."""
     from cyclopts import CycloptsError, UnusedCliTokensError
 
     from webots_mcp.cli.commands import COMMANDS
@@ -116,7 +119,7 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
             for each in app[argv[0]].assemble_argument_collection()
             if each.names
         )
-    # Nothing of a recording, and may have colours.
+    # Nothing here comes from a recording, so it may have colours.
     is_help = argv[:1] == ["help"] or not {"--help", "-h"}.isdisjoint(argv)
     if is_help:
         argv = [each for each in argv if each != "--all" or argv[0] in COMMANDS]
@@ -134,7 +137,7 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
 
 
 def _named(error: CycloptsError) -> str:
-    """Say what is wrong, and with which argument: cyclopts omits some names."""
+    """Describe an error with the argument that caused it: cyclopts omits some names."""
     text = re.sub(r' Did you mean "?([^\s"?]+)"?\?', _harmless_offer, str(error))
     argument = error.argument
     if argument is None or any(name in text for name in argument.names):
@@ -143,12 +146,12 @@ def _named(error: CycloptsError) -> str:
 
 
 def _harmless_offer(offer: re.Match[str]) -> str:
-    """Return what cyclopts offers for an unknown name, unless that would destroy something."""
+    """Return cyclopts' correction of an unknown name, unless it would destroy data."""
     return "" if is_destructive(offer[1]) else offer[0]
 
 
 def _fail(code: int, text: str, given: Sequence[str], answer: Mapping[str, Any] = _NOTHING) -> int:
-    """End with an error, which programs read as JSON beside what became of a command."""
+    """End with an error, which programs read as JSON together with the outcome of a command."""
     if "--json" in given:
         with contextlib.suppress(OSError):
             print(spelled_out(json.dumps({**answer, "error": text}, ensure_ascii=False)))
@@ -156,7 +159,10 @@ def _fail(code: int, text: str, given: Sequence[str], answer: Mapping[str, Any] 
 
 
 def _end(code: int, text: str) -> int:
-    """Say why in one line; what could not be printed before is not tried again at the exit."""
+    """Report the reason in one line.
+
+    What could not be printed before is not retried at the exit.
+    """
     with contextlib.suppress(OSError):
         print(f"webots-mcp: {spelled_out(text)}", file=sys.stderr, flush=True)
         _print_details()
@@ -183,7 +189,7 @@ def _explain_missing(error: ModuleNotFoundError) -> str:
     """Name the missing packages, and the line that installs them.
 
     Raises:
-        ModuleNotFoundError: Again, where it is a defect of ours.
+        ModuleNotFoundError: Raised again if it is a defect of webots-mcp.
     """
     if (error.name or "").partition(".")[0] == "webots_mcp":
         raise error
@@ -211,7 +217,7 @@ def _explain_value(error: Exception) -> str:
     """Return what is most likely wrong with the recording, and where it shows.
 
     Raises:
-        Exception: Again, where it is not about a value of a row.
+        Exception: Raised again if it is not about a value of a row.
     """
     from webots_mcp.store.recording import is_over_a_value
 
@@ -228,7 +234,8 @@ def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-# -- commands as cyclopts knows them --
+# -- commands as cyclopts knows them
+# -----------------------------------------------------------------
 
 
 def app_for(argv: Sequence[str], *, shows_all: bool = False) -> App:
@@ -236,7 +243,7 @@ def app_for(argv: Sequence[str], *, shows_all: bool = False) -> App:
 
     Args:
         argv: Only the called command, or for its help those of everyday use (`--all`: all).
-        shows_all: Have all commands, for completion and documentation.
+        shows_all: Whether to include all commands, for completion and documentation.
     """
     from cyclopts import App, Group, Parameter
 
@@ -263,7 +270,7 @@ def app_for(argv: Sequence[str], *, shows_all: bool = False) -> App:
 
 
 def _function_of(command: CommandEntry) -> Callable[..., Any]:
-    """Its function, with the parameters that are its options."""
+    """Return the function of a command, with the parameters that are its options."""
     found = command.declared()
     if inspect.isfunction(found):
         return found
@@ -273,14 +280,14 @@ def _function_of(command: CommandEntry) -> Callable[..., Any]:
 
 
 class CommandHelp(NamedTuple):
-    """A command as its help describes it; arguments by how they are typed."""
+    """A command as its help describes it, with arguments by their spelling."""
 
     text: str
     arguments: dict[str, str]
 
 
 def described() -> dict[str, CommandHelp]:
-    """Every command by its name."""
+    """Return every command by its name."""
     from webots_mcp.cli.commands import COMMANDS
 
     app = app_for([], shows_all=True)
@@ -299,7 +306,7 @@ def described() -> dict[str, CommandHelp]:
 
 def called_value(argument: Argument) -> str:
     """Return the word for its value."""
-    metavar = getattr(argument.parameter, "metavar", None)  # cyclopts 4 has none
+    metavar = getattr(argument.parameter, "metavar", None)  # missing in cyclopts 4
     return metavar if isinstance(metavar, str) else value_name(argument.names[-1])
 
 

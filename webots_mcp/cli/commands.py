@@ -1,6 +1,6 @@
-"""Every command: its group in the help, and the question or the function that it calls.
+"""List every command: its group in the help, and the question or the function that it calls.
 
-Only the command that is called is imported, so that it answers at once.
+Only the called command is imported, so that it answers at once.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ FORMER_NAMES: Final = {
 
 
 class CommandEntry(NamedTuple):
-    """Where a command is found: a question, or a function whose parameters are its options."""
+    """The place of a command: a question, or a function whose parameters are its options."""
 
     group: str
     module: str
     name: str
 
     def declared(self) -> Any:
-        """Return what the module has under its name: a `Question`, or a function."""
+        """Return the object of that name in the module: a `Question` or a function."""
         return getattr(importlib.import_module(self.module), self.name)
 
 

@@ -1,7 +1,7 @@
-"""Pages of the documentation in the terminal: `webots-mcp help stuck`.
+"""Show pages of the documentation in the terminal: `webots-mcp help stuck`.
 
 A topic is the name of a page, a heading, or words of one. The index of headings is read from the
-pages themselves, which a checkout has in `docs/` and an installation inside the package.
+pages themselves, which are in `docs/` of a checkout or inside the installed package.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import re
 import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
@@ -20,13 +21,27 @@ from webots_mcp.cli.terminal import print_json
 from webots_mcp.contract import bundled
 from webots_mcp.errors import InvalidInputError
 
-MAX_WIDTH: Final = 100
-MAX_SEE_ALSO: Final = 5
 _INDEX: Final = "index"
 
 
+@dataclass(frozen=True)
+class HelpLayout:
+    """The layout of help pages.
+
+    Attributes:
+        width: Maximum characters of a line.
+        see_also: Related topics that are named.
+    """
+
+    width: int = 100
+    see_also: int = 5
+
+
+_LAYOUT: Final = HelpLayout()
+
+
 class Section(NamedTuple):
-    """A heading of a page, with the text below it and that of its own headings.
+    """A heading of a page with its text and that of its subheadings.
 
     Attributes:
         page: The name of the page.
@@ -42,7 +57,7 @@ class Section(NamedTuple):
 
     @property
     def topic(self) -> str:
-        """What `webots-mcp help` prints it for."""
+        """The topic for which `webots-mcp help` prints it."""
         return self.page if self.level == 1 else f"{self.page} {anchor_of(self.title)}"
 
 
@@ -63,7 +78,7 @@ def help_(
         return _print_help_of(topic[0])
     if not found:
         raise InvalidInputError(_nothing_about(" ".join(topic)))
-    best, others = found[0], [each.topic for each in found[1 : MAX_SEE_ALSO + 1]]
+    best, others = found[0], [each.topic for each in found[1 : _LAYOUT.see_also + 1]]
     text = with_topics_for_links(best.text)
     if as_json:
         return print_json({"topic": best.topic, "text": text, "see_also": others})
@@ -76,10 +91,10 @@ def help_(
 
 
 def sections_about(topic: Sequence[str]) -> list[Section]:
-    """Return what the pages have about a topic, the best first.
+    """Return the sections about a topic, the best first.
 
     The page of that name comes first, then headings with exactly these words, headings with all of
-    them, headings on a page whose title has the others, and last sections whose text has all.
+    them, headings on a page whose title has the others, and finally sections whose text has all.
 
     Args:
         topic: Words, the first of which may be the name of a page.
@@ -97,7 +112,7 @@ def sections_about(topic: Sequence[str]) -> list[Section]:
 
 
 def _matching(wanted: frozenset[str], candidates: Sequence[Section]) -> list[Section]:
-    """Return the sections that match, those whose headings do before others."""
+    """Return the matching sections, those with matching headings first."""
     if not wanted:
         return []
     ranked: list[tuple[int, int, Section]] = []
@@ -122,7 +137,7 @@ def _matching(wanted: frozenset[str], candidates: Sequence[Section]) -> list[Sec
 
 
 def with_topics_for_links(text: str) -> str:
-    """Return Markdown in which links to other pages name the topic to ask for."""
+    """Return Markdown in which links to other pages name the topic that prints them."""
     text = re.sub(r"!\[([^\]]*)\]\([^)]*\)", r"(picture: \1)", text)
     return re.sub(r"\[([^\]]+)\]\((?!https?:)([^)\s#]*)(?:#([\w-]+))?\)", _topic_for_link, text)
 
@@ -135,7 +150,7 @@ def _topic_for_link(link: re.Match[str]) -> str:
 
 
 def anchor_of(heading: str) -> str:
-    """Return the anchor of a heading, as code hosts make it."""
+    """Return the anchor of a heading, as code hosts create it."""
     return re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-")
 
 
@@ -144,7 +159,7 @@ def anchor_of(heading: str) -> str:
 
 @cache
 def page_files() -> dict[str, Path]:
-    """Return the file of each page, by its name, without the list of all pages."""
+    """Return the file of each page by its name, without the list of all pages."""
     files = sorted(bundled("docs").glob("*.md"))
     return {file.stem: file for file in files if file.stem != _INDEX}
 
@@ -171,9 +186,9 @@ def _sections(page: str) -> tuple[Section, ...]:
 
 
 def _ranked() -> list[str]:
-    """Return the names of the pages, those about symptoms first, then as the index lists them."""
+    """Return the names of the pages, those about symptoms first, then in the order of the index."""
     listed = [name for _, names in _groups() for name in names]
-    # Someone who asks about a symptom wants to know what to do before what is recorded of it.
+    # Someone who looks up a symptom wants to know what to do before what is recorded.
     first = [
         name for name in ("my-robot", "troubleshooting", "events", "check") if name in page_files()
     ]
@@ -191,7 +206,7 @@ def _groups() -> list[tuple[str, list[str]]]:
 
 
 def _words(text: str) -> frozenset[str]:
-    """Return the words of a text, in small letters and without the plural's s."""
+    """Return the words of a text in lower case and without the s of plurals."""
     words = re.findall(r"[^\W_]+(?:_[^\W_]+)*", text.lower())
     return frozenset(re.sub(r"(?<=[a-z]{3})(?<![su])s$", "", word) for word in words)
 
@@ -229,12 +244,12 @@ def _nothing_about(topic: str) -> str:
 
 
 def _print_markdown(text: str) -> None:
-    """Print Markdown: rendered on a terminal, else as it is."""
+    """Print Markdown, rendered on a terminal and raw elsewhere."""
     if not sys.stdout.isatty():
         print(text)
         return
     from rich.console import Console
     from rich.markdown import Markdown
 
-    width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
+    width = min(shutil.get_terminal_size().columns, _LAYOUT.width)
     Console(width=width).print(Markdown(text, hyperlinks=False))

@@ -1,4 +1,4 @@
-"""How a command ends early: by Ctrl-C or by SIGTERM.
+"""End a command early, by Ctrl-C or by SIGTERM.
 
 Both clean up in the same way, and end the process after a short time in any case.
 """
@@ -20,10 +20,10 @@ Handler: TypeAlias = Callable[[int, "FrameType | None"], None]
 
 @contextlib.contextmanager
 def ending_by_signals(*, is_process: bool) -> Generator[None]:
-    """Let SIGTERM clean up as Ctrl-C does: by a KeyboardInterrupt, which carries the signal.
+    """Let SIGTERM clean up like Ctrl-C: by a KeyboardInterrupt, which carries the signal.
 
-    A process that SIGTERM has not ended after 2.5 s, because a thread of it still works, ends at
-    once: the database rolls back what was being written.
+    A process that SIGTERM has not ended after 2.5 s, because one of its threads still works, ends
+    at once: the database rolls back what was being written.
 
     Args:
         is_process: The command is all that the process does, to the exit of the interpreter, which
@@ -51,10 +51,10 @@ def ending_by_signals(*, is_process: bool) -> Generator[None]:
 
 @contextlib.contextmanager
 def ending_by_event(stopping: threading.Event) -> Generator[None]:
-    """Let a signal only set an event, and end the command when what watches it is over.
+    """Let a signal only set an event, and end the command when the watcher of the event is done.
 
-    This is for work in threads: two exceptions out of handlers break the locks that they meet. A
-    second signal ends the process at once.
+    This is for work in threads: two exceptions from signal handlers break the locks that they
+    interrupt. A second signal ends the process at once.
     """
     came: list[int] = []
 
@@ -62,7 +62,7 @@ def ending_by_event(stopping: threading.Event) -> Generator[None]:
         if came:
             _exit(number)
         came.append(number)
-        threading.Thread(target=stopping.set).start()  # this thread may hold the lock already
+        threading.Thread(target=stopping.set).start()  # this thread may already hold the lock
 
     try:
         with _handling(end, *_WORDS):
@@ -74,14 +74,14 @@ def ending_by_event(stopping: threading.Event) -> Generator[None]:
 
 @contextlib.contextmanager
 def ending_in_time() -> Generator[None]:
-    """End the process at a signal, after half a second at most, whatever its threads wait for.
+    """End the process within half a second of a signal, whatever its threads wait for.
 
-    One that reads from a terminal waits for the next line, which nobody will type.
+    A thread that reads from a terminal waits for the next line, which nobody will type.
     """
-    import logging  # only here: most commands do without it
+    import logging  # imported here, because most commands do without it
 
     def end(number: int, frame: FrameType | None) -> None:
-        # A task that the interrupt meets in the middle is no defect that anybody has to read of.
+        # A task that the interrupt ends halfway is no defect that a person has to read about.
         logging.getLogger("asyncio").disabled = True
         late = threading.Timer(0.5, _exit, [number])
         late.daemon = True
@@ -97,7 +97,7 @@ def ending_in_time() -> Generator[None]:
 
 @contextlib.contextmanager
 def _handling(handler: Handler, *numbers: int) -> Generator[None]:
-    """Handle signals; not in a thread that does not get them."""
+    """Handle signals, except in a thread that does not receive them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -110,7 +110,7 @@ def _handling(handler: Handler, *numbers: int) -> Generator[None]:
 
 
 def ended_by(interrupt: KeyboardInterrupt) -> tuple[int, str]:
-    """Return the exit code of a process that a signal has ended, and a word about it."""
+    """Return the exit code of a process that a signal has ended, and the signal in words."""
     number = signal.Signals(interrupt.args[0] if interrupt.args else signal.SIGINT)
     return 128 + number, _WORDS[number]
 

@@ -1,4 +1,4 @@
-"""Commands that judge runs: is it well, where do two part, does it repeat, what takes its time."""
+"""Define the commands that judge runs: their checks, differences, repeatability and profile."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from webots_mcp.judging.divergence import Parting
 
 EXIT_CODES: Final = {"fail": 1, "not looked at": 2}
-_ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
+_ELEMENTS: Final = {  # The elements of JUnit XML, and the attributes that count them.
     "fail": ("failure", "failures"),
     "not looked at": ("error", "errors"),
     "not applicable": ("skipped", "skipped"),
@@ -93,26 +93,26 @@ def check(
     reply = ask(webots_check_run, given, recorded)
     data = reply.data or {}
     shown = reply if as_json else reply._replace(data=_in_short(_as_typed(data)))
-    if junit is not None:  # first: who reads what is shown may not read it to its end
+    if junit is not None:  # first, because the reader of the output may stop early
         _write(junit, data)
     show(webots_check_run, shown, recorded, as_json=as_json)
     return EXIT_CODES.get(data.get("outcome", ""), 0)
 
 
 def _compile(recorded: Where) -> None:
-    """Let controllers that start without a server read what their project expects now."""
+    """Compile the project's expectations for controllers that start without a server."""
     from webots_mcp.store.project_file import NO_PROJECT, compile_project, file_of, read_project
 
     recording = recorded.recording(read_only=False)
     file = file_of(recording.data_dir)
     project = read_project(file) if file else NO_PROJECT
-    # Where nothing can be written it is asked all the same, of what is recorded.
+    # If nothing can be written, the check still uses what is recorded.
     with contextlib.suppress(WebotsMCPError, sqlite3.Error), recording.writer() as connection:
         compile_project(connection, project)
 
 
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
-    """Return the answer with commands in the place of calls, and what passed in one line."""
+    """Return the answer with commands instead of calls, and with passed checks in one line."""
     from webots_mcp.cli.question_commands import OPTIONS
     from webots_mcp.cli.wording import commands_by_tool
 
@@ -141,7 +141,7 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_short(answer: dict[str, Any]) -> dict[str, Any]:
-    """Return the answer with what does not apply in one line, and no details of what passed."""
+    """Return the answer with inapplicable checks in one line, and no details of passed ones."""
     table = answer.get("checks")
     if is_verbose() or not table:
         return answer
@@ -164,7 +164,7 @@ _DESCRIBE_TYPED: Final = "webots-mcp signals --describe"
 
 
 def _description_as_typed(call: str) -> str:
-    """The command that describes a signal, for the call of the tool."""
+    """Return the command that describes a signal, for the call of the tool."""
     keywords: Any = cast("Any", ast.parse(call, mode="eval").body).keywords
     said = {each.arg: ast.literal_eval(each.value) for each in keywords}
     (name,) = said.pop("signals")
@@ -172,7 +172,7 @@ def _description_as_typed(call: str) -> str:
 
 
 def _write(file: Path, answer: dict[str, Any]) -> None:
-    """Write an answer as JUnit XML: a warning passes, and stands in `system-out`.
+    """Write an answer as JUnit XML; a warning passes and appears in `system-out`.
 
     Raises:
         InvalidInputError: The file cannot be written.
@@ -277,7 +277,8 @@ def repeatability(
     from webots_mcp.store.run_rows import fetch_run
     from webots_mcp.store.runs import annotate_run
 
-    ways = sorted(dict.fromkeys(by or ["reset"]))  # processes first: others are judged by them
+    # processes first, because the others are compared with them
+    ways = sorted(dict.fromkeys(by or ["reset"]))
     if number < 2:
         raise InvalidInputError(
             f"-n {number} is too few: at least two runs are needed to compare. Use -n 2 or more."
@@ -316,7 +317,7 @@ def repeatability(
 def _in_processes(
     world: Path | None, asked: Waiting, for_s: float, number: int, *, stand_in: bool
 ) -> list[int]:
-    """Run a world in simulators of their own, as trials without parameters."""
+    """Run a world in separate simulators, as trials without parameters."""
     from webots_mcp.cli.steering_commands import TrialOptions, run_plan
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.store.trial_sets import trials_of
@@ -340,7 +341,7 @@ def _in_processes(
 
 
 def _live(way: str, asked: Waiting, for_s: float) -> int:
-    """Let the live simulation begin anew and run; the run that was recorded."""
+    """Restart the live simulation and let it run. Return the recorded run."""
     from webots_mcp.cli.question_commands import ask
     from webots_mcp.questions.control_simulation import webots_run, webots_world_reload
 
@@ -358,7 +359,7 @@ def _live(way: str, asked: Waiting, for_s: float) -> int:
 
 
 def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
-    """Whose fault it is that runs part, where processes of their own tell."""
+    """Say what makes runs diverge, if separate processes show it."""
     first, *ways = found
     if first != "process" or not ways:
         return {}
@@ -387,7 +388,7 @@ def _answer(found: Sequence[Parting]) -> dict[str, Any]:
     return {
         "run_ids": [found[0].run_ids[0], *(each["run_id"] for each in facts)],
         "diverging": diverging,
-        "parted": diverging,  # its former name, for scripts
+        "parted": diverging,  # its former name, kept for scripts
         "verdict": verdict_on(found),
         "repeats": [{name: each[name] for name in shown if each[name]} for each in facts],
     }

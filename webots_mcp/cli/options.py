@@ -1,4 +1,4 @@
-"""Options that commands share: values, the recording, a part of it, and limits of retention."""
+"""Define the options that commands share: values, recording, range, limits of retention."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ if TYPE_CHECKING:
 
 if TYPE_CHECKING or hasattr(cyclopts.Parameter(), "metavar"):
     Parameter = cyclopts.Parameter
-else:  # cyclopts 4, the last for Python 3.10: options have no words for their values
+else:  # cyclopts 4, the last version for Python 3.10, has no words for the values of options
 
     def Parameter(*names: str, metavar: str | None = None, **given: Any) -> cyclopts.Parameter:  # noqa: N802
-        """Return how an argument is typed, without the word for its value."""
+        """Return a parameter by its spelling, without the word for its value."""
         return cyclopts.Parameter(*names, **given)
 
 
-_TOO_LARGE: Final = 2**63  # for SQLite, and no id that it has given
+_TOO_LARGE: Final = 2**63  # limit of SQLite, above all assigned ids
 _NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
 _RUNS: Final = "outlive"
 
 
 def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
-    """Return what was typed; cyclopts by itself would round 1.5.
+    """Return the typed whole number; cyclopts by itself would round 1.5.
 
     Raises:
-        ValueError: It is no whole number, or one that SQLite cannot hold.
+        ValueError: It is no whole number, or exceeds the range of SQLite.
     """
     text = tokens[0].value
     if not re.fullmatch(r"[+-]?[0-9]+", text):
@@ -64,10 +64,10 @@ def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
 
 
 def refuse_options(_kind: Any, value: Any) -> None:
-    """A hyphen alone is a value, and so is a condition such as '-x > 3'.
+    """Refuse unknown options, but accept a lone hyphen and conditions such as '-x > 3' as values.
 
     Raises:
-        ValueError: It is an option, and nobody knows it.
+        ValueError: It is an unknown option.
     """
     if isinstance(value, (str, Path)) and re.match(r"--?\w[\w-]*(=|$)", str(value)):
         raise ValueError(f"unknown option {value}")
@@ -77,7 +77,7 @@ def _row_id(_kind: Any, tokens: Sequence[Token]) -> int:
     text = tokens[0].value
     if (
         text.isascii() and text.isdecimal() and int(text) < _TOO_LARGE
-    ):  # what SQLite could have given
+    ):  # an id that SQLite could have assigned
         return int(text)
     raise ValueError(f"{text!r} is not an id. An id is a number from an answer")
 
@@ -87,15 +87,15 @@ Count: TypeAlias = Annotated[int, Parameter(converter=whole_number, validator=Nu
 
 
 def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> dict[str, Any]:
-    """Values by name, of texts NAME=VALUE; a value that is no JSON is a text.
+    """Return values by name from texts NAME=VALUE; a value that is no JSON is a text.
 
     Args:
-        texts: As they were typed.
-        kinds: Of parameters, by name: the value of one of kind `str` is a text, also one that looks
-            like a number.
+        texts: The texts as typed.
+        kinds: Kinds of parameters by name: a value of kind `str` is a text even if it looks like a
+            number.
 
     Raises:
-        InvalidInputError: One has no `=`.
+        InvalidInputError: A text has no `=`.
     """
     values: dict[str, Any] = {}
     for text in texts:
@@ -107,7 +107,7 @@ def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> d
 
 
 def value_of(text: str) -> Any:
-    """Return what was typed, as JSON; what is none is a text."""
+    """Return a typed value parsed as JSON, or else as text."""
     try:
         return json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError):
@@ -115,11 +115,11 @@ def value_of(text: str) -> Any:
 
 
 def _no_constant(name: str) -> float:
-    """NaN and the infinities are Python's, and none of JSON."""
+    """Refuse NaN and the infinities, which Python accepts but JSON does not."""
     raise ValueError(name)
 
 
-# -- which recording, which part of it, and how it is opened --
+# -- which recording, which part of it, and how it is opened ---------------------------------------
 
 _Given = ParamSpec("_Given")
 Json: TypeAlias = Annotated[
@@ -131,7 +131,7 @@ Robot: TypeAlias = Annotated[
         "--robot", metavar="NAME", help="Name of the robot. Needed only if several robots are live."
     ),
 ]
-# Of a `Path` the shell completes the names of files.
+# Shells complete file names for arguments of type `Path`.
 DataDir: TypeAlias = Annotated[
     Path | None,
     Parameter(
@@ -172,13 +172,13 @@ class Where:
         return RecordingAccess(*where, read_only=read_only, asker="cli")
 
     def typed(self) -> list[str]:
-        """Return the options that name it in another command line."""
+        """Return the options that name the recording in another command line."""
         given = (("--data-dir", self.data_dir), ("--database", self.database))
         return [text for option, value in given if value for text in (option, str(value))]
 
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
-        """A connection that reads; how the file is read is said on stderr where that matters."""
+        """Open a reading connection; unusual ways of reading the file are reported on stderr."""
         from webots_mcp.store.recording import storage
 
         with self.recording().reader() as connection:
@@ -187,7 +187,7 @@ class Where:
             yield connection
 
     def may_change(self) -> bool:
-        """Return whether rows may still come: none do where the file cannot be written."""
+        """Return whether rows may still be added; never if the file cannot be written."""
         from webots_mcp.database.connection import FrozenConnection
 
         with self.recording().reader() as connection:
@@ -197,7 +197,7 @@ class Where:
     def writer(
         self, command: str, arguments: Mapping[str, Any] = _NO_KINDS, *, create: bool = False
     ) -> Generator[tuple[RecordingAccess, sqlite3.Connection]]:
-        """The recording, and a connection that may write to it for a command with such arguments.
+        """Open the recording and a writing connection for a command with such arguments.
 
         Raises:
             NotAllowedError: The project's file does not allow the command.
@@ -218,7 +218,7 @@ HERE: Final = Where()
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ToRobot(Where):
-    """The robot that a command asks."""
+    """The robot that a command addresses."""
 
     robot: Robot = None
 
@@ -226,7 +226,7 @@ class ToRobot(Where):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Waiting(ToRobot):
-    """The robot that a command asks, and how long it waits for the answer."""
+    """The robot that a command addresses, and how long it waits for the answer."""
 
     timeout_wall_s: Annotated[
         float | None,
@@ -239,7 +239,7 @@ class Waiting(ToRobot):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ToWebots(Waiting):
-    """The same, where Webots itself can be asked as well."""
+    """The robot that a command addresses, if Webots itself can do it as well."""
 
     force: Annotated[
         bool, Parameter("--force", help="Press keys in the window of Webots if nothing else works.")
@@ -258,7 +258,7 @@ class ToWebots(Waiting):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class TimeRangeOptions:
-    """Which run of which robot, and which stretch of it: the options that commands share."""
+    """The options for a run of a robot and a range of it."""
 
     robot: Robot = None
     run_id: RunId = None
@@ -292,7 +292,7 @@ class TimeRangeOptions:
     ] = None
 
     def scope(self) -> Scope:
-        """Return what is asked for."""
+        """Return the scope that the options mean."""
         from webots_mcp.store.reading.ranges import Scope
 
         return Scope(**vars(self))
@@ -305,7 +305,7 @@ class TimeRangeOptions:
 
 
 def only_reading(command: Callable[_Given, None]) -> Callable[_Given, None]:
-    """Return a command that reads again past invalid rows if a value makes it fail."""
+    """Decorate a command that only reads, so that it reads again past invalid rows if needed."""
 
     @functools.wraps(command)
     def read(*arguments: _Given.args, **options: _Given.kwargs) -> None:
@@ -315,7 +315,7 @@ def only_reading(command: Callable[_Given, None]) -> Callable[_Given, None]:
 
 
 def past_wrong_values(run: Callable[[], None]) -> None:
-    """Run what only reads; where it fails over a value, again past invalid rows."""
+    """Run a reading function; if it fails because of a value, run it again past invalid rows."""
     try:
         return run()
     except Exception as error:
@@ -327,7 +327,7 @@ def past_wrong_values(run: Callable[[], None]) -> None:
 
 
 def past_invalid_rows(run: Callable[[], None]) -> None:
-    """Run what only reads past invalid rows, which are named on stderr."""
+    """Run a reading function past invalid rows, which are named on stderr."""
     from webots_mcp.store import invalid_rows
 
     with invalid_rows.past_invalid_rows() as invalid:
@@ -337,7 +337,7 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
 
 
 def make_chunks_first(recording: RecordingAccess) -> None:
-    """Put into chunks what no server has, so that a question of any length is answered."""
+    """Put rows into chunks that no server has handled, so that any question can be answered."""
     from webots_mcp.cli.streams import shown_progress
     from webots_mcp.store.chunk_making import make_missing_chunks
 
@@ -352,7 +352,7 @@ def make_chunks_first(recording: RecordingAccess) -> None:
 
 
 def _option(name: str, text: str) -> Parameter:
-    """Return the option of a limit, with what holds where nobody has set one."""
+    """Return the option of a limit, with the default."""
     value = getattr(DEFAULT, name)
     text += f" Default: {value:g}." if name == _RUNS else f" Default: {limit_text(value)}."
     if isinstance(value, Limit) and value.limits:
@@ -367,7 +367,7 @@ def _name_of(name: str) -> str:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class RetentionOptions:
-    """How much is kept of what, as it was typed; by the names of `Retention`."""
+    """How much of each kind is kept, as typed; by the names of `Retention`."""
 
     state: Annotated[str | None, _option("state", "Limit for recorded states.")] = None
     kept_state: Annotated[
@@ -394,7 +394,7 @@ class RetentionOptions:
     ] = None
 
     def asked(self) -> Asked:
-        """Return the limits that were given; None goes back to the default.
+        """Return the given limits; None resets a limit to the default.
 
         Raises:
             InvalidInputError: A text is not a limit, or a number is below 1.
@@ -415,7 +415,7 @@ def _value(name: str, text: str) -> Limit | float | None:
 
 
 def _times_of(text: str) -> float:
-    """Return how many times; 0 means for ever, which a person writes as all."""
+    """Return a number of times; 0 means for ever, which is typed as all."""
     if text == NO_LIMIT:
         return 0.0
     try:

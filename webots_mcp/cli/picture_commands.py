@@ -1,4 +1,4 @@
-"""Commands that fetch a picture: the robot's camera, or the simulator's 3D view."""
+"""Define the commands that fetch a picture: the robot's camera, or the simulator's 3D view."""
 
 from __future__ import annotations
 
@@ -94,10 +94,10 @@ def screenshot(
 def _save(
     question: Question, given: dict[str, Any], asked: ToRobot, file: Path, *, as_json: bool
 ) -> None:
-    """Ask for a picture, write it and say what it shows; the ending follows its format.
+    """Request a picture, write it and describe it; the file extension follows its format.
 
     Raises:
-        NothingRecordedError: There is no picture; the text says why.
+        NothingRecordedError: There is no picture; the text explains why.
     """
     from webots_mcp.cli.question_commands import ask
 
@@ -105,7 +105,7 @@ def _save(
     texts = [each for each in reply.shown if isinstance(each, str)]
     picture = next((each for each in reply.shown if not isinstance(each, str)), None)
     facts: dict[str, Any] = {}
-    for text in texts:  # the facts are JSON, as a model reads them
+    for text in texts:  # the facts are JSON, as in the answer for a model
         with contextlib.suppress(ValueError):
             facts |= json.loads(text)
     if picture is None:

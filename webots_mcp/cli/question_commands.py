@@ -1,6 +1,6 @@
-"""Questions as commands: options and help, the call, and the answer in a terminal.
+"""Turn questions into commands: options and help, the call, and the answer in a terminal.
 
-All of it comes from the question's declaration; nothing here knows any single question.
+Everything is derived from the question's declaration; nothing here knows any single question.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from webots_mcp.questions.arguments import FOR_A_PERSON, SCOPE
 from webots_mcp.questions.declaration import Caller, Question, Reply
 from webots_mcp.store.recording import RecordingAccess
 
-# How options are called whose argument has another name in all questions.
+# Options of arguments that have another name in all questions.
 OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
     {
         "run_id": "--run",
@@ -67,7 +67,7 @@ _VALUE_NAMES: Final = {
 _NAMES_OF_TYPES: Final[Mapping[Any, str]] = types.MappingProxyType(
     {int: "N", float: "X", str: "TEXT"}
 )
-# What a person does not give, where a model's client would soon give up waiting.
+# Default of arguments for which a model's client would stop waiting early, but a person would not.
 _DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_wall_s": 600.0})
 _FOLLOW: Final = Annotated[
     bool,
@@ -140,7 +140,7 @@ def _is_list(question: Question, argument: str) -> bool:
 
 
 def _without_none(kind: Any) -> Any:
-    """Of something that may be left out, what it is otherwise."""
+    """Return the type of an optional argument without None."""
     kinds = [each for each in get_args(kind) if each is not type(None)]
     is_optional = get_origin(kind) in (Union, types.UnionType) and len(kinds) == 1
     return kinds[0] if is_optional else kind
@@ -149,23 +149,23 @@ def _without_none(kind: Any) -> Any:
 def ask_and_show(
     question: Question, given: Mapping[str, Any], where: Where, *, as_json: bool
 ) -> None:
-    """Ask a question and print its answer.
+    """Answer a question and print the answer.
 
     Raises:
-        WebotsMCPError: As `ask`, and as `show`.
+        WebotsMCPError: As for `ask` and `show`.
     """
     show(question, ask(question, given, where), where, as_json=as_json)
 
 
 def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
-    """Ask a question as a person does: of any length of recording, for as long as it takes.
+    """Answer a question for a person: about any length of recording, without a time limit.
 
     Raises:
         InvalidInputError: An argument is out of bounds.
-        NothingRecordedError: There is nothing to ask about.
-        WebotsMCPError: As the question says.
+        NothingRecordedError: Nothing is recorded that the question is about.
+        WebotsMCPError: As the question declares.
     """
-    asks_controllers = question.has_caller  # which takes a row in the queue, also to read
+    asks_controllers = question.has_caller  # reading also takes a row in the queue
     recording = where.recording(read_only=question.effect.reads and not asks_controllers)
     valid = _valid(question, given, recording)
     if {"signals", "pattern"} & {each.name for each in question.parameters}:
@@ -176,7 +176,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
 
 @contextmanager
 def _caller(question: Question, recording: RecordingAccess) -> Generator[Caller | None]:
-    """Who asks, where the question wants to know; what it starts ends with the command."""
+    """Return the caller, if the question needs it; what it starts ends with the command."""
     if not question.has_caller:
         yield None
         return
@@ -193,7 +193,7 @@ def _caller(question: Question, recording: RecordingAccess) -> Generator[Caller 
 def _valid(
     question: Question, given: Mapping[str, Any], recording: RecordingAccess
 ) -> dict[str, Any]:
-    """Return the arguments as the question takes them; others keep their defaults."""
+    """Return the arguments in the types of the question; others keep their defaults."""
     meant: dict[str, Any] = {}
     for parameter in question.parameters:
         value, kind = given.get(parameter.name), _plain(parameter.annotation)
@@ -220,7 +220,7 @@ def _valid(
 
 
 def _kinds_in(recording: RecordingAccess) -> Mapping[str, str]:
-    """Of the parameters that robots have, by name."""
+    """Return the kinds of the parameters that robots have, by name."""
     from webots_mcp.store.run_parameters import kinds_of
 
     with recording.reader() as connection:
@@ -231,8 +231,8 @@ def show(question: Question, reply: Reply, where: Where, *, as_json: bool) -> No
     """Print an answer.
 
     Raises:
-        CommandRefusedError: It is of a command that was not done.
-        NothingRecordedError: Nothing was recorded: the answer is only why.
+        CommandRefusedError: The answer is about a command that was not carried out.
+        NothingRecordedError: Nothing was recorded, and the answer only says why.
     """
     data = reply.data
     if data is None:
@@ -249,7 +249,7 @@ def show(question: Question, reply: Reply, where: Where, *, as_json: bool) -> No
 
 
 def _not_done(question: Question, answer: Mapping[str, Any], where: Where) -> str:
-    """Return what became of a command, and what to do next."""
+    """Return the outcome of a command that was not carried out, and what to do next."""
     is_under_way = answer["outcome"] == "claimed" and "command_id" in answer
     hint = _under_way(answer, where) if is_under_way else answer.get("hint")
     failed = (f"{route}: {reason}" for route, reason in answer.get("failed_routes", {}).items())
@@ -258,7 +258,7 @@ def _not_done(question: Question, answer: Mapping[str, Any], where: Where) -> st
 
 
 def _under_way(answer: Mapping[str, Any], where: Where) -> str:
-    """Return the command lines that go on waiting, and that end what lets the loop come round."""
+    """Return the command lines that continue waiting, and that free the loop."""
     wait = shlex.join(["webots-mcp", "wait", str(answer["command_id"]), *where.typed()])
     robot = ["--robot", answer["robot"]] if "robot" in answer else []
     end = shlex.join(["webots-mcp", "pause", *robot, *where.typed()])
@@ -276,12 +276,12 @@ def _require_recorded(data: Mapping[str, Any]) -> None:
 
 
 def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json: bool) -> None:
-    """Show an answer, then the rows that come, of the robot that it was about.
+    """Show an answer, then new rows of its robot as they arrive.
 
-    It ends after the answer where nothing can be written to the recording.
+    It ends after the answer if nothing can be written to the recording.
 
     Raises:
-        BrokenPipeError: Nobody reads it any more.
+        BrokenPipeError: The reader has closed the pipe.
     """
     assert question.follows is not None
     if given.get("cursor") is not None:
@@ -312,13 +312,13 @@ def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json:
 
 
 class _NewRows:
-    """Which rows of the newest ones were not among those before."""
+    """Find which of the newest rows are new."""
 
     def __init__(self) -> None:
         self._newest: dict[bool, int] = {}
 
     def of(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Return those that are new; rows that wait for a run have numbers of their own."""
+        """Return the new rows; rows that wait for a run have numbers of their own."""
         new = [row for row in rows if row["id"] > self._newest.get(row["run_id"] is None, 0)]
         for row in new:
             self._newest[row["run_id"] is None] = row["id"]
@@ -365,7 +365,7 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         default = inspect.Parameter.empty
     elif not isinstance(usual := _DEFAULTS.get(name, declared.default), bool) and usual:
         text += f" Default: {usual:g}." if isinstance(usual, float) else f" Default: {usual}."
-    text = text.replace("*", r"\*")  # help is Markdown, where two of them would be emphasis
+    text = text.replace("*", r"\*")  # help is Markdown, where two asterisks would mean emphasis
     if default is None and type(None) not in get_args(kind):
         kind = Union[kind, None]  # noqa: UP007
     option = option_of(question, name)
@@ -381,7 +381,7 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
             converter=whole_number if _without_none(kind) is int else None,
         )  # fmt: skip
         place = inspect.Parameter.POSITIONAL_ONLY
-    elif default is True:  # its option is the one that turns it off
+    elif default is True:  # its option turns it off
         text += f" This is the default; {option} turns it off."
         shown = Parameter(f"--{name.replace('_', '-')}", help=text, negative=option)
     else:
@@ -398,24 +398,24 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
 
 
 def _help_of(question: Question, argument: str) -> str:
-    """Return what an argument means, with examples as they are typed."""
+    """Return the description of an argument, with examples as typed."""
     text = as_typed(question.described(argument))
     text = re.sub(r"\{['\"](\w+)['\"]: ([^{},]+)\}", r"\1=\2", text)
     return re.sub(r"\['(\w+)'\]", r"\1", text)
 
 
 def _value_name(argument: str) -> str | None:
-    """Return how the help calls its value; None for the name of its type."""
+    """Return the word for its value in the help; None for the name of its type."""
     return next((name for end, name in _VALUE_NAMES.items() if argument.endswith(end)), None)
 
 
 def _place(question: Question, argument: str) -> list[int]:
-    """Return where it stands among those without an option's name."""
+    """Return its position among the positional arguments."""
     return [place for place, name in enumerate(question.positional) if name == argument]
 
 
 def _plain(annotation: Any) -> Any:
-    """Return the type without what pydantic is reported beside it."""
+    """Return the type without pydantic's annotations."""
     if get_origin(annotation) is Annotated:
         return _plain(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
@@ -426,7 +426,7 @@ def _plain(annotation: Any) -> Any:
 
 
 def _number_of_items(question: Question, argument: str) -> int | None:
-    """Of an argument that always has the same number of them."""
+    """Return the number of items of an argument that always has the same number of them."""
     bounds = question.arguments.model_fields[argument].metadata
     least, most = (
         next((getattr(each, name) for each in bounds if hasattr(each, name)), None)
@@ -442,12 +442,12 @@ def _is_mapping(kind: Any) -> bool:
 
 
 def _is_of_parameters(kind: Any) -> bool:
-    """Return whether the values of a mapping are those of parameters, which have declared kinds."""
+    """Return whether a mapping holds values of parameters, which have declared kinds."""
     return get_args(_without_none(kind))[1] is not Any
 
 
 def _is_json(kind: Any) -> bool:
-    """Return whether several types are possible; JSON decides which one was typed."""
+    """Return whether several types are possible, so that JSON decides which one was typed."""
     each = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
     kinds = [one for one in each if one is not type(None)]
     return kinds == [Any] or (len(kinds) > 1 and all(get_origin(k) is not Literal for k in kinds))

@@ -1,4 +1,4 @@
-"""Commands about the recording: shown as it grows and as a picture; taken out, in, and away."""
+"""Define the commands about the recording: export, import, prune, retention, tail and plot."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _UNLIMITED: Final = RetentionOptions()
 
 
 class _Written(NamedTuple):
-    """What came of an export; of a table on stdout only what there is to know about it."""
+    """The outcome of an export; for a table on stdout only notes about it."""
 
     file: Path | None
     text: str
@@ -156,7 +156,7 @@ def export(
             written = _export_table(recorded, part, trial_set, file, form, safe_cells=safe_cells)
         _show(written, as_json=json)
 
-    # What went to stdout cannot be taken back: there each row is looked at first.
+    # Output to stdout cannot be taken back, so each row is checked first.
     past_invalid_rows(run) if file is None else past_wrong_values(run)
 
 
@@ -218,7 +218,7 @@ def _export_for_viewers(recorded: Where, part: TimeRangeOptions, file: Path, for
 
 
 def _notes_of(wanted: TimeRange) -> list[str]:
-    """Each call in a full-rate segment is a row of an export, whatever else was asked for."""
+    """Note that each call in a full-rate segment is a row of an export."""
     from webots_mcp.store.reading.ranges import USE_EVERY_ROW
 
     return [note.removesuffix(USE_EVERY_ROW) for note in wanted.notes]
@@ -251,7 +251,7 @@ def _show(written: _Written, *, as_json: bool) -> None:
         beside = str(written.data.get("beside", ""))
         beside = f" {beside[0].upper()}{beside[1:]}" if beside else ""
         print(f"Exported {written.text} to {written.file}.{beside}")
-    print_notes(written.notes, sys.stderr)  # stdout may be the table
+    print_notes(written.notes, sys.stderr)  # stdout may hold the table
 
 
 def import_(
@@ -295,12 +295,12 @@ def import_(
 
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
-    """Return what the import has brought, of the runs that are in both recordings now."""
+    """Return what the import has brought, from the runs that both recordings now have."""
     from webots_mcp.database.schema_migration import in_current_schema
     from webots_mcp.store.merging import settled
 
     with in_current_schema(source) as current:
-        settled(current)  # first: no database is made for what is no recording
+        settled(current)  # first, so that no database is created for a file that is no recording
         return _merge_into(recorded, source, current)
 
 
@@ -325,7 +325,7 @@ def _merge_into(recorded: Where, source: Path, current: Path) -> dict[str, Any]:
 
 
 def _imported(found: dict[str, Any], source: Path) -> str:
-    """Return what an import has brought, in a sentence."""
+    """Return a sentence on what an import has brought."""
     new, known = found["new_run_ids"], found["known_run_ids"]
     was = "was" if len(known) == 1 else "were"
     before = f"{runs_named(known)} {was} imported before" if known else ""
@@ -431,7 +431,7 @@ def retention(
 def _prune(
     recording: RecordingAccess, connection: sqlite3.Connection, retention: Retention
 ) -> Purged:
-    """Purge, with somebody who keeps the log of the database short meanwhile."""
+    """Purge, while a maintainer keeps the log of the database short."""
     from webots_mcp.database.connection import CHECKPOINT_TIMEOUT_MS
     from webots_mcp.database.maintenance import Maintainer
     from webots_mcp.store.purge import prune as purge
@@ -440,7 +440,8 @@ def _prune(
     assert isinstance(recording.database, Path)
     connection.execute(f"PRAGMA busy_timeout={CHECKPOINT_TIMEOUT_MS}")
     live = any(robot.live for robot in list_robots(connection, time.time()))
-    maintainer = Maintainer(recording.database, "prune")  # idle while a server or a bridge is it
+    # idle while a server or a bridge is the maintainer
+    maintainer = Maintainer(recording.database, "prune")
     maintainer.start()
     try:
         with shown_progress("pruning") as progress:
@@ -450,7 +451,7 @@ def _prune(
 
 
 def _as_data(wanted: Plan) -> dict[str, Any]:
-    """Return what goes and what does not, for programs."""
+    """Return what is deleted and what stays, for programs."""
     return {
         "goes": [
             {
@@ -586,7 +587,7 @@ def _print_lines(lines: Sequence[FollowedLine], *, as_json: bool) -> None:
 
 
 def _newest_states_only(lines: Sequence[FollowedLine]) -> list[FollowedLine]:
-    """Return a robot that publishes a hundred times a second would scroll all else away."""
+    """Keep only the newest state of each robot; a hundred a second would hide the rest."""
     newest = {line.robot: line for line in lines if line.kind == "state"}
     return [line for line in lines if line.kind != "state" or newest[line.robot] is line]
 
@@ -665,7 +666,7 @@ def _is_id(text: str) -> bool:
 
 
 def write_picture(file: Path, picture: PlotImage, *, as_json: bool = False) -> None:
-    """Write a picture as a file of its owner alone, and say what it shows.
+    """Write a picture as a private file, and describe it.
 
     Raises:
         InvalidInputError: The file cannot be written.

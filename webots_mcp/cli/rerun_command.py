@@ -1,4 +1,4 @@
-"""The command that runs new code on an old run, also in a debugger."""
+"""Define the command that runs new code on an old run, also in a debugger."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that run beside Webots, and the one that starts it."""
+"""Define the commands that run next to Webots (serve, token, observe) or start it (launch)."""
 
 from __future__ import annotations
 
@@ -165,10 +165,10 @@ def serve(
 def _endpoint(
     http: str | None, allow_host: Sequence[str], tls_cert: Path | None, tls_key: Path | None
 ) -> Endpoint | None:
-    """Return where to serve over HTTP; None for stdin and stdout.
+    """Return the HTTP endpoint to serve at; None for stdin and stdout.
 
     Raises:
-        InvalidInputError: If the endpoint is not safe, or options of HTTP are given without it.
+        InvalidInputError: The endpoint is not safe, or options of HTTP are given without it.
     """
     if http is not None:
         from webots_mcp.server.endpoint import endpoint_of
@@ -213,7 +213,7 @@ def token(
 
 @contextmanager
 def _ending_with_the_client() -> Generator[None]:
-    """A client that has gone does not read the last answer: that is an end and no defect."""
+    """End normally when the client has gone and cannot read the last answer."""
     try:
         yield
     except Exception as error:
@@ -223,14 +223,14 @@ def _ending_with_the_client() -> Generator[None]:
 
 
 def _is_broken_pipe(error: object) -> bool:
-    """Return whether it is nothing else, also where the server's tasks have grouped it."""
+    """Return whether an error is only a broken pipe, even inside a group of errors."""
     parts: tuple[object, ...] = getattr(error, "exceptions", ())
     return all(map(_is_broken_pipe, parts)) if parts else isinstance(error, BrokenPipeError)
 
 
 @contextmanager
 def _keeping_what_is_made() -> Generator[None]:
-    """What is imported stays for good: to look for garbage in it takes a tenth of the start."""
+    """Exempt imported objects from garbage collection, which would take a tenth of the start."""
     gc.disable()
     try:
         yield
@@ -240,7 +240,7 @@ def _keeping_what_is_made() -> Generator[None]:
 
 
 def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
-    """Set the limits where that is this server's to do; say which others hold."""
+    """Set the limits that this server may set, and report which others apply."""
     from webots_mcp.errors import NoDatabaseError
     from webots_mcp.store.recording import RecordingAccess
     from webots_mcp.store.retention_limits import ask
@@ -249,8 +249,8 @@ def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
         with RecordingAccess(database, data_dir).writer() as connection:
             notes = ask(connection, limits)
     except NoDatabaseError:
-        return  # they are set when there is one
-    except WebotsMCPError as error:  # which the tools tell, in an answer
+        return  # set once the database exists
+    except WebotsMCPError as error:  # reported by the tools in an answer
         notes = [f"the limits were not set: {error}"]
     for note in notes:
         print(f"webots-mcp: {note}", file=sys.stderr)
@@ -307,10 +307,10 @@ def observe(
 
 
 def _connect_to(url: str | None, robot: str) -> str:
-    """Set what Webots' library needs to find its simulator; returns the address of the robot.
+    """Set what Webots' library needs to find its simulator. Return the address of the robot.
 
     Raises:
-        CommandRefusedError: There is no such library.
+        CommandRefusedError: The library does not exist.
     """
     from webots_mcp.simulator.installations import HOME_VARIABLE, installations
     from webots_mcp.simulator.instances import DEFAULT_PORT
@@ -485,7 +485,7 @@ def _launch_stand_in(
 
 
 def _controllers(robots: Sequence[str]) -> dict[str, str]:
-    """Controller files by robot name, of NAME=FILE."""
+    """Return controller files by robot name, from texts NAME=FILE."""
     named: dict[str, str] = {}
     for text in robots:
         name, equals, file = text.partition("=")
@@ -509,7 +509,7 @@ def _has_recorded(recording: RecordingAccess, before: int) -> bool:
 
 
 def _watch(recording: RecordingAccess, before: int, world: Path, patience_s: float) -> None:
-    """Say which controller records in the stand-in, after the session `before`; or why none."""
+    """Report the first controller that records in the stand-in after the session `before`."""
     from webots_mcp.simulator.launch import starts_since, why_silent
 
     until_s = time.monotonic() + patience_s
@@ -518,7 +518,7 @@ def _watch(recording: RecordingAccess, before: int, world: Path, patience_s: flo
             begun = starts_since(recording, before)
         except WebotsMCPError as error:
             return _say(str(error))
-        if begun and begun[0].run_id is not None:  # those that have recorded come first
+        if begun and begun[0].run_id is not None:  # robots that have recorded come first
             _say(f"{begun[0].robot} records: run {begun[0].run_id}")
             return _say(_next_step(recording))
         if time.monotonic() > until_s:
@@ -544,7 +544,7 @@ def _recording(data_dir: Path | None, project: Path) -> RecordingAccess:
 def _follow(
     launched: WebotsLaunch, patience_s: float, console: _Console, recorder: _Recorder
 ) -> int:
-    """Until Webots has ended; its exit code."""
+    """Wait until Webots has ended. Return its exit code."""
     webots, first = launched.webots, None
     until_s = time.monotonic() + patience_s
     while (code := webots.exit_code) is None:
@@ -563,7 +563,7 @@ def _follow(
 
 
 def _announce_first(launched: WebotsLaunch, recording: RecordingAccess) -> SessionStart | None:
-    """Say which controller records first, once there is one."""
+    """Report the first controller that records."""
     first = launched.first_record()
     if first is not None:
         address = launched.webots.address_now()
@@ -574,26 +574,26 @@ def _announce_first(launched: WebotsLaunch, recording: RecordingAccess) -> Sessi
 
 
 class _Console:
-    """Shows Webots' console on this one."""
+    """Show Webots' console on the console of this command."""
 
     def __init__(self) -> None:
         self._broken: OSError | None = None
 
     def show(self, line: WebotsLine) -> None:
-        """In a thread of its own."""
+        """Print a line; called in a thread of its own."""
         try:
             print(line.text, file=getattr(sys, line.stream), flush=True)
         except OSError as error:
             self._broken = error
 
     def require_reader(self) -> None:
-        """Raise what was raised where nobody reads it any more."""
+        """Raise the error of writing to a pipe that nobody reads any more."""
         if self._broken is not None:
             raise self._broken
 
 
 class _Recorder(ExitStack):
-    """Records Webots' console, from when it listens."""
+    """Record Webots' console from the moment it listens."""
 
     def __init__(self, launched: WebotsLaunch, recording: RecordingAccess) -> None:
         super().__init__()
@@ -602,7 +602,7 @@ class _Recorder(ExitStack):
         self._begun = False
 
     def begin(self) -> None:
-        """Unless it has begun, or Webots does not listen yet."""
+        """Begin to record, unless that has begun or Webots does not listen yet."""
         from webots_mcp.simulator.console import follow_console
 
         instance = None if self._begun else self._launched.webots.instance
@@ -620,7 +620,7 @@ def _next_step(recording: RecordingAccess) -> str:
 
 
 def _data_dir_option(recording: RecordingAccess) -> str:
-    """Return the option that names the recording; none where the current folder says it."""
+    """Return the option that names the recording; empty if the current folder implies it."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER
     from webots_mcp.database.location import find_project
 

@@ -1,4 +1,4 @@
-"""Commands that make a project ready, and say why nothing works."""
+"""Define the commands that set up a project and explain what does not work."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Writing:
-    """Whether files are written, and how it is answered what was."""
+    """Whether files are written, and how to ask before writing."""
 
     yes: Annotated[
         bool, Parameter("--yes", negative=(), help="Change existing files without asking.")
@@ -46,7 +46,7 @@ class Writing:
         """Ask whether a file may be written.
 
         Raises:
-            CommandRefusedError: It may not, or nobody can be asked.
+            CommandRefusedError: The answer was no, or nobody can be asked.
         """
         if self.yes or self.dry_run:
             return
@@ -66,14 +66,14 @@ class Writing:
         """Show the lines that change, and ask whether they may.
 
         Raises:
-            CommandRefusedError: It may not, or nobody can be asked.
+            CommandRefusedError: The answer was no, or nobody can be asked.
         """
         if not self.as_json:
             print(change.diff)
         self.require_yes(change.file)
 
     def apply(self, change: FileChange) -> dict[str, str]:
-        """Write a file unless it holds that already; what was done."""
+        """Write a file unless it already has this content. Return what was done."""
         from webots_mcp.setup.file_change import apply
 
         if not change.is_needed:
@@ -83,7 +83,7 @@ class Writing:
         return self._done(change.file, "written")
 
     def delete(self, file: Path) -> dict[str, str]:
-        """Delete a file; what was done."""
+        """Delete a file. Return what was done."""
         if not self.dry_run:
             file.unlink()
         return self._done(file, "deleted")
@@ -269,7 +269,7 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
     change = world_change(world, in_place=in_place, extern=extern)
     project = project_of(str(world.resolve().parent))
     changes = [change] if extern else [controller_change(project), change]
-    for each in changes:  # what somebody has changed is not written over without a yes
+    for each in changes:  # a file that somebody has changed is overwritten only after a yes
         is_meant = in_place and each is change
         if each.before is not None and each.is_needed and not is_meant:
             writing.require_yes_to(each)
@@ -281,7 +281,7 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
 
 
 def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
-    """Return the Python that can run the observer, where the one that Webots takes cannot."""
+    """Return the Python that can run the observer, if the one that Webots takes cannot."""
     from webots_mcp.setup.interpreter import probe_interpreter
     from webots_mcp.setup.observer_edits import python_change
 
@@ -312,7 +312,7 @@ def _remove_observer(world: Path, writing: Writing) -> None:
         files += [writing.delete(file) for file in unused]
         for folder in {file.parent for file in unused}:
             _remove_if_empty(folder)
-            if any((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}")):  # it stays a project
+            if any((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}")):  # it remains a project
                 _remove_if_empty(project / CONTROLLER_FOLDER)
     _print_files(files, writing)
 
@@ -325,7 +325,7 @@ def _remove_if_empty(folder: Path) -> None:
 def _print_files(
     files: Sequence[dict[str, str]], writing: Writing, *, then: str | None = None
 ) -> None:
-    """Say what became of each file, and what is to be done next."""
+    """Report what was done with each file, and what to do next."""
     if writing.as_json:
         return print_json({"files": files} | ({"then": then} if then else {}))
     for each in files:
@@ -348,7 +348,7 @@ def _make_ready(
     claude_desktop: bool,
     skills: bool,
 ) -> None:
-    """Tell clients of the server, and say what the controllers need."""
+    """Register the server with clients, and list what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER, PROJECT_FILE
     from webots_mcp.setup import client_entries
     from webots_mcp.setup.skills import managed_texts
@@ -363,7 +363,8 @@ def _make_ready(
     project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
     of_windows, border = (None, None) if http else windows_server(project)
-    expected = None if of_windows else _expected(data_dir, writing)  # a database not to be shared
+    # a database that should not be shared
+    expected = None if of_windows else _expected(data_dir, writing)
     clients = client_entries.clients_of(project)
     clients += [client_entries.claude_desktop()] if claude_desktop else []
     line = http or of_windows or client_entries.server_command(data_dir)
@@ -394,7 +395,7 @@ def _make_ready(
 
 
 def _expected(data_dir: Path, writing: Writing) -> str | None:
-    """Let bridges know what the project's file expects; what it is, or None without a file.
+    """Compile the project file for bridges. Return what it expects, or None without a file.
 
     Raises:
         InvalidInputError: The file is invalid.
@@ -428,7 +429,7 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
 def _written(
     file: Path, writing: Writing, planned: Callable[[], tuple[FileChange, str | None]]
 ) -> dict[str, str]:
-    """Return what was done with a file, with notes, or why it was left as it is."""
+    """Return what was done with a file, with notes, or why it was left unchanged."""
     try:
         change, note = planned()
         return writing.apply(change) | ({"note": note} if note else {})
@@ -437,7 +438,7 @@ def _written(
 
 
 def _allowed(project: Path) -> tuple[FileChange, str | None]:
-    """Return what may be asked for in the project, unless that is written already."""
+    """Return what may be requested in the project, if the file does not say so yet."""
     from webots_mcp.setup.client_entries import policy_file
     from webots_mcp.store.policy import read_policy
 
@@ -458,7 +459,7 @@ def _ignored(data_dir: Path, writing: Writing) -> tuple[FileChange, str | None]:
 
 
 def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
-    """Return a controller, the lines that it needs, and the Python that it is started with."""
+    """Return a controller, the lines that it needs, and the Python that starts it."""
     from dataclasses import asdict
 
     from webots_mcp.setup.interpreter import probe_interpreter
@@ -535,7 +536,7 @@ def _next_steps(project: Path, controllers: list[dict[str, Any]]) -> list[str]:
 
 
 def _launch_line(project: Path) -> str | None:
-    """Return the command that runs the first world of a project; None where it has no world."""
+    """Return the command that runs the first world of a project; None without a world."""
     from webots_mcp.contract import WORLD_ENDING, WORLD_FOLDER
     from webots_mcp.simulator.installations import installations
 
@@ -548,7 +549,7 @@ def _launch_line(project: Path) -> str | None:
 
 
 def _shown(file: Path) -> str:
-    """Return a path as it is typed in the current folder."""
+    """Return a path as typed in the current folder."""
     try:
         return shlex.quote(str(file.relative_to(Path.cwd())))
     except ValueError:
@@ -572,11 +573,11 @@ def _is_shared(file: Path, project: Path | None = None) -> bool:
     """Return whether a file lies in a Git repository that does not ignore it."""
     folder = project or file.parent
     if not file.resolve().is_relative_to(folder.resolve()):
-        return False  # of the user, not of the project
+        return False  # belongs to the user, not to the project
     asked = ["git", "-C", str(folder), "check-ignore", "--quiet", str(file)]
     try:
         return subprocess.run(asked, capture_output=True, check=False, timeout=10).returncode == 1
-    except (OSError, subprocess.TimeoutExpired):  # there is no Git
+    except (OSError, subprocess.TimeoutExpired):  # Git is not installed
         return False
 
 
@@ -674,7 +675,7 @@ def _print_checks(checked: list[Checked]) -> None:
 
 
 def _print_folded(head: str, text: str) -> None:
-    """Print a text behind a head; on a terminal its further lines stand below its first."""
+    """Print a text after a heading; on a terminal, further lines are aligned with the first."""
     width = terminal_width(sys.stdout)
     lines = textwrap.wrap(
         printable(as_typed(text)),
@@ -765,7 +766,7 @@ def completion(
         shell = shell or detect_shell()
     except ShellDetectionError as error:
         raise InvalidInputError("The shell is not known. Name it: bash, zsh or fish.") from error
-    if shell == "powershell" and sys.version_info < (3, 11):  # cyclopts 4 knows none
+    if shell == "powershell" and sys.version_info < (3, 11):  # unknown to cyclopts 4
         raise InvalidInputError("the script for PowerShell needs Python 3.11 or newer")
     app = app_for([], shows_all=True)
     if install:

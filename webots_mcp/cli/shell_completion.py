@@ -1,7 +1,7 @@
-"""What a shell completes beyond names of commands and options: robots, runs, signals and kinds.
+"""Complete names of robots, runs, signals and kinds in shells, in addition to commands and options.
 
-The script of cyclopts knows commands, options, choices and files. Lines added to it ask
-`webots-mcp completion --values KIND` for names that are in the recording.
+The script of cyclopts completes commands, options, choices and files. Added lines call `webots-mcp
+completion --values KIND` for names in the recording.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ complete -F _webots_mcp_values webots-mcp
 
 
 def with_values(script: str, shell: str) -> str:
-    """Return the script of a shell, which offers names of the recording too (bash and fish)."""
+    """Return the script of a shell that also completes names of the recording (bash and fish)."""
     if shell == "bash":
         return script + _BASH.replace("@options@", _bash_cases(_OPTIONS, 4)).replace(
             "@positionals@", _bash_cases(_POSITIONALS, 6)
@@ -80,7 +80,7 @@ def _fish_line(kind: str) -> str:
 
 
 def values_of(kind: ValueKind, recording: RecordingAccess) -> list[str]:
-    """Return the names of a kind that are in a recording.
+    """Return the names of a kind in a recording.
 
     Raises:
         NoDatabaseError: Nothing is recorded there.

@@ -1,6 +1,6 @@
-"""The command `status`: every robot on one screen, what it does, since when, and what is wrong.
+"""Define the command `status`: what each robot does, since when, and what is wrong.
 
-The limits and sizes of the recording follow with `--storage`.
+With `--storage` it also shows the limits and sizes of the recording.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from webots_mcp.cli.terminal import (
     terminal_width,
 )
 
-_MOST_MODES: Final = 10  # robots whose mode is looked up: each takes a query
+_MOST_MODES: Final = 10  # robots whose mode is read: each takes a query
 _COLUMNS: Final = ("robot", "status", "run_id", "sim_time_s", "mode", "mode_since_s", "kind")
 
 

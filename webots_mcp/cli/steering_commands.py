@@ -1,6 +1,6 @@
-"""Commands that steer a simulation, where one asks several questions or a part of one.
+"""Define commands that steer a simulation and combine several questions, or use a part of one.
 
-What an assistant can ask for, a person can: each is answered as the MCP tool answers it.
+Everything that an assistant can do, a person can do: each is answered like the MCP tool.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def signals(
 
 
 def _fields_of(words: tuple[str, ...]) -> dict[str, Any]:
-    """What is said of a signal, of texts FIELD=VALUE; only limits are numbers."""
+    """Return what is said of a signal, of texts FIELD=VALUE; only limits are numbers."""
     from webots_mcp.cli.options import settings_of
     from webots_mcp.signals.meaning import MEANING_FIELDS
 
@@ -328,7 +328,7 @@ def field(
 
 
 def _show(question: Question, asked: ToRobot, *, as_json: bool, **given: Any) -> None:
-    """Ask a question, with those options that it has, and print the answer."""
+    """Ask a question with the options that it has, and print the answer."""
     from webots_mcp.cli.question_commands import ask_and_show
 
     of_options = {name: value for name, value in vars(asked).items() if _has(question, name)}
@@ -379,11 +379,11 @@ def _request_row(request: dict[str, Any]) -> list[Any]:
     commands = "; ".join(f"{number} {action} {status}" for number, action, status in
                          request["commands"])  # fmt: skip
     when = clock_text(request["wall_time_s"])
-    told = [request["id"], when, request["sim_time_s"], by, request["tool"]]
-    return [*told, request["arguments"] or None, outcome, commands or None]
+    reported = [request["id"], when, request["sim_time_s"], by, request["tool"]]
+    return [*reported, request["arguments"] or None, outcome, commands or None]
 
 
-# -- trials of a plan file, each in a simulator of its own --
+# -- trials of a plan file, each in a simulator of its own -----------------------------------------
 
 
 @Parameter(name="*")
@@ -489,7 +489,7 @@ def trials(
 
 
 def run_plan(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions) -> int:
-    """Run what is left of the plan's set; returns its id."""
+    """Run the remaining trials of the plan's set. Return its id."""
     from webots_mcp.steering.trial_search import require_optuna
     from webots_mcp.steering.trial_set import SetRun, run_trials
     from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
@@ -510,7 +510,7 @@ def run_plan(recording: RecordingAccess, plan: WorldPlan, options: TrialOptions)
 
 
 def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManager[Simulators]:
-    """Return where the trials run; that the program exists is checked first."""
+    """Return where the trials run; the program is checked first."""
     from webots_mcp.steering.trial_run import LocalSimulators, stand_in, webots
 
     if options.scheduler is not None:
@@ -542,7 +542,7 @@ def _cluster(options: TrialOptions, plan: WorldPlan) -> Generator[Simulators]:
 
 
 def _picture_of(file: Path | None) -> Callable[[RecordingAccess, int], None] | None:
-    """Return what draws the picture that is asked for; None where none is."""
+    """Return a function that draws the requested picture, or None."""
     if file is None:
         return None
     from webots_mcp.plotting.canvas import Sheet, image_format_of
@@ -553,7 +553,7 @@ def _picture_of(file: Path | None) -> Callable[[RecordingAccess, int], None] | N
     def draw(recording: RecordingAccess, set_id: int) -> None:
         with recording.reader() as connection:
             picture = plot_trials(connection, set_id, sheet=sheet)
-        with redirect_stdout(sys.stderr):  # stdout may be JSON
+        with redirect_stdout(sys.stderr):  # stdout may hold JSON
             write_picture(file, picture)
 
     return draw
@@ -575,7 +575,7 @@ def _begun_set(
     """Return the set that was begun with this plan.
 
     Raises:
-        NothingRecordedError: There is none.
+        NothingRecordedError: No set was begun with this plan.
     """
     from webots_mcp.store.trial_sets import find_trial_set
 
@@ -590,12 +590,12 @@ def _begun_set(
 
 
 def _text_of(plan: WorldPlan, options: TrialOptions) -> str:
-    """By which a set is found again."""
+    """Return the text by which a set is found again."""
     return json.dumps({"stand_in": options.stand_in, **json.loads(plan.text)}, sort_keys=True)
 
 
 class _TrialProgress:
-    """A line on stderr for each trial that is over, and for each set that takes the lead."""
+    """Print a line on stderr for each finished trial, and for each set that takes the lead."""
 
     def __init__(self, recording: RecordingAccess, set_id: int, plan: WorldPlan) -> None:
         from webots_mcp.store.trial_sets import trials_of
@@ -611,7 +611,7 @@ class _TrialProgress:
                   file=sys.stderr)  # fmt: skip
 
     def tell(self, trial: TrialRecord, result: TrialResult) -> None:
-        """That a trial is over, and what came of it."""
+        """Report a finished trial and its outcome."""
         self._over += 1
         came = text_of(result.score) if result.status == "done" else result.error
         word = {"done": "score", "failed": "failed:", "pruned": "pruned:"}[result.status]

@@ -1,8 +1,9 @@
-"""The streams to which a command writes: a terminal obeys nothing that is in a recording.
+"""Protect the streams of a command: no content of a recording can control a terminal.
 
-Names, texts and log lines come from controllers and from recordings of others. Control characters,
-and those that turn the direction of writing, are spelled out as JSON escapes, so that JSON stays
-the same data. Progress is shown on stderr: on a terminal in one line, else every few seconds.
+Names, texts and log lines come from controllers and from other people's recordings. Control
+characters, and those that change the direction of writing, are written as JSON escapes, so that
+JSON keeps its meaning. Progress appears on stderr: in one line on a terminal, elsewhere every few
+seconds.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from typing import Any, Final, TextIO, cast
 
 from webots_mcp.signals.naming import spelled_out
 
-_PLAIN_INTERVAL_S: Final = 3.0  # between two lines where no line can be rewritten
+_PLAIN_INTERVAL_S: Final = 3.0  # between two lines where a line cannot be rewritten
 
 
 class _SpelledOut:
-    """A text stream to another one."""
+    """A text stream that escapes control characters for another one."""
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -41,7 +42,7 @@ class _SpelledOut:
 
 
 class _Bytes(io.RawIOBase):
-    """A binary stream to a text stream; what is no UTF-8 is replaced."""
+    """A binary stream for a text stream; invalid UTF-8 is replaced."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -57,26 +58,27 @@ class _Bytes(io.RawIOBase):
 
 @contextlib.contextmanager
 def spelling_out() -> Generator[None]:
-    """Inside, whatever is printed to stdout or stderr is spelled out."""
+    """Escape control characters in everything printed to stdout or stderr in this context."""
     out, err = (cast("TextIO", _SpelledOut(stream)) for stream in (sys.stdout, sys.stderr))
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         yield
 
 
 def binary_stdout() -> Any:
-    """Return where data is written as it is; on a terminal it is spelled out as all else."""
+    """Return a stream that writes data unchanged; on a terminal, control characters are escaped."""
     return _Bytes(sys.stdout) if sys.stdout.isatty() else sys.stdout.buffer
 
 
 def wait(seconds: float) -> None:
-    """Wait for the next look, or end where nobody reads a pipe any more (`tail | head`).
+    """Wait before the next poll, or end if the reader of a pipe has closed it (`tail | head`).
 
     Raises:
-        BrokenPipeError: The reader is gone; printing would tell only when there is a line.
+        BrokenPipeError: The reader has closed the pipe; printing would only report that with a
+            line.
     """
     try:
         output = sys.stdout.fileno()
-        watch = select.poll()  # not on Windows
+        watch = select.poll()  # not available on Windows
     except (AttributeError, OSError):
         return time.sleep(seconds)
     watch.register(output, 0)
@@ -85,13 +87,13 @@ def wait(seconds: float) -> None:
 
 
 def write_styled(stream: TextIO, line: str) -> None:
-    """Write a line whose parts are spelled out already, with the colours that it has."""
+    """Write a line with colours whose parts are already escaped."""
     raw = stream.stream if isinstance(stream, _SpelledOut) and "\x1b[" in line else stream
     print(line, file=raw)
 
 
 def rewrite(stream: TextIO, text: str = "") -> None:
-    """Put a text in the place of the line that stands there, on a terminal; elsewhere nothing."""
+    """Replace the current line on a terminal; elsewhere do nothing."""
     if stream.isatty():
         raw = stream.stream if isinstance(stream, _SpelledOut) else stream
         raw.write(f"\r{spelled_out(text)}\x1b[K")
@@ -100,10 +102,10 @@ def rewrite(stream: TextIO, text: str = "") -> None:
 
 @contextlib.contextmanager
 def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
-    """A function to call with how much is done and how much there is.
+    """Provide a function to call with the amount done and the total.
 
-    It writes to stderr, because stdout may be the data: on a terminal one line, which vanishes at
-    the end; elsewhere a line every 3 s, so that short work stays silent.
+    It writes to stderr, because stdout may hold the data: on a terminal one line, which disappears
+    at the end; elsewhere a line every 3 s, so that short work stays silent.
     """
     is_terminal = sys.stderr.isatty()
     next_s = 0.0 if is_terminal else time.monotonic() + _PLAIN_INTERVAL_S
@@ -131,9 +133,9 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
 
 @contextlib.contextmanager
 def shown_activity(doing: str) -> Generator[None]:
-    """Show on stderr for how long something has been running whose amount is not known.
+    """Show on stderr for how long work of unknown length has been running.
 
-    On a terminal it is one line from the second second on, which vanishes at the end; elsewhere a
+    On a terminal it is one line after the first second, which disappears at the end; elsewhere a
     line every 3 s, so that short work stays silent.
     """
     ended = threading.Event()
@@ -143,7 +145,7 @@ def shown_activity(doing: str) -> Generator[None]:
     def show() -> None:
         while not ended.wait(1.0 if is_terminal else _PLAIN_INTERVAL_S):
             text = f"{doing}: {time.monotonic() - started_s:.0f} s"
-            with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
+            with contextlib.suppress(OSError, ValueError):  # the reader has closed the pipe
                 if is_terminal:
                     rewrite(stream, text)
                 else:
@@ -161,7 +163,7 @@ def shown_activity(doing: str) -> Generator[None]:
 
 @contextlib.contextmanager
 def line_of_progress() -> Generator[None]:
-    """Inside, `show_progress` has a line, which vanishes at the end."""
+    """Give `show_progress` a line in this context, which disappears at the end."""
     try:
         yield
     finally:
@@ -169,5 +171,5 @@ def line_of_progress() -> Generator[None]:
 
 
 async def show_progress(progress: float, total: float | None, text: str) -> None:
-    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
+    """Rewrite one line on a terminal; do nothing in a pipe."""
     rewrite(sys.stderr, text)

@@ -1,8 +1,8 @@
-"""Answers as text in a terminal.
+"""Show answers as text in a terminal.
 
-The first line answers. Tables fit the terminal: cells are folded, and columns that do not fit are
-left out, the least important first, and named below the table. In a pipe each row is one line and
-nothing is left out. Notes are wrapped and never cut. `--verbose` shows every column.
+The first line answers. Tables fit the terminal: cells are wrapped, and columns that do not fit are
+named below the table, starting with the least important. In a pipe each row is one line and nothing
+is left out. Notes are wrapped and never cut. `--verbose` shows every column.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ _HEAD: Final = {
 }
 _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
 _NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
-# Columns that a narrow table does without first, least important first; then those on the right.
+# Columns that a narrow table drops first, least important first; then those on the right.
 _LESS_IMPORTANT: Final = (
     "sha256", "git_commit", "world", "controller", "route", "database", "began_by", "kind_of",
     "own_ms", "step_wait_ms", "real_time_factor", "took_wall_s", "deviation", "pace", "command_id",
     "actions", "runs", "row_count", "age_s", "more", "set_by", "source", "live", "first_id",
     "arguments", "by", "at_s",
 )  # fmt: skip
-# Columns that stay as long as two columns fit.
+# Columns that are shown as long as two columns fit.
 _MOST_IMPORTANT: Final = frozenset(
     {"outcome", "status", "why", "message", "evidence", "reason", "error", "result", "mode", "tool"}
 )
-# Columns whose words have a colour, and the colours of those words.
+# Columns with coloured words, and the colours of those words.
 _COLOURED_COLUMNS: Final = frozenset({"outcome", "status", "level", "ended_by", "verdict"})
 _COLOURS: Final[Sequence[tuple[str, frozenset[str]]]] = (
     ("green", frozenset({"done", "pass", "running", "ok", "finished"})),
@@ -92,7 +92,7 @@ class Display(NamedTuple):
 
     Attributes:
         verbose: Show every column and every detail.
-        colour: Whether colour may be used where stdout is a terminal.
+        colour: Whether colours may be used if stdout is a terminal.
     """
 
     verbose: bool = False
@@ -115,7 +115,7 @@ def note_recording(database: object) -> None:
 
 
 def recording_read() -> str:
-    """Return the database of the recording that the command reads; empty where it reads none."""
+    """Return the database of the recording that the command reads; empty if it reads none."""
     return _recording_read.get()
 
 
@@ -125,7 +125,7 @@ def is_verbose() -> bool:
 
 
 def has_colour() -> bool:
-    """Return whether stdout is a terminal that shows colours, and nobody forbids them."""
+    """Return whether stdout is a terminal with colours, and nothing forbids them."""
     if not _display.get().colour or os.environ.get("NO_COLOR") or not sys.stdout.isatty():
         return False
     return os.environ.get("TERM", "") not in ("", "dumb")
@@ -145,13 +145,13 @@ def answer_lines(
     most_rows: int | None = None,
     colour: bool = False,
 ) -> Iterator[str]:
-    """Yield what an answer says in a sentence, whom and when it is about, then its parts.
+    """Yield what an answer says in a sentence, its subject and time, then its parts.
 
     Args:
-        answer: As JSON knows it.
-        width: Of the lines, characters.
-        most_rows: Of tables; it is said how many more there are. None for all.
-        colour: Whether lines have the colour codes of a terminal.
+        answer: The answer as JSON values.
+        width: Maximum characters of a line.
+        most_rows: Maximum rows of a table, with a note on how many more exist; None for all.
+        colour: Whether lines contain the colour codes of a terminal.
     """
     layout = _Layout(width, most_rows, is_of_command="outcome" in answer, colour=colour)
     if summary := answer.get("summary"):
@@ -170,9 +170,9 @@ def answer_lines(
 
 
 def _head_of(answer: Mapping[str, Any]) -> list[str]:
-    """Return the members of the header, as words.
+    """Return the members of the header as words.
 
-    An age of hours is in the words of sentences. It is left out where the status says it.
+    An age of hours is worded as in sentences. It is left out if the status contains it.
     """
     head: list[str] = []
     for name, text in _HEAD.items():
@@ -194,7 +194,7 @@ def _styled(line: str, style: str) -> str:
 
 
 def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:
-    """Return what there is to know about an answer, whole."""
+    """Return all notes about an answer."""
     note = f"note: {printable(as_typed(text))}"
     if width >= _LAYOUT.endless:
         return [" ".join(note.split())]
@@ -207,14 +207,14 @@ def note_lines(text: str, width: int = _LAYOUT.paragraph) -> list[str]:
 
 
 def print_notes(notes: Iterable[str], file: TextIO | None = None) -> None:
-    """What there is to know about an answer, below it; on stdout, or in that file."""
+    """Print the notes about an answer below it, on stdout or into a file."""
     for note in notes:
         for line in note_lines(note, terminal_width(file or sys.stdout)):
             print(line, file=file)
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print rows under their column names; columns that are empty throughout are left out."""
+    """Print rows under their column names; empty columns are left out."""
     for line in table_lines(columns, rows, terminal_width(sys.stdout), colour=has_colour()):
         write_styled(sys.stdout, line)
 
@@ -226,10 +226,10 @@ def table_lines(
     *,
     colour: bool = False,
 ) -> Iterator[str]:
-    """Yield the lines of a table that is no wider than `width` characters.
+    """Yield the lines of a table of at most `width` characters.
 
-    Longer cells are folded. Columns that do not fit are left out and named below the table; with
-    `--verbose` each row is a paragraph instead, which names every value.
+    Longer cells are wrapped. Columns that do not fit are left out and named below the table; with
+    `--verbose` each row is instead a paragraph that names every value.
     """
     kept = [i for i in range(len(columns)) if any(row[i] is not None for row in rows)]
     least = {i: _minimum_width(columns[i], [row[i] for row in rows]) for i in kept}
@@ -251,7 +251,7 @@ def table_lines(
 def _minimum_width(header: str, values: Sequence[Any]) -> int:
     """Return the width below which a column cannot be read.
 
-    That is its longest word, and a few words of a text.
+    That is the length of its longest word, or of a few words of a text.
     """
     texts = [text_of(value) for value in values]
     words = [word for text in texts for word in text.split()]
@@ -326,7 +326,7 @@ def _drawn(
 
 
 def _cut(text: str, width: int) -> str:
-    """Return a text that takes a few lines of a cell, with an ellipsis where some is left out."""
+    """Return a text cut to a few lines of a cell, with an ellipsis if something is left out."""
     most = width * _LAYOUT.cell_lines
     return text if len(text) <= most else textwrap.shorten(text, most - 2, placeholder=" ...")
 
@@ -354,9 +354,9 @@ def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> lis
 
 
 def _shared_out(space: int, least: Mapping[int, int], full: Mapping[int, int]) -> dict[int, int]:
-    """Return the width of each column: what its words need, and a share of what is left.
+    """Return the width of each column: what its words need, and a share of the remaining width.
 
-    Those that want little more come first.
+    Columns that need little more are served first.
     """
     widths = dict(least)
     spare = max(space - sum(least.values()), 0)
@@ -373,7 +373,7 @@ def _longest(words: Iterable[str]) -> int:
 
 
 def text_of(value: Any) -> str:
-    """Return a value in one line; what a terminal would obey is spelled out instead."""
+    """Return a value in one line, with control characters escaped."""
     if value is None:
         return ""
     if isinstance(value, float):
@@ -385,13 +385,13 @@ def text_of(value: Any) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text in one line, with what a terminal would obey spelled out."""
+    """Return a text in one line, with control characters escaped."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return spelled_out(line)
 
 
 def id_ranges(numbers: Sequence[int]) -> str | None:
-    """Numbers as a person lists them: 1 to 7, 9."""
+    """Return numbers as a person lists them: 1 to 7, 9."""
     parts: list[list[int]] = []
     for number in sorted(numbers):
         if parts and number == parts[-1][-1] + 1:
@@ -412,24 +412,24 @@ def clock_text(wall_time_s: float) -> str:
 
 
 def print_json(found: Any) -> None:
-    """Print an answer for programs; what is no JSON as its text."""
+    """Print an answer as JSON for programs; values that are no JSON become texts."""
     print(json.dumps(found, ensure_ascii=False, default=str))
 
 
 def terminal_width(stream: TextIO) -> int:
-    """Return the characters of a line; no limit where nobody looks at it."""
+    """Return the characters of a line; no limit if stdout is no terminal."""
     return shutil.get_terminal_size().columns if stream.isatty() else _LAYOUT.endless
 
 
 def _number_text(value: float) -> str:
-    """4 significant digits, but never coarser than a thousandth."""
+    """Return a number with 4 significant digits, but never coarser than a thousandth."""
     if not math.isfinite(value):
         return str(value)
     return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= 1 else f"{value:.4g}"
 
 
 class _Layout:
-    """How the parts of an answer stand below each other."""
+    """Lay out the parts of an answer below each other."""
 
     def __init__(
         self, width: int, most_rows: int | None, *, is_of_command: bool, colour: bool
@@ -441,7 +441,7 @@ class _Layout:
         self._is_of_command = is_of_command
 
     def members(self, members: Mapping[str, Any]) -> Iterator[str]:
-        """Short members stand together in a paragraph, each other one on lines of its own."""
+        """Lay out members: short ones share a paragraph, each other one has lines of its own."""
         short = list[str]()
         for name, value in members.items():
             line = "" if _has_members(value) else f"{name} {text_of(value)}"
@@ -454,7 +454,7 @@ class _Layout:
         yield from self._wrapped(short)
 
     def _series(self, part: Mapping[str, Any]) -> Iterator[str]:
-        """Lists that belong to a list of times are columns; what is left stands below them."""
+        """Lay out lists that belong to a list of times as columns, and the rest below them."""
         columns = {name: part[name] for name in _TIMES if isinstance(part.get(name), list)}
         (length,) = {len(each) for each in columns.values()}
         rest = _without_lists(part, length, (), columns)
@@ -472,7 +472,7 @@ class _Layout:
             yield f"{name}:"
             if name == "verdicts":
                 part = _as_typed_texts(part)
-            # In rows of a database null is a value.
+            # In database rows, null is a value.
             if name == "result" and "rows" in part and not self._is_of_command:
                 part = part | {
                     "rows": [["NULL" if v is None else v for v in row] for row in part["rows"]]
@@ -511,7 +511,7 @@ class _Layout:
 
 
 def _as_typed_texts(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return texts of our own, such as what to do where nothing was searched, as typed."""
+    """Return texts of webots-mcp itself, such as advice, with commands instead of calls."""
     typed: dict[str, Any] = {}
     for name, value in part.items():
         if isinstance(value, dict):
@@ -530,7 +530,7 @@ def _without_lists(
         if isinstance(value, dict):
             members = cast("dict[str, Any]", value)
             is_series = any(isinstance(members.get(each), list) for each in _TIMES)
-            # What they hold has names of its own.
+            # Their contents have names of their own.
             inner = (*path, *([] if name in ("numbers", "signals") else [name]))
             left = members if is_series else _without_lists(members, length, inner, columns)
             if left:
@@ -547,6 +547,6 @@ def _without_lists(
 
 
 def _has_members(value: Any) -> bool:
-    """Return whether it is an object, or a list of such."""
+    """Return whether a value is an object or a list of objects."""
     each = cast("list[Any]", value)[:1] if isinstance(value, list) else [value]
     return any(isinstance(one, dict) for one in each)

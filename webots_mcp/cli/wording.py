@@ -1,7 +1,7 @@
-"""Texts in the words of the command line: `last_s=-3` is `--last -3` there.
+"""Reword texts for the command line, where `last_s=-3` is `--last -3`.
 
-The questions name their arguments as the MCP tools do. For the command that runs it is known which
-option each is typed by. Hints that name a tool name the command that gives the same answer.
+The questions name their arguments as the MCP tools do. While a command runs, the option of each of
+its arguments is known. Hints that name a tool name the command with the same answer instead.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from collections.abc import Iterable
 from contextvars import ContextVar
 from typing import Final, NamedTuple
 
-_UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
+_UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is data of the user
 _NOT_ON: Final = r"(?![\w'\"])"
-_OTHERS: Final = {  # by tool: those that are answered by a command of another name or function
+_OTHERS: Final = {  # by tool, for tools whose command has another name or function
     "get_full_state": "tail", "get_robot_state": "tail", "monitor": "tail",
     "breakpoint": "breakpoint", "list_breakpoints": "breakpoint",
     "remove_breakpoint": "breakpoint --remove",
@@ -28,7 +28,7 @@ _OTHERS: Final = {  # by tool: those that are answered by a command of another n
     "launch_world": "launch", "list_robots": "status", "get_world_info": "status --verbose",
     "get_camera": "camera", "take_screenshot": "screenshot", "check_run": "check",
 }  # fmt: skip
-_FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
+_FOR_A_CLIENT: Final = {  # what only an MCP client can do, and what a person does instead
     "start the server with --data-dir or --database": "give --data-dir or --database",
     "the resource webots://schema": "'.schema' in the sqlite3 shell",
     "pause, step or reset use webots_simulation_control": "pause, step or reset use the commands "
@@ -44,7 +44,7 @@ _running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 
 
 def speak_of(arguments: Iterable[Typed]) -> None:
-    """Let `as_typed` speak of these arguments: those of the command that runs."""
+    """Let `as_typed` use these arguments: those of the command that runs."""
     _running.set(tuple(arguments))
 
 
@@ -54,10 +54,10 @@ def running() -> tuple[Typed, ...]:
 
 
 class Typed(NamedTuple):
-    """An argument, as a person types it.
+    """An argument as a person types it.
 
     Attributes:
-        turned_off: Of a flag, the option that turns it off; empty where there is none.
+        turned_off: The option that turns a flag off; empty if there is none.
     """
 
     name: str
@@ -74,10 +74,10 @@ def value_name(option: str) -> str:
 def as_typed(text: str) -> str:
     """Return the text with a person's options instead of the names of arguments.
 
-    A name that is a common word (`since`) is meant only where a value follows it, or where it is
-    joined to another one ("since and until").
+    A name that is a common word (`since`) is replaced only before a value, or next to another name
+    ("since and until").
     """
-    # Calls in a controller stay as they are.
+    # Calls in a controller do not change.
     parts = re.split(r"(\b(?:bridge\.\w+|MCPBridge)\([^()]*\))", text)
     parts[::2] = map(_text_as_typed, parts[::2])
     return "".join(parts)
@@ -117,20 +117,20 @@ def _text_as_typed(text: str) -> str:
 
 
 def commands_by_tool() -> dict[str, str]:
-    """Return the command that answers what a tool does, by the tool's name without `webots_`."""
+    """Return the command that corresponds to a tool, by the tool's name without `webots_`."""
     from webots_mcp.cli.commands import COMMANDS
 
     return {each.name.removeprefix("webots_"): name for name, each in COMMANDS.items()} | _OTHERS
 
 
 def _control_as_typed(found: re.Match[str]) -> str:
-    """Return the command that gives the same order, to the same robot."""
+    """Return the command that gives the same order to the same robot."""
     robot = f" --robot {shlex.quote(found[2])}" if found[2] else ""
     return f"'webots-mcp {found[1]}{robot}'"
 
 
 def _command_for(found: re.Match[str]) -> str:
-    """Return the command that answers what a tool does; the tool itself where there is none."""
+    """Return the command that corresponds to a tool, or the tool itself."""
     tool, number = found["tool"], found["id"]
     command = commands_by_tool().get(tool)
     whole = f"{command} {number}" if number else command

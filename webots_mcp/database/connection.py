@@ -10,6 +10,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -30,9 +31,7 @@ from webots_mcp.errors import (
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
 LONGEST_READ_S: Final = 60.0  # of a statement of a reader
-_STEPS_PER_CHECK: Final = 1_000_000  # of SQLite's virtual machine: some 20 ms
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
-_MOST_DESCRIPTORS: Final = 1024
 # Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
 # so only the maintainer checkpoints; NORMAL costs the last commits at a power cut, never the file.
 _PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
@@ -49,6 +48,22 @@ Role = Literal["loop", "writer", "reader"]
 # locks that it does not have, and destroys the database under its parent.
 # Device and inode of each such file; None if this process was forked and has not listed them yet.
 _inherited: set[tuple[int, int]] | None = set()
+
+
+@dataclass(frozen=True)
+class ReaderLimits:
+    """Limits of a connection.
+
+    Attributes:
+        steps_per_check: Instructions of SQLite's virtual machine between two checks: some 20 ms.
+        descriptors: Open files of a process that are checked.
+    """
+
+    steps_per_check: int = 1_000_000
+    descriptors: int = 1024
+
+
+_READER: Final = ReaderLimits()
 
 
 class ReadingConnection(sqlite3.Connection):
@@ -73,7 +88,7 @@ class ReadingConnection(sqlite3.Connection):
 def keep_deadline(connection: sqlite3.Connection) -> None:
     """Restore a connection's own deadline, if it has one, after another one was set."""
     is_late = connection.is_late() if isinstance(connection, ReadingConnection) else None
-    connection.set_progress_handler(is_late, _STEPS_PER_CHECK)
+    connection.set_progress_handler(is_late, _READER.steps_per_check)
 
 
 class FrozenConnection(ReadingConnection):
@@ -183,7 +198,7 @@ def is_inherited(file: Path) -> bool:
 
 def _open_files() -> set[tuple[int, int]]:
     files: set[tuple[int, int]] = set()
-    for descriptor in range(_MOST_DESCRIPTORS):
+    for descriptor in range(_READER.descriptors):
         try:
             status = os.fstat(descriptor)
         except OSError:

@@ -22,7 +22,7 @@ from webots_mcp.errors import LeaseLostError
 
 LEASE_S: Final = 30.0
 # One that ends later was taken before the clock was set back. It is not one lease from now: the
-# holder may renew after the asker looked at the clock and before its statement reads the row.
+# holder may renew after the caller read the clock and before its statement reads the row.
 _TIMES: Final = 2
 
 

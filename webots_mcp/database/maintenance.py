@@ -21,6 +21,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
@@ -33,20 +34,14 @@ from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn
 
 INTERVAL_S: Final = 1.0
-HURRIED_INTERVAL_S: Final = 0.25  # while the log grows fast: a long one takes long to copy
 LEASE_S: Final = 5.0
 _JOB: Final = "maintainer"
 _BRIDGES: Final = "bridge %"  # which give way to a server
-WAL_LIMIT_BYTES: Final = 1_000_000  # a shorter log is left alone
 LONG_LOG_BYTES: Final = 12_000_000  # it begins anew, for which rows wait a few milliseconds
 LONGEST_LOG_BYTES: Final = 32_000_000  # its file is cut
-FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
 # A log that a reader holds cannot begin anew. A warning is printed if it is longer than this or, on
-# a disk with little space, than a share of the free space.
+# a disk with little space, than `share_of_free_space`.
 HELD_LOG_BYTES: Final = 100_000_000
-SHARE_OF_FREE_SPACE: Final = 0.1
-_SHORTEST_HELD_LOG_BYTES: Final = 40_000_000  # a log that nobody holds may be nearly as long
-_HELD_RETRY_S: Final = 10.0  # while nothing is written: each attempt makes the log longer
 FREE_THE_LOG: Final = (
     "end the transaction of the program that reads the database, or close that program (a sqlite3 "
     "shell, a notebook, a browser of databases); the log is cut by itself then, as long as "
@@ -55,6 +50,33 @@ FREE_THE_LOG: Final = (
 
 
 Kind = Literal["server", "bridge", "prune", "question"]
+
+
+@dataclass(frozen=True)
+class LogLimits:
+    """Sizes of the write-ahead log, and times for keeping it short.
+
+    Attributes:
+        hurried_interval_s: Interval of maintenance while the log grows fast, because a long one
+            takes long to copy.
+        short_bytes: Size up to which a log is left alone.
+        fast_growth_bytes: Growth in one interval that counts as fast.
+        share_of_free_space: Share of the free space from which a held log is reported, on a disk
+            with little space.
+        shortest_held_bytes: Size up to which a log may grow that nobody holds.
+        held_retry_s: Time between two attempts while nothing is written; each attempt makes the log
+            longer.
+    """
+
+    hurried_interval_s: float = 0.25
+    short_bytes: int = 1_000_000
+    fast_growth_bytes: int = 4_000_000
+    share_of_free_space: float = 0.1
+    shortest_held_bytes: int = 40_000_000
+    held_retry_s: float = 10.0
+
+
+LOG_LIMITS: Final = LogLimits()
 
 
 class Maintainer(threading.Thread):
@@ -84,7 +106,7 @@ class Maintainer(threading.Thread):
         self._files: tuple[int, ...] = ()
         self._ending = threading.Event()
         self._held_before = False
-        self._interval_s = HURRIED_INTERVAL_S
+        self._interval_s = LOG_LIMITS.hurried_interval_s
         self._data_version = -1
         self._log_bytes = 0  # after the last checkpoint
         self._is_held = False  # a reader keeps the log from beginning anew
@@ -177,15 +199,15 @@ class Maintainer(threading.Thread):
         """Copy the log back, if it is long and grew since the last time; cut it once it rests."""
         log = Path(f"{self._database}-wal")
         file_bytes = log.stat().st_size if log.exists() else 0
-        if file_bytes < WAL_LIMIT_BYTES:
+        if file_bytes < LOG_LIMITS.short_bytes:
             return
         version = int(connection.execute("PRAGMA data_version").fetchone()[0])
         rests, self._data_version = version == self._data_version, version
         if rests and self._is_held and time.monotonic() < self._retry_s:
             return
         log_bytes = self._copy_log(connection, "PASSIVE")
-        if log_bytes - self._log_bytes > FAST_GROWTH_BYTES:
-            self._interval_s = HURRIED_INTERVAL_S
+        if log_bytes - self._log_bytes > LOG_LIMITS.fast_growth_bytes:
+            self._interval_s = LOG_LIMITS.hurried_interval_s
         # The file stays long where a commit began the log anew before it could be cut.
         cut = rests or file_bytes > LONGEST_LOG_BYTES
         if cut or log_bytes > LONG_LOG_BYTES:
@@ -198,7 +220,7 @@ class Maintainer(threading.Thread):
 
     def _note_held(self, *, is_held: bool) -> None:
         """Warn of a reader that holds a long log, once until it releases it."""
-        self._is_held, self._retry_s = is_held, time.monotonic() + _HELD_RETRY_S
+        self._is_held, self._retry_s = is_held, time.monotonic() + LOG_LIMITS.held_retry_s
         description = held_log(self._database) if is_held else None
         if description is not None and not self._has_warned_of_reader:
             warn(f"{description}: {FREE_THE_LOG}")
@@ -239,7 +261,7 @@ class Maintainer(threading.Thread):
 
 
 def held_log(database: Database) -> str | None:
-    """Describe a log that is so long that a reader must hold it; None for a shorter one."""
+    """Describe a log whose length shows that a reader holds it; None for a shorter one."""
     if isinstance(database, MemoryDatabase):
         return None
     import shutil  # which a controller loads only here, in the maintainer's thread
@@ -249,7 +271,7 @@ def held_log(database: Database) -> str | None:
         log_bytes, free_bytes = log.stat().st_size, shutil.disk_usage(log.parent).free
     except OSError:
         return None  # there is none
-    share_bytes = max(SHARE_OF_FREE_SPACE * free_bytes, _SHORTEST_HELD_LOG_BYTES)
+    share_bytes = max(LOG_LIMITS.share_of_free_space * free_bytes, LOG_LIMITS.shortest_held_bytes)
     if log_bytes <= min(HELD_LOG_BYTES, share_bytes):
         return None
     return (

@@ -15,15 +15,13 @@ import json
 import sqlite3
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES, new_uuid
-from webots_mcp.database.transactions import is_busy
+from webots_mcp.database.transactions import repeat_while_busy
 from webots_mcp.errors import InvalidInputError
 
 MAX_PARAMS_BYTES: Final = 65_536
-# A writer connection waits 5 s for the lock by itself; then the statement is sent again.
-_ATTEMPTS: Final = 3
 
 # -- the statements by which a controller claims and answers commands, and others settle them ------
 
@@ -56,7 +54,7 @@ FINISH: Final = (
     "UPDATE command SET status = :status, finished_wall_time_s = :now, "
     f"finished_sim_time_s = :sim_time, result = :result, error = :error {_OF_CLAIMER}"
 )
-# The process that asked for the reload is gone; that this one runs is the proof that it worked.
+# The process that requested the reload has ended; that this one runs proves that it worked.
 CONFIRM_RELOAD: Final = (
     "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
     "finished_sim_time_s = :sim_time, result = json_object('run_id', :run, 'mode', :mode, "
@@ -78,7 +76,6 @@ LOSE: Final = (
     "UPDATE command SET status = 'lost', finished_wall_time_s = :now, error = :why "
     "WHERE id = :id AND status = 'claimed'"
 )
-_T = TypeVar("_T")
 
 
 class QueuedCommand(NamedTuple):
@@ -174,7 +171,7 @@ class CommandQueue:
             "expires": now_s + time_to_live_s,
             "request": request_id,
         }
-        _while_busy(
+        repeat_while_busy(
             lambda: self._connection.execute(
                 "INSERT INTO command (robot_id, action, params, status, requested_by, "
                 "idempotency_key, created_wall_time_s, expires_wall_time_s, request_id) VALUES "
@@ -201,7 +198,7 @@ class CommandQueue:
             return False
         values = {"id": command_id, "note": f"{why}; the command continues"}
         statement = "UPDATE command SET error = :note WHERE id = :id AND status = 'claimed'"
-        return _while_busy(lambda: self._connection.execute(statement, values)).rowcount == 1
+        return repeat_while_busy(lambda: self._connection.execute(statement, values)).rowcount == 1
 
     def cancel(self, command_id: int, why: str) -> bool:
         """Cancel a command that is not claimed yet; True if it will now never run."""
@@ -210,7 +207,7 @@ class CommandQueue:
             "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
             "WHERE id = :id AND status = 'pending'"
         )
-        return _while_busy(lambda: self._connection.execute(statement, values)).rowcount == 1
+        return repeat_while_busy(lambda: self._connection.execute(statement, values)).rowcount == 1
 
 
 def find_command(connection: sqlite3.Connection, idempotency_key: str) -> QueuedCommand | None:
@@ -288,13 +285,3 @@ def _encode_params(params: Mapping[str, Any]) -> str:
             "to a file and send its path."
         )
     return text
-
-
-def _while_busy(execute: Callable[[], _T], attempts: int = _ATTEMPTS) -> _T:
-    """Repeat a statement that is safe to repeat while another process holds the write lock."""
-    try:
-        return execute()
-    except sqlite3.OperationalError as error:
-        if not is_busy(error) or attempts == 1:
-            raise
-    return _while_busy(execute, attempts - 1)

@@ -57,7 +57,7 @@ def _copy_rows(database: Path, copy: Path, *, is_frozen: bool) -> None:
     with closing(connect(copy, "writer", create=True)) as connection:
         create_schema(connection)
         connection.execute("PRAGMA journal_mode=DELETE")
-        connection.execute("PRAGMA synchronous=OFF")  # a copy that a power cut damages is not kept
+        connection.execute("PRAGMA synchronous=OFF")  # a copy that a power cut damages is discarded
         connection.execute("PRAGMA foreign_keys=OFF")
         connection.execute(
             "ATTACH DATABASE ? AS old", (f"{database.absolute().as_uri()}?mode=ro{frozen}",)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from importlib import import_module
 from pathlib import Path
@@ -27,11 +28,25 @@ _SECRET: Final = (
     r"(?i)passw|passphrase|passcode|pwd|secret|token|credential|cookie|auth(?!or)"
     r"|(?:api|access|private|encryption|signing|ssh)[-_ ]?key"
 )
-_MOST_KNOWN: Final = 2_000  # names whose answer is remembered
-_LONGEST_KNOWN: Final = 200
 _KEYS: Final = ("secret", "enabled")
 _OFF: Final = ("0", "false", "no", "off")
 _ENDED: Final = "inspection is switched off by {}"
+
+
+@dataclass(frozen=True)
+class RememberedNames:
+    """How many names have a remembered answer.
+
+    Attributes:
+        names: Names that are remembered.
+        characters: Length up to which a name is remembered.
+    """
+
+    names: int = 2_000
+    characters: int = 200
+
+
+_REMEMBERED: Final = RememberedNames()
 
 
 class SecretNames:
@@ -50,7 +65,7 @@ class SecretNames:
         known = self._known.get(name)
         if known is None:
             known = self._judge(name)
-            if len(self._known) < _MOST_KNOWN and len(name) <= _LONGEST_KNOWN:
+            if len(self._known) < _REMEMBERED.names and len(name) <= _REMEMBERED.characters:
                 self._known[name] = known
         return known
 

@@ -115,7 +115,7 @@ def reap_if_dead(connection: sqlite3.Connection) -> None:
 
 
 def find_dead_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:
-    """Find sessions that look open although their process on this host has ended.
+    """Find sessions that seem open although their process on this host has ended.
 
     Returns:
         The id of each, and how it ended: `reload` or `crashed`.

@@ -16,6 +16,7 @@ import re
 import signal
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
@@ -36,14 +37,33 @@ INSTALLED: Final = (
     r"[/\\](?:site|dist)-packages[/\\]|[/\\]lib[/\\]controller[/\\]python[/\\]|^<frozen "
 )
 _DEBUGGER: Final = r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)"
-_EARLY: Final = 0.9  # of the limit: the clock of files is coarse
-_UNTOUCHED_S: Final = 3.0  # the maintainer's thread normally touches the file once a second
-_MOST_BYTES: Final = 200_000
-_MOST_TEXT: Final = 4000
-_MOST_CALLERS: Final = 3
-_LONGEST_NAME: Final = 60
 # The errors that a file of unknown origin may raise.
 _STRANGE: Final = (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError)
+
+
+@dataclass(frozen=True)
+class StackLimits:
+    """Limits of what is read from a file of stacks.
+
+    Attributes:
+        early_share: Share of the limit of silence, because the clock of files is coarse.
+        untouched_s: Age from which the maintainer's thread counts as stuck; normally it touches the
+            file once a second.
+        file_bytes: Size up to which a file is read.
+        text_characters: Length at which the text in a log row is cut.
+        callers: Callers that a place names.
+        name_characters: Length at which a name is cut.
+    """
+
+    early_share: float = 0.9
+    untouched_s: float = 3.0
+    file_bytes: int = 200_000
+    text_characters: int = 4000
+    callers: int = 3
+    name_characters: int = 60
+
+
+_LIMITS: Final = StackLimits()
 
 
 class Call(NamedTuple):
@@ -90,19 +110,20 @@ class Stacks(NamedTuple):
 
     def began_after(self, last_seen_wall_time_s: float) -> bool:
         """Return whether the loop had been silent for the limit since that sign of life."""
-        return self.wall_time_s - last_seen_wall_time_s >= _EARLY * self.limit_s
+        return self.wall_time_s - last_seen_wall_time_s >= _LIMITS.early_share * self.limit_s
 
     @property
     def place(self) -> str:
         """Where the loop was, the controller's own code first."""
         place, *callers = self.own or self.calls
-        names = " and ".join(call.as_caller for call in callers[:_MOST_CALLERS])
+        names = " and ".join(call.as_caller for call in callers[: _LIMITS.callers])
         text = f"{place}, called from {names}" if names else f"{place}"
         return text if place is self.calls[0] else f"{text}; there in {self.calls[0]}"
 
     def log_values(self, sim_time_s: float | None) -> dict[str, float | str | None]:
         """Return the values of the log row, which its time identifies."""
-        text = f"silent for more than {self.limit_s:g} s in {self.place}\n{self.text[:_MOST_TEXT]}"
+        shown = self.text[: _LIMITS.text_characters]
+        text = f"silent for more than {self.limit_s:g} s in {self.place}\n{shown}"
         return {"sim_time": sim_time_s, "wall_time": self.wall_time_s, "message": text}
 
 
@@ -114,7 +135,7 @@ def stacks_path(database: Path, session_uuid: str) -> Path:
 def read_stacks(file: BinaryIO) -> Stacks | None:
     """Read the stacks in a file; None if there are none, or it cannot be read."""
     file.seek(0)
-    head, _, rest = file.read(_MOST_BYTES).partition(b"\n")
+    head, _, rest = file.read(_LIMITS.file_bytes).partition(b"\n")
     text = rest.decode("utf-8", "replace")
     try:
         about = json.loads(head)
@@ -170,10 +191,12 @@ def needs_signal(path: Path, silent_s: float) -> bool:
             time.time() - os.fstat(file.fileno()).st_mtime,
         )
         is_written, limit_s = bool(file.read(1)), float(about["limit_s"])
-        is_stuck = not is_written and untouched_s > limit_s + _UNTOUCHED_S
+        is_stuck = not is_written and untouched_s > limit_s + _LIMITS.untouched_s
         return bool(SIGNAL) and about["signal"] == SIGNAL and is_stuck and silent_s >= limit_s
     return False
 
 
 def _cut(name: str) -> str:
-    return name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
+    return (
+        name if len(name) <= _LIMITS.name_characters else f"{name[: _LIMITS.name_characters - 1]}…"
+    )

@@ -201,3 +201,23 @@ def is_unwritable(error: Exception) -> bool:
     return isinstance(error, sqlite3.OperationalError) and any(
         text in str(error) for text in ("readonly database", "unable to open database file")
     )
+
+
+def repeat_while_busy(execute: Callable[[], Result], attempts: int = 3) -> Result:
+    """Repeat a statement that is safe to repeat while another process holds the write lock.
+
+    A writer connection waits 5 s for the lock by itself before each new attempt.
+
+    Args:
+        execute: Runs the statement.
+        attempts: How often it runs at most.
+
+    Raises:
+        sqlite3.OperationalError: The last attempt found the lock held, or the error is another.
+    """
+    try:
+        return execute()
+    except sqlite3.OperationalError as error:
+        if not is_busy(error) or attempts == 1:
+            raise
+    return repeat_while_busy(execute, attempts - 1)

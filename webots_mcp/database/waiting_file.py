@@ -25,6 +25,7 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from io import FileIO
 from pathlib import Path
@@ -188,12 +189,8 @@ STATEMENTS: Final[dict[Kind, str]] = {
 }
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
 FORMAT: Final = 1  # of the file; versions that know another one leave the file alone
-_LONGEST_HEADER_BYTES: Final = 16_000_000
 MAX_FILE_BYTES: Final = 1_000_000_000
 _VERSION: Final = "webots_mcp_waiting"
-_NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
-_LOCKED_BYTE: Final = 1 << 40  # far beyond the end: Windows refuses to read what is locked
-_PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 _SESSION_OF: Final = "SELECT id, last_adopted_entry FROM session WHERE uuid = ?"
 _RUN_OF: Final = "SELECT id FROM run WHERE uuid = ? AND session_id = ?"
 SESSION_COLUMNS: Final = (
@@ -222,6 +219,26 @@ _OF_THE_FILE: Final = (
 )  # fmt: skip
 # At the end of the name of a journal's part: the session's UUID and the number of the part.
 _PART: Final = r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
+
+
+@dataclass(frozen=True)
+class WaitingFileLimits:
+    """Limits of a file of waiting rows.
+
+    Attributes:
+        header_bytes: Maximum size of its first line.
+        no_number: First number that SQLite's integers cannot hold.
+        locked_byte: Offset of the lock, far beyond the end: Windows refuses to read what is locked.
+        piece_s: Time for which a transaction may keep other writers out.
+    """
+
+    header_bytes: int = 16_000_000
+    no_number: int = 1 << 63
+    locked_byte: int = 1 << 40
+    piece_s: float = 0.001
+
+
+_FILE: Final = WaitingFileLimits()
 
 
 class WaitingEntry(NamedTuple):
@@ -309,11 +326,11 @@ class WaitingFile:
     """The entries of one session that wait next to its database, written by that session.
 
     The file is made with the first entry and stays locked while it is open: a file that is not
-    locked belongs to a process that is gone. All calls come from one thread at a time.
+    locked belongs to a process that has ended. All calls come from one thread at a time.
 
     Args:
         path: See `waiting_path`.
-        describe_session: Who records, as `adopt` enters it into a database that does not know.
+        describe_session: The recording process, as `adopt` enters it into a database without it.
     """
 
     def __init__(self, path: Path, describe_session: Callable[[], dict[str, Any]]) -> None:
@@ -355,7 +372,9 @@ class WaitingFile:
         if file is None:
             return
         if remove:
-            file.truncate(len(self._header))  # who finds it before it is gone finds nothing in it
+            file.truncate(
+                len(self._header)
+            )  # a process that finds it before its deletion finds nothing in it
         file.close()
         if remove:
             with contextlib.suppress(OSError):
@@ -433,8 +452,8 @@ def read_header(file: BinaryIO) -> dict[str, Any] | None:
         ValueError: If another version wrote the file, or the line is not a JSON object.
     """
     file.seek(0)
-    line = file.readline(_LONGEST_HEADER_BYTES)
-    if not line.endswith(b"\n") and len(line) < _LONGEST_HEADER_BYTES:
+    line = file.readline(_FILE.header_bytes)
+    if not line.endswith(b"\n") and len(line) < _FILE.header_bytes:
         return None
     try:
         header = cast("dict[str, Any]", json.loads(line.decode("utf-8-sig", "replace")))
@@ -460,7 +479,7 @@ def _decoded(line: bytes) -> WaitingEntry | None:
         known = kind in STATEMENTS
     except (ValueError, TypeError, RecursionError):
         return None
-    whole = type(number) is int and 0 < number < _NO_NUMBER
+    whole = type(number) is int and 0 < number < _FILE.no_number
     return entry if known and whole and (run is None or isinstance(run, str)) else None
 
 
@@ -470,7 +489,7 @@ def lock(fd: int) -> bool:
         if sys.platform == "win32":
             import msvcrt
 
-            os.lseek(fd, _LOCKED_BYTE, os.SEEK_SET)
+            os.lseek(fd, _FILE.locked_byte, os.SEEK_SET)
             msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
         else:
             import fcntl
@@ -528,7 +547,7 @@ def ingest(
     """
 
     def act() -> Ingested:
-        until_s = time.monotonic() + _PIECE_S
+        until_s = time.monotonic() + _FILE.piece_s
         statement = "SELECT last_adopted_entry FROM session WHERE id = ?"
         session = connection.execute(statement, (session_id,)).fetchone()
         if session is None:

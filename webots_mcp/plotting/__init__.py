@@ -42,7 +42,7 @@ def plot(
         kind: "signals" over time, or "trajectory" in the plane.
         signals: Names, with `*`; none for the three that changed most. Of a trajectory the two of
             the position, or none to find them by name.
-        scope: Robot and stretch of time; None for the whole newest run.
+        scope: Robot and time range; None for the whole newest run.
         run_ids: More runs than that of the scope; of several, each from its start, in one picture.
         trial_set: The scores of that set instead, over one or two parameters, which `signals` may
             name; of what else is asked only the form of the picture counts.

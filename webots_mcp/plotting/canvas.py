@@ -27,10 +27,25 @@ LEAST_HEIGHT_PX: Final = 300
 MOST_PX: Final = 2000
 ROW_PX: Final = 17
 TEXT_PX: Final = 11.0  # the size of usual letters
-_LONGEST_NAME: Final = 24
-_CELL_PX: Final = 24
-_SHOWN_TEXTS: Final = 3
 ImageFormat = Literal["png", "svg"]
+
+
+@dataclass(frozen=True)
+class CanvasTexts:
+    """How the canvas writes names and samples of colour.
+
+    Attributes:
+        name_characters: Characters of a name.
+        cell_px: Width of a colour sample.
+        texts: Texts that are listed.
+    """
+
+    name_characters: int = 24
+    cell_px: int = 24
+    texts: int = 3
+
+
+_LEGEND: Final = CanvasTexts()
 
 
 @dataclass(frozen=True)
@@ -79,7 +94,7 @@ class Room:
     Attributes:
         points: How many buckets a curve is made of.
         panels: How many panels are readable below each other.
-        lanes: How many rows of modes and flags have room below the panels.
+        lanes: Number of rows of modes and flags that fit below the panels.
         rows: The same with the rows of events.
     """
 
@@ -161,7 +176,7 @@ class Canvas:
     ) -> None:  # fmt: skip
         """Add a text in one line; `y` is where its letters stand.
 
-        No text turns the direction of what stands beside it, nor breaks the XML.
+        No text changes the direction of its surroundings or breaks the XML.
         """
         text = spelled_out(text)
         self._texts.append(text)
@@ -230,7 +245,7 @@ def _missing_fonts(texts: Iterable[str]) -> tuple[str, ...]:
     named = [repr(text) for text in dict.fromkeys(texts) if boxed & set(text)]
     if not named:
         return ()
-    more = [f"{len(named) - _SHOWN_TEXTS} more"] if len(named) > _SHOWN_TEXTS else []
+    more = [f"{len(named) - _LEGEND.texts} more"] if len(named) > _LEGEND.texts else []
     return (
         f"no font of this computer has all characters of {', '.join([*named[:3], *more])}: boxes "
         "stand for them (install a font that has them, or draw an .svg)",
@@ -238,7 +253,7 @@ def _missing_fonts(texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def _is_foreign(character: str) -> bool:
-    """Return whether a font may lack a character: not ASCII, and no space, control or accent."""
+    """Return whether a font may not have a character: not ASCII, no space, control or accent."""
     unseen = ("Cc", "Cf", "Zs", "Zl", "Zp", "Mn", "Me")
     return not character.isascii() and unicodedata.category(character) not in unseen
 
@@ -247,12 +262,12 @@ def _boxed(characters: Sequence[str]) -> set[str]:
     """Return those that are drawn like a character that no font has."""
     from PIL import Image
 
-    cells = Canvas(_CELL_PX, _CELL_PX * (len(characters) + 1))
+    cells = Canvas(_LEGEND.cell_px, _LEGEND.cell_px * (len(characters) + 1))
     for row, character in enumerate(["\U0010ffff", *characters]):  # no font has it
-        cells.text(4, _CELL_PX * (row + 0.8), character)
+        cells.text(4, _LEGEND.cell_px * (row + 0.8), character)
     drawn = Image.open(io.BytesIO(_png(cells.svg()))).convert("L")
-    rows = [drawn.crop((0, y, _CELL_PX, y + _CELL_PX)).tobytes()
-            for y in range(0, drawn.height, _CELL_PX)]  # fmt: skip
+    rows = [drawn.crop((0, y, _LEGEND.cell_px, y + _LEGEND.cell_px)).tobytes()
+            for y in range(0, drawn.height, _LEGEND.cell_px)]  # fmt: skip
     return {each for each, row in zip(characters, rows[1:], strict=True) if row == rows[0]}
 
 
@@ -276,9 +291,11 @@ def _em(character: str) -> float:
 
 
 def short(name: str) -> str:
-    """Return a name that fits a legend, in one line: of a long one the end, which tells more."""
+    """Return a name that fits a legend, in one line: of a long one the end, which says more."""
     line = " ".join(spelled_out(name).split())
-    return line if len(line) <= _LONGEST_NAME else f"…{line[1 - _LONGEST_NAME :]}"
+    return (
+        line if len(line) <= _LEGEND.name_characters else f"…{line[1 - _LEGEND.name_characters :]}"
+    )
 
 
 def fitted(text: str, width_px: float, size: float = TEXT_PX) -> str:

@@ -37,7 +37,7 @@ MOST_VALUES: Final = 2 * len(AREAS)
 
 
 class Area(NamedTuple):
-    """How an area, or a stretch of a way, is filled."""
+    """How an area, or a segment of a path, is filled."""
 
     colour: str
     dotted: bool
@@ -49,8 +49,8 @@ MERGED: Final = Area("#DDDDDD", dotted=False)
 def area_styles(values: Iterable[str]) -> dict[str, Area]:
     """Return a style for each value: eight colours, the same with dots, then grey.
 
-    The colour hangs on the value's own text, so that "cruise" looks alike in every picture, unless
-    another value in the same one has taken it.
+    The colour hangs on the value's own text, so that "cruise" has one colour in every picture,
+    unless another value in the same one has taken it.
     """
     styles: dict[str, Area] = {}
     for value in sorted(set(values)):

@@ -148,7 +148,7 @@ def _shared_parts(names: Sequence[Sequence[str]]) -> tuple[int, int]:
 
 def _is_visible(curve: Curve, height: float) -> bool:
     interval = curve.high - curve.low
-    # A curve that moves within less than 7 % of the axis would look flat.
+    # A curve that moves within less than 7 % of the axis would appear flat.
     return interval == 0 or interval >= 0.07 * height
 
 

@@ -1,4 +1,4 @@
-"""The same pictures in a page: SVG with the values beside it, which `figure.js` lets be looked at.
+"""Draw the pictures for a page: SVG with its values, which `figure.js` shows.
 
 A page that shows them has the script, and the custom properties --ink, --faint, --grid and
 --ground.

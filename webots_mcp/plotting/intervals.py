@@ -16,7 +16,7 @@ from webots_mcp.store.signal_history import ChangeColumns, RunHistory
 
 @dataclass(frozen=True)
 class Interval:
-    """A value or a kind of event over a stretch of time; an instant has no length."""
+    """A value or a kind of event over an interval; an instant has no length."""
 
     value: str
     start_s: float
@@ -96,7 +96,7 @@ def at_resolution(intervals: Sequence[Interval], step_s: float) -> Sequence[Inte
 
 
 def merged_notes(lanes: Sequence[Lane]) -> list[str]:
-    """Return which values of which signal cannot be told apart in the picture."""
+    """Return which values of which signal cannot be distinguished in the picture."""
     return [
         f"{lane.name} has {len(lane.merged)} more values than colours, drawn as {OTHER_VALUES}: "
         f"{listed(dict.fromkeys(lane.merged))}"
@@ -111,7 +111,7 @@ def _stretches(points: Sequence[Point], end_s: float) -> list[tuple[Point, float
 
 
 def _recorded(start_s: float, end_s: float, gaps: Sequence[Gap]) -> list[tuple[float, float]]:
-    """Return the parts of a stretch outside the gaps."""
+    """Return the parts of an interval outside the gaps."""
     inside = [gap for gap in gaps if start_s <= gap.start_s and gap.end_s <= end_s]
     starts = [start_s, *(gap.end_s for gap in inside)]
     ends = [*(gap.start_s for gap in inside), end_s]

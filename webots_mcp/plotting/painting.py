@@ -84,7 +84,7 @@ class LegendEntry(NamedTuple):
 
 
 def line_sample(colour: str, dash: str = "none", width: float = 1.6) -> Sample:
-    """Draws a stretch of a line."""
+    """Draw a segment of a line."""
 
     def draw(canvas: Canvas, x: float, y: float) -> None:
         canvas.add("path", d=f"M{x - 10:g} {y:g}h20", stroke=colour, stroke_width=width,

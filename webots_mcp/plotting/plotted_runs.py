@@ -61,7 +61,7 @@ class PlottedRun:
 
     @property
     def unread(self) -> Interval | None:
-        """The stretch of which not all was read; None where all was."""
+        """The interval that was not read completely; None if all was read."""
         cut_s = self.run.cut_at_s
         if cut_s is None:
             return None
@@ -140,7 +140,7 @@ def _histories(
     points: int,
     deadline_s: float,
 ) -> list[History]:
-    """Return the same data must look the same: the longest run decides how long a bucket is."""
+    """Return histories with the longest run's bucket length, so that equal data looks equal."""
     least_step_s = 0.0
     while True:
         histories = [
@@ -169,7 +169,7 @@ def _part(
 
 
 def title_of(parts: Sequence[PlottedRun]) -> str:
-    """Robots, runs and the stretch of time."""
+    """Robots, runs and the time range."""
     robots = " and ".join(dict.fromkeys(part.robot for part in parts))
     if len(parts) > 1:
         return f"{robots}: {', '.join(part.name for part in parts)}"
@@ -251,8 +251,8 @@ def event_lanes(
         connection: Any.
         part: The run.
         names: The drawn signals.
-        rows: How many lanes have room.
-        known: By run, what was searched before in all of it, and told by whoever did.
+        rows: Number of lanes that fit.
+        known: By run, what an earlier search of all of it found.
         deadline_s: For the search; a note says which kinds were not searched for.
     """
     most = min(rows, MOST_LANES)

@@ -65,7 +65,7 @@ class RobotPath:
     is_whole: bool = True
 
     def pieces(self) -> Iterator[Sequence[PathPoint]]:
-        """The parts between the breaks."""
+        """Return the parts between the breaks."""
         edges = [0, *sorted(self.breaks), len(self.places)]
         return (self.places[start:end] for start, end in pairwise(edges) if end > start)
 

@@ -74,7 +74,7 @@ class SignalLayout:
         time_labels_px: Height of the labels of the time axis.
         band_opacity: Opacity of modes behind curves.
         event_lines: Events that are marked by a line through the panels: more would be a curtain.
-        events_share: Share of the reading time that is kept for events, whatever the curves take.
+        events_share: Share of the reading time reserved for events, whatever the curves take.
     """
 
     small_text_px: float = 9.5
@@ -605,7 +605,7 @@ class _SignalPainter:
                 self._name(short(each.value), x, middle, colour=ink, anchor="middle")
 
     def _mark_events(self, frame: AxesBox, middle: float, lane: Lane) -> None:
-        """A mark at the start of each, its name behind it or before it where there is room."""
+        """A mark at the start of each, its name after it or before it if it fits."""
         marked: dict[float, list[str]] = {}  # what begins at the same pixel shares a mark
         for each in lane.intervals:
             marked.setdefault(round(float(frame.px(each.start_s)), 0), []).append(each.value)
@@ -708,7 +708,7 @@ def _has_room(frame: AxesBox, interval: Interval) -> bool:
 
 
 def _unnamed(lanes: Sequence[Lane], frame: AxesBox) -> list[str]:
-    """Values in the rows below that no interval had room for."""
+    """Values in the rows below that fit into no interval."""
     intervals = [interval for lane in lanes for interval in lane.intervals]
     named = {interval.value for interval in intervals if _has_room(frame, interval)}
     return [v for v in dict.fromkeys(each.value for each in intervals) if v not in named]

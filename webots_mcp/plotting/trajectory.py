@@ -398,7 +398,7 @@ class _TrajectoryPainter:
         return theme.ink if self._alone else line_style(index, theme).colour
 
     def _obstacles(self, frame: AxesBox) -> None:
-        """Outlines where sizes are known, squares elsewhere; a page tells their names."""
+        """Outlines where sizes are known, squares elsewhere; a page shows their names."""
         for each in self._standing:
             x, y = float(frame.px(each.x)), float(frame.py(each.y))
             d = f"M{x - 4:.1f} {y - 4:.1f}h8v8h-8Z"
@@ -463,7 +463,7 @@ class _TrajectoryPainter:
     def _line(
         self, frame: AxesBox, stretches: Any, colour: str, width: float, **style: Any
     ) -> None:
-        """One line, broken between the stretches."""
+        """One line, broken between the segments."""
         drawn = [np.array(thinned(each))[:, 1:] for each in stretches if len(each) > 1]
         if drawn:
             d = "".join(line_through(frame.px(each[:, 0]), frame.py(each[:, 1])) for each in drawn)

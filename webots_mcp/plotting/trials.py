@@ -154,10 +154,10 @@ def _paint_scores(canvas: Canvas, plot: TrialAxes, top: float) -> None:
     """Over one parameter: each score, and the mean of each value with its range."""
     (name,) = plot.names
     places, named = _places([each.parameters[name] for each in plot.sets])
-    told = sorted(((places[repr(each.parameters[name])], each) for each in plot.sets),
+    reported = sorted(((places[repr(each.parameters[name])], each) for each in plot.sets),
                   key=lambda pair: pair[0])  # fmt: skip
-    scored = [(place, each, each.score) for place, each in told if each.score is not None]
-    failed = [place for place, each in told if each.failures]
+    scored = [(place, each, each.score) for place, each in reported if each.score is not None]
+    failed = [place for place, each in reported if each.failures]
     entries = _legend(has_best=bool(plot.best), has_failures=bool(failed))
     legend = rows_of(entries, canvas.width_px - 20, canvas.height_px)
     y = axis_range(min(s.low for *_, s in scored), max(s.high for *_, s in scored))
@@ -214,7 +214,7 @@ def _paint_grid(canvas: Canvas, plot: TrialAxes, top: float) -> None:
         corner = left + column * cell_px[0], frame.bottom - (row + 1) * cell_px[1]
         share = (each.score.mean - bounds[0]) / (bounds[1] - bounds[0]) if each.score else None
         # More texts in a grid would not fit.
-        _paint_cell(canvas, each, corner, cell_px, share, told=len(plot.sets) <= 60)
+        _paint_cell(canvas, each, corner, cell_px, share, reported=len(plot.sets) <= 60)
         if each.parameters == plot.best:
             canvas.add("rect", x=corner[0] + 3, y=corner[1] + 3, width=cell_px[0] - 6,
                        height=cell_px[1] - 6, **_RING)  # fmt: skip
@@ -234,7 +234,7 @@ def _frame_sample(canvas: Canvas, x: float, y: float) -> None:
 
 def _paint_cell(
     canvas: Canvas, ranked: Ranked, corner: tuple[float, float], size: tuple[float, float],
-    share: float | None, *, told: bool,
+    share: float | None, *, reported: bool,
 ) -> None:  # fmt: skip
     lines = [f"{len(ranked.failures)} failed"] if ranked.failures else []
     if ranked.score is not None and share is not None:
@@ -245,7 +245,7 @@ def _paint_cell(
         spread = [f"{low:.3g} to {high:.3g}"] if low != high else []
         lines = [f"{mean:.4g}", *spread, *lines]
     ink = "#FFFFFF" if share is not None and share < 0.5 else INK  # white on dark cells
-    for row, line in enumerate(lines if told else ()):
+    for row, line in enumerate(lines if reported else ()):
         y = corner[1] + size[1] / 2 + 4 + (row - (len(lines) - 1) / 2) * (LINE_PX - 3)
         canvas.text(corner[0] + size[0] / 2, y, line, colour=ink, anchor="middle")
 
@@ -260,7 +260,7 @@ def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[tuple[float, 
 
 
 def _ordered(values: Sequence[Any]) -> list[Any]:
-    """Each value once, numbers before texts."""
+    """Return each value once, numbers before texts."""
     each = {repr(value): value for value in values}
     numbers = [value for value in each.values() if isinstance(value, (int, float))]
     return sorted(numbers) + sorted(

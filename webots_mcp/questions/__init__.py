@@ -22,7 +22,7 @@ MODULES: Final = (
 
 
 def all_questions() -> list[Question]:
-    """Every question there is, once; a module may use those of others."""
+    """Return every question there is, once; a module may use those of others."""
     modules = [importlib.import_module(f"{__name__}.{name}") for name in MODULES]
     found = (each for module in [*modules, *question_modules()] for each in vars(module).values())
     return list(dict.fromkeys(each for each in found if isinstance(each, Question)))

@@ -21,7 +21,7 @@ from webots_mcp import contract
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90
-FOR_A_PERSON: Final = "person"  # the context of a validation: whoever waits can press Ctrl-C
+FOR_A_PERSON: Final = "person"  # the context of a validation: a person who waits can press Ctrl-C
 LONGEST_NAME: Final = 200
 _CURSOR: Final = "Cursor of the previous answer, to continue it."
 
@@ -45,7 +45,7 @@ def _as_wait(value: float, info: ValidationInfo) -> float:
 
 
 # Bounds that only an absurd value meets stay out of the schemas, which every client carries along:
-# `CheckedTool` leaves the lengths of texts out, a validator has the others. The bounds beside a
+# `CheckedTool` leaves the lengths of texts out, a validator has the others. The bounds next to a
 # validator stand before it: behind it pydantic does not know JSON Schema's words.
 Id = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
 _Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]

@@ -36,7 +36,7 @@ Force = Annotated[bool, Field(description="If nothing else works, press keys in 
 
 @dataclass(frozen=True)
 class ControlTimes:
-    """How long questions wait unless told otherwise, in seconds of wall time.
+    """How long questions wait by default, in seconds of wall time.
 
     Attributes:
         command_s: For a command.

@@ -100,11 +100,11 @@ def webots_get_parameters(
     """
     with recording.view(robot, run_id) as view:
         rows = _shown_rows(view, names)
-        told = fitting(rows)
-        hints = [f"{len(told)} of {len(rows)}: names shows others"] * (len(told) < len(rows))
+        shown = fitting(rows)
+        hints = [f"{len(shown)} of {len(rows)}: names shows others"] * (len(shown) < len(rows))
         return ParametersAnswer(
             **view.header(),
-            parameters=without_empty(COLUMNS, told),
+            parameters=without_empty(COLUMNS, shown),
             total=len(rows),
             hint="; ".join(hints) or (None if rows else _none(view)),
         )

@@ -57,7 +57,7 @@ TIERS: Final = get_args(Tier)
 
 @dataclass(frozen=True)
 class Effect:
-    """What a question does beside answering, in the words of MCP's annotations.
+    """What a question does in addition to answering, in the words of MCP's annotations.
 
     Attributes:
         reads: It changes nothing, neither the simulation nor the recording.
@@ -83,7 +83,7 @@ class Caller:
     Attributes:
         by: The program that asks, and by which way.
         report: Shows how long it has waited: progress, total, text.
-        companions: The trials and the Webots that run on beside the answers.
+        companions: The trials and the Webots that continue to run after an answer.
     """
 
     client: Client
@@ -109,7 +109,7 @@ class Question:
     """A declared question.
 
     Attributes:
-        function: Its first parameter is the recording. One annotated `Caller` is who asks; in
+        function: Its first parameter is the recording. One annotated `Caller` is the caller; in
             place of one annotated `Scope` the asker gives what `SCOPE` lists. The others are the
             arguments; the docstring says what is answered.
         title: A few words, as a client's list shows them.
@@ -189,7 +189,7 @@ class Question:
 
     @property
     def has_caller(self) -> bool:
-        """Whether it wants to know who asks."""
+        """Whether it needs to know the caller."""
         return self._parameter_of(Caller) is not None
 
     async def ask(
@@ -198,7 +198,7 @@ class Question:
         """Return the answer to valid arguments.
 
         One that only reads, and fails over a value that no bridge has written, is asked again past
-        such rows, which the answer names; one that acts looks past them at once.
+        such rows, which the answer names; one that acts ignores them at once.
 
         Raises:
             WebotsMCPError: As the question says.

@@ -6,6 +6,7 @@ What is wrong comes first; of what passed only the names are shown.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.answers.answer_models import (
@@ -19,8 +20,21 @@ from webots_mcp.questions.declaration import READS, question
 from webots_mcp.setup.doctor import Checked, diagnose, subject_of, worst
 from webots_mcp.store.recording import RecordingAccess
 
-_LONGEST_TEXT: Final = 320
-_BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
+
+@dataclass(frozen=True)
+class DiagnosisLimits:
+    """Limits of an answer.
+
+    Attributes:
+        text_characters: Length at which a text is cut.
+        tokens: Budget of checks; further checks are only named.
+    """
+
+    text_characters: int = 320
+    tokens: int = 1_250
+
+
+_LIMITS: Final = DiagnosisLimits()
 
 
 @question("Diagnose the set-up", READS, tier="core")
@@ -42,22 +56,26 @@ def webots_diagnose_setup(recording: RecordingAccess) -> DiagnosisAnswer:
 
 def _failed(checked: Sequence[Checked]) -> list[dict[str, str]]:
     """Return what is wrong before what might be."""
-    told: list[dict[str, str]] = []
-    left = _BUDGET_TOKENS
+    reported: list[dict[str, str]] = []
+    left = _LIMITS.tokens
     for verdict in ("wrong", "warning"):
         for check, finding in checked:
             if finding.verdict == verdict:
                 head = {"check": check.name, "verdict": verdict}
                 texts = {"seen": finding.seen, "fix": finding.fix or ""}
-                cut = {name: cut_text(text, _LONGEST_TEXT) for name, text in texts.items() if text}
+                cut = {
+                    name: cut_text(text, _LIMITS.text_characters)
+                    for name, text in texts.items()
+                    if text
+                }
                 left -= sum(map(tokens_in, cut.values()))
-                told.append(head | (cut if left > 0 else {}))
-    return told
+                reported.append(head | (cut if left > 0 else {}))
+    return reported
 
 
 def _by_reason(checked: Sequence[Checked]) -> dict[str, str]:
     names: dict[str, list[str]] = {}
     for check, finding in checked:
         if finding.verdict == "not checked":
-            names.setdefault(cut_text(finding.seen, _LONGEST_TEXT), []).append(check.name)
+            names.setdefault(cut_text(finding.seen, _LIMITS.text_characters), []).append(check.name)
     return {reason: ", ".join(those) for reason, those in names.items()}

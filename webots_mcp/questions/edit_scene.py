@@ -1,4 +1,4 @@
-"""The scene tree of a world: looking at it, and changing it."""
+"""Read and change the scene tree of a world."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 from pydantic import AfterValidator, Field
 
 from webots_mcp.answers.answer_models import EventsAnswer, TimelineAnswer
-from webots_mcp.answers.budget import answer_about, notes_of, range_in, room_tokens, seconds
+from webots_mcp.answers.budget import answer_about, notes_of, range_in, row_budget_tokens, seconds
 from webots_mcp.answers.event_tables import events_table, fitting_events, not_shown_of, verdicts_of
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.errors import InvalidInputError
@@ -141,12 +141,12 @@ def _found(
 ) -> dict[str, Any]:
     found = search_events(view.connection, asked, options, group=group, after=cursor or None)
     verdicts, notes = verdicts_of(found.verdicts), notes_of(_notes(found.notes, options))
-    budget_tokens = room_tokens(limit, [verdicts.model_dump(exclude_none=True), notes])
-    told, events = fitting_events(
+    budget_tokens = row_budget_tokens(limit, [verdicts.model_dump(exclude_none=True), notes])
+    reported, events = fitting_events(
         found, limit or DEFAULT_LIMIT, budget_tokens, view, time_of_day=time_of_day
     )
-    hints = ["ask again with this cursor for what is not shown"] if told.cursor else []
-    if any(event.count > 1 for event in told.events):
+    hints = ["ask again with this cursor for what is not shown"] if reported.cursor else []
+    if any(event.count > 1 for event in reported.events):
         hints.append(
             "group=false tells alike events one by one: name the kinds, or a shorter range"
         )
@@ -156,8 +156,8 @@ def _found(
         "events": events,
         "verdicts": verdicts,
         "start_s": _begin_of(view, asked),
-        "not_shown": not_shown_of(told),
-        "cursor": told.cursor,
+        "not_shown": not_shown_of(reported),
+        "cursor": reported.cursor,
         "notes": notes,
         "hint": "; ".join(hints) or None,
     }
@@ -213,7 +213,7 @@ def _timeline(
     time_of_day: bool,
 ) -> dict[str, Any]:
     """Return a page; a shorter one where it would be too long."""
-    budget_tokens = room_tokens(limit)
+    budget_tokens = row_budget_tokens(limit)
     entries = limit or DEFAULT_LIMIT
     while True:
         page = timeline(view.connection, asked, options, limit=entries, after=cursor or None)

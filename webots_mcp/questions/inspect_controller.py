@@ -5,6 +5,7 @@ Nothing can be set: parameters are for that.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, cast
 
 from anyio import to_thread
@@ -22,9 +23,6 @@ from webots_mcp.store.inspections import Inspection, inspection_at, inspections_
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 INSPECTION_COLUMNS: Final = ("event_id", "at_s", "cause", "name", "line")
-_WAIT_S: Final = 10.0
-_LIST_BUDGET_TOKENS: Final = 500
-_LONGEST_NAME: Final = 120
 _NOTHING: Final = (
     "no variables are recorded in this run. They are recorded at breakpoint hits "
     "(webots_breakpoint), violated expectations, logged errors and hangs"
@@ -33,6 +31,24 @@ _PATH: Final = Field(
     max_length=200,
     description="Variable of the controller, such as self.pid.integral or path[3].",
 )
+
+
+@dataclass(frozen=True)
+class InspectionLimits:
+    """Limits of an answer about the controller's variables.
+
+    Attributes:
+        wait_s: How long the answer of the bridge is awaited.
+        list_tokens: Budget of a list of inspections.
+        name_characters: Length at which a name is cut.
+    """
+
+    wait_s: float = 10.0
+    list_tokens: int = 500
+    name_characters: int = 120
+
+
+_LIMITS: Final = InspectionLimits()
 
 
 @question(
@@ -57,7 +73,7 @@ async def webots_inspect_controller(
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _LIMITS.wait_s,
 ) -> InspectionAnswer:
     """Show the controller's own variables: which line it executed and what its variables held.
 
@@ -97,7 +113,7 @@ async def webots_watch(
     ] = 1,
     stop: Annotated[bool, Field(description="Stop watching this path.")] = False,
     robot: RobotName = None,
-    timeout_wall_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _LIMITS.wait_s,
 ) -> CommandAnswer:
     """Record a variable of the running controller as a signal from now on: watched.PATH.
 
@@ -152,7 +168,7 @@ def _listed(view: RobotView, run_id: int | None) -> list[list[Any]]:
             each.event_id,
             seconds(each.sim_time_s),
             each.cause,
-            cut_text(each.name, _LONGEST_NAME),
+            cut_text(each.name, _LIMITS.name_characters),
             each.place,
         ]
         for each in inspections_of(view.connection, run_id)
@@ -166,16 +182,16 @@ def _answer(view: RobotView, found: Inspection, others: list[list[Any]]) -> Insp
         **header,
         event_id=found.event_id,
         at_s=seconds(found.sim_time_s),
-        cause=f"{found.cause}: {cut_text(found.name, _LONGEST_NAME)}",
+        cause=f"{found.cause}: {cut_text(found.name, _LIMITS.name_characters)}",
         frames=_fitting(found.frames),
         inspections=(
-            table(INSPECTION_COLUMNS, fitting(others, _LIST_BUDGET_TOKENS)) if several else None
+            table(INSPECTION_COLUMNS, fitting(others, _LIMITS.list_tokens)) if several else None
         ),
     )
 
 
 def _fitting(frames: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
-    """Return the frames, shortened where they are long; the innermost ones keep their room."""
+    """Return the frames, shortened if they are long; the innermost ones keep their length."""
     shown = shorten(frames, RESULT_BUDGET_TOKENS).value
     return cast("list[dict[str, Any]]", shown) if isinstance(shown, list) else frames[:1]
 

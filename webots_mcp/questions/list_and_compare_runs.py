@@ -23,7 +23,7 @@ from webots_mcp.answers.budget import (
     fitting,
     header_of_only,
     notes_of,
-    room_tokens,
+    row_budget_tokens,
     seconds,
     short_name,
     shown,
@@ -277,9 +277,9 @@ def webots_annotate_run(
     with recording.writer() as connection:
         annotate_run(connection, run.id, label=_change(label), note=_change(note))
     with recording.view(robot, run.id) as view:
-        told = run_info(view.connection, run.id)
-        named = zip(RUN_COLUMNS, _run_row(told), strict=True)
-        pairs = (("label", before.label, told.label), ("note", before.note, told.note))
+        after = run_info(view.connection, run.id)
+        named = zip(RUN_COLUMNS, _run_row(after), strict=True)
+        pairs = (("label", before.label, after.label), ("note", before.note, after.note))
         replaced = [
             f"{what} {short_name(old)!r} was {'replaced' if new else 'removed'}"
             for what, old, new in pairs
@@ -305,7 +305,7 @@ def _no_runs(parameters: dict[str, Any] | None) -> str:
 
 def _values_of(parameters: Mapping[str, Any]) -> Any:
     """Values of parameters as they are, of many the first."""
-    budget_tokens = room_tokens() if is_for_a_person() else DETAIL_BUDGET_TOKENS
+    budget_tokens = row_budget_tokens() if is_for_a_person() else DETAIL_BUDGET_TOKENS
     return shorten(dict(parameters), budget_tokens, WHOLE).value or None
 
 
@@ -350,7 +350,7 @@ def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     known = {short_name(n): shown([*pair]) for n, pair in list(found.unlike.items())[:most]}
     names, parted = PartedSignal._fields[1:-1], found.parted[: limit or _SIZES.diverging]
     rows = [[short_name(each.signal), *map(_cell, names, each[1:-1])] for each in parted]
-    rows = fitting(rows, room_tokens(limit, [known, notes]))
+    rows = fitting(rows, row_budget_tokens(limit, [known, notes]))
     left, worst = len(found.parted) - len(rows), found.worst
     return {
         "verdict": cut_for_a_model(found.verdict, _SIZES.verdict_characters),
@@ -393,12 +393,12 @@ def _compared(
     groups, only_in = _groups(found), list(found.only_in.items())
     notes = notes_of([*_edit_note(found.groups), *found.notes])
     most = len(only_in) if is_for_a_person() else _SIZES.only_in
-    beside: list[Any] = [groups and groups.rows, found.unknown, undecided, notes]
-    of_measures = int(_SIZES.measures_share * room_tokens(limit, beside))
+    others: list[Any] = [groups and groups.rows, found.unknown, undecided, notes]
+    of_measures = int(_SIZES.measures_share * row_budget_tokens(limit, others))
     measures = fitting(list(map(_measure_row, found.measures)), of_measures)
-    beside.append(measures)
+    others.append(measures)
     rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
-    rows = fitting(rows, room_tokens(limit, [*beside, only_in[:most]]))
+    rows = fitting(rows, row_budget_tokens(limit, [*others, only_in[:most]]))
     tables = [without_empty(MEASURE_COLUMNS, measures), without_empty(DIFFERENCE_COLUMNS, rows)]
     return {
         "groups": groups,
@@ -445,7 +445,7 @@ def _runs_and_code(group: Group) -> str:
 def _undecided(
     measures: Sequence[Measure], differences: Sequence[Difference]
 ) -> dict[str, str] | None:
-    """Why `different` is null, by the names of the figures that share a reason."""
+    """Return why `different` is null, by the names of the figures that share a reason."""
     names: dict[str, list[str]] = {}
     figures: list[Measure | Difference] = [*measures, *differences]
     for each in figures:
@@ -457,7 +457,7 @@ def _undecided(
 
 
 def _differs(difference: Difference) -> bool:
-    """Whether mean or deviation of any group differs from the first, or it was asked for."""
+    """Return whether mean or deviation of any group differs from the first, or it was asked for."""
     if difference.asked:
         return True
     first, *others = difference.deviation
@@ -483,7 +483,7 @@ def _medians(spreads: Sequence[Spread | None]) -> list[float | None]:
 
 
 def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None] | None:
-    """Return the least and the greatest of each group; None where each group is one run."""
+    """Return the minimum and the maximum of each group; None where each group is one run."""
     if all(each is None or each.low == each.high for each in spreads):
         return None
     return [None if each is None else figures([each.low, each.high]) for each in spreads]
@@ -548,14 +548,14 @@ def _intervals(found: Sequence[tuple[float, float] | None]) -> Any:
     return _verdicts_against_first([None if each is None else figures(each) for each in found])
 
 
-def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: int) -> str | None:
+def _hint(found: Comparison, measures: int, shown: int, differing: int, only_in: int) -> str | None:
     if len(found.groups) == 1:
         return "what its signals did: webots_get_trends; what happened: webots_find_events"
-    more = told < differing or differing == len(found.differences) < found.total
+    more = shown < differing or differing == len(found.differences) < found.total
     hints = [f"{measures} of {len(found.measures)} measures: limit shows the others"] * (
         measures < len(found.measures)
     )
-    hints += [f"the {told} that differ most of {found.total}: limit or signals for others"] * more
+    hints += [f"the {shown} that differ most of {found.total}: limit or signals for others"] * more
     hints += ["no numeric signal differs"] * (differing == 0)
     equal = 0 if more else found.total - differing
     hints += [f"mean and deviation of the other {equal} are equal"] * (equal > 0 and differing > 0)

@@ -18,7 +18,7 @@ from webots_mcp.answers.answer_models import (
 )
 from webots_mcp.answers.budget import (
     fitting,
-    room_tokens,
+    row_budget_tokens,
 )
 from webots_mcp.answers.shortening import (
     cut_for_a_model,
@@ -102,20 +102,20 @@ def webots_list_robots(recording: RecordingAccess) -> RobotsAnswer:
     Start here to learn the robots' names. For the values of one robot use webots_get_robot_state;
     if a robot is missing or silent use webots_diagnose_setup.
     """
-    told = is_for_a_person()
+    in_full = is_for_a_person()
     with recording.reader() as connection:
         now_s = time.time()
         robots = list_robots(connection, now_s)
         none = f"{nothing_recorded(connection)}. {GETTING_STARTED}"
-        if not robots and not told:
+        if not robots and not in_full:
             raise NothingRecordedError(none)
         views = _fitting([view_of(connection, robot, now_s) for robot in _liveliest(robots)])
         live = [view for view in views if view.robot.live]
         return RobotsAnswer(
             **(live[0].header() if len(live) == 1 else storage(connection)),
-            robots=_robots(views, told=told) if views else None,
-            database=name_of(recording.database) if told else None,
-            retention=_retention(recording, connection) if told else None,
+            robots=_robots(views, in_full=in_full) if views else None,
+            database=name_of(recording.database) if in_full else None,
+            retention=_retention(recording, connection) if in_full else None,
             hint=_hint_of_robots(connection, robots, len(views)) if robots else none,
         )
 
@@ -161,19 +161,19 @@ def webots_get_world_info(
             retention=_retention(recording, view.connection),
             data_dir=str(recording.data_dir),
         )
-        room = room_tokens(beside=answer.model_dump(exclude_none=True))
-        seen = _seen(world_seen(view.connection, run), room)
+        space_tokens = row_budget_tokens(others=answer.model_dump(exclude_none=True))
+        seen = _seen(world_seen(view.connection, run), space_tokens)
         hints = [seen.pop("hint", None), more if len(shown) < len(others) else None]
         return answer.model_copy(update=seen | {"hint": "; ".join(filter(None, hints)) or None})
 
 
-def _robots(views: list[RobotView], *, told: bool) -> AnswerTable:
+def _robots(views: list[RobotView], *, in_full: bool) -> AnswerTable:
     """Return a row for each robot; counts of losses only if there are any, or for a person."""
     columns, rows = [*ROBOT_COLUMNS], [_row(view) for view in views]
     recorders = [_recorder(view) for view in views]
     for name in RECORDER_COLUMNS:
         values = [recorder[name] for recorder in recorders]
-        if any(values) and (told or name not in ("row_count", "why")):
+        if any(values) and (in_full or name not in ("row_count", "why")):
             columns.append(name)
             for row, value in zip(rows, values, strict=True):
                 row.append(value)

@@ -1,4 +1,4 @@
-"""Watching a robot for a while, or looking back: what was recorded in that window."""
+"""Watch a robot for a while, or report what was recorded in a past window."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from webots_mcp.answers.budget import (
     answer_about,
     newest_runs,
     notes_of,
-    room_tokens,
+    row_budget_tokens,
 )
 from webots_mcp.answers.event_tables import fitting_events, not_shown_of, verdicts_of
 from webots_mcp.answers.movement import movement
@@ -158,19 +158,21 @@ def _found(connection: sqlite3.Connection, view: RobotView, wall_start_s: float)
     described = (
         trends(connection, window.rows, limit=MOST_SIGNALS, shown=shown) if recorded else None
     )
-    told = described.runs if described else ()
-    newest = told[-_SIZES.runs :]
+    runs = described.runs if described else ()
+    newest = runs[-_SIZES.runs :]
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
     known = in_window.verdicts if recorded else _unlooked(in_window.verdicts)
     verdicts = verdicts_of(known, in_short=recorded)
     moved = movement(view, window.rows) if recorded else None
-    notes = notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told)))))
-    beside = [verdicts.model_dump(exclude_none=True), moved, notes]
-    room = room_tokens(beside=beside, usual_tokens=_SIZES.rows_tokens)
-    shown, events = fitting_events(in_window, _SIZES.events, int(room * _SIZES.events_share), view)
-    of_a_run = int(room * (1 - _SIZES.events_share)) // max(len(newest), 1)
-    rows = sum(run.rows for run in told)
+    notes = notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(runs)))))
+    others = [verdicts.model_dump(exclude_none=True), moved, notes]
+    space_tokens = row_budget_tokens(others=others, usual_tokens=_SIZES.rows_tokens)
+    shown, events = fitting_events(
+        in_window, _SIZES.events, int(space_tokens * _SIZES.events_share), view
+    )
+    of_a_run = int(space_tokens * (1 - _SIZES.events_share)) // max(len(newest), 1)
+    rows = sum(run.rows for run in runs)
     return {
         "row_count": rows,
         "movement": moved,
@@ -184,15 +186,15 @@ def _found(connection: sqlite3.Connection, view: RobotView, wall_start_s: float)
 
 
 def _unlooked(verdicts: Verdicts) -> Verdicts:
-    """With the kinds that were not asked for because there is no row to look at."""
+    """Add the kinds that were not searched because there is no row."""
     others = [each.name for each in asked_kinds(EventOptions()) if each.name not in _ROWLESS.kinds]
     why = dict.fromkeys(others, ("no row was recorded in that time",))
     return replace(verdicts, reasons=verdicts.reasons | why)
 
 
-def _of_earlier(told: Sequence[RunTrends]) -> list[str]:
+def _of_earlier(runs: Sequence[RunTrends]) -> list[str]:
     """Return where the trends of all runs but the newest are."""
-    earlier = ", ".join(str(run.run_id) for run in told[: -_SIZES.runs])
+    earlier = ", ".join(str(run.run_id) for run in runs[: -_SIZES.runs])
     return [f"the trends of run {earlier}: webots_get_trends(run_id)"] if earlier else []
 
 

@@ -27,7 +27,7 @@ from webots_mcp.answers.budget import (
     fitting,
     notes_of,
     range_in,
-    room_tokens,
+    row_budget_tokens,
     seconds,
     short_name,
     shown,
@@ -216,7 +216,7 @@ def _series(
     view: RobotView, asked: TimeRange, names: Sequence[str], max_points: int | None
 ) -> dict[str, Any]:
     """As many buckets as were asked for, or as fit; fewer where the answer would be too long."""
-    budget_tokens = room_tokens(max_points)
+    budget_tokens = row_budget_tokens(max_points)
     points = min(max_points or DEFAULT_POINTS, _likely_points(view, asked, names, budget_tokens))
     while True:
         history = query_history(view.connection, asked, names, max_points=points)
@@ -225,7 +225,7 @@ def _series(
         if tokens <= budget_tokens or points == 1:
             break
         points = max(1, int(points * 0.9 * budget_tokens / tokens))
-    # Told once for all runs: the names would take more room than the values.
+    # Reported once for all runs: the names would take more space than the values.
     dropped = (_drop_signals(run, budget_tokens // len(runs)) for run in runs)
     left_out = [*dict.fromkeys(name for names in dropped for name in names)]
     where = f"run {runs[0].run_id}" if len(runs) == 1 else "one run or more"
@@ -352,7 +352,7 @@ def _page(
     page = query_rows(
         view.connection, asked, names, limit=limit or DEFAULT_POINTS, after_id=after_id
     )
-    budget_tokens = room_tokens(limit)
+    budget_tokens = row_budget_tokens(limit)
     rows = _most(
         lambda rows: tokens_of(_as_dict(_row_columns(page, rows, view))), page, budget_tokens
     )
@@ -443,7 +443,7 @@ def _trends(
 ) -> dict[str, Any]:
     most = limit or _SIZES.trends
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS, shown=most)
-    budget_tokens = room_tokens(limit) // max(len(found.runs), 1)
+    budget_tokens = row_budget_tokens(limit) // max(len(found.runs), 1)
     recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
     runs = [trend_tables(run, most, budget_tokens) for run in recorded]
     return {

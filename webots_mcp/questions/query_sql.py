@@ -15,7 +15,7 @@ from anyio.lowlevel import RunVar
 from pydantic import Field
 
 from webots_mcp.answers.answer_models import AnswerTable, SqlAnswer
-from webots_mcp.answers.budget import LONGEST_NAME, fitting, header_of_only, room_tokens
+from webots_mcp.answers.budget import LONGEST_NAME, fitting, header_of_only, row_budget_tokens
 from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person, tokens_of
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.arguments import ShownLimit
@@ -99,7 +99,7 @@ async def webots_query_sql(
     found = await _run(recording, sql, limit or _SIZES.rows, max_bytes)
     columns = [cut_for_a_model(name, LONGEST_NAME) for name in found.columns[:most_columns]]
     rows = [list(row[:most_columns]) for row in found.rows]
-    budget_tokens = room_tokens(limit, columns)
+    budget_tokens = row_budget_tokens(limit, columns)
     rows = fitting(rows, budget_tokens)
     longest = None
     if len(rows) == 1 and tokens_of(rows) > budget_tokens:

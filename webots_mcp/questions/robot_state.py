@@ -92,7 +92,7 @@ class StateSizes:
         events_tokens: Budget of the events.
         page: Members, items or characters of a page, unless a limit is given.
         names: Names in a hint.
-        margin_tokens: Budget that is kept for hints.
+        margin_tokens: Budget that is reserved for hints.
         replaced: Replaced values.
         devices: Devices that the state does not name.
         error_characters: Characters of an error or a reason.
@@ -191,17 +191,17 @@ def webots_get_full_state(
                 f"offset is possible only with a list, a text or a branch, and {path!r:.80} is a "
                 "single value. Leave offset out."
             )
-        beside: dict[str, Any] = view.header()
+        others: dict[str, Any] = view.header()
         if not (path or offset):
-            beside |= {"replaced": _some_replaced(view.state.replaced_paths())}
-            beside |= {"events": _events(view), "recorder": _health(view)}
+            others |= {"replaced": _some_replaced(view.state.replaced_paths())}
+            others |= {"events": _events(view), "recorder": _health(view)}
         most_tokens = ANSWER_TOKENS if limit is None else LARGE_ANSWER_TOKENS
-        told = {
-            name: each.model_dump() if name == "events" else each for name, each in beside.items()
+        reported = {
+            name: each.model_dump() if name == "events" else each for name, each in others.items()
         }
-        left_tokens = most_tokens - _SIZES.margin_tokens - tokens_of(told)
+        left_tokens = most_tokens - _SIZES.margin_tokens - tokens_of(reported)
         return FullStateAnswer(
-            **_page(part, path, offset, limit or _SIZES.page, left_tokens), **beside
+            **_page(part, path, offset, limit or _SIZES.page, left_tokens), **others
         )
 
 
@@ -374,7 +374,7 @@ def _dropped(view: RobotView, of_session: int) -> int:
 
 
 def _kept(view: RobotView) -> str | None:
-    """Return which seconds of the run were kept last at full rate, and why."""
+    """Return the last full-rate segment of the run, and its reason."""
     newest = newest_kept(view.connection, view.run.id) if view.run else None
     if newest is None or view.run is None:
         return None
@@ -443,7 +443,7 @@ def _has_sensor_word(key: str) -> bool:
 
 
 def _paths(value: Any, path: str = "") -> Iterator[str]:
-    """The path of each member at any depth, and of the first items of arrays."""
+    """Yield the path of each member at any depth, and of the first items of arrays."""
     yield path
     if isinstance(value, dict):
         for key, member in cast("dict[str, Any]", value).items():

@@ -210,7 +210,7 @@ def _answer(view: RobotView, commands: list[QueuedCommand], limit: int) -> Comma
 
 
 def _shown_actions(actions: Mapping[str, str]) -> dict[str, str]:
-    """Return the registered actions with as much of their docstrings as fits beside all the names.
+    """Return the registered actions with as much of their docstrings as fits next to all the names.
 
     A controller that registers none sees commands in its loop.
     """

@@ -1,4 +1,4 @@
-"""Tools that show pictures: content only, because clients drop pictures beside structured data."""
+"""Tools that show pictures: content only, because clients drop pictures next to structured data."""
 
 from __future__ import annotations
 
@@ -130,8 +130,8 @@ def _show_recorded(
             picture, shown = _sheet(recording, found)
         else:
             picture, shown = _single(recording, view, found[0])
-        told = _told_of(view, found) | shown | _far_off(at_s, found)
-        return [_caption(view.header() | told), picture]
+        reported = _told_of(view, found) | shown | _far_off(at_s, found)
+        return [_caption(view.header() | reported), picture]
 
 
 def _far_off(at_s: float | None, found: list[StoredImage]) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def _far_off(at_s: float | None, found: list[StoredImage]) -> dict[str, Any]:
 
 
 def _told_of(view: RobotView, found: list[StoredImage]) -> dict[str, Any]:
-    """Return the camera, and the stretch that its frames are kept with."""
+    """Return the camera, and the full-rate segment that its frames belong to."""
     first, last = found[0], found[-1]
     if first.kind != KEPT_FRAME:
         return {"camera": first.device}
@@ -314,7 +314,7 @@ def webots_plot(
     webots_query_history; for a description in words use webots_get_trends.
     """
     draw = partial(plot, kind=kind, signals=signals or (), width_px=width_px, height_px=height_px)
-    if trial_set is not None:  # which may be of a robot that is gone
+    if trial_set is not None:  # which may be of a robot that was removed
         with recording.reader() as connection:
             picture = draw(connection, trial_set=trial_set)
         facts = {"shows": picture.caption, "notes": notes_of(picture.notes) or []}
@@ -332,11 +332,11 @@ def webots_plot(
         return [_caption(facts), ShownPicture(data=picture.data, format="png")]
 
 
-# -- pictures as a model can look at them: small enough, in a format that clients show -------------
+# -- pictures for a model: small enough, in a format that clients show -------------
 
 
 def _load_sheet(files: Sequence[Path]) -> ShownPicture:
-    """Pictures beside each other, from left to right and from top to bottom, as one.
+    """Arrange pictures next to each other, from left to right and from top to bottom, as one.
 
     Raises:
         InvalidInputError: A file holds no complete picture, or is too large.

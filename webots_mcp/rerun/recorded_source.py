@@ -18,7 +18,7 @@ from typing import Final
 
 from webots_mcp.contract import host_name
 from webots_mcp.database.location import find_project
-from webots_mcp.database.tapes.source_files import MOST_SOURCE_FILES, root_of
+from webots_mcp.database.tapes.source_files import LIMITS, root_of
 
 _COMMIT: Final = re.compile(r"[0-9a-f]{7,64}")
 _GIT_S: Final = 10.0  # that git may take for a file
@@ -136,7 +136,7 @@ def _with_imports(controller: Path, root: Path, read: Read) -> dict[str, str]:
     """Return the texts of a controller and of the modules next to it that it imports, by path."""
     texts: dict[str, str] = {}
     waiting = [controller]
-    while waiting and len(texts) < MOST_SOURCE_FILES:
+    while waiting and len(texts) < LIMITS.files:
         file = waiting.pop()
         name = file.relative_to(root).as_posix()
         if name in texts or (content := read(file)) is None:

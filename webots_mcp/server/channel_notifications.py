@@ -1,4 +1,4 @@
-"""The channel by which a server tells Claude Code what happened, without being asked.
+"""Notify Claude Code of what happened over a channel, without a request.
 
 Claude Code shows the notification `notifications/claude/channel` of a server that announces the
 experimental capability `claude/channel`; other clients ignore both. See 'webots-mcp help updates'.

@@ -7,6 +7,7 @@ only, since over HTTP each of its requests stands alone.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import anyio
@@ -14,8 +15,21 @@ from mcp.server.connection import Connection
 from mcp.server.context import CallNext, HandlerResult, ServerRequestContext
 from mcp_types.version import MODERN_PROTOCOL_VERSIONS
 
-SEND_TIMEOUT_S: Final = 5.0  # for a client that does not read
-MOST_CLIENTS: Final = 256  # more than the sessions that are served over HTTP
+
+@dataclass(frozen=True)
+class ClientLimits:
+    """Limits of connected clients.
+
+    Attributes:
+        send_timeout_s: Wall time for a client that does not read.
+        clients: Maximum number; more than the sessions that are served over HTTP.
+    """
+
+    send_timeout_s: float = 5.0
+    clients: int = 256
+
+
+_LIMITS: Final = ClientLimits()
 
 
 class ConnectedClients:
@@ -58,7 +72,7 @@ class ConnectedClients:
         if connection.protocol_version in MODERN_PROTOCOL_VERSIONS:
             self._pipe = connection
             return
-        if len(self._staying) < MOST_CLIENTS:
+        if len(self._staying) < _LIMITS.clients:
             self._staying[id(connection)] = connection
             connection.exit_stack.callback(self._staying.pop, id(connection), None)
 
@@ -69,5 +83,5 @@ def connection_of(ctx: ServerRequestContext[Any, Any]) -> Connection:
 
 
 async def _send(connection: Connection, method: str, params: Mapping[str, Any]) -> None:
-    with anyio.move_on_after(SEND_TIMEOUT_S):
+    with anyio.move_on_after(_LIMITS.send_timeout_s):
         await connection.notify(method, dict(params))

@@ -146,7 +146,7 @@ def create_server(
 
 
 class _ChunkMaker(threading.Thread):
-    """Makes the chunks that a recording lacks which is only read, once, in a temporary file."""
+    """Make the missing chunks of a read-only recording once, in a temporary file."""
 
     def __init__(self, recording: RecordingAccess) -> None:
         super().__init__(name="webots-mcp chunks", daemon=True)
@@ -235,7 +235,7 @@ def add_resources(mcp: MCPServer, recording: RecordingAccess) -> None:
                 return describe_schema(connection)
         except NoDatabaseError:
             return _schema_to_come()
-        except WebotsMCPError as error:  # of any other a client is not told what it says
+        except WebotsMCPError as error:  # a client does not see the text of any other error
             raise ResourceError(str(error)) from error
 
 

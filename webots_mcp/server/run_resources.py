@@ -1,7 +1,7 @@
 """Resources of each run: its report and its plot, and who wants to know when they change.
 
 They change when the run ends. Clients of protocols before 2026-07-28 subscribe to a resource, later
-ones listen; both are told the address alone, and read it again.
+ones listen; both receive only the address, and read it again.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Subscriptions:
     async def __call__(
         self, ctx: ServerRequestContext[Any, Any], call_next: CallNext
     ) -> HandlerResult:
-        """Begin to watch before a client is told that it listens."""
+        """Begin to watch before a client learns that it listens."""
         if ctx.method == "subscriptions/listen":
             await self._watch.begin()
         return await call_next(ctx)

@@ -41,7 +41,7 @@ class Client(NamedTuple):
 
 
 def clients_of(project: Path) -> list[Client]:
-    """Return those that look into the folder of a project."""
+    """Return the clients that read files in the folder of a project."""
     return [
         Client("Claude Code", project / ".mcp.json", variable="${%s}"),
         Client("Cursor", project / ".cursor" / "mcp.json"),
@@ -186,7 +186,7 @@ def can_be_started(entry: dict[str, Any]) -> bool:
 
 
 def policy_file(project: Path) -> FileChange:
-    """Return the project's file with what is harmless allowed; one that is there is kept."""
+    """Return the project's file that allows what is harmless; an existing file stays unchanged."""
     file = project / PROJECT_FILE
     before = read(file)
     usual = Path(__file__).with_name("allowed.toml").read_bytes()
@@ -194,7 +194,7 @@ def policy_file(project: Path) -> FileChange:
 
 
 def ignore_file(data_dir: Path) -> FileChange:
-    """Return the file that keeps the recordings out of a Git repository; one that is there is kept.
+    """Return the file that keeps the recordings out of a Git repository; an existing file stays.
 
     Raises:
         CommandRefusedError: The data folder is a file.

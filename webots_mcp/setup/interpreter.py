@@ -22,7 +22,7 @@ from webots_mcp.simulator.installations import installations
 
 PROBE_TIMEOUT_S: Final = 30.0
 _PREFERENCE: Final = "pythonCommand"
-# For any Python 3. -B leaves no compiled files behind in a folder that is only looked at.
+# For any Python 3. -B leaves no compiled files behind in a folder that is only read.
 _PROBE: Final = """
 import json, os, sys
 said = {"executable": sys.executable, "python": "%d.%d.%d" % sys.version_info[:3]}
@@ -65,7 +65,7 @@ class Interpreter:
         python: Its version.
         bridge: The version of webots-mcp that a controller imports there; None if it cannot.
         error: Why the bridge cannot be imported.
-        fix: What mends it, to be typed in a shell or done.
+        fix: How to fix it: a command to type, or something to do.
     """
 
     command: str

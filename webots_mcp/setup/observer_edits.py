@@ -171,7 +171,7 @@ def _find(world: bytes) -> tuple[int, int] | None:
 
 
 def _robots(world: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """The Robot nodes at the top of a world: where each begins and ends, and its name."""
+    """Yield the Robot nodes at the top of a world: where each begins and ends, and its name."""
     depth, start, name = 0, 0, b""
     before: list[re.Match[bytes]] = []  # the words at this place of the top
     last = b""

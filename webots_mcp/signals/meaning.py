@@ -2,7 +2,8 @@
 
 A meaning is declared by a person, known from the device that was read, or read from the name. The
 words of names are compared as whole words, in their singular and common short forms; no part of a
-name is matched as a bare text. What none of these tells has an unknown meaning, and is not judged.
+name is matched as a bare text. A signal without any of these has an unknown meaning, and is not
+judged.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Final, Literal, NamedTuple, get_args
@@ -48,8 +50,6 @@ _UNITS: Final = {  # as people write them, and as names are understood
 LONGEST_NAME: Final = 500  # characters of a signal's name that a meaning is declared for
 _LONGEST_UNIT: Final = 20  # characters
 _BAD_UNIT: Final = "signal {!r}: unit must be a text of up to {} characters, such as 'm/s', not {}"
-_REMEMBERED: Final = 4096  # names whose words are kept
-_ROBOTS_REMEMBERED: Final = 16  # lists of names whose meanings are kept
 
 # -- the words of names ------------------------------------------------------------------------
 
@@ -98,7 +98,7 @@ INPUTS: Final = frozenset((  # what a person moves by hand
     "keyboard", "key", "button", "input",
 ))  # fmt: skip
 _HEADINGS: Final = frozenset(("heading", "yaw"))
-_OF_HEADINGS: Final = frozenset((  # who measures a heading, and what else may stand beside it
+_OF_HEADINGS: Final = frozenset((  # what measures a heading, and words next to it
     "compass", "gyro", "gyroscope", "imu", "gps", "gnss", "odometry", "estimate", "estimated",
     "fused", "ekf", "true", "robot", "body", "base", "raw", "rad", "deg", "value", "angle",
 )) | _MEASURED | _TARGET | _COMMAND  # fmt: skip
@@ -136,9 +136,6 @@ ANGLES: Final = frozenset[Quantity | None](("heading", "roll", "pitch", "joint p
 _NO_SENSOR: Final = frozenset[Quantity | None]((
     None, "colour", "count", "flag", "mode", "text", "time",
 ))  # fmt: skip
-_NEARLY_A_TURN: Final = 0.9  # of a turn, that an angle leaps where its scale ends
-_FEW_LEVELS: Final = 8  # different values of something that is quantised
-_LEAST_VALUES: Final = 20  # of fewer values nothing follows
 _CHOICES: Final[dict[str, tuple[str, ...]]] = {
     "quantity": QUANTITIES, "role": ROLES, "side": SIDES,
 }  # fmt: skip
@@ -157,7 +154,41 @@ _OF_SPEEDS: Final = frozenset((
 ))  # fmt: skip
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@dataclass(frozen=True)
+class RememberedMeanings:
+    """Sizes of caches.
+
+    Attributes:
+        names: Names whose words are cached.
+        robots: Lists of names whose meanings are cached.
+    """
+
+    names: int = 4096
+    robots: int = 16
+
+
+_CACHE: Final = RememberedMeanings()
+
+
+@dataclass(frozen=True)
+class BehaviourRules:
+    """What the values of an unknown signal must show before a meaning follows.
+
+    Attributes:
+        turn_share: Share of a turn that an angle jumps at the end of its scale.
+        levels: Different values up to which a signal counts as quantised.
+        values: Number of values from which something follows.
+    """
+
+    turn_share: float = 0.9
+    levels: int = 8
+    values: int = 20
+
+
+_BEHAVIOUR: Final = BehaviourRules()
+
+
+@lru_cache(maxsize=_CACHE.names)
 def words_in(name: str) -> tuple[str, ...]:
     """Return the words of a dotted name in their long, singular form: `motorsCmd.0`, motor command.
 
@@ -174,9 +205,9 @@ def words_in(name: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=_CACHE.names)
 def side_in(name: str) -> str | None:
-    """Return the side that a name tells, such as `left` or `front right`; None without one."""
+    """Return the side in a name, such as `left` or `front right`; None without one."""
     words = words_in(name)
     side = next((_SIDES[word] for word in words if word in _SIDES), None)
     end = next((_ENDS[word] for word in words if word in _ENDS), None)
@@ -325,7 +356,7 @@ def _array_reduced_to(name: str, names: frozenset[str]) -> str | None:
 
 
 def _of_reduction(name: str, array: str, names: Iterable[str]) -> Meaning:
-    """What sums up an array: the least, the greatest and the mean are values of its quantity."""
+    """Return the meaning of a reduction: minimum, maximum and mean have the array's quantity."""
     last = name.rpartition(".")[2]
     if last in ("count", "argmin"):
         why = "how many items an array has" if last == "count" else "which item is the least"
@@ -349,7 +380,7 @@ def meanings_by_name(
     return dict(_meanings_of_all(asked))
 
 
-@lru_cache(maxsize=_ROBOTS_REMEMBERED)  # a question about many runs asks of the same names
+@lru_cache(maxsize=_CACHE.robots)  # a question about many runs asks of the same names
 def _meanings_of_all(asked: tuple[tuple[str, str, str | None], ...]) -> dict[str, Meaning]:
     names = frozenset(name for name, _, _ in asked)
     return {name: meaning_by_name(name, kind, role, names) for name, kind, role in asked}
@@ -368,7 +399,7 @@ def meaning_by_behaviour(values: Sequence[float]) -> Meaning:
         A meaning of the source `behaviour`, on which a warning may rest; else an unknown one. What
         is constant or quantised has no quantity.
     """
-    if len(values) < _LEAST_VALUES:
+    if len(values) < _BEHAVIOUR.values:
         return UNKNOWN
     levels = set(values)
     if len(levels) == 1:
@@ -380,16 +411,21 @@ def meaning_by_behaviour(values: Sequence[float]) -> Meaning:
     is_whole = all(value == int(value) for value in values)
     falls = [after for before, after in pairwise(values) if after < before]
     falls_to_start = not falls or max(falls) <= min(levels) + 1
-    if is_whole and falls_to_start and len(rises) > len(steps) / 2 and len(levels) > _FEW_LEVELS:
+    if (
+        is_whole
+        and falls_to_start
+        and len(rises) > len(steps) / 2
+        and len(levels) > _BEHAVIOUR.levels
+    ):
         return _behaves("count", "its whole numbers only rise, or begin again")
     for turn, unit in ((math.tau, "rad"), (360.0, "deg")):
         fits = max(map(abs, values)) <= turn * 1.01 and max(values) - min(values) <= turn * 1.01
-        leaps = [step for step in steps if abs(step) >= _NEARLY_A_TURN * turn]
-        others = [abs(step) for step in steps if abs(step) < _NEARLY_A_TURN * turn]
+        leaps = [step for step in steps if abs(step) >= _BEHAVIOUR.turn_share * turn]
+        others = [abs(step) for step in steps if abs(step) < _BEHAVIOUR.turn_share * turn]
         if fits and leaps and others and max(others) < turn / 4:
             angle = _behaves("heading", "it leaps by a full turn, as an angle does")
             return angle._replace(unit=unit)
-    if len(levels) <= _FEW_LEVELS:
+    if len(levels) <= _BEHAVIOUR.levels:
         return _behaves(None, f"it has only {len(levels)} different values")
     return UNKNOWN
 
@@ -522,7 +558,7 @@ def meaning_stated(name: str, stated: Sequence[StatedMeaning], named: Meaning) -
     Args:
         name: The signal.
         stated: What is said of it, the strongest first.
-        named: What its name tells.
+        named: The meaning of its name.
     """
     meaning = named
     for each in reversed(stated):
@@ -588,7 +624,7 @@ def targets_in(meanings: Mapping[str, Meaning]) -> list[tuple[str, str]]:
     return list(found.items())
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=_CACHE.names)
 def _subject_of(name: str) -> tuple[frozenset[str], tuple[str, ...]]:
     """The words of a name without those of its role and quantity, and its numbers of items."""
     words = (word for part in name.split(".") for word in words_of(part))
@@ -606,7 +642,7 @@ def _named(quantity: Quantity, role: Role | None, name: str, why: str) -> Meanin
     return Meaning(quantity, role, unit, side=side_in(name), source="named", why=why)
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=_CACHE.names)
 def is_asked_for(name: str) -> bool:
     """Return whether a name is of a command, a target or an input: of nothing measured."""
     words = frozenset(words_in(name))
@@ -668,7 +704,7 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
 def _motion_in(
     name: str, base: str, said: frozenset[str], unit: str | None, names: frozenset[str]
 ) -> Quantity | None:
-    """Which speed it is, of robot, wheel, motor or joint; None where it is no speed."""
+    """Return which speed it is, of robot, wheel, motor or joint; None where it is no speed."""
     is_rate = unit in ("rad/s", "deg/s", "rpm")
     is_speed = bool(said & {"speed", "velocity"}) or unit in ("m/s", "cm/s", "mm/s", "km/h")
     if not (
@@ -705,7 +741,7 @@ def _motion_in(
 
 
 def _has_other_side(name: str, side: str, names: frozenset[str]) -> bool:
-    """Whether a signal of the other side has the same words otherwise."""
+    """Return whether a signal of the other side has the same words otherwise."""
     other = {"left": "right", "right": "left"}
     own = tuple(other.get(word, word) for word in words_in(name))
     return any(words_in(each) == own for each in names if each != name)

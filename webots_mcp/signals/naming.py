@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
 from typing import Any, Final, Literal, TypeAlias
@@ -31,7 +32,6 @@ _UNITS: Final = {
     "km_h": "km/h", "kmh": "km/h", "rpm": "rpm", "ms": "ms", "s": "s", "hz": "Hz", "v": "V",
     "a": "A", "w": "W", "nm": "N·m", "n": "N", "kg": "kg", "percent": "%", "bytes": "B",
 }  # fmt: skip
-_LONGEST_UNIT: Final = 3  # words: m_per_s
 _ANGLES: Final = ("yaw", "heading", "theta", "bearing", "roll", "pitch")
 _ANGLES_IF_UNIT: Final = (*_ANGLES, "course")  # a course without a unit may be of anything
 _KEPT: Final = 4096  # names whose units are remembered
@@ -96,8 +96,24 @@ NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x
 _OBEYED: Final = re.compile(
     r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f]|\r(?!\n)"
 )
-_LONGEST_PLACE: Final = 7  # digits of the place of an item
-_LONGEST_COMPARED: Final = 100  # characters of a name
+
+
+@dataclass(frozen=True)
+class NameLimits:
+    """Limits of how much of a name is read.
+
+    Attributes:
+        unit_words: Words of a unit, as in m_per_s.
+        index_digits: Digits of the index of an item.
+        compared_characters: Length up to which names are compared for similarity.
+    """
+
+    unit_words: int = 3
+    index_digits: int = 7
+    compared_characters: int = 100
+
+
+_NAME_LIMITS: Final = NameLimits()
 
 
 def array_item(name: str) -> tuple[str, int] | None:
@@ -106,7 +122,7 @@ def array_item(name: str) -> tuple[str, int] | None:
     `scan.12` is item 12 of `scan`, and so is `scan[12]`: see `with_dots`.
     """
     array, _, last = name.rpartition(".")
-    is_place = last.isascii() and last.isdigit() and len(last) <= _LONGEST_PLACE
+    is_place = last.isascii() and last.isdigit() and len(last) <= _NAME_LIMITS.index_digits
     return (array, int(last)) if array and is_place else None
 
 
@@ -116,7 +132,7 @@ def with_dots(name: str) -> str:
 
 
 def flatten(state: dict[str, Any]) -> dict[str, Value]:
-    """Every number, flag, text and null of a state, by its dotted name.
+    """Return every number, flag, text and null of a state, by its dotted name.
 
     Arrays of more than 16 items become `name.count`, `.min`, `.max`, `.mean` and `.argmin` (of
     their numbers; `count` and `argmin` of all items). Where two values share a name (a key that
@@ -146,7 +162,7 @@ def _reduce(name: str, array: list[Any], values: dict[str, Value]) -> None:
 
 
 def reduce_array(array: list[Any]) -> tuple[Value, ...]:
-    """An array as one value per reduction."""
+    """Return an array as one value per reduction."""
     numbers = [item for item in array if type(item) is float or type(item) is int]
     low = min(numbers, default=None)
     return (
@@ -168,7 +184,7 @@ def mean_of(numbers: Collection[int | float]) -> float | None:
 
 
 def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
-    """The names of a robot's x and y, among those of its numbers; None without any.
+    """Return the names of a robot's x and y, among those of its numbers; None without any.
 
     In metres, unless the names have another unit: see `units.metres_in`.
     """
@@ -176,7 +192,7 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
 
 
 def positions_in(numeric: Collection[str]) -> list[tuple[str, str]]:
-    """The names that may be a robot's x and y, the best ones first.
+    """Return the names that may be a robot's x and y, the best ones first.
 
     It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:
@@ -244,18 +260,18 @@ def find_targets(name: str, names: Iterable[str]) -> tuple[str | None, str | Non
 
 @lru_cache(maxsize=_KEPT)
 def _subject_words(name: str) -> frozenset[str]:
-    """The words of all parts of a name, one of several being the same as one alone."""
+    """Return the words of all parts of a name, one of several being the same as one alone."""
     return frozenset(word.rstrip("s") for word in _branch_words(name))
 
 
 def is_seen_speed(name: str) -> bool:
-    """Whether it is the speed of a body as an observer sees it, which no command set."""
+    """Return whether it is the speed of a body as an observer sees it, which no command set."""
     branch, _, rest = name.partition(".")
     return branch in (WORLD, SOLIDS) and rest.endswith(f".{SEEN_SPEED}")
 
 
 def find_mode(texts: Collection[str]) -> str | None:
-    """The name of what a robot is doing, among those of its texts; None without any."""
+    """Return the name of what a robot is doing, among those of its texts; None without any."""
     return next(iter(modes_in(texts)), None)
 
 
@@ -295,18 +311,18 @@ def _place_first(pair: tuple[str, tuple[str, str]]) -> tuple[bool, tuple[str, st
 
 
 def listed(names: Collection[str], most: int = 10) -> str:
-    """The first of several names, and how many more there are."""
+    """Return the first of several names, and how many more there are."""
     more = len(names) - most
     return ", ".join(list(names)[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def counted(count: int, what: str) -> str:
-    """How many there are: `1 row`, `2 rows`."""
+    """Return how many there are: `1 row`, `2 rows`."""
     return f"{count} {what}" + "s" * (count != 1)
 
 
 def spelled_out(text: str) -> str:
-    """A text without what a terminal obeys or what turns the direction of writing.
+    """Return a text without what a terminal obeys or what turns the direction of writing.
 
     Control characters other than tabs and the ends of lines, and Unicode's marks of direction, are
     spelled as JSON spells them.
@@ -326,7 +342,7 @@ def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]
     harmless = [each for each in names if not is_destructive(each)]
     if same := [each for each in harmless if _groups_of(each) & _groups_of(action)]:
         return same
-    spelled = action[:_LONGEST_COMPARED]
+    spelled = action[: _NAME_LIMITS.compared_characters]
     nearest = get_close_matches(spelled, names, 1)
     if is_destructive(action) or not nearest or is_destructive(nearest[0]):
         return []
@@ -336,7 +352,7 @@ def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]
 def misfit_of_parameters(
     given: Iterable[str], known: Sequence[str] | None, required: Iterable[str], action: str
 ) -> str | None:
-    """Return the error of parameters that an action does not take, or that it lacks.
+    """Return the error for parameters that an action does not take, or that are missing.
 
     Args:
         given: The names that were given.
@@ -389,8 +405,10 @@ def nearest_first(name: str, known: Iterable[str]) -> list[str]:
     Alike is who has the same letters, whatever their case, as a whole or in the last part of a
     dotted name: `front` is near `sensors.front`.
     """
-    wanted = name[:_LONGEST_COMPARED].lower()
-    return sorted(known, key=lambda each: -_likeness(wanted, each[:_LONGEST_COMPARED].lower()))
+    wanted = name[: _NAME_LIMITS.compared_characters].lower()
+    return sorted(
+        known, key=lambda each: -_likeness(wanted, each[: _NAME_LIMITS.compared_characters].lower())
+    )
 
 
 def _likeness(name: str, other: str) -> float:
@@ -404,7 +422,7 @@ def _likeness(name: str, other: str) -> float:
 
 @lru_cache(maxsize=_KEPT)
 def unit_in(name: str) -> str | None:
-    """The unit that the last part of a name has, or else one before it; None without any."""
+    """Return the unit that the last part of a name has, or else one before it; None without any."""
     units = (_unit_of(part) for part in reversed(name.split(".")))
     return next(filter(None, units), None)
 
@@ -458,7 +476,7 @@ def _unit_of(part: str) -> str | None:
     """
     words = words_of(part)
     for end in range(len(words), 0, -1):
-        for start in range(max(0, end - _LONGEST_UNIT), end):
+        for start in range(max(0, end - _NAME_LIMITS.unit_words), end):
             unit = "_".join(words[start:end])
             if unit in _UNITS and (len(unit) > 1 or part.lower().endswith(f"_{unit}")):
                 return _UNITS[unit] if words.count("per") == unit.count("per") else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.errors import InvalidInputError
@@ -18,11 +19,6 @@ Value: TypeAlias = "float | int | bool | str"
 MOST_PARAMETERS: Final = 500  # of one controller: each run records all of them
 MOST_TEXT_CHARACTERS: Final = 1000
 LARGEST_INT: Final = 2**53  # up to here JSON, SQLite and floats hold an integer exactly
-_MOST_NAME_CHARACTERS: Final = 100
-_MOST_UNIT_CHARACTERS: Final = 40
-_MOST_CHOICES: Final = 100
-_MOST_NEAR: Final = 5
-_SHOWN: Final = 80
 _KINDS: Final[dict[type[Any], str]] = {bool: "bool", int: "int", float: "float", str: "str"}
 _MEANT: Final = {
     "float": "a number",
@@ -32,13 +28,35 @@ _MEANT: Final = {
 }
 
 
+@dataclass(frozen=True)
+class DeclarationLimits:
+    """Limits of a declaration of a parameter.
+
+    Attributes:
+        name_characters: Maximum length of a name.
+        unit_characters: Maximum length of a unit.
+        choices: Maximum number of choices.
+        near: Similar names or choices that an error offers.
+        shown_characters: Length at which an error cuts a value.
+    """
+
+    name_characters: int = 100
+    unit_characters: int = 40
+    choices: int = 100
+    near: int = 5
+    shown_characters: int = 80
+
+
+_LIMITS: Final = DeclarationLimits()
+
+
 class Declaration(NamedTuple):
     """A parameter as a controller declares it; made by `declare`.
 
     Attributes:
         kind: `float`, `int`, `bool` or `str`.
-        low: The least value; None without a bound. Only numbers have bounds.
-        high: The greatest value; None without a bound.
+        low: The minimum; None without a bound. Only numbers have bounds.
+        high: The maximum; None without a bound.
         choices: All values that it may have; None where it may have others.
         doc: What it does.
         unit: Of a number.
@@ -54,7 +72,7 @@ class Declaration(NamedTuple):
     unit: str | None = None
 
     def as_row(self) -> dict[str, Any]:
-        """What its row in the table `parameter` holds, where texts stand for JSON."""
+        """Return what its row in the table `parameter` holds, where texts stand for JSON."""
         choices = None if self.choices is None else json.dumps(self.choices, ensure_ascii=False)
         default = json.dumps(self.default, ensure_ascii=False)
         return {**self._asdict(), "default": default, "choices": choices}
@@ -67,7 +85,7 @@ class Declaration(NamedTuple):
         return cls(name, kind, json.loads(default), low, high, listed, doc, unit)
 
     def checked(self, value: object) -> Value:
-        """The value as the parameter holds it: a float parameter takes 3 as 3.0.
+        """Return the value as the parameter holds it: a float parameter takes 3 as 3.0.
 
         Raises:
             InvalidInputError: It is of another type, out of bounds or none of the choices.
@@ -109,7 +127,7 @@ def declare(
     doc: object = "",
     unit: object = None,
 ) -> Declaration:
-    """A declaration, checked as a whole.
+    """Return a declaration, checked as a whole.
 
     Raises:
         TypeError: The name, the default or another argument is of a type that it cannot have.
@@ -149,11 +167,15 @@ def require_known(names: Sequence[str], known: Sequence[str]) -> None:
             "set. In it, write "
             'kp = bridge.parameter("kp", 2.0, low=0.0, high=10.0) and use kp.value in its loop'
         )
-    near = nearest_first(unknown[0], known)[:_MOST_NEAR]
-    more = f", nor {', '.join(repr(name[:_SHOWN]) for name in unknown[1:4])}" if unknown[1:] else ""
+    near = nearest_first(unknown[0], known)[: _LIMITS.near]
+    more = (
+        f", nor {', '.join(repr(name[: _LIMITS.shown_characters]) for name in unknown[1:4])}"
+        if unknown[1:]
+        else ""
+    )
     raise InvalidInputError(
-        f"No parameter {unknown[0][:_SHOWN]!r}{more}. The nearest of {len(known)} that the "
-        f"controller declares: {', '.join(near)}"
+        f"No parameter {unknown[0][: _LIMITS.shown_characters]!r}{more}. "
+        f"The nearest of {len(known)} that the controller declares: {', '.join(near)}"
     )
 
 
@@ -170,7 +192,7 @@ def as_plain(value: Any) -> object:
 
 
 def _as_kind(kind: str, value: object) -> Value | None:
-    """The value as one of that kind; None where it is none."""
+    """Return the value as one of that kind; None where it is none."""
     if kind == "bool" or isinstance(value, bool):
         return value if kind == "bool" and isinstance(value, bool) else None
     if kind == "str" or isinstance(value, str):
@@ -199,16 +221,16 @@ def _is_storable(text: str) -> bool:
 def _require_name(name: object) -> None:
     if not isinstance(name, str):
         raise TypeError(f"the name of a parameter is a text, not {_shown(name)}")
-    fits = 0 < len(name) <= _MOST_NAME_CHARACTERS and name.isprintable()
+    fits = 0 < len(name) <= _LIMITS.name_characters and name.isprintable()
     if not fits or " " in name or "=" in name:
         raise ValueError(
-            f"parameter {name[:_MOST_NAME_CHARACTERS]!r} needs another name: 1 to "
-            f"{_MOST_NAME_CHARACTERS} printable characters without a space or '='"
+            f"parameter {name[: _LIMITS.name_characters]!r} needs another name: 1 to "
+            f"{_LIMITS.name_characters} printable characters without a space or '='"
         )
 
 
 def _bound(name: object, kind: str, bound: object, none: float) -> float | None:
-    """A bound; None for none, as which infinity on its side counts."""
+    """Return a bound; None for none, as which infinity on its side counts."""
     plain = as_plain(bound)
     if plain is None:
         return None
@@ -229,9 +251,10 @@ def _listed(declaration: Declaration, choices: object) -> tuple[Value, ...]:
             f"parameter {declaration.name!r}: choices is a list of values, not {_shown(choices)}"
         )
     values = cast("Sequence[object]", choices)
-    if not 0 < len(values) <= _MOST_CHOICES:
+    if not 0 < len(values) <= _LIMITS.choices:
         raise ValueError(
-            f"parameter {declaration.name!r}: give 1 to {_MOST_CHOICES} choices, not {len(values)}"
+            f"parameter {declaration.name!r}: give 1 to {_LIMITS.choices} choices, "
+            f"not {len(values)}"
         )
     return tuple(dict.fromkeys(declaration.checked(value) for value in values))
 
@@ -249,15 +272,15 @@ def _doc(name: object, doc: object) -> str:
 def _unit(name: object, unit: object) -> str | None:
     if unit is None:
         return None
-    if isinstance(unit, str) and unit.isprintable() and len(unit) <= _MOST_UNIT_CHARACTERS:
+    if isinstance(unit, str) and unit.isprintable() and len(unit) <= _LIMITS.unit_characters:
         return unit
     raise TypeError(f"parameter {name!r}: the unit is a short text such as 'm/s', not {unit!r:.80}")
 
 
 def _shown(value: object) -> str:
-    """A value as an error names it; its own words may fail, or be long."""
+    """Return a value as an error names it; its own words may fail, or be long."""
     try:
-        text = repr(value)[:_SHOWN]
+        text = repr(value)[: _LIMITS.shown_characters]
     except Exception as error:  # noqa: BLE001  (an object of the user's, or an integer too long)
         text = f"(no text: its repr() raised {type(error).__name__})"
     return f"{text} ({type(value).__name__})"

@@ -15,6 +15,7 @@ import re
 import sqlite3
 import time
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, cast
@@ -39,8 +40,6 @@ from webots_mcp.signals.naming import (
 
 
 Kind = Literal["num", "bool", "text", "angle", "null"]
-MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
-MAX_YAW_RAD: Final = 3.2  # the last item of a pose that goes beyond is no yaw
 
 _END_OF_POSE: Final = re.compile(r"(^|[._])(?:pose|odom|odometry)\.([235])$")
 PLACES: Final = ("", *(str(place) for place in range(2, 10)))  # in line for a role
@@ -81,6 +80,22 @@ _LONGEST_TEXT: Final = 1000  # characters; a longer text is not a mode either
 _UNSEEN: Final = object()
 
 
+@dataclass(frozen=True)
+class AngleRanges:
+    """Values that show whether a signal is an angle in radians.
+
+    Attributes:
+        angle_rad: Maximum of an angle; larger values are in degrees, or turns were counted.
+        yaw_rad: Maximum of the last item of a pose; with larger values it is no yaw.
+    """
+
+    angle_rad: float = 6.3
+    yaw_rad: float = 3.2
+
+
+_ANGLE_RANGES: Final = AngleRanges()
+
+
 class Place(NamedTuple):
     """Where a signal's value stands in a state row.
 
@@ -94,7 +109,7 @@ class Place(NamedTuple):
 
 
 def places(state: dict[str, Any]) -> dict[str, Place]:
-    """Where each leaf of a state stands; the same names as `flatten`, but slower."""
+    """Return where each leaf of a state stands; the same names as `flatten`, but slower."""
     found: dict[str, Place] = {}
     for key, value in state.items():
         _locate(key, f"$.{_step(key)}", value, found)
@@ -128,7 +143,7 @@ def is_reachable(name: str) -> bool:
 
 
 def kind_of(name: str, value: Value, *, ends_pose: bool = False) -> Kind:
-    """What a single value says about its signal; an angle also by the signal's name.
+    """Return what a single value says about its signal; an angle also by the signal's name.
 
     Args:
         name: Of the signal.
@@ -141,19 +156,25 @@ def kind_of(name: str, value: Value, *, ends_pose: bool = False) -> Kind:
         return "bool"
     if isinstance(value, str):
         return "text"
-    limit = MAX_YAW_RAD if ends_pose else MAX_ANGLE_RAD if angle_unit(name) == "rad" else -1.0
+    limit = (
+        _ANGLE_RANGES.yaw_rad
+        if ends_pose
+        else _ANGLE_RANGES.angle_rad
+        if angle_unit(name) == "rad"
+        else -1.0
+    )
     return "angle" if abs(value) <= limit else "num"
 
 
 def turn_of(name: str, kind: Kind) -> float | None:
-    """A whole turn of an angle: 2 pi, or 360 where the name says degrees; else None."""
+    """Return a whole turn of an angle: 2 pi, or 360 where the name says degrees; else None."""
     if kind == "angle":
         return math.tau
     return 360.0 if kind == "num" and angle_unit(name) == "deg" else None
 
 
 def ends_pose(name: str, names: Container[str]) -> bool:
-    """Whether it is the last of three, four or six items of a pose or of odometry.
+    """Return whether it is the last of three, four or six items of a pose or of odometry.
 
     There the yaw stands, if anywhere: `[x, y, yaw]`, `[x, y, z, yaw]`, `[x, y, z, roll, pitch,
     yaw]`.
@@ -163,7 +184,7 @@ def ends_pose(name: str, names: Container[str]) -> bool:
 
 
 def widen(known: Kind, seen: Kind) -> Kind:
-    """The kind of a signal that was `known` when a value of kind `seen` comes."""
+    """Return the kind of a signal that was `known` when a value of kind `seen` comes."""
     if known == seen or seen == "null":
         return known
     if known == "null":
@@ -172,7 +193,7 @@ def widen(known: Kind, seen: Kind) -> Kind:
 
 
 def unit_of(name: str, kind: Kind) -> str | None:
-    """The unit, where a part of the name ends in one (`speed_m_s`, `distance_m.left`)."""
+    """Return the unit, where a part of the name ends in one (`speed_m_s`, `distance_m.left`)."""
     if kind == "angle":
         return "rad"
     if kind != "num" or name.rpartition(".")[2] in ("count", "argmin"):
@@ -185,14 +206,14 @@ def unit_of(name: str, kind: Kind) -> str | None:
 # The outcome stands in `signal.role`, where tools, views and pools read it:
 #
 #     x, y, z           position; z where it has one
-#     yaw               where the robot looks
+#     yaw               where the robot faces
 #     mode              what it is doing: a text, or a whole number with few different values
 #     commanded_speed   how fast it shall be
 #     speed             how fast it is; the name leaves open whether it is commanded or measured
 #     wheel             how fast one of its several wheels or driving motors turns
 #     commanded_wheel   how fast one of them shall turn
 #
-# The robot's other names decide as well: `pose.0` is x only beside `pose.1`. Where several signals
+# The robot's other names decide as well: `pose.0` is x only next to `pose.1`. Where several signals
 # fit, a run may have the second alone, as its code was another: so each has a place in line, `x`
 # before `x2` (with `y2`, `z2`) up to `x9`, and the first that is there counts.
 
@@ -202,7 +223,7 @@ def decide_roles(
     choices: Container[str] = (),
     position: tuple[str, str] | None = None,
 ) -> dict[str, str]:
-    """The role of each signal of a robot that has one.
+    """Return the role of each signal of a robot that has one.
 
     Args:
         kinds: Of all names that the robot has published.
@@ -258,7 +279,7 @@ def _apart(pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
 def _height(known: Mapping[str, Kind], x: str, *, first: bool) -> str | None:
     """The third of the position's numbers, or an altitude next to it; for the first at the top too.
 
-    The third of a pose or odometry of three is where it looks.
+    The third of a pose or odometry of three is its heading.
     """
     branch, _, axis = x.rpartition(".")
     third = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
@@ -306,15 +327,15 @@ def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
     by_motion: dict[str, list[str]] = {each: [] for each in _MOTIONS}
     names = frozenset(numbers)
     for name in sorted(names, key=_shortest):
-        told = _motions_of(name)
-        meaning = meaning_by_name(name, "num", next(iter(told), None), names)
+        reported = _motions_of(name)
+        meaning = meaning_by_name(name, "num", next(iter(reported), None), names)
         if meaning.role == "limit":
             continue
         if meaning.quantity == "speed":
             by_motion["commanded_speed" if meaning.sets else "speed"].append(name)
         elif meaning.quantity == "wheel speed":
             by_motion["commanded_wheel" if meaning.sets else "wheel"].append(name)
-        elif "wheel" in told and meaning.quantity == "motor speed":
+        elif "wheel" in reported and meaning.quantity == "motor speed":
             by_motion["wheel"].append(name)
     _line_up(roles, "commanded_speed", by_motion["commanded_speed"])
     _line_up(roles, "speed", by_motion["speed"])
@@ -324,7 +345,7 @@ def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
 
 @lru_cache(maxsize=_KEPT)
 def _motions_of(name: str) -> tuple[str, ...]:
-    """What a number may tell by its name."""
+    """Return what a number may tell by its name."""
     if is_seen_speed(name):
         return ()
     words = in_snake_case(name)
@@ -345,12 +366,12 @@ def _shortest(name: str) -> tuple[int, str]:
 
 
 def pair_in(roles: Container[str]) -> str | None:
-    """The place in line of the first position of which both x and y are there."""
+    """Return the place in line of the first position of which both x and y are there."""
     return next((place for place in PLACES if f"x{place}" in roles and f"y{place}" in roles), None)
 
 
 def first_in(role: str, roles: Container[str]) -> str | None:
-    """The first in line for a role, of those that are there."""
+    """Return the first in line for a role, of those that are there."""
     return next((f"{role}{place}" for place in PLACES if f"{role}{place}" in roles), None)
 
 
@@ -389,7 +410,7 @@ class Changes(NamedTuple):
 def find_changes(
     connection: sqlite3.Connection, robot_id: int, seen: Mapping[str, Seen]
 ) -> Changes:
-    """What the register of a robot lacks once these values are recorded.
+    """Return what is missing in the register of a robot once these values are recorded.
 
     Names beyond `MAX_SIGNALS` of a robot stay out. Of each name the kind is widened; which roles
     the names have is decided anew.
@@ -447,13 +468,13 @@ def write_changes(connection: sqlite3.Connection, robot_id: int, changes: Change
     connection.executemany(statement, changed)
 
 
-# What a recorder looks at in each state: names that are new, and changes of what the robot does.
+# What a recorder checks in each state: names that are new, and changes of what the robot does.
 
 
 class SignalNames:
     """What the register has of this session's names.
 
-    A state is looked at where its keys at the top or the number of its values are new, and in the
+    A state is checked if its keys at the top or the number of its values are new, and in the
     2nd, 4th, 8th, ... row of the session: what was null at first may have a value by then.
     """
 
@@ -490,7 +511,7 @@ class SignalNames:
     def _take(self, text: str) -> None:
         state = cast("dict[str, Any]", json.loads(text))
         values, now_s = flatten(state), time.time()
-        told = dict[str, tuple[Kind, bool]]()
+        reported = dict[str, tuple[Kind, bool]]()
         room = MAX_SIGNALS - len(self._known)
         for name, value in values.items():
             is_new = name not in self._known
@@ -501,10 +522,10 @@ class SignalNames:
             is_whole = is_whole and (value is None or type(value) is int)
             if is_new or (kind, is_whole) != before:
                 room -= is_new
-                told[name] = kind, is_whole
-        found = places(_part_with(told, state))
-        self._waiting |= {name: Seen(*found[name], *each, now_s) for name, each in told.items()}
-        self._known |= told
+                reported[name] = kind, is_whole
+        found = places(_part_with(reported, state))
+        self._waiting |= {name: Seen(*found[name], *each, now_s) for name, each in reported.items()}
+        self._known |= reported
 
     def _enter(self, enter: Callable[[dict[str, Seen]], bool]) -> None:
         some = dict(islice(self._waiting.items(), ADDED_AT_ONCE))
@@ -544,7 +565,7 @@ class StateChanges:
         self._count = 0
 
     def compare(self, state: Mapping[Any, Any]) -> list[tuple[Any, object, object]]:
-        """The (key, before, after) of each change since the last call; usually none."""
+        """Return the (key, before, after) of each change since the last call; usually none."""
         changed: list[tuple[Any, object, object]] = []
         last = self._last
         if len(state) > MOST_KEYS:

@@ -1,4 +1,4 @@
-"""Recording the console of each Webots of a recording: one process at a time follows each of them.
+"""Record the console of each Webots of a recording; one process at a time follows each of them.
 
 `ConsoleWatch` finds the running Webots, `ConsoleFollower` follows one of them, and `StandInConsole`
 records a stand-in that runs in this process.
@@ -233,7 +233,7 @@ class ConsoleFollower(_RecordingThread):
 
 
 class StandInConsole(_RecordingThread):
-    """Records the console of a stand-in that runs in this process, while its context lasts.
+    """Record the console of a stand-in that runs in this process, while its context lasts.
 
     The lines have the names of the robots whose controllers printed them.
 
@@ -340,7 +340,7 @@ class ConsoleWatch(threading.Thread):
                 self._followers[key].start()
 
     def stop(self) -> None:
-        """Let others follow."""
+        """Let other processes follow."""
         self._ending.set()
         if self.is_alive():
             self.join(timeout=2)

@@ -1,4 +1,4 @@
-"""Turns lines of Webots' console into rows of a recording.
+"""Turn lines of Webots' console into rows of a recording.
 
 At most 500 lines a second become rows. If more arrive, one row says how many were left out.
 """
@@ -17,8 +17,9 @@ from webots_mcp.simulator.orders import (
 )
 from webots_mcp.store.logs import Said
 
-MOST_LINES_PER_S: Final = 500  # of wall time
-MOST_OLD_LINES: Final = 2_000  # of those printed before the console was followed, the newest
+MOST_LINES_PER_S: Final = 500  # per second of wall time
+# the newest of the lines that were printed before the console was followed
+MOST_OLD_LINES: Final = 2_000
 _LEVELS: Final[dict[str, LogLevel]] = {"stdout": "info", "stderr": "warning"}
 # How Webots' own lines begin, by the stream that they come on.
 _OWN: Final[dict[str, dict[str, LogLevel]]] = {

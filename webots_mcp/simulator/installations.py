@@ -1,7 +1,6 @@
-"""The Webots that are installed on this machine: its folder, programs and version.
+"""Find the installations of Webots on this machine: folder, programs and version.
 
-What Webots' sources say about each version, and what happens here if it is otherwise, is listed in
-'webots-mcp help webots'.
+'webots-mcp help webots' lists what each version's source code says, and what happens otherwise.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _DEFAULT_HOMES: Final[dict[str, tuple[str, ...]]] = {
     "darwin": ("/Applications/Webots.app", "~/Applications/Webots.app"),
     "win32": ("%PROGRAMFILES%/Webots", "%LOCALAPPDATA%/Programs/Webots"),
 }
-# Relative to the home folder, the likeliest first; a layout of another version may be the next one.
+# Relative to the home folder, the most likely first; the layout of another version comes next.
 _PROGRAM_FOLDERS: Final[dict[str, tuple[str, ...]]] = {
     "linux": (".",),
     "darwin": ("Contents/MacOS", "."),
@@ -55,7 +54,7 @@ class Installation:
 
 
 def installations(platform: str = sys.platform) -> list[Installation]:
-    """Return all Webots that are found, in the order in which they are used: each of them once."""
+    """Return all installations in the order of preference, each once."""
     found: dict[Path, Installation] = {}
     for each in _search(platform):
         found.setdefault(each.program.resolve(), each)

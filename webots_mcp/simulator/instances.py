@@ -1,4 +1,4 @@
-"""The Webots that run on this machine, and where they listen.
+"""Find the running instances of Webots on this machine, and their ports.
 
 They are found by their command lines, as far as the system shows these.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 DEFAULT_PORT: Final = 1234
-PORTS_TRIED: Final = 11  # Webots takes the next one where a port is taken, ten times
+PORTS_TRIED: Final = 11  # Webots tries up to ten following ports if one is taken
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Orders for a running Webots by key presses, the last resort.
+"""Give orders to a running Webots by key presses, as the last resort.
 
 The keys are those of Webots' menu actions in R2023b to R2025a, with Command instead of Ctrl on
-macOS. They go to the window of one Webots, or nowhere.
+macOS. They are sent to the window of one Webots, or not at all.
 """
 
 from __future__ import annotations

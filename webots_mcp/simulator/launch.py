@@ -1,4 +1,4 @@
-"""Starting the user's Webots on a world of a project, until the first controller records."""
+"""Start the user's Webots on a world of a project, and wait until the first controller records."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, 
     """Return the file of a world, and the project that it lies in.
 
     Args:
-        path: Absolute, or from the current folder or the project's; a name alone is that of one of
-            the project's worlds too.
-        project: It has to lie in this one; None for any, then a name is one of the project around
-            the current folder.
+        path: An absolute path, or one relative to the current folder or the project; a bare name
+            may also be that of one of the project's worlds.
+        project: The project that must contain it; None for any, in which case a bare name belongs
+            to the project around the current folder.
 
     Raises:
-        InvalidInputError: There is no such world, or it lies in no project, or in another one.
+        InvalidInputError: The world does not exist, or lies in no project or in another one.
     """
     try:
         world = _found(Path(path), project)
-    except OSError as error:  # of the name: too long, a NUL, links in a circle
+    except OSError as error:  # the name is too long, has a NUL, or links form a circle
         why = error.strerror or str(error)
         raise InvalidInputError(
             f"{str(path)[:100]!r} is not the name of a world: {why}."
@@ -105,7 +105,9 @@ class WebotsLaunch:
         self._began_s = time.time()
         self.webots = LaunchedWebots(start, environment, show)
         try:
-            recording.create()  # it has a console to record before any controller begins
+            # the database must exist before any controller starts, because the console is recorded
+            # too
+            recording.create()
             self._before = newest_in(recording)
             self.webots.start()
         except BaseException:
@@ -117,7 +119,7 @@ class WebotsLaunch:
         return next((each for each in self._begun() if each.run_id is not None), None)
 
     def silence(self) -> str:
-        """Return why no controller has recorded yet, as far as that shows."""
+        """Return why no controller has recorded yet, as far as that is known."""
         reasons = [*self._of_webots(), *why_silent(self._begun(), self.world)]
         return "; ".join(reasons) or "no controller has recorded yet"
 
@@ -194,7 +196,7 @@ def why_silent(
 
 
 def newest_in(recording: RecordingAccess) -> int:
-    """Return the newest session of a recording; 0 where there is none yet."""
+    """Return the id of the newest session of a recording; 0 without sessions."""
     return next(
         (newest for (newest,) in _read(recording, "SELECT coalesce(max(id), 0) FROM session")), 0
     )

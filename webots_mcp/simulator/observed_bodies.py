@@ -1,4 +1,4 @@
-"""The bodies of a world that an observer records: robots and solids, found in the scene tree.
+"""Find the bodies of a world that an observer records: robots and solids of the scene tree.
 
 Poses come with the steps (`enablePoseTracking`), so that fifty robots cost no more requests than
 one. The tree is walked a few milliseconds at a time: at the start, after a body has vanished or the
@@ -56,7 +56,7 @@ _UNITS: Final[dict[Quantity, str]] = {
 
 
 class BodyPose(NamedTuple):
-    """Where a body is at a moment, and how it is turned against the world's up direction."""
+    """Where a body is at a moment, and its orientation relative to the world's up direction."""
 
     sim_time_s: float
     x_m: float
@@ -72,7 +72,7 @@ class BodyPose(NamedTuple):
         return math.dist((self.x_m, self.y_m, self.z_m), position)
 
     def signals(self) -> dict[str, float]:
-        """Return it as it is recorded."""
+        """Return the pose as recorded signals."""
         values = self._asdict()
         del values["sim_time_s"]
         return {name: round(value, DIGITS) + 0.0 for name, value in values.items()}  # no -0.0
@@ -135,12 +135,12 @@ class ObservedBody:
 
     @property
     def is_published(self) -> bool:
-        """A robot always; another solid once it has moved."""
+        """Whether the body is recorded: a robot always, another solid once it has moved."""
         return self.is_robot or self.has_moved
 
     @property
     def is_there(self) -> bool:
-        """Whether its node is; else what the library knows is of another node now."""
+        """Whether its node still exists; otherwise the library may have reused its id."""
         node: Any = self.scene.node
         return int(node.getId()) == self.scene.id
 
@@ -275,7 +275,7 @@ class ObservedBodies:
         return seen
 
     def go_on(self) -> None:
-        """Walk on, or begin to walk where it is time to."""
+        """Continue the walk, or begin one when it is due."""
         if self._walk is None and self._is_due():
             self._walk = self._survey()
         until_s = time.monotonic() + _LIMITS.walk_s

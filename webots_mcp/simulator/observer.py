@@ -1,13 +1,13 @@
-"""The observer: a robot that records what it sees of the world, and steers the simulation.
+"""Define the observer: a robot that records what it sees of the world, and steers the simulation.
 
-It is a Supervisor with a bridge of its own, so that nothing has to be changed in the controllers of
-the robots that it watches. Standard library only: it runs inside a controller.
+It is a Supervisor with a bridge of its own, so the controllers of the robots that it watches need
+no change. It uses the standard library only, because it runs inside a controller.
 
-The loop must neither hold up the world nor hang in a pause. `step(n)` of a paused simulation does
-not return, so a controller waiting in it cannot resume. A robot without synchronization need not
-wait: it asks `step(0)`, which is answered at once, again and again. Whether these answers carry the
-current time is tested, not assumed; if they do not, and in fast mode, where a moment would be long
-in simulation time, the loop makes steps like any other.
+The loop must neither delay the world nor hang in a pause. `step(n)` of a paused simulation does not
+return, so a controller waiting in it cannot resume. A robot without synchronization need not wait:
+it calls `step(0)` again and again, which is answered at once. The observer tests whether these
+answers carry the current time. If they do not, and in fast mode, where a moment would be long in
+simulation time, the loop makes steps like any other.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.signals.meaning import DeclaredMeaning
 from webots_mcp.simulator.observed_bodies import DIGITS, ObservedBodies, ObservedBody
 
-PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
+PERIOD_MS: Final = 100  # default simulation time between two rows
 LONGEST_PERIOD_MS: Final = 60_000
-_GRACE_S: Final = 2.0  # of wall time in which a loop that a signal ends has to come round
+_GRACE_S: Final = 2.0  # wall time within which a loop that a signal ends has to return
 
 
 def checked_period(period_ms: int) -> int:
@@ -261,7 +261,7 @@ class Observer:
             return False
         try:
             self._observe()
-        except Exception as error:  # noqa: BLE001  (it still steers, and looks again later)
+        except Exception as error:  # noqa: BLE001  (it still steers, and tries again later)
             self.bridge.failed(error)
         self.bridge.get_command()
         return True
@@ -282,7 +282,7 @@ class Observer:
         )
 
     def _record_news(self) -> None:
-        """Record the mode and what there is where they are not as before, or long ago."""
+        """Record the mode and the content of the world if they changed or are old."""
         is_due, mode = time.monotonic() > self._record_again_s, int(self._robot.simulationGetMode())
         if mode != self._mode or is_due:
             self._mode = mode

@@ -1,7 +1,7 @@
-"""Orders for a running Webots, over its WebSocket.
+"""Give orders to a running Webots over its WebSocket.
 
-Every Webots listens at the port of `--port`. It carries out orders only if it was started with
-`--stream`; its console it sends to every client. This module never sends the bare words `w3d` and
+Every Webots listens at the port of `--port`. It obeys orders only if it was started with
+`--stream`, but sends its console to every client. This module never sends the bare words `w3d` and
 `x3d`, which pause the simulation at its next step.
 """
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 
 Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 MAX_MESSAGE_BYTES: Final = 4 << 20
-ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
+ANSWER_S: Final = 1.0  # Webots answers at once or does not obey
 _CLOSING_S: Final = 0.2
 # What is sent, and how the reply begins. The number is a time limit in ms; -1 means no limit.
 _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
-    "pause": ("pause", ("pause",)),  # "paused by client", and "pause: <ms>" to the others
+    "pause": ("pause", ("pause",)),  # "paused by client", and "pause: <ms>" for the others
     "resume": ("real-time:-1", ("real-time",)),
     "fast": ("fast:-1", ("fast",)),
     "step": ("step", ("pause", "step")),
     "reset": ("reset", ("reset finished",)),
     "reload": ("reload", ("delete world", "loading:", "world:", "scene load completed")),
 }
-RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
+RESTARTING: Final = ("reset", "reload")  # these may be answered to other clients, or much later
 
 
 class WebotsAddress(NamedTuple):
@@ -69,7 +69,7 @@ class OrderReply(NamedTuple):
     """Webots' reply to an order.
 
     Attributes:
-        text: Webots' own words; None where it did not reply.
+        text: Webots' own words; None without a reply.
         is_alive: Whether its main thread answered at all, so that it is not busy.
         other: Another message of Webots, which only a Webots that accepts orders sends.
     """

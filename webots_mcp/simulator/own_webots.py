@@ -1,8 +1,8 @@
-"""Which Webots of this machine belong to a recording: no other is followed or steered unasked.
+"""Determine which Webots of this machine belong to a recording; no other is steered unasked.
 
-A Webots belongs to a recording if a living session of the recording runs in it; or if it was
-started with a world of the recording's project, or with one that was recorded here before, unless
-its controllers record elsewhere.
+A Webots belongs to a recording if a living session of the recording runs in it. It also belongs to
+one if it was started with a world of the recording's project, or with a world that was recorded
+here before, unless its controllers record elsewhere.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Runs a simulator for as long as its starter lives: `python program_keeper.py COMMAND...`.
+"""Run a simulator for as long as its starter lives: `python program_keeper.py COMMAND...`.
 
 The keeper starts the command when it reads a byte from its standard input, and ends it when that
 input ends. The input ends when the starter closes it or dies, in whatever way. The keeper runs in a
@@ -32,7 +32,7 @@ def main(command: list[str]) -> int:
     threading.Thread(target=_end_with_input, args=(simulator,), daemon=True).start()
     code = simulator.wait()
     if os.name == "posix":
-        os.killpg(os.getpgrp(), signal.SIGTERM)  # controllers that a crash left over
+        os.killpg(os.getpgrp(), signal.SIGTERM)  # controllers that remained after a crash
     return code if code >= 0 else _SIGNALLED - code
 
 
@@ -52,7 +52,7 @@ def _end_with_keeper() -> Callable[[], object] | None:
 
     def ask() -> None:
         set_option(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != keeper:  # it died a moment ago
+        if os.getppid() != keeper:  # it ended a moment ago
             os.kill(os.getpid(), signal.SIGTERM)
 
     return ask
@@ -95,7 +95,7 @@ def windows_command(pid: int, *, hard: bool) -> list[str]:
 
 
 def _run(command: list[str]) -> None:
-    with contextlib.suppress(OSError):  # there is none: it is ended the hard way alone
+    with contextlib.suppress(OSError):  # taskkill is missing: the process is ended by force only
         subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
 
 

@@ -1,4 +1,4 @@
-"""A Webots project: its folder, its worlds, its controllers, and which of them record."""
+"""Read a Webots project: its folder, worlds and controllers, and which of them record."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.extras.requirements import quoted
 
 _PYTHON: Final = "Python"
-# Of a world file: strings and names; a comment is neither, and hides what is in it.
+# Tokens of a world file: strings and names; a comment is neither, and hides its content.
 _WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
-# By language: how the files of a controller end that are built before Webots starts it.
+# By language: the extensions of controllers that are built before Webots starts them.
 _SOURCES: Final = {"C": (".c",), "C++": (".cpp", ".cc", ".cxx"), "Java": (".java",)}
 _CALLS: Final = {
     "C": 'wb_robot_set_custom_data("{...}")',
@@ -61,7 +61,7 @@ class ProjectController(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """How to record a controller in which the bridge cannot be used."""
+        """Return how to record a controller in which the bridge cannot be used."""
         header = (
             "include webots_mcp.h ('webots-mcp header' writes it), or "
             if self.language in ("C", "C++")

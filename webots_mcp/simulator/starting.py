@@ -1,4 +1,4 @@
-"""Starting Webots or another simulator, which ends with this process at the latest.
+"""Start Webots or another simulator, which ends at the latest with this process.
 
 `Start` says how Webots is started, `KeptProgram` runs any program through `program_keeper`, and
 `LaunchedWebots` is a Webots of ours with its console.
@@ -51,10 +51,10 @@ class Start:
 
     Attributes:
         world: The world file.
-        mode: The mode that it begins with; None for that of its preferences.
-        headless: Without its window and its 3D view; cameras and lidars still see.
+        mode: The initial mode; None for that of its preferences.
+        headless: Whether to start without its window and its 3D view; cameras and lidars still see.
         streams: Whether it obeys orders from outside, and serves the project's files at its port.
-        port: Where it is to listen; it takes one of the ten after it where that is taken.
+        port: The port at which it listens; if it is taken, one of the ten following ones.
     """
 
     world: Path

@@ -25,7 +25,7 @@ class ControllerEndpoint(ABC):
     is_ending = False
     """Whether its next request is answered by the end of the simulation."""
     was_told = False
-    """Whether it was told to quit."""
+    """Whether it was ordered to quit."""
 
     @abstractmethod
     def reply(self, message: Message) -> None:

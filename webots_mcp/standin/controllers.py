@@ -20,14 +20,25 @@ from webots_mcp.standin.controller_path import LIBRARY
 from webots_mcp.standin.simulator import SimulatedRobot, Simulator
 from webots_mcp.standin.standin_errors import StandInError
 
-_TERMINATION_S: Final = 1.0
-"""How long a process may take to end after SIGTERM."""
-_LAST_LINES_S: Final = 0.5
-"""How long to wait for the last lines of a process: a child of it may hold the pipes open."""
-
 _EXTERN: Final = "<extern>"
 _INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
 _EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
+
+
+@dataclass(frozen=True)
+class EndingTimes:
+    """Wall time for the end of a controller, in seconds.
+
+    Attributes:
+        termination_s: How long a process may take to end after SIGTERM.
+        last_lines_s: How long to wait for its last lines: a child of it may hold the pipes open.
+    """
+
+    termination_s: float = 1.0
+    last_lines_s: float = 0.5
+
+
+_ENDING: Final = EndingTimes()
 
 
 class ControllerProcess:
@@ -82,7 +93,7 @@ class ControllerProcess:
             self.was_ended = True
             self._process.terminate()
         try:
-            self._process.wait(_TERMINATION_S)
+            self._process.wait(_ENDING.termination_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
         self._watcher.join()
@@ -94,7 +105,7 @@ class ControllerProcess:
 
     def _watch(self) -> None:
         self._process.wait()
-        until_s = time.monotonic() + _LAST_LINES_S
+        until_s = time.monotonic() + _ENDING.last_lines_s
         for reader in self._readers:
             reader.join(max(until_s - time.monotonic(), 0.0))
         self._on_exit(self)
@@ -215,12 +226,12 @@ class Controller(ControllerEndpoint):
 
     @property
     def awaits_quit(self) -> bool:
-        """Return whether it is connected and was not told to quit yet."""
+        """Return whether it is connected and was not ordered to quit yet."""
         return self.connection is not None and not self.was_told
 
     @property
     def is_leaving(self) -> bool:
-        """Return whether it was told to quit, or has disconnected, and still runs."""
+        """Return whether it was ordered to quit, or has disconnected, and still runs."""
         is_going = self.was_told or self.has_left
         return is_going and (self.is_running or self.connection is not None)
 

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final, Protocol, TypeVar, cast
@@ -29,17 +30,31 @@ from webots_mcp.standin.simulator import Mode
 from webots_mcp.standin.standin_errors import StandInError
 
 _MODES: Final = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
-_NOTIFY_INTERVAL_S: Final = 0.002
-"""Minimum time between two notifications of waiting threads: each costs a thread switch."""
-_RECHECK_S: Final = 0.05
-"""Maximum time between two checks of a condition that a thread waits for."""
 _CONSOLE_LINES: Final = 10_000
-_PATIENCE_S: Final = 1.0
-"""How long Webots waits for a controller to make a request, and then for it to exit."""
-_MAX_LAG_S: Final = 0.1
-"""Maximum delay behind real time that is caught up."""
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SimulationTimes:
+    """Times of the simulation's loop, in seconds of wall time.
+
+    Attributes:
+        notify_interval_s: Minimum time between two notifications of waiting threads: each costs a
+            thread switch.
+        recheck_s: Maximum time between two checks of a condition that a thread waits for.
+        patience_s: How long Webots waits for a controller to make a request, and then for it to
+            exit.
+        max_lag_s: Maximum delay behind real time that is caught up.
+    """
+
+    notify_interval_s: float = 0.002
+    recheck_s: float = 0.05
+    patience_s: float = 1.0
+    max_lag_s: float = 0.1
+
+
+_TIMES: Final = SimulationTimes()
 
 
 class ConsoleRecorder(Protocol):
@@ -220,7 +235,7 @@ class StandInSimulation(BaseSimulation):
                 tail = "\n".join(self.console[-20:])
                 raise TimeoutError(f"not the case after {timeout_s} s; the console says:\n{tail}")
             with self._changed:
-                self._changed.wait(min(left_s, _RECHECK_S))
+                self._changed.wait(min(left_s, _TIMES.recheck_s))
         return value
 
     # From other threads --------------------------------------------------------------------------
@@ -263,7 +278,7 @@ class StandInSimulation(BaseSimulation):
     def _notice(self) -> None:
         """Notify threads in `wait_for`; called in the simulation's thread, such as after a step."""
         now_s = time.monotonic()
-        if now_s - self._noticed_s > _NOTIFY_INTERVAL_S:
+        if now_s - self._noticed_s > _TIMES.notify_interval_s:
             self._noticed_s = now_s
             self._tell()
 
@@ -299,7 +314,7 @@ class StandInSimulation(BaseSimulation):
     def _advance(self) -> None:
         now_s, step_s = time.monotonic(), self.simulator.world.basic_time_step_ms / 1000.0
         # A step that was made early, as in fast mode, must not delay the next one.
-        self._due_s = max(min(self._due_s, now_s) + step_s, now_s - _MAX_LAG_S)
+        self._due_s = max(min(self._due_s, now_s) + step_s, now_s - _TIMES.max_lag_s)
         self._steps_asked = max(self._steps_asked - 1, 0)
         super()._advance()
         self._notice()
@@ -309,7 +324,7 @@ class StandInSimulation(BaseSimulation):
             key.data(key.fileobj)
 
     def _listen_until(self, condition: Callable[[], bool]) -> None:
-        deadline_s = time.monotonic() + _PATIENCE_S
+        deadline_s = time.monotonic() + _TIMES.patience_s
         while not condition() and (left_s := deadline_s - time.monotonic()) > 0.0:
             self._listen(left_s)
 

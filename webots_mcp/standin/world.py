@@ -43,7 +43,7 @@ class World:
         self.nodes: list[WorldNode] = []
         """Every node once, in the order of the scene tree. Nodes that were added come last."""
         self.left_out: list[WorldNode] = []
-        """Nodes of the file whose type the stand-in does not know. The world lacks them."""
+        """Nodes of the file whose type the stand-in does not know. The world omits them."""
         self._ids: dict[WorldNode, int] = {}
         self._by_id: dict[int, WorldNode] = {}
         self._next_id = 0

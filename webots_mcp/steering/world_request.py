@@ -142,7 +142,7 @@ class WorldRequest(Request):
     def _require_same_folder(
         self, situation: Situation, address: WebotsAddress, world: Path
     ) -> None:
-        """Refuse a world of another folder: Webots looks for it next to the current world only."""
+        """Refuse a world of another folder: Webots searches it next to the current world only."""
         current = self._current_world(situation, address)
         if current is None:
             raise CommandRefusedError(

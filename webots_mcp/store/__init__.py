@@ -1,5 +1,5 @@
-"""What was recorded: models, chunks, reading, logs, retention, merging, export, permissions.
+"""Store what was recorded: models, chunks, reading, logs, retention, merging, export, permissions.
 
-Judgements, questions and everything above them read through it. It never imports the bridge: both
-know the file by `database` alone.
+Judgements, questions and everything above them read through this package. It never imports the
+bridge; the two share the file only through `database`.
 """

@@ -1,11 +1,11 @@
-"""Making chunks: the maintainer's work, never the control loop's.
+"""Make chunks: the work of the maintainer, never of the control loop.
 
-1,024 rows of a run become a group with a chunk of each signal when there are as many, what is left
-of a run when it has ended (from 32 rows on), and all of it before retention deletes its rows. A
+1,024 rows of a run become a group with one chunk per signal. The rest of an ended run becomes a
+group if it has at least 32 rows, and so does everything whose rows retention is about to delete. A
 group is prepared outside the write lock, stored in pieces of about half a millisecond, and counts
-once its last piece is in. Ids of state rows are given under the write lock, so that a watermark
-tells which rows were looked at. Rows that come late, into a time that is in chunks, become a group
-of their own.
+once its last piece is stored. Ids of state rows are assigned under the write lock, so a watermark
+records which rows were examined. Rows that arrive late, at a time that is already in chunks, become
+a group of their own.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ _BEGIN_GROUP: Final = (
     "max_state_id, row_count, stored_row_count, lost_value_count, stored_row_bytes, chunk_bytes, "
     "is_complete) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 0)"
 )
-_STORE: Final = AtomicStatements(  # unless another process has cleared the group up
+_STORE: Final = AtomicStatements(  # unless another process has removed the group
     "store_chunks",
     ("group_id", "first", "last"),
     f"INSERT INTO chunk (group_id, {_LIST}) SELECT NEW.group_id, {_LIST} FROM new_chunk "
@@ -96,7 +96,7 @@ _COMPLETE: Final = AtomicStatements(  # unless another process has stored these 
     "(SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE run_id = NEW.run_id "
     "AND is_complete = 1) <> NEW.max_state_id",
 )
-# Unless rows of the old group were deleted, or it was replaced meanwhile.
+# Unless rows of the old group were deleted or it was replaced in the meantime.
 _REPLACE: Final = AtomicStatements(
     "replace_group",
     ("old_id", "new_id", "chunks"),
@@ -106,9 +106,9 @@ _REPLACE: Final = AtomicStatements(
     "AND stored_row_count = row_count)",
 )
 _LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
-MIN_ROWS_ON_DEMAND: Final = 2000  # a question reads fewer as they are
-_PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
-INDEX_BYTES: Final = 21  # an entry (run_id, sim_time_s, id) of a time index, measured
+MIN_ROWS_ON_DEMAND: Final = 2000  # a question reads fewer rows without chunks
+_PAUSE_S: Final = 0.002  # pause between two short writes, so that robots can write
+INDEX_BYTES: Final = 21  # size of an entry (run_id, sim_time_s, id) of a time index, measured
 
 
 @dataclass(frozen=True)
@@ -144,11 +144,11 @@ _SIZES: Final = ChunkMakingSizes()
 
 
 class Made(NamedTuple):
-    """What a call of `make_chunks` did.
+    """Result of a call of `make_chunks`.
 
     Attributes:
-        rows: State rows that were put into chunks.
-        done: Whether nothing is left that could be put into chunks now.
+        rows: Number of state rows that were put into chunks.
+        done: Whether nothing remains that could be put into chunks now.
     """
 
     rows: int
@@ -158,15 +158,15 @@ class Made(NamedTuple):
 def make_chunks(
     connection: sqlite3.Connection, budget_rows: int = 4096, pause_s: float = 0.0
 ) -> Made:
-    """Put rows into chunks that are in none, about `budget_rows` of them at most.
+    """Put rows that are in no chunk into chunks, at most about `budget_rows` of them.
 
-    It may end at any moment: what is stored stays, and the next call goes on from there. Rows that
-    hold what no bridge writes are left out, and said on stderr.
+    The call may be interrupted at any moment: what is stored stays, and the next call continues
+    from there. Rows with values that no bridge writes are left out and reported on stderr.
 
     Args:
-        connection: Of the one maintainer (the role "writer"), in autocommit mode.
-        budget_rows: Bounds the time of the call: about 30 us per row of 40 values.
-        pause_s: Between two writes, for others to write; 0 where no other process does.
+        connection: Connection of the only maintainer (role "writer"), in autocommit mode.
+        budget_rows: Limit that bounds the time of the call: about 30 us per row of 40 values.
+        pause_s: Pause between two writes, so that other processes can write; 0 if none does.
 
     Raises:
         sqlite3.Error: The database is locked or damaged; what was stored before stays.
@@ -176,7 +176,7 @@ def make_chunks(
     rows = 0
     ended = connection.execute(
         "SELECT id, robot_id FROM run WHERE ended_wall_time_s IS NOT NULL AND is_chunked = 0"
-    ).fetchall()  # one scan, however many rounds follow
+    ).fetchall()  # one scan, regardless of the number of rounds
     while rows < budget_rows:
         mark = watermark(connection)
         last = connection.execute(
@@ -212,7 +212,7 @@ def make_chunks(
 
 
 def chunk_whole_run(connection: sqlite3.Connection, run_id: int, pause_s: float = 0.0) -> bool:
-    """Put every row of a run into chunks, however few are left; whether all of them are in one."""
+    """Put every row of a run into chunks, however few remain. Return whether all are in chunks."""
     (robot_id,) = connection.execute(
         "SELECT robot_id FROM run WHERE id = ?", (run_id,)
     ).fetchone() or (None,)
@@ -225,15 +225,15 @@ def chunk_whole_run(connection: sqlite3.Connection, run_id: int, pause_s: float 
 
 
 class _RunChunks:
-    """The chunks of one run that are still to be made.
+    """Make the remaining chunks of one run.
 
     Args:
-        connection: Of the maintainer.
-        run_id: Which run.
+        connection: Connection of the maintainer.
+        run_id: The run.
         robot_id: Its robot.
-        pause_s: Between two writes.
-        new_ids: The first and last id of its rows beyond the watermark; late rows are among them.
-        least_rows: How many rows make a group; `GROUP_ROWS` if not given.
+        pause_s: Pause between two writes.
+        new_ids: First and last id of its rows beyond the watermark, late rows included.
+        least_rows: Minimum number of rows in a group; `GROUP_ROWS` by default.
     """
 
     def __init__(
@@ -254,12 +254,12 @@ class _RunChunks:
         self.done = False
 
     def make(self, budget_rows: int, last_id: int) -> int:
-        """Make those of rows up to an id; how many rows were put into chunks."""
+        """Make the chunks of rows up to an id. Return how many rows were put into chunks."""
         rows, least_rows, has_ended = 0, self._least_rows, self._has_ended()
         if has_ended:
             least_rows = min(least_rows, MIN_ROWS_AT_END)
         at = reached(self._connection, self._run_id)
-        # Once a later group is stored, the ids of rows that came late would no longer show them.
+        # Once a later group is stored, the ids of late rows no longer show that they are late.
         while rows < budget_rows and len(late := self._late(at, last_id)):
             if not self._store(late, at):
                 return rows
@@ -270,7 +270,8 @@ class _RunChunks:
             if tail is None or not len(tail):
                 self.done = True
                 if has_ended:
-                    left = self._tail(at, last_id)  # few, read as they are, whose names are entered
+                    # Few rows stay as they are, but their names are registered.
+                    left = self._tail(at, last_id)
                     _signals_of(self._connection, self._robot_id, left)
                     self._connection.execute(
                         "UPDATE run SET is_chunked = 1 WHERE id = ?", (self._run_id,)
@@ -283,7 +284,7 @@ class _RunChunks:
         return rows
 
     def _late(self, at: ChunkProgress, last_id: int) -> StateColumns:
-        """Rows in no chunk that came after others of later times were put into one."""
+        """Find rows in no chunk that arrived after rows of later times were put into one."""
         first_id, newest_id = self._new_ids
         after_id, last_id = max(at.max_state_id, first_id - 1), min(last_id, newest_id)
         if at.end_s == -math.inf or last_id <= after_id:
@@ -299,7 +300,7 @@ class _RunChunks:
         )
 
     def _has_tail(self, at: ChunkProgress, last_id: int, least_rows: int) -> bool:
-        """Whether there are so many rows after those that are in chunks."""
+        """Return whether at least N rows follow those that are in chunks."""
         place = (at.end_s, at.last_state_id)
         asked = (self._run_id, *place, last_id, least_rows)
         # The index alone answers this.
@@ -313,7 +314,7 @@ class _RunChunks:
         )
 
     def _tail(self, at: ChunkProgress, last_id: int) -> StateColumns:
-        """The first rows after those that are in chunks."""
+        """Return the first rows that follow those in chunks."""
         place = (at.end_s, at.last_state_id)
         return _read(
             self._connection,
@@ -337,16 +338,16 @@ class _RunChunks:
 def store_group(
     connection: sqlite3.Connection, owner: tuple[int, int], columns: StateColumns, pause_s: float
 ) -> tuple[int | None, int]:
-    """Store a group that readers do not see until it is marked as complete.
+    """Store a group, which readers ignore until it is marked as complete.
 
     Args:
-        connection: Of the maintainer.
+        connection: Connection of the maintainer.
         owner: The run and its robot.
         columns: The rows of the group.
-        pause_s: Between two writes.
+        pause_s: Pause between two writes.
 
     Returns:
-        The id of the group, and how many chunks it has.
+        The id of the group and its number of chunks.
     """
     run_id, robot_id = owner
     signals = _signals_of(connection, robot_id, columns)
@@ -369,7 +370,7 @@ def store_group(
 def _sizes_of(
     connection: sqlite3.Connection, columns: StateColumns, chunks: Sequence[tuple[Any, ...]]
 ) -> tuple[float, int]:
-    """Bytes on the disk, with indexes: of a state row on average, and of all chunks."""
+    """Return the mean size of a state row and the size of all chunks, on the disk with indexes."""
     page_bytes = connection.execute("PRAGMA page_size").fetchone()[0]
     texts = (len(text.encode()) + _SIZES.state_row for text in columns.texts)
     packed = (_packed_bytes(chunk) + _SIZES.statistics for chunk in chunks)
@@ -378,7 +379,7 @@ def _sizes_of(
 
 
 def _prepare(connection: sqlite3.Connection, chunks: Sequence[tuple[Any, ...]]) -> None:
-    """Fill the temporary table, in a transaction that locks nothing but it."""
+    """Fill the temporary table, in a transaction that locks nothing else."""
     connection.execute(
         f"CREATE TEMP TABLE IF NOT EXISTS new_chunk (number INTEGER PRIMARY KEY, {_LIST})"
     )
@@ -393,20 +394,20 @@ def _prepare(connection: sqlite3.Connection, chunks: Sequence[tuple[Any, ...]]) 
         connection.execute("COMMIT")
 
 
-# A group of which a chunk is damaged, and whose rows are all still there, is made anew as a whole.
-# Readers cannot write: they report such a group, and the maintainer of their process remakes it.
+# A damaged group whose rows all still exist is remade as a whole. Readers cannot write, so they
+# report the group, and the maintainer of their process remakes it.
 
 
 _reported: set[tuple[str, int]] = set()  # database file and group
 
 
 def report_damaged_group(connection: sqlite3.Connection, group_id: int) -> None:
-    """Have the next call of `make_chunks` in this process remake a group of this database."""
+    """Report a damaged group, so that the next `make_chunks` of this process remakes it."""
     _reported.add((_file_of(connection), group_id))
 
 
 def remake_reported_groups(connection: sqlite3.Connection, pause_s: float) -> None:
-    """Remake the groups of this database that readers of this process found damaged."""
+    """Remake the groups of this database that readers of this process reported as damaged."""
     file = _file_of(connection)
     for report in [each for each in _reported if each[0] == file]:
         _reported.discard(report)
@@ -419,10 +420,10 @@ def _file_of(connection: sqlite3.Connection) -> str:
 
 
 def remake_if_damaged(connection: sqlite3.Connection, group_id: int, pause_s: float = 0.0) -> int:
-    """Make a group anew if one of its chunks is damaged and all of its rows are still there.
+    """Remake a group if one of its chunks is damaged and all of its rows still exist.
 
     Returns:
-        The id of the new group; that of the old one if it stays as it is.
+        The id of the new group, or of the old one if it was not replaced.
     """
     group = connection.execute(
         "SELECT g.run_id, r.robot_id, g.row_count, g.last_state_id, coalesce((SELECT min(min) "
@@ -455,7 +456,7 @@ def remake_if_damaged(connection: sqlite3.Connection, group_id: int, pause_s: fl
 
 
 def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]) -> StateColumns:
-    """Rows as columns; where one holds what no bridge writes, without such rows."""
+    """Read rows as columns, without rows that hold values no bridge writes."""
     columns = StateColumns()
     with reading_texts(connection):
         rows = connection.execute(query, (*values, GROUP_ROWS)).fetchall()
@@ -488,11 +489,11 @@ def _is_valid(row: tuple[Any, ...]) -> bool:
 def _signals_of(
     connection: sqlite3.Connection, robot_id: int, columns: StateColumns
 ) -> dict[str, RegisteredSignal]:
-    """The robot's signals by name; what some rows tell of them is entered."""
+    """Return the robot's signals by name, and register those that are new in these rows."""
     known = registered(connection, robot_id)
     budget = max(0, MAX_SIGNALS - len(known))
     fresh = [name for name, each in columns.values.items() if may_widen(known.get(name), each)]
-    # A state may have many times more names than there is budget for.
+    # A state may have many more names than the register accepts.
     entered = [name for name in fresh if name in known]
     entered += islice((name for name in fresh if name not in known), budget)
     if entered:
@@ -501,12 +502,15 @@ def _signals_of(
 
 
 def count_lost(columns: StateColumns, signals: dict[str, RegisteredSignal]) -> int:
-    """How many values of some rows chunks do not hold as they were ('webots-mcp help database')."""
+    """Count the values that chunks do not hold exactly as recorded (see 'webots-mcp help
+    database').
+    """
     lost = 0
     for name, values in columns.values.items():
         signal = signals.get(name)
         types = set(map(type, values))
-        if signal is None or signal.reduction == "count":  # beyond the limit, or a long array
+        # beyond the number of registered signals, or a long array
+        if signal is None or signal.reduction == "count":
             lost += sum(value is not ABSENT for value in values)
         if str in types:
             lost += sum(isinstance(value, str) and len(value) > MAX_TEXT for value in values)
@@ -518,7 +522,7 @@ def count_lost(columns: StateColumns, signals: dict[str, RegisteredSignal]) -> i
 def _chunks_of(
     run_id: int, columns: StateColumns, ids: dict[str, int]
 ) -> Iterator[tuple[Any, ...]]:
-    """Rows of the table `chunk`: of the times, and of each signal that is registered."""
+    """Yield rows of the table `chunk`: for the times, and for each registered signal."""
     places: tuple[tuple[int, Sequence[Any]], ...] = (
         (SIM_TIMES, columns.times),
         (WALL_TIMES, columns.wall_times),
@@ -537,7 +541,7 @@ def _packed_bytes(chunk: tuple[Any, ...]) -> int:
 def _in_short_steps(
     sizes: Sequence[int], store: Callable[[int, int], object], pause_s: float
 ) -> None:
-    """Store the items from one to another, as many at a time as half a millisecond takes."""
+    """Store items in steps of about half a millisecond each."""
     most, done = _SIZES.first_piece, 0
     while done < len(sizes):
         last, size = done, sizes[done] + _SIZES.per_chunk
@@ -553,7 +557,7 @@ def _in_short_steps(
 
 
 def _delete_left_behind(connection: sqlite3.Connection, pause_s: float) -> None:
-    """Groups of which a process that ended meanwhile had not stored all chunks."""
+    """Delete groups that an ended process left without all of their chunks."""
     for (group_id,) in connection.execute(_LEFT_BEHIND).fetchall():
         # The maker of a group may have completed it in the meantime.
         while connection.execute(
@@ -565,11 +569,9 @@ def _delete_left_behind(connection: sqlite3.Connection, pause_s: float) -> None:
         connection.execute("DELETE FROM row_group WHERE id = ? AND is_complete = 0", (group_id,))
 
 
-# Making chunks on demand, where no server does it in the background.
-#
-# What is in no chunk is read row by row until a deadline, and what was not read is left out of the
-# answer. A server makes chunks of what comes; of a recording that none looks after, who asks does
-# it.
+# Making chunks on demand, if no server makes them in the background. Rows in no chunk are read one
+# by one until a deadline, and an answer omits the rest. A server puts new rows into chunks; for a
+# recording without a server, the process that asks does it.
 
 
 def make_missing_chunks(
@@ -580,25 +582,25 @@ def make_missing_chunks(
     called_off: Callable[[], bool] = lambda: False,
     write: bool = True,
 ) -> str:
-    """Put the states that are there now and in no chunk yet into chunks, unless a server does.
+    """Put all states that are in no chunk yet into chunks, unless a server does.
 
-    It may end at any moment, also by an exception: the chunks that are made stay, and the next call
-    goes on from there.
+    The call may be interrupted at any moment, also by an exception: finished chunks stay, and the
+    next call continues from there.
 
     Args:
-        recording: Of the current schema.
-        progress: Called now and then with how many rows are done, and how many there are to do.
+        recording: The recording, with the current schema.
+        progress: Called now and then with the number of finished rows and the total.
         limit_s: Wall seconds after which it stops.
-        called_off: Asked between two batches whether to stop.
-        write: Where false, or where the file cannot be written, the chunks are made in a temporary
-            file of this process.
+        called_off: Called between two batches; returns whether to stop.
+        write: If false, or if the file cannot be written, the chunks are made in a temporary file
+            of this process.
 
     Returns:
-        How many states are left in no chunk, and why; "" where there are none, or so few that a
-        question reads all of them.
+        The number of states that remain in no chunk, and why; "" if none remain, or so few that a
+        question reads them all.
 
     Raises:
-        DatabaseError: There is no such recording, or it cannot be read.
+        DatabaseError: The recording does not exist or cannot be read.
     """
     with recording.reader() as connection:
         total = left = _rows_left(connection)
@@ -629,7 +631,7 @@ def make_missing_chunks(
 
 
 def _rows_left(connection: sqlite3.Connection) -> int:
-    """About how many rows are in no chunk."""
+    """Estimate how many rows are in no chunk."""
     # Ids have gaps only where rows were deleted.
     return int(
         connection.execute(
@@ -645,7 +647,7 @@ def _rows_left(connection: sqlite3.Connection) -> int:
 def _opened(
     recording: RecordingAccess, *, write: bool, frozen: bool
 ) -> Generator[sqlite3.Connection]:
-    """A connection to make chunks on, with a maintainer that keeps the log short meanwhile."""
+    """Open a connection for making chunks, with a maintainer that keeps the log short."""
     database = recording.database
     if isinstance(database, Path) and (frozen or not write):
         with chunks_aside(database, frozen=frozen) as connection:
@@ -653,7 +655,7 @@ def _opened(
         return
     with recording.writer() as connection, ExitStack() as at_the_end:
         if isinstance(database, Path):
-            maintainer = Maintainer(database, "question")  # idle while a bridge is it
+            maintainer = Maintainer(database, "question")  # idle if a bridge is the maintainer
             maintainer.start()
             at_the_end.callback(maintainer.stop)
         yield connection
@@ -663,19 +665,18 @@ def _say(rows: int, why: str) -> str:
     return f"the newest {rows} rows are in no chunk yet: {why}"
 
 
-# How rows lie on the pages of a file: what a table takes on the disk is more than its text.
-#
-# The rows of a table fill its pages in the order of their ids. One that does not fit the rest of a
-# page begins the next, and what is too long for a page lies on pages of its own (SQLite, Database
-# File Format, section 1.6: B-tree Pages).
+# How rows are stored on the pages of a file: the disk space of a table exceeds its text. Rows fill
+# the pages of a table in the order of their ids. A row that does not fit the rest of a page starts
+# the next page, and what is too long for a page has pages of its own (SQLite, Database File Format,
+# section 1.6: B-tree Pages).
 
 
 def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
-    """Bytes that rows which follow each other in a table take on the disk, without its indexes.
+    """Return the disk space of rows that follow each other in a table, without its indexes.
 
     Args:
-        payloads: Bytes of the record of each row.
-        page_bytes: Of the database.
+        payloads: Size of the record of each row, in bytes.
+        page_bytes: Page size of the database.
     """
     space = page_bytes - _SIZES.page_head
     full_pages = own_bytes = filled = used = rows = 0
@@ -687,7 +688,7 @@ def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
         used, rows = used + local, rows + 1
     if not rows:
         return 0.0
-    # The last page goes on with other rows: it will be as full as the others.
+    # Other rows follow on the last page, which will be as full as the others.
     per_byte = page_bytes / (space - used / rows / 2)
     if full_pages:
         per_byte = full_pages * page_bytes / filled
@@ -695,7 +696,7 @@ def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
 
 
 def _cell(payload: int, page_bytes: int) -> tuple[int, int]:
-    """Bytes of a row on its table page, and bytes of the pages that it has for itself."""
+    """Return the size of a row on its table page and the size of the pages it occupies alone."""
     most, least = page_bytes - 35, (page_bytes - 12) * 32 // 255 - 23
     if payload <= most:
         return payload + _SIZES.cell_head, 0

@@ -1,8 +1,8 @@
-"""State rows as columns from their chunks, for exports, where chunks hold every value as it was.
+"""Read state rows as columns from their chunks, for exports, if chunks hold every value exactly.
 
-Where they do not (long arrays, long texts, integers beyond 2^53, a signal of several kinds), where
-rows were deleted, came late or lie in a kept stretch, there is no such table: `chunk_table` gives
-None, and rows are read one by one.
+If they do not, `chunk_table` returns None and rows are read one by one. That is so for long arrays,
+long texts, integers beyond 2^53 and signals of several kinds, and if rows were deleted, arrived
+late or belong to a full-rate segment.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from webots_mcp.store.registered_signals import registered
 
 Kind = Literal["null", "bool", "int", "num", "text"]
 
-MOST_NEW_ROWS: Final = 20_000  # that are in no chunk: they are parsed, and stay in memory
+MOST_NEW_ROWS: Final = 20_000  # Rows in no chunk are parsed and stay in memory.
 _NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -41,8 +41,8 @@ class RunColumns:
     """The rows of one run in such a table.
 
     Attributes:
-        kinds: Of each signal that a row has: what its values are.
-        first_rows: And the id of the first state that has it.
+        kinds: The kind of the values of each signal that occurs.
+        first_rows: The id of the first state that has each signal.
     """
 
     run_id: int
@@ -51,7 +51,7 @@ class RunColumns:
     first_rows: dict[str, int]
 
     def slices(self, rows: int) -> Iterator[Frame]:
-        """Its rows, so many at a time."""
+        """Yield its rows, N at a time."""
         for start in range(0, len(self.frame), rows):
             yield self.frame.rows(start, start + rows)
             self.frame.forget()
@@ -60,13 +60,13 @@ class RunColumns:
 def chunk_table(
     connection: sqlite3.Connection, segments: Sequence[Segment], counts: Sequence[int], last_id: int
 ) -> list[RunColumns] | None:
-    """The rows of some segments by columns; None where chunks do not hold all as it was.
+    """Return the rows of some segments as columns; None unless chunks hold all values exactly.
 
     Args:
-        connection: Any.
-        segments: Which rows.
-        counts: How many state rows each has.
-        last_id: Of them.
+        connection: An open database.
+        segments: The segments to read.
+        counts: The number of state rows of each segment.
+        last_id: The highest id among them.
     """
     parts = list[RunColumns]()
     for segment, count in zip(segments, counts, strict=True):
@@ -102,7 +102,7 @@ def _part(
     frame = read_frame(connection, segment, Deadline(math.inf), full_rate=False)
     if len(frame) < count or not frame.is_as_stored:
         return None
-    frame = frame.rows(0, count)  # others have come since they were counted
+    frame = frame.rows(0, count)  # more rows were added since they were counted
     (robot_id,) = connection.execute("SELECT robot_id FROM run WHERE id = ?", (run_id,)).fetchone()
     known = registered(connection, robot_id)
     if count_lost(frame.new_rows, known):
@@ -123,7 +123,7 @@ def _part(
 
 
 def _is_in_wall_time(frame: Frame, segment: Segment) -> bool:
-    """Whether all rows lie between the limits in wall time, whatever a clock did between them."""
+    """Return whether all rows lie within the limits in wall time, whatever the clock did."""
     limits = (segment.wall_start_s, segment.wall_end_s)
     if not any(map(math.isfinite, limits)):
         return True
@@ -132,10 +132,10 @@ def _is_in_wall_time(frame: Frame, segment: Segment) -> bool:
 
 
 def _kinds_of(frame: Frame, name: str) -> tuple[set[Kind] | None, int]:
-    """What the values of a signal are, and the first row that has it; None where they are others.
+    """Return the kind of a signal's values and its first row; None if the values are mixed.
 
-    A name may be that of a reduction, or `*`, by which it is told what was replaced in an array:
-    where it is that of a value of its own, it is not known what its null was.
+    A name may be that of a reduction, or `*`, which records what was replaced in an array. If a
+    signal of its own has that name, its nulls are ambiguous.
     """
     kinds, first, last_part = set[Kind](), len(frame), name.rpartition(".")[2]
     for at, values in frame.parts(name):
@@ -154,7 +154,7 @@ def _kinds_of(frame: Frame, name: str) -> tuple[set[Kind] | None, int]:
                 return None, first
             is_cut = frame.cuts_chunks and (at == 0 or at + len(numbers) == len(frame))
             if is_cut and (held_numbers == np.floor(held_numbers)).all():
-                return None, first  # what made the chunk one of floats may be outside
+                return None, first  # the value that made the chunk one of floats may lie outside
         present: set[int] = set() if values.codes is None else set(np.unique(values.codes).tolist())
         for code, label in enumerate(values.labels, FIRST_LABEL):
             if code not in present:
@@ -183,11 +183,11 @@ def _kind_of_label(label: object) -> Kind:
 
 
 class ColumnCells:
-    """The values of a signal in some rows, as a library for columns takes them.
+    """The values of a signal in some rows, in the form that column libraries take.
 
     Attributes:
-        values: One for each row; of texts the place of the text among `labels`.
-        is_null: In which rows there is none.
+        values: One value per row; for texts the index of the text in `labels`.
+        is_null: Flags of the rows without a value.
     """
 
     def __init__(self, frame: Frame, name: str, kind: str) -> None:

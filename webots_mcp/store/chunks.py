@@ -1,8 +1,8 @@
-"""Chunks: the values of one signal over some rows, as they become bytes and values again.
+"""Encode the values of one signal over some rows as bytes, and decode them again.
 
-Numbers are compressed by pcodec, which loses nothing. Each row has a code: it holds a number, or
-its state lacks the signal, or it holds one of a few other values (a text, a flag, null), which
-stand as JSON in a list of labels. Where every row holds a number there are no codes.
+Numbers are compressed by pcodec without loss. Each row has a code: it holds a number, its state
+does not have the signal, or it holds one of a few other values (a text, a flag, null), which are
+stored as JSON in a list of labels. If every row holds a number, there are no codes.
 """
 
 from __future__ import annotations
@@ -29,16 +29,13 @@ from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import DatabaseError, MalformedRowError
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
 
-MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
+MAX_TEXT: Final = 200  # characters of a text value that are stored and compared
 ANY_ITEM: Final = "*"
 IS_NUMBER: Final = 0  # codes
 IS_ABSENT: Final = 1
-FIRST_LABEL: Final = 2  # and those above: the place of a label, counted from it on
+FIRST_LABEL: Final = 2  # codes from this one on are indexes of labels
 
-_LEVEL: Final = 4  # of pcodec: a quarter of the time of its default, for 2 % more bytes
-_CODES_LEVEL: Final = 1
-_CHECKSUM_BYTES: Final = 4  # CRC-32: a decompressor is not asked what it makes of damaged bytes
-EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
+EXACT_INTEGERS: Final = 2**53  # beyond it, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NUMBERS: Final = frozenset({int, float})
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
@@ -46,26 +43,44 @@ STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
 SIM_TIMES: Final = 0  # in the place of a signal's id
 WALL_TIMES: Final = -1
 STATE_IDS: Final = -2
-NEWEST_STATE_ID: Final = (  # that was ever given
+NEWEST_STATE_ID: Final = (  # the highest id ever assigned
     "max((SELECT coalesce(max(id), 0) FROM state), (SELECT coalesce(max(CAST(reserved_state_id "
     "AS INTEGER)), 0) FROM recording))"
 )
-IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
+IS_MARK: Final = (  # no value of another program, beyond which no row would be examined
     f"typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= {NEWEST_STATE_ID}"
 )
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
-_FEW: Final = 0.25  # of the groups between two: they are asked for one by one
+_FEW: Final = 0.25  # maximum number of groups between two of them: they are queried one by one
 _SEEN: Final = ("signal", "row_group", "chunk", "watermark")
 _COPIED: Final = ("robot", "session", "run", *_SEEN)
-_UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may have the number of a deleted one
+_UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may reuse the inode of a deleted one
+
+
+@dataclass(frozen=True)
+class ChunkCompression:
+    """How chunks are compressed.
+
+    Attributes:
+        numbers_level: Level of pcodec: a quarter of the time of its default, for 2 % more bytes.
+        codes_level: Level of zlib for codes.
+        checksum_bytes: Size of a CRC-32, so that no decompressor is given damaged bytes.
+    """
+
+    numbers_level: int = 4
+    codes_level: int = 1
+    checksum_bytes: int = 4
+
+
+_COMPRESSION: Final = ChunkCompression()
 
 
 class Absent:
-    """What a row has of a signal that its state lacks."""
+    """Stands for a signal that a row's state does not have."""
 
 
 class Replaced(NamedTuple):
-    """What a row has where JSON cannot hold the value: why, such as nan or inf."""
+    """Stands for a value that JSON cannot hold, with the reason, such as nan or inf."""
 
     why: str
 
@@ -79,17 +94,17 @@ class DamagedChunkError(DatabaseError):
 
 
 class UnsupportedChunkError(DamagedChunkError):
-    """A chunk is not damaged, but this installation cannot read it."""
+    """A chunk is intact, but this installation cannot read it."""
 
 
 class EncodedChunk(NamedTuple):
     """The values of a signal as a row of the table `chunk` holds them.
 
     Attributes:
-        codec: How `numbers` are compressed.
-        numbers: Of the rows that hold one.
-        codes: One for each row, compressed by zlib; None where every row holds a number.
-        labels: JSON array of what codes from 2 on mean.
+        codec: Compression of `numbers`.
+        numbers: The numbers of the rows that hold one.
+        codes: One per row, compressed by zlib; None if every row holds a number.
+        labels: JSON array with the meaning of codes from 2 on.
     """
 
     codec: str
@@ -102,10 +117,10 @@ class Decoded(NamedTuple):
     """The values of a signal over some rows.
 
     Attributes:
-        numbers: One for each row: NaN where it holds none; flags are 0 and 1.
-        codes: One for each row; None where every row holds a number.
-        labels: What codes from 2 on mean; of a replaced value `Replaced`.
-        is_whole: All numbers were integers when they were stored.
+        numbers: One per row: NaN if it holds none; flags are 0 and 1.
+        codes: One per row; None if every row holds a number.
+        labels: The meaning of codes from 2 on; `Replaced` for a replaced value.
+        is_whole: Whether all numbers were integers when they were stored.
     """
 
     numbers: Array
@@ -115,7 +130,7 @@ class Decoded(NamedTuple):
 
 
 def decoded_of(values: Sequence[Recorded]) -> Decoded:
-    """The same of values that were not stored: nothing is compressed."""
+    """Return values that were not stored in the form of decoded ones, without compressing them."""
     types = set(map(type, values))
     if _NUMBERS.issuperset(types):
         held = _numbers(values)
@@ -131,35 +146,35 @@ def decoded_of(values: Sequence[Recorded]) -> Decoded:
 def encode(values: Sequence[Recorded]) -> EncodedChunk:
     """Compress the values of some rows; see `pack`.
 
-    What is lost: integers beyond 2^53 become floats, texts are cut after 200 characters, and where
-    integers and floats are mixed all are floats.
+    Integers beyond 2^53 become floats, texts are cut after 200 characters, and a mix of integers
+    and floats becomes floats.
     """
     return pack(decoded_of(values))
 
 
 def pack(values: Decoded) -> EncodedChunk:
-    """Compress values that are numbers and codes already."""
+    """Compress values that already are numbers and codes."""
     if values.codes is None:
         return EncodedChunk(*_compressed(values.numbers, values.is_whole), None, None)
     listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
     width = np.uint8 if len(listed) + FIRST_LABEL < 2**8 else np.uint16
     return EncodedChunk(
         *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
-        zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
+        zlib.compress(values.codes.astype(width).tobytes(), _COMPRESSION.codes_level),
         json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
     )
 
 
 def decode(encoded: EncodedChunk, rows: int, into: Array | None = None) -> Decoded:
-    """The values of some rows.
+    """Return the values of some rows.
 
     Args:
         encoded: The chunk.
-        rows: How many.
-        into: Takes their numbers, where every row holds one; None for a new array.
+        rows: The number of rows.
+        into: Receives their numbers if every row holds one; None for a new array.
 
     Raises:
-        DamagedChunkError: The bytes are not what `encode` makes of so many rows.
+        DamagedChunkError: The bytes are not what `encode` produces for that number of rows.
     """
     try:
         if encoded.codes is None:
@@ -174,12 +189,12 @@ def decode(encoded: EncodedChunk, rows: int, into: Array | None = None) -> Decod
         ) from None
     except DamagedChunkError:
         raise
-    except Exception as error:  # whatever a library says of bytes that it did not make
+    except Exception as error:  # the library may raise anything for bytes that it did not produce
         raise DamagedChunkError(f"damaged: {error}") from error
 
 
 def is_damaged(encoded: EncodedChunk, rows: int) -> bool:
-    """Return whether the bytes of a chunk are not what `encode` makes of so many rows."""
+    """Return whether the bytes of a chunk are not what `encode` makes of that number of rows."""
     try:
         decode(encoded, rows)
     except UnsupportedChunkError:
@@ -233,9 +248,9 @@ def _fill_flags(numbers: Array, codes: Indexes, labels: Sequence[Value | Replace
 
 
 def _coded(values: Sequence[Recorded]) -> tuple[Indexes, list[Value | Replaced]]:
-    """The code of each row, and the labels."""
+    """Return the code of each row, and the labels."""
     labels: list[Value | Replaced] = []
-    known: dict[object, int] = {}  # a flag equals a number, so that the type is in the key
+    known: dict[object, int] = {}  # a flag equals a number, so the key contains the type
     codes = np.empty(len(values), np.intp)
     for row, value in enumerate(values):
         if type(value) in _NUMBERS:
@@ -253,7 +268,7 @@ def _coded(values: Sequence[Recorded]) -> tuple[Indexes, list[Value | Replaced]]
 
 
 def _numbers(values: Sequence[Any]) -> Array:
-    """As floats; an integer that is too large for one becomes infinite."""
+    """Convert to floats; an integer that is too large becomes infinite."""
     try:
         return np.array(values, np.float64)
     except OverflowError:
@@ -269,12 +284,12 @@ def _float(value: float) -> float:
 
 @functools.cache
 def _pcodec(module: str = "pcodec.standalone") -> Any:
-    """The library, which has no types; imported where the first chunk is made or read."""
+    """Return the untyped library, imported when the first chunk is made or read."""
     return import_module(module)
 
 
 def _is_exact(numbers: Array) -> bool:
-    """Whether these integers are the same as floats."""
+    """Return whether floats hold these integers exactly."""
     return bool(np.abs(numbers).max(initial=0) < EXACT_INTEGERS)
 
 
@@ -283,10 +298,10 @@ def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
         # No row holds a number.
         return "none", None
     codec = _INTEGERS if is_whole else _FLOATS
-    config = _pcodec("pcodec").ChunkConfig(compression_level=_LEVEL)
+    config = _pcodec("pcodec").ChunkConfig(compression_level=_COMPRESSION.numbers_level)
     numbers = numbers.astype(np.int64) if is_whole else numbers
     packed = bytes(_pcodec().simple_compress(numbers, config))
-    return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
+    return codec, zlib.crc32(packed).to_bytes(_COMPRESSION.checksum_bytes, "little") + packed
 
 
 def _decompress(encoded: EncodedChunk, into: Array) -> None:
@@ -296,8 +311,10 @@ def _decompress(encoded: EncodedChunk, into: Array) -> None:
         )
     if encoded.numbers is None:
         raise DamagedChunkError("damaged: its numbers are missing")
-    packed = encoded.numbers[_CHECKSUM_BYTES:]
-    if zlib.crc32(packed) != int.from_bytes(encoded.numbers[:_CHECKSUM_BYTES], "little"):
+    packed = encoded.numbers[_COMPRESSION.checksum_bytes :]
+    if zlib.crc32(packed) != int.from_bytes(
+        encoded.numbers[: _COMPRESSION.checksum_bytes], "little"
+    ):
         raise DamagedChunkError("damaged: its bytes do not match their checksum")
     whole: Any = into if encoded.codec == _FLOATS else np.empty(len(into), np.int64)
     progress = _pcodec().simple_decompress_into(packed, whole)
@@ -307,19 +324,19 @@ def _decompress(encoded: EncodedChunk, into: Array) -> None:
         into[:] = whole
 
 
-# What the numbers of one signal in one chunk come to, so that a reader can leave it closed.
+# Statistics of the numbers of one signal in one chunk, so that a reader need not open it.
 
 
 class Statistics(NamedTuple):
-    """Columns of the table `chunk`; None where there is no number, as of texts.
+    """Statistics of a chunk, as columns of the table `chunk`; None without numbers, as for texts.
 
     Attributes:
-        row_count: Rows whose state has the signal.
-        value_count: Of them with a value that is not null; of numbers, with a usable one: not NaN,
-            and not beyond 1e100.
-        change_count: Values unlike the one before.
+        row_count: Number of rows whose state has the signal.
+        value_count: Number of rows with a value that is not null; for numbers, a usable value: not
+            NaN and not beyond 1e100.
+        change_count: Number of values that differ from the one before.
         squared_deviations: Sum of squared deviations from the mean.
-        largest_step: Largest difference of values that follow each other; 0 of a single one.
+        largest_step: Largest difference between consecutive values; 0 for a single one.
     """
 
     row_count: int
@@ -335,7 +352,7 @@ class Statistics(NamedTuple):
 
 
 def statistics_of(values: Decoded) -> Statistics:
-    """What the values of one signal in some rows come to."""
+    """Return the statistics of the values of one signal in some rows."""
     rows = len(values.numbers)
     if values.codes is not None:
         rows -= int(np.count_nonzero(values.codes == IS_ABSENT))
@@ -360,7 +377,7 @@ def statistics_of(values: Decoded) -> Statistics:
 
 
 def _without_numbers(values: Decoded, rows: int) -> Statistics:
-    """Of texts: how many there are, and how often they change."""
+    """Return the statistics of texts: their number and how often they change."""
     if values.codes is None:
         return Statistics(rows, 0)
     texts = [
@@ -370,7 +387,7 @@ def _without_numbers(values: Decoded, rows: int) -> Statistics:
     return Statistics(rows, len(codes), int(np.count_nonzero(np.diff(codes))))
 
 
-# State rows turned into columns: the values of each signal, one for each row.
+# State rows as columns: one value per row and signal.
 
 
 @dataclass
@@ -378,9 +395,9 @@ class StateColumns:
     """Rows of one run in order.
 
     Attributes:
-        values: Of each signal its value in each row: `ABSENT` where the state lacks it, `Replaced`
-            where it held what JSON cannot hold.
-        texts: The states as they were recorded, JSON.
+        values: One value per row and signal: `ABSENT` if the state does not have the signal,
+            `Replaced` if it held what JSON cannot hold.
+        texts: The states as recorded, in JSON.
     """
 
     ids: list[int] = field(default_factory=list[int])
@@ -393,10 +410,10 @@ class StateColumns:
         return len(self.ids)
 
     def add(self, rows: Sequence[tuple[Any, ...]], whose: str = "") -> None:
-        """Add rows of `STATE_COLUMNS`; one whose data is no JSON object has no signals.
+        """Add rows of `STATE_COLUMNS`. A row whose data is no JSON object has no signals.
 
         Raises:
-            MalformedRowError: Another program wrote what no bridge writes.
+            MalformedRowError: Another program wrote a value that no bridge writes.
         """
         if not rows:
             return
@@ -433,7 +450,7 @@ class StateColumns:
                 values[row] = Replaced(reasons[name])
 
     def part(self, start: int, rows: int) -> StateColumns:
-        """Some of the rows."""
+        """Return a slice of the rows."""
         inside = slice(start, start + rows)
         values = {name: values[inside] for name, values in self.values.items()}
         places = (self.ids[inside], self.times[inside], self.wall_times[inside])
@@ -441,7 +458,7 @@ class StateColumns:
 
 
 def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]:
-    """Of each name its value in each state; states mostly have the same names in the same order."""
+    """Return the value of each name in each state; most states have the same names in one order."""
     names = list(states[0])
     if names and all(list(state) == names for state in states):
         columns = zip(*(state.values() for state in states), strict=True)
@@ -450,11 +467,11 @@ def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]
     return {name: [state.get(name, ABSENT) for state in states] for name in every}
 
 
-# The chunks of a run as they are stored: which groups of rows there are, and what is in them.
+# The stored chunks of a run: its groups of rows and their content.
 
 
 class ChunkGroup(NamedTuple):
-    """Rows that follow each other, of which each signal has a chunk. Columns of `row_group`."""
+    """Consecutive rows of which each signal has a chunk. Columns of `row_group`."""
 
     id: int
     start_s: float
@@ -465,13 +482,13 @@ class ChunkGroup(NamedTuple):
 
 
 class ChunkProgress(NamedTuple):
-    """Which rows of a run are in chunks: those up to a place, but for rows that came later.
+    """Which rows of a run are in chunks: those up to a place, except rows that arrived later.
 
     Attributes:
         end_s: Simulation time of the last of them; -inf before the first chunk.
-        last_state_id: Its id; rows of one time are in the order of their ids.
-        max_state_id: Rows up to that place with greater ids came late and are in none.
-        max_in_groups: The greatest id of a row that is in a chunk.
+        last_state_id: Its id; rows with the same time are ordered by id.
+        max_state_id: Rows up to that place with greater ids arrived late and are in no chunk.
+        max_in_groups: The highest id of a row that is in a chunk.
     """
 
     end_s: float
@@ -483,7 +500,7 @@ class ChunkProgress(NamedTuple):
 def groups_in(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[ChunkGroup]:
-    """The groups of a run that reach into [start_s, end_s), in order of time."""
+    """Return the groups of a run that overlap [start_s, end_s), ordered by time."""
     rows = connection.execute(
         "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
         "FROM row_group WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? "
@@ -496,7 +513,7 @@ def groups_in(
 def groups_as_array(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> Array:
-    """The same as columns: id, times of the first and last row in s, how many rows, greatest id."""
+    """Return the groups as columns: id, times of first and last row in s, row count, highest id."""
     rows = connection.execute(
         "SELECT id, start_sim_time_s, end_sim_time_s, row_count, max_state_id FROM row_group "
         "WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? "
@@ -508,7 +525,7 @@ def groups_as_array(
 
 
 def reached(connection: sqlite3.Connection, run_id: int) -> ChunkProgress:
-    """Up to where a run is in chunks."""
+    """Return up to where the rows of a run are in chunks."""
     end_s, max_id = connection.execute(
         "SELECT max(end_sim_time_s), max(max_state_id) FROM row_group WHERE run_id = :run "
         "AND is_complete = 1",
@@ -525,7 +542,7 @@ def reached(connection: sqlite3.Connection, run_id: int) -> ChunkProgress:
 
 
 def watermark(connection: sqlite3.Connection) -> int:
-    """Rows with ids up to it have been looked at, of all runs: none of them comes late any more."""
+    """Return the id up to which the rows of all runs were examined, so that none arrives late."""
     row = connection.execute(
         f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
     ).fetchone()
@@ -533,7 +550,7 @@ def watermark(connection: sqlite3.Connection) -> int:
 
 
 def signals_in(connection: sqlite3.Connection, run_id: int) -> set[int]:
-    """The ids of the signals that have chunks in a run."""
+    """Return the ids of the signals that have chunks in a run."""
     return {
         signal_id
         for (signal_id,) in connection.execute(
@@ -545,7 +562,7 @@ def signals_in(connection: sqlite3.Connection, run_id: int) -> set[int]:
 def statistics_in(
     connection: sqlite3.Connection, run_id: int, signal_id: int, between: tuple[int, int]
 ) -> Array:
-    """What a signal comes to in the groups between two ids: a row for each that has it.
+    """Return the statistics of a signal in the groups between two ids, a row per group that has it.
 
     The first column is the id of the group, the others are the fields of `Statistics`.
     """
@@ -583,7 +600,7 @@ def chunks_by_signal(
 def decoded_or_why(
     encoded: EncodedChunk, rows: int, into: Array | None
 ) -> Decoded | DamagedChunkError:
-    """As `decode`; of a chunk that cannot be read return the error that says why."""
+    """Decode a chunk like `decode`; return the error instead if it cannot be read."""
     try:
         return decode(encoded, rows, into)
     except DamagedChunkError as error:
@@ -597,16 +614,16 @@ def values_in(
     wanted: Mapping[int, int],
     into: Mapping[int, Array] | None = None,
 ) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
-    """The values of a signal in some groups, by their ids, in no order; none of those that lack it.
+    """Yield the values of a signal in some groups, by group id and in no order.
 
-    Of a chunk that cannot be read comes the error that says why.
+    Groups without the signal are left out. For a chunk that cannot be read, the error is yielded.
 
     Args:
-        connection: Any.
-        run_id: Of which run.
-        signal_id: Of which signal; or times or ids.
-        wanted: How many rows each group has, by its id.
-        into: Arrays that take the numbers of some groups; see `decode`.
+        connection: An open database.
+        run_id: The run.
+        signal_id: The signal, or the number that stands for times or ids.
+        wanted: The number of rows of each group, by its id.
+        into: Arrays that receive the numbers of some groups; see `decode`.
     """
     into = into or {}
     values_query = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
@@ -626,29 +643,30 @@ def values_in(
         yield group_id, decoded_or_why(EncodedChunk(*stored), rows, into.get(group_id))
 
 
-# Chunks of a recording that is not to be written: in a temporary file of this process, made once.
-#
-# The file is a recording without states, which are read from the other one; a reader sees its
-# groups, chunks and signals in the place of those of the recording. It goes when the process ends.
+# Chunks of a recording that must not be written are made once, in a temporary file of this process.
+# The file is a recording without states, which are read from the other one. A reader sees its
+# groups, chunks and signals in place of those of the recording. It is deleted when the process
+# ends.
 
 
 class _Made(NamedTuple):
     file: Path
     uuid: str  # of the recording
-    last_id: int  # up to which its rows are in chunks
+    last_id: int  # id up to which its rows are in chunks
 
 
 _made: dict[tuple[int, int], _Made] = {}
 
 
 def is_chunked_aside(connection: sqlite3.Connection, database: Path) -> bool:
-    """Whether this process has chunks of its own of a recording, which has not got as far.
+    """Return whether this process has chunks of a recording beyond those that the recording has.
 
-    A server that has begun to maintain it meanwhile deletes rows after it put them into chunks.
+    A server that has started to maintain it in the meantime deletes rows after putting them into
+    chunks.
     """
     try:
         made = _made.get(_key(database))
-    except FileNotFoundError:  # moved away since the connection was opened
+    except FileNotFoundError:  # moved since the connection was opened
         return False
     if made is None or connection.execute(_UUID.format("main")).fetchone() != (made.uuid,):
         return False
@@ -659,7 +677,7 @@ def is_chunked_aside(connection: sqlite3.Connection, database: Path) -> bool:
 
 
 def show_chunks_aside(connection: sqlite3.Connection, database: Path) -> None:
-    """Let a reader see the chunks that this process has of its recording, if it has any."""
+    """Make the chunks that this process holds for its recording visible to a reader."""
     if not is_chunked_aside(connection, database):
         return
     file = _made[_key(database)].file
@@ -672,11 +690,11 @@ def show_chunks_aside(connection: sqlite3.Connection, database: Path) -> None:
 
 @contextmanager
 def chunks_aside(database: Path, *, frozen: bool) -> Generator[sqlite3.Connection]:
-    """A connection on which `make_chunks` writes into the temporary file; readers see it after.
+    """Open a connection on which `make_chunks` writes into the temporary file for readers.
 
     Args:
         database: The recording.
-        frozen: No process writes to it, nor can one.
+        frozen: Whether no process writes to it or can write to it.
     """
     key = _key(database)
     file = _made[key].file if key in _made else _new_file()
@@ -694,12 +712,12 @@ def chunks_aside(database: Path, *, frozen: bool) -> Generator[sqlite3.Connectio
         finally:
             (last_id,) = connection.execute(
                 "SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE is_complete = 1"
-            ).fetchone()  # also of work that broke off
+            ).fetchone()  # also left over by interrupted work
             _made[key] = _Made(file, uuid, max(last_id, watermark(connection)))
 
 
 def _new_file() -> Path:
-    """One in which whatever is not copied is missing, so that it is read from the recording."""
+    """Create the file; what is not copied into it is read from the recording."""
     folder = tempfile.mkdtemp(prefix="webots-mcp-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     file = Path(folder) / DATABASE_NAME
@@ -721,7 +739,7 @@ def _key(database: Path) -> tuple[int, int]:
 
 
 def parse(text: str) -> dict[str, Any]:
-    """A state row's JSON text; empty where it is no JSON object (rows of foreign origin)."""
+    """Parse the JSON text of a state row; return {} if it is no JSON object (a foreign row)."""
     try:
         state = json.loads(text)
     except (ValueError, RecursionError):
@@ -730,16 +748,16 @@ def parse(text: str) -> dict[str, Any]:
 
 
 def shown(value: Value) -> str | None:
-    """A value of a text or boolean signal as change points have it."""
+    """Return a value of a text or boolean signal in the form that change points use."""
     if value is None or isinstance(value, str):
         return value[:MAX_TEXT] if value else value
     return json.dumps(value)
 
 
 def replaced_names(replaced: str | None) -> dict[str, str]:
-    """What was replaced (nan, inf, ...) by signal: by its own name, or by an item of its array.
+    """Return what was replaced (nan, inf, ...) by signal: by its own name or an item of its array.
 
-    Of an array in which all nulls are of one kind it is named for every item, and under `name.*`.
+    An array whose nulls are all of one kind is listed for every item and under `name.*`.
     """
     if replaced is None:
         return {}
@@ -755,6 +773,6 @@ def replaced_names(replaced: str | None) -> dict[str, str]:
 
 
 def is_replaced(reasons: dict[str, str], name: str, value: Value) -> bool:
-    """Whether a value is what the reasons of its row are about: of `name.*` only the nulls are."""
+    """Return whether the reasons of a row concern a value; those of `name.*` concern only nulls."""
     array, _, item = name.rpartition(".")
     return not item.isdecimal() or value is None or f"{array}.{ANY_ITEM}" not in reasons

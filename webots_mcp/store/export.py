@@ -1,4 +1,4 @@
-"""Exporting in constant memory: states or trials as flat tables, all of a range for viewers."""
+"""Export in constant memory: states or trials as flat tables, a whole range for viewers."""
 
 from __future__ import annotations
 
@@ -46,27 +46,26 @@ from webots_mcp.store.registered_signals import RegisteredSignal, registered
 from webots_mcp.store.run_rows import put_back
 from webots_mcp.store.trial_sets import TrialRecord, best_of, fetch_trial_set, ranking_of, trials_of
 
-# Rows to be exported: those of a range, flattened, and trials; one value per dotted name.
-#
-# State rows that retention has deleted are given back from their chunks, as JSON, as they were
-# recorded. What chunks do not hold ('webots-mcp help database') is missing in them; `notes` says
-# how much.
+# Rows of a range or trials to export, flattened to one value per dotted name. State rows that
+# retention has deleted are restored from their chunks as JSON, as they were recorded. They miss
+# what chunks do not hold ('webots-mcp help database'); `notes` reports how much.
 
 
 _STEP: Final = re.compile(r'\."((?:[^"\\]|\\.)*)"|\.([^.\[]+)|\[(\d+)\]')
-_VALUE: Final = None  # in a tree, the key of the value that stands at the place itself
+_VALUE: Final = None  # key in a tree for the value at the node itself
 
 _encode: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
 
 StoredRow = tuple[int, float, float, str, "str | None"]
 _Tree = dict[Any, Any]
-CHUNK_ROWS: Final = 2000  # read in one short transaction each: no checkpoint waits for an export
+# read in one short transaction each, so that no checkpoint waits for an export
+CHUNK_ROWS: Final = 2000
 _IN_SEGMENT: Final = (
     "run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
     "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
 )
-# Where there are kept stretches, with negative ids for what only they have. Of several calls in one
-# step wall time gives the order.
+# Includes full-rate segments, with negative ids for rows that only they have. Several calls in one
+# step are ordered by wall time.
 _AFTER_WALL: Final = "(sim_time_s > :start_s OR wall_time_s > :after_wall_s)"
 _COUNT: Final = (
     "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
@@ -98,7 +97,7 @@ _OF_PARAMETERS: Final = ("rank", "mean", "least", "greatest", "scores", "pruned"
 
 
 class _WhyNone(NamedTuple):
-    """A value that JSON could not hold, by its name and why; null stands for it."""
+    """A value that JSON could not hold, by its name and the reason; stored as null."""
 
     name: str
     why: str
@@ -108,8 +107,8 @@ class PurgedRows:
     """The rows of a part of a run that are in chunks and no longer in `state`.
 
     Attributes:
-        unread: What could not be given back, once the rows were read.
-        notes: How many values chunks do not hold as they were.
+        unread: What could not be restored, once the rows were read.
+        notes: The number of values that chunks do not hold exactly.
     """
 
     def __init__(self, connection: sqlite3.Connection, segment: Segment) -> None:
@@ -137,7 +136,7 @@ class PurgedRows:
         return sum(len(self._places(group)) for group in self._groups)
 
     def __iter__(self) -> Iterator[StoredRow]:
-        """The rows in order of simulation time."""
+        """Yield the rows in order of simulation time."""
         waiting = list[StoredRow]()
         for group in self._groups:
             ready = [row for row in waiting if row[1] < group.start_s]  # groups may overlap
@@ -146,7 +145,7 @@ class PurgedRows:
         yield from waiting
 
     def _places(self, group: ChunkGroup) -> Indexes:
-        """Which rows of a group are meant, in order; of a group the lowest ids go first."""
+        """Return which rows of a group are meant, in order; the lowest ids are deleted first."""
         times, walls, ids = (
             self._numbers(each, group) for each in (SIM_TIMES, WALL_TIMES, STATE_IDS)
         )
@@ -158,7 +157,7 @@ class PurgedRows:
         wanted &= (times >= part.start_s) & (times < part.end_s)
         wanted &= (walls >= part.wall_start_s) & (walls < part.wall_end_s)
         bounds = (part.run_id, group.start_s, group.end_s)
-        # Rows that were purged from the states are here if a full-rate segment kept them.
+        # Rows that were purged from the states are available if a full-rate segment kept them.
         for time_s, wall_s in self._connection.execute(
             "SELECT sim_time_s, wall_time_s FROM kept_state WHERE run_id = ? AND call IS NULL "
             "AND sim_time_s BETWEEN ? AND ?",
@@ -210,7 +209,7 @@ class PurgedRows:
 
 
 def _put(tree: _Tree, signal: RegisteredSignal, column: int) -> None:
-    """Note at which place of a state a signal stands."""
+    """Note the place of a signal in a state."""
     steps = [int(index) if index else key or json.loads(f'"{quoted}"')
              for quoted, key, index in _STEP.findall(signal.path)]  # fmt: skip
     for step in (*steps, *([signal.reduction] if signal.reduction else [])):
@@ -219,7 +218,7 @@ def _put(tree: _Tree, signal: RegisteredSignal, column: int) -> None:
 
 
 def _built(tree: _Tree, row: Sequence[Any]) -> Any:
-    """The part of a state that is at a place; ABSENT where nothing is."""
+    """Return the part of a state at a place, or ABSENT."""
     if _VALUE in tree and (value := row[tree[_VALUE]]) is not ABSENT:
         return None if type(value) is _WhyNone else value
     found = {
@@ -233,18 +232,18 @@ def _built(tree: _Tree, row: Sequence[Any]) -> Any:
 
 
 def _stored(state: Any, row: Sequence[Any]) -> tuple[str, str | None]:
-    """A state as the table has it, and what was replaced in it."""
+    """Return a state as stored in the table, and what was replaced in it."""
     replaced = {each.name: each.why for each in row if type(each) is _WhyNone}
     text = _encode({} if state is ABSENT else state)
     return text, _encode(replaced) if replaced else None
 
 
 def _listed(name: str, values: Decoded, places: Indexes) -> list[Any]:
-    """The values in some rows as JSON holds them."""
+    """Return the values in some rows as JSON holds them."""
     numbers: list[Any] = values.numbers[places].tolist()
     if values.is_whole:
         numbers = [int(number) if number == number else number for number in numbers]
-    elif math.inf in map(abs, numbers):  # an integer that is beyond all floats
+    elif math.inf in map(abs, numbers):  # an integer beyond the range of floats
         numbers = [_WhyNone(name, "int") if abs(each) == math.inf else each for each in numbers]
     if values.codes is None:
         return numbers
@@ -258,7 +257,7 @@ def _listed(name: str, values: Decoded, places: Indexes) -> list[Any]:
     ]
 
 
-# Rows to be exported, and those of a range, flattened: one value per dotted name.
+# Rows to export and rows of a range, flattened to one value per dotted name.
 
 
 Progress = Callable[[int, int], object]
@@ -266,7 +265,7 @@ ColumnKind = Literal["null", "bool", "int", "num", "text", "numbers"]
 
 
 class Recorded(NamedTuple):
-    """A state row as it is stored; the id of one that only a kept stretch has is below 0."""
+    """A stored state row; the id is negative if only a full-rate segment has the row."""
 
     run_id: int
     state_id: int
@@ -280,11 +279,11 @@ class FlatRow(NamedTuple):
     """A row of a table.
 
     Attributes:
-        head: One value per column of `ExportTable.head`. The id of a state that only a full-rate
-            segment has is below 0.
-        values: By dotted name. What was not finite is so again; an array of more than 16 items
-            is one value.
-        replaced: Path of every value that JSON could not hold, and what it was.
+        head: One value per column of `ExportTable.head`. The id is negative for a state that only a
+            full-rate segment has.
+        values: Values by dotted name. Values that were not finite are restored; an array of more
+            than 16 items is one value.
+        replaced: The path of every value that JSON could not hold, and what it was.
     """
 
     head: tuple[Any, ...]
@@ -293,7 +292,7 @@ class FlatRow(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A dotted name, and what its values are: "text" also where they are of several kinds."""
+    """A dotted name and the kind of its values; "text" also for mixed kinds."""
 
     name: str
     kind: ColumnKind
@@ -319,10 +318,10 @@ class ExportTable(ABC):
 
     @abstractmethod
     def rows(self, pass_number: int = 1) -> Iterator[FlatRow]:
-        """All of them; the second pass reports its own progress."""
+        """Yield all rows; the second pass reports its own progress."""
 
     def columns(self) -> list[Column]:
-        """What the rows hold, in the order in which it first appears; this reads all of them."""
+        """Return the columns of the rows in order of first appearance; this reads all rows."""
         kinds: dict[str, ColumnKind] = {}
         for row in self.rows():
             for name, value in row.values.items():
@@ -346,7 +345,7 @@ class ByColumn:
     progress: Progress | None = None
 
     def slices(self, rows: int) -> Iterator[tuple[list[Any], list[ColumnCells]]]:
-        """So many rows at a time: what `StateTable.head` names, and the cells of each column."""
+        """Yield N rows at a time: the values of `StateTable.head` and the cells of each column."""
         done = 0
         for part in self.parts:
             for frame in part.slices(rows):
@@ -360,12 +359,12 @@ class ByColumn:
 
 @dataclass(frozen=True)
 class StateTable(ExportTable):
-    """The state rows that were there when the export began; they can be read more than once.
+    """The state rows that existed when the export began; they can be read more than once.
 
     Attributes:
-        passes: How often they will be read, so that progress can be reported.
-        purged: Of each segment the rows that only its chunks have.
-        counts: Of each segment the rows of the table `state`.
+        passes: How often they will be read, for progress reports.
+        purged: The rows of each segment that only its chunks have.
+        counts: The number of rows of each segment in the table `state`.
     """
 
     head: ClassVar[tuple[Column, ...]] = _HEAD
@@ -387,7 +386,7 @@ class StateTable(ExportTable):
         passes: int,
         progress: Progress | None,
     ) -> StateTable:
-        """The rows that these segments have now; ids are given in the order of writing."""
+        """Return the rows that these segments have now; ids ascend in the order of writing."""
         bounds = [(part.run_id, part.start_s, part.end_s) for part in segments]
         last_ids, counts = dict[str, int](), dict[str, list[int]]()
         for table in ("state", "kept_state"):
@@ -403,7 +402,7 @@ class StateTable(ExportTable):
 
     @property
     def notes(self) -> list[str]:
-        """What could not be given back of rows that retention has deleted, once they were read."""
+        """Return what could not be restored of deleted rows, once they were read."""
         notes = [note for each in self.purged for note in (*each.notes, *map(str, each.unread))]
         unread = (each for part in self.__dict__.get("_parts") or () for each in part.frame.unread)
         return [*notes, *map(str, unread)]
@@ -413,7 +412,7 @@ class StateTable(ExportTable):
         return chunk_table(self.connection, self.segments, self.counts, self.last_id)
 
     def by_column(self) -> ByColumn | None:
-        """The same from chunks, a column at a time; None where these hold not all as it was."""
+        """Return the rows by columns from chunks; None if chunks do not hold all values exactly."""
         if self._parts is None:
             return None
         kinds: dict[str, set[Kind]] = {}
@@ -452,15 +451,15 @@ class StateTable(ExportTable):
         return flat_row(Recorded(run_id, *row)) if row else None
 
     def rows(self, pass_number: int = 1) -> Iterator[FlatRow]:
-        """All of them, run by run, in the order of simulation time."""
+        """Return all of them, run by run, in the order of simulation time."""
         return (flat_row(recorded) for recorded in self.recorded(pass_number))
 
     def recorded(self, pass_number: int = 1) -> Iterator[Recorded]:
-        """The same rows as they are stored."""
+        """Yield the same rows as they are stored."""
         done = (pass_number - 1) * self.total
         for segment, purged in zip(self.segments, self.purged, strict=True):
             stored = (row for chunk in self._chunks(segment) for row in chunk)
-            # Ids fall where only a kept stretch has a row.
+            # Ids descend where only a full-rate segment has a row.
             for row in heapq.merge(purged, stored, key=lambda row: (row[1], row[2])):
                 yield Recorded(segment.run_id, *row)
                 done += 1
@@ -495,7 +494,7 @@ class StateTable(ExportTable):
 
 
 def flat_row(recorded: Recorded) -> FlatRow:
-    """A stored row as one value per dotted name."""
+    """Return a stored row as one value per dotted name."""
     *head, data, replaced_text = recorded
     state = parse(data)
     replaced = cast("dict[str, str]", json.loads(replaced_text)) if replaced_text else {}
@@ -510,7 +509,7 @@ def flat_row(recorded: Recorded) -> FlatRow:
 
 
 def value_at(state: dict[str, Any], name: str) -> Any:
-    """The value of that dotted name in a state; None where there is none."""
+    """Return the value at a dotted name in a state, or None."""
     inner: Any = state
     try:
         for step in name.split("."):
@@ -521,7 +520,7 @@ def value_at(state: dict[str, Any], name: str) -> Any:
 
 
 def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Any]) -> None:
-    """As `naming.flatten`, with which it shares the names; but a long array stays as it is."""
+    """Flatten like `naming.flatten`, with the same names, but leave long arrays whole."""
     for key, value in items:
         name = prefix + key
         kind = cast("type[object]", type(value))
@@ -534,7 +533,7 @@ def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Any
 
 
 def kind_of(value: object) -> ColumnKind:
-    """What a flattened value is; "text" also for what is none and has no column of its own."""
+    """Return the kind of a flattened value; "text" also for values without their own column."""
     plain = _PLAIN_KINDS.get(type(value))
     if plain is not None:
         return plain
@@ -550,7 +549,7 @@ def _is_numbers(items: list[Any]) -> bool:
 
 
 def _widened(known: ColumnKind, seen: ColumnKind) -> ColumnKind:
-    """The kind of a column that was `known` when such a value comes."""
+    """Return the new kind of a column after such a value."""
     if known == seen:
         return known
     if "null" in (known, seen):
@@ -559,7 +558,7 @@ def _widened(known: ColumnKind, seen: ColumnKind) -> ColumnKind:
 
 
 def _kind_of(seen: Iterable[Kind]) -> Kind:
-    """The kind of a column that has values of these kinds."""
+    """Return the kind of a column that has values of these kinds."""
     kind: ColumnKind = "null"
     for each in seen:
         kind = _widened(kind, each)
@@ -567,7 +566,7 @@ def _kind_of(seen: Iterable[Kind]) -> Kind:
 
 
 def as_text(value: object) -> str | None:
-    """A value in a cell of text: numbers in the shortest form that reads back as the same."""
+    """Return the text of a cell; numbers in the shortest form that reads back unchanged."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, bool):
@@ -582,9 +581,9 @@ class Exported(NamedTuple):
     """What was written for viewers.
 
     Attributes:
-        counts: How many there are of each kind: states, log lines, events, commands, pictures.
-        beside: Which other file was written, and what for; empty where none was.
-        notes: What could not be given back of deleted rows.
+        counts: The number of states, log lines, events, commands and pictures.
+        beside: The other file that was written and its purpose; empty if there is none.
+        notes: What could not be restored of deleted rows.
     """
 
     counts: Counter[str]
@@ -602,28 +601,27 @@ def export(
     safe_cells: bool = False,
     notes: list[str] | None = None,
 ) -> int:
-    """Write the state rows of a range, as many as there are now, flattened.
+    """Write the state rows of a range, as many as exist now, flattened.
 
-    Those that retention has deleted are given back from their chunks.
-
-    Columns are run, state id, simulation and wall time, then the dotted names in the order in
-    which they first appear; one that has the name of those or `replaced` is called `state.NAME`.
+    Rows that retention has deleted are restored from their chunks. Columns are run, state id,
+    simulation and wall time, then the dotted names in order of first appearance. A signal called
+    like one of these or `replaced` becomes `state.NAME`.
 
     Args:
-        connection: Any; it is never kept busy for more than an instant.
-        wanted: From `find_range`; or trials, which are a table as they are.
+        connection: An open database; it is never kept busy for more than an instant.
+        wanted: A range from `find_range`, or trials, which already are a table.
         form: One of `FORMATS`.
-        sink: Takes bytes; need not be seekable.
-        progress: Called now and then with the rows read so far and in all.
+        sink: Receives bytes; need not be seekable.
+        progress: Called now and then with the number of rows read and the total.
         safe_cells: See `write_csv`; the other formats have no cells that could be formulas.
-        notes: Takes what could not be given back of deleted rows.
+        notes: Receives what could not be restored of deleted rows.
 
     Returns:
         The number of rows.
 
     Raises:
-        InvalidInputError: There is no such format, or it needs what is not installed.
-        OSError: The sink takes no more.
+        InvalidInputError: The format does not exist, or needs a library that is not installed.
+        OSError: The sink cannot be written.
     """
     chosen = FORMATS.get(form)
     if chosen is None:
@@ -651,10 +649,10 @@ def export_file(
     safe_cells: bool = False,
     notes: list[str] | None = None,
 ) -> int:
-    """As `export`, into a file of its owner alone that appears only when it is complete.
+    """Export like `export`, into a private file that appears only when it is complete.
 
     Raises:
-        InvalidInputError: Also where the file cannot be written.
+        InvalidInputError: As for `export`, or the file cannot be written.
     """
     with placed(file) as aside, aside.open("wb") as sink:
         return export(connection, wanted, form, sink, progress, safe_cells=safe_cells, notes=notes)
@@ -668,17 +666,17 @@ def export_for_viewers(
     file: Path,
     progress: Progress | None = None,
 ) -> Exported:
-    """Write all of a range in a format that viewers read.
+    """Write all of a range in a format for viewers.
 
-    The files are of their owner alone and appear when they are complete.
+    The files are private to their owner and appear only when they are complete.
 
     Args:
-        connection: Any; it is never kept busy for more than an instant.
+        connection: An open database; it is never kept busy for more than an instant.
         data_dir: The folder of the pictures.
-        wanted: From `find_range`.
+        wanted: A range from `find_range`.
         form: One of `FOR_VIEWERS`.
-        file: Where to.
-        progress: Called now and then with the rows read so far and in all.
+        file: The file to write.
+        progress: Called now and then with the number of rows read and the total.
 
     Raises:
         InvalidInputError: The library is not installed, or a file cannot be written.
@@ -688,10 +686,10 @@ def export_for_viewers(
 
 
 def format_of(file: Path) -> str:
-    """The format that a file's name asks for.
+    """Return the format that the name of a file stands for.
 
     Raises:
-        InvalidInputError: None does.
+        InvalidInputError: No format has this suffix.
     """
     ending = file.suffix.lower().lstrip(".")
     if ending == BUNDLE:
@@ -716,19 +714,19 @@ _encode_export: Final = json.JSONEncoder(
 
 
 def write_csv(source: ExportTable, sink: BinaryIO, *, safe_cells: bool = False) -> None:
-    r"""One line per row under a line of column names; UTF-8, lines end as in RFC 4180.
+    r"""Write one line per row under a line of column names; UTF-8, line ends as in RFC 4180.
 
-    What a row lacks, or is null, is empty; flags are `true` and `false`; what was not finite is
-    `nan`, `inf` or `-inf`; a long array is its JSON text; a NUL character is `\0`, because many
-    readers of CSV end there.
+    Missing and null values are empty; flags are `true` and `false`; values that were not finite are
+    `nan`, `inf` or `-inf`; a long array is its JSON text; a NUL character is written as `\0`,
+    because many CSV readers stop there.
 
     A spreadsheet runs a text that begins with =, +, - or @ as a formula. With `safe_cells` such a
-    text (also a name) gets an apostrophe before it; numbers are left as they are.
+    text (also a name) gets an apostrophe before it; numbers do not change.
     """
     spell = _harmless if safe_cells else _without_nul
     columns = source.columns()
     names = [column.name for column in columns]
-    # The writer itself turns numbers into text, and null into nothing.
+    # The csv writer itself turns numbers into text and null into nothing.
     spelled = [
         i
         for i, column in enumerate(columns, len(source.head))
@@ -756,10 +754,10 @@ def _harmless(text: str | None) -> str | None:
 
 
 def write_json_lines(source: ExportTable, sink: BinaryIO) -> None:
-    """One JSON object per row and line: what it holds by dotted name, null where it is not finite.
+    """Write one JSON object per row and line: values by dotted name, null if not finite.
 
-    `replaced`, where a row has it, names the path of every value that JSON cannot hold, and what
-    it was.
+    `replaced`, if a row has it, names the path of every value that JSON cannot hold, and what it
+    was.
     """
     head = [column.name for column in source.head]
     for row in source.rows():
@@ -770,7 +768,7 @@ def write_json_lines(source: ExportTable, sink: BinaryIO) -> None:
 
 
 def json_text(value: dict[str, Any]) -> str:
-    """Strict JSON: null where a number is not finite."""
+    """Return strict JSON: null for numbers that are not finite."""
     try:
         return _encode_export(value)
     except ValueError:
@@ -789,16 +787,16 @@ def _finite(value: Any) -> Any:
     return [_finite(item) for item in value] if isinstance(value, list) else value  # pyright: ignore[reportUnknownVariableType]
 
 
-# The trials of a set as a flat table: one row per trial, with the figures of its parameters.
+# The trials of a set as a flat table: one row per trial, with statistics of its parameters.
 
 
 @dataclass(frozen=True)
 class TrialTable(ExportTable):
     """The trials of a set, in order.
 
-    Columns are those of the table `trial`, the parameters by name, and how trials with the same
-    parameters did: rank (1 is the best), mean, least and greatest score, and how many gave a
-    score, were pruned, and failed. A parameter called like one of those is `parameter NAME`.
+    Columns are those of the table `trial`, the parameters by name, and the results of all trials
+    with the same parameters: rank (1 is the best), mean, minimum and maximum score, and how many
+    gave a score, were pruned, and failed. A parameter called like one of those is `parameter NAME`.
     """
 
     head: ClassVar[tuple[Column, ...]] = ()
@@ -808,10 +806,10 @@ class TrialTable(ExportTable):
 
     @classmethod
     def of(cls, connection: sqlite3.Connection, set_id: int) -> TrialTable:
-        """The trials as they are now.
+        """Return the trials as they are now.
 
         Raises:
-            InvalidInputError: There is no such set.
+            InvalidInputError: The set does not exist.
         """
         trials = trials_of(connection, set_id)
         plan = json.loads(fetch_trial_set(connection, set_id).plan)
@@ -826,7 +824,7 @@ class TrialTable(ExportTable):
         return len(self.trials)
 
     def rows(self, pass_number: int = 1) -> Iterator[FlatRow]:
-        """All of them; `pass_number` makes no difference."""
+        """Yield all rows; `pass_number` makes no difference."""
         for each in self.trials:
             values: dict[str, Any] = {name: getattr(each, name) for name in _OF_TRIAL}
             for name, value in each.values.items():

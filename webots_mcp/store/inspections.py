@@ -1,4 +1,4 @@
-"""Inspections that were recorded: the controller's own variables at a hit, an error or a hang."""
+"""Read recorded inspections: the controller's own variables at a hit, an error or a hang."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, Final, NamedTuple, cast
 from webots_mcp.contract import INSPECTION_EVENT
 
 _COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, name, data"
-_COMPARED: Final = 200  # characters of a name: an inspection has those of its event
-_AT: Final = (  # of an event: it is written right after it
+_COMPARED: Final = 200  # characters of a name: an inspection is named like its event
+_AT: Final = (  # of an event, because the inspection is written right after it
     f"SELECT {', '.join(f'i.{name}' for name in _COLUMNS.split(', '))} FROM event i JOIN event e "
     f"ON e.id = :id WHERE i.kind = '{INSPECTION_EVENT}' AND i.id >= e.id AND i.run_id = e.run_id "
     "AND i.sim_time_s = e.sim_time_s AND "
@@ -51,7 +51,7 @@ class Inspection(NamedTuple):
 
 
 def inspection_at(connection: sqlite3.Connection, event_id: int) -> Inspection | None:
-    """Return an inspection by its id, or the one that belongs to another event."""
+    """Return an inspection by its own id or by that of its event."""
     row = connection.execute(_AT, {"id": event_id}).fetchone()
     return None if row is None else _inspection(row)
 
@@ -64,11 +64,11 @@ def inspections_of(
 
 
 def reference_to(event_id: int, data: object) -> dict[str, Any]:
-    """Return what stands for the variables in a list of events: how to ask for them.
+    """Return the reference to an inspection in a list of events: how to ask for its variables.
 
     Args:
-        event_id: Of the inspection.
-        data: Of its event.
+        event_id: The event of the inspection.
+        data: The data of that event.
     """
     said = cast("dict[str, Any]", data if isinstance(data, dict) else {})
     place = Inspection(0, 0, 0.0, 0.0, "", "", _frames_of(said)).place
@@ -95,7 +95,7 @@ def _frames_of(data: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _frame(found: dict[str, Any]) -> dict[str, Any]:
-    """Return a frame with all its members, whatever program has written it."""
+    """Return a frame with all its members, whatever program wrote it."""
     source, variables = found.get("source"), found.get("variables")
     return {
         "at": str(found.get("at")),

@@ -1,10 +1,10 @@
-"""Reading past rows that hold what no bridge writes.
+"""Read past rows that hold values no bridge writes.
 
-Other programs may write to a recording, and SQLite takes any value in any column. Checking every
-value would double the cost of every question. So a question is asked without checks first; one that
-fails over a value is asked again of temporary views that have the names of the tables and leave out
-the invalid rows, or show null in place of an invalid value that may be missing. The answer names
-what was left out.
+Other programs may write to a recording, and SQLite accepts any value in any column. Checking every
+value would double the cost of every question, so a question runs without checks first. If it fails
+because of a value, it runs again on temporary views that have the names of the tables. They leave
+out invalid rows, or show null instead of an invalid value if null is allowed. The answer names what
+was left out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, Final, cast
 
 from webots_mcp.database.schema import shipped_statements
 
-MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
+MAX_DEPTH: Final = 100  # nesting of JSON: the bridge records 20 levels
 _SHOWN: Final = 5
 _OBJECTS: Final = frozenset(
     {"robot.devices", "session.versions", "session.actions", "state.data", "state.replaced",
@@ -32,12 +32,12 @@ _PLAIN: Final = (bool, int, float, str)
 _OF_TEXTS: Final = frozenset(
     {"robot.devices", "session.actions", "state.replaced", "kept_state.replaced"}
 )
-_SHAPES: Final = {  # of JSON that is no object
+_SHAPES: Final = {  # Values of JSON that is no object.
     "command.result": "any", "request.purged_commands": "any",
     "parameter.choices": "values", "parameter.default_value": "value",
     "parameter.next_value": "value", "parameter_value.value": "value",
 }  # fmt: skip
-# A row that refers to an invalid one would lead there.
+# Following a row that refers to an invalid one would fail.
 _REFERENCES: Final = {
     "session": (("robot_id", "robot"),),
     "run": (("session_id", "session"), ("robot_id", "robot")),
@@ -71,17 +71,20 @@ _VALID: Final = ValidRange()
 
 
 class InvalidValues:
-    """The values that a question met and left out, in the order in which it met them."""
+    """The invalid values that a question met and left out, in order."""
 
     def __init__(self) -> None:
         self._met: dict[str, None] = {}
 
     def note(self, table: str, row: object, column: str, kind: str) -> None:
-        """Called by SQLite for each such value; its row, or the value, is not seen."""
+        """Note an invalid value.
+
+        SQLite calls this, and the reader does not see its row or value.
+        """
         self._met[f"{table} {row}: {column} holds no valid {kind}"] = None
 
     def described(self) -> list[str]:
-        """The first few, and how many more there are."""
+        """Return the first few values and the number of the others."""
         more = len(self._met) - _SHOWN
         return [*list(self._met)[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
@@ -91,7 +94,7 @@ _reading: ContextVar[InvalidValues | None] = ContextVar("reading past invalid ro
 
 @contextmanager
 def past_invalid_rows() -> Generator[InvalidValues]:
-    """Readers that are opened inside, in this context, do not see invalid rows and values."""
+    """Hide invalid rows and values from readers that are opened inside this context."""
     invalid = InvalidValues()
     token = _reading.set(invalid)
     try:
@@ -101,27 +104,27 @@ def past_invalid_rows() -> Generator[InvalidValues]:
 
 
 def left_out_so_far() -> list[str]:
-    """What readers that were opened inside `past_invalid_rows` have left out until now."""
+    """Return what readers opened inside `past_invalid_rows` have left out so far."""
     invalid = _reading.get()
     return invalid.described() if invalid is not None else []
 
 
 def is_past_invalid_rows() -> bool:
-    """Whether this is inside `past_invalid_rows`."""
+    """Return whether the caller is inside `past_invalid_rows`."""
     return _reading.get() is not None
 
 
 def shadow_if_asked(connection: sqlite3.Connection) -> None:
-    """Inside `past_invalid_rows` give a reader views of the valid rows under the tables' names."""
+    """Give a reader views of the valid rows under the tables' names, inside `past_invalid_rows`."""
     if (invalid := _reading.get()) is None:
         return
-    # A view of `main` reads the tables of `main`, also where several are read as one.
+    # A view of `main` reads the tables of `main`, even if several recordings are read as one.
     if (
         connection.execute("SELECT 1 FROM sqlite_temp_master WHERE name = 'robot'").fetchone()
         is None
     ):
         _shadow(connection, invalid)
-    else:  # by a question before, on a connection that is kept open
+    else:  # by an earlier question on a connection that stays open
         connection.create_function("note_invalid", 4, invalid.note)
 
 
@@ -178,11 +181,11 @@ def _view(connection: sqlite3.Connection, table: str) -> str:
 
 
 def _check(table: str, name: str, kind: str) -> tuple[str, str]:
-    """An SQL condition that a valid value meets, and what such a value is called."""
+    """Return an SQL condition that valid values meet, and the description of an invalid one."""
     place = f"{table}.{name}"
     if place in _OBJECTS or place in _SHAPES:
         what = "texts" if place in _OF_TEXTS else _SHAPES.get(place, "object")
-        checked = f"valid_json(CAST({name} AS BLOB), '{what}')"  # it may be no UTF-8
+        checked = f"valid_json(CAST({name} AS BLOB), '{what}')"  # the value may not be UTF-8
         return f"CASE typeof({name}) WHEN 'text' THEN {checked} ELSE 0 END", "JSON"
     if kind == "TEXT":
         return f"typeof({name}) = 'text'", "text"
@@ -200,7 +203,7 @@ def _check(table: str, name: str, kind: str) -> tuple[str, str]:
 
 
 def _is_valid_json(stored: bytes, what: str) -> int:
-    """Whether it is JSON that SQLite, Python and a client read alike, and of the right shape."""
+    """Return whether SQLite, Python and clients read a text as the same JSON of the right shape."""
     try:
         value: Any = json.loads(stored.decode(), parse_constant=_refuse)
         json.dumps(value, ensure_ascii=False).encode()
@@ -211,7 +214,10 @@ def _is_valid_json(stored: bytes, what: str) -> int:
 
 
 def _has_shape(value: Any, what: str) -> bool:
-    """Whether it is anything, an object, one of texts, a parameter's value, or a list of these."""
+    """Return whether a value has the shape.
+
+    Anything, an object, texts, a parameter value or a list.
+    """
     if what in ("object", "texts"):
         members = cast("dict[str, Any]", value).values() if isinstance(value, dict) else None
         return members is not None and (
@@ -228,7 +234,7 @@ def _refuse(constant: str) -> None:
 
 
 def _require_plain(value: Any, levels: int) -> None:
-    """Raise where it is nested too deeply, or holds a number that is no finite float."""
+    """Raise an error if a value is nested too deeply or holds a number that is no finite float."""
     if isinstance(value, (dict, list)):
         if not levels:
             raise ValueError("too deep")

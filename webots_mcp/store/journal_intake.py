@@ -1,20 +1,21 @@
-"""Takes into the database what controllers write without it: journals.
+"""Ingest journals: what controllers without a database write into files.
 
-Their format is described by 'webots-mcp help journal'.
+'webots-mcp help journal' describes their format.
 
-A controller in C, or any program, appends lines to a file of its session in the data folder, and
-never opens the database. Servers and commands take the lines in while it does: exactly once, as
-`session.last_adopted_entry` is written in the same transaction, and in order, as the parts of a
-journal are read one after the other. How far this process has read is remembered, so that nothing
-is read twice; whatever else reads the same journal meanwhile, or is killed at any place, only finds
-entries that are in already.
+A controller in C, or any program, appends lines to a file of its session in the data folder and
+never opens the database. Servers and commands ingest the lines meanwhile. They do so exactly once,
+because `session.last_adopted_entry` is written in the same transaction, and in order, because the
+parts of a journal are read one after the other. Each process remembers how far it has read, so that
+it reads nothing twice. Any other reader of the same journal, even one that is killed, only finds
+entries that are already stored.
 
-The writer holds the lock of the part that it writes. A part without one is complete: it is deleted
-once it is taken in. Bridges leave journals alone, which would cost their robots time.
+The writer holds the lock of the part that it writes. A part without a lock is complete, and is
+deleted once it has been ingested. Bridges do not ingest journals, which would take time from their
+robots.
 
-Values that do not fit cost as little as possible: null is stored instead where a row can be without
-one, a run whose line cannot be read is made from its first row, and what is dropped is counted in
-`session.rows_dropped` and in an event. A part of which nothing fits stays where it is.
+Values that do not fit cost as little as possible. Null is stored instead if a row can be without
+the value, and a run whose line cannot be read is created from its first row. What is dropped is
+counted in `session.rows_dropped` and in an event. A part of which nothing fits stays where it is.
 """
 
 from __future__ import annotations
@@ -59,11 +60,13 @@ from webots_mcp.errors import warn
 from webots_mcp.signals import register as signal_register
 from webots_mcp.signals.naming import flatten
 
-BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
-MAINTAINER_BUDGET_S: Final = 1.0  # in each of its rounds, so that its lease does not run out
+# Wall time of a question for journals; the rest waits for the next question and is reported.
+BUDGET_S: Final = 5.0
+# Wall time in each round of the maintainer, so that its lease does not expire.
+MAINTAINER_BUDGET_S: Final = 1.0
 LONGEST_LINE_BYTES: Final = 4_000_000
-# The values of each kind: (n)umbers, (c)ounts, (s)trings, (o)bjects. Those with a capital letter
-# may be null. For these and for those with a question mark null stands for what does not fit.
+# The values of each kind: (n)umbers, (c)ounts, (s)trings, (o)bjects. Capital letters may be null.
+# For these and for those with a question mark, null replaces a value that does not fit.
 _FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
     "run": ("s uuid?", "S world", "N step_ms", "s reason?", "n wall_time?", "n sim_time?"),
     "state": ("n sim_time", "n wall_time", "o data", "O replaced"),
@@ -76,9 +79,10 @@ _SESSION_FIELDS: Final = (
     "c pid?", "n started_wall_time_s?", "S host", "C parent_pid", "O environment", "S controller",
     "O versions", "C throttle_interval",
 )  # fmt: skip
-_NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
+# kinds whose values are an object instead of an array
+_NAMED: Final = ("run", "run end", "session end")
 _REASONS: Final[dict[str, str]] = {"run": "start", "run end": "finished", "session end": "finished"}
-# Of statements, which bridges alone know.
+# arguments of statements that only bridges use
 _UNGIVEN: Final = dict.fromkeys(("rows", "monotonic", "own", "step_wait", "steps"))
 _KNOWN: Final = (
     "SELECT id, robot_id, last_adopted_entry, (SELECT data FROM state WHERE run_id = "
@@ -112,13 +116,13 @@ _LIMITS: Final = JournalLimits()
 
 
 class _Faults(NamedTuple):
-    """How many lines or values of lines were dropped, and what was wrong with the first."""
+    """The number of lines or values that were dropped, and what was wrong with the first."""
 
     lines: int = 0
     first: str = ""
 
     def and_those(self, faults: Iterable[str]) -> _Faults:
-        """These and others that follow."""
+        """Return the sum of these faults and later ones."""
         found = [fault for fault in faults if fault]
         return _Faults(self.lines + len(found), self.first or next(iter(found), ""))
 
@@ -132,9 +136,9 @@ class _JournalPosition(NamedTuple):
     Attributes:
         file: Its device and inode, and those of the database.
         offset: The byte after the last line.
-        number: Of the last entry that is in.
+        number: The number of the last ingested entry.
         fits: Whether any of its lines is an entry.
-        faults: Of lines that are to be counted with the next entry.
+        faults: Faults of lines, to be counted with the next entry.
     """
 
     file: tuple[int, ...]
@@ -145,13 +149,13 @@ class _JournalPosition(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """A complete line, its entry if it is one, and what is wrong with it.
+    """A complete line, its entry if it has one, and what is wrong with it.
 
     Attributes:
         end: The byte after it.
-        state: That of its entry.
-        fault: What was dropped of it, or of the whole line.
-        lost_run: What could be read of a run that cannot be made yet, by the names of its values.
+        state: The state of its entry.
+        fault: Why a value or the whole line was dropped.
+        lost_run: The readable values of a run that cannot be created yet, by name.
     """
 
     end: int
@@ -166,7 +170,7 @@ class _JournalState:
 
     Attributes:
         run: UUID of the newest run.
-        lost_runs: Those whose line could not be read whole, by UUID; "" for one without.
+        lost_runs: The runs whose line could not be read completely, by UUID; "" for one without.
     """
 
     def __init__(self, newest: str | None, run: str | None) -> None:
@@ -180,11 +184,11 @@ class _JournalState:
 _lock = threading.Lock()
 _places: dict[Path, _JournalPosition] = {}
 _states: dict[str, _JournalState] = {}
-_kept: dict[Path, str] = {}  # of which nothing fits, and why
+_kept: dict[Path, str] = {}  # parts of which nothing fits, with the reason
 
 
 def kept_journals(database: Path) -> dict[str, str]:
-    """The journals that this process could not read any of and left as they are, each with why."""
+    """Return the journals that this process could not read and left unchanged, with reasons."""
     return {
         path.name: why
         for path, why in list(_kept.items())
@@ -193,7 +197,7 @@ def kept_journals(database: Path) -> dict[str, str]:
 
 
 def has_news(database: Path) -> bool:
-    """Whether a journal next to a database has bytes that this process has not taken in."""
+    """Return whether a journal next to a database has bytes that this process has not ingested."""
     for path in (path for parts in journal_parts(database).values() for path in parts):
         with suppress(OSError):
             status, place = path.stat(), _places.get(path)
@@ -203,7 +207,7 @@ def has_news(database: Path) -> bool:
 
 
 def journals_behind(connection: sqlite3.Connection, database: Path) -> list[str]:
-    """The journals of which rows are not in the database, although there was time."""
+    """Return the journals whose rows are not in the database although there was time."""
     behind: list[str] = []
     kept = kept_journals(database)
     for uuid, parts in journal_parts(database).items():
@@ -223,15 +227,15 @@ def _identity(status: os.stat_result, database: Path) -> tuple[int, ...]:
 def ingest_journals(
     connection: sqlite3.Connection, database: Path, budget_s: float = math.inf
 ) -> None:
-    """Take in what controllers have written up to now, as far as there is time.
+    """Ingest what controllers have written up to now, as far as time allows.
 
     Args:
         connection: A writer in autocommit mode and in no transaction.
         database: Its file.
-        budget_s: Of wall time, also of waiting for another thread that takes them in.
+        budget_s: Wall time, including the wait for another thread that is ingesting.
 
     Raises:
-        sqlite3.Error: The database is locked; what is in is in, the rest waits.
+        sqlite3.Error: The database is locked; what was ingested stays, the rest waits.
     """
     until_s = time.monotonic() + budget_s
     with _turn(budget_s) as is_ours:
@@ -243,8 +247,8 @@ def ingest_journals(
                 del _places[path]
                 _kept.pop(path, None)
         for uuid, parts in journals.items():
-            # In order, and no part before those ahead of it are in: of its entries only those that
-            # are newer than the last one that is in are taken.
+            # Parts are ingested in order, and no part before its predecessors: only entries with a
+            # number above the last ingested one are accepted.
             all(_ingest_part(connection, database, uuid, path, until_s) for path in parts)
             if time.monotonic() > until_s:
                 return
@@ -252,7 +256,7 @@ def ingest_journals(
 
 @contextmanager
 def _turn(budget_s: float) -> Generator[bool]:
-    """Whether no other thread takes journals in, or ends with it in that time."""
+    """Return whether no other thread is ingesting journals, or it finishes within that time."""
     timeout_s = -1 if budget_s == math.inf else min(max(budget_s, 0.0), threading.TIMEOUT_MAX)
     is_ours = _lock.acquire(timeout=timeout_s)
     try:
@@ -265,14 +269,14 @@ def _turn(budget_s: float) -> Generator[bool]:
 def _ingest_part(
     connection: sqlite3.Connection, database: Path, uuid: str, path: Path, until_s: float
 ) -> bool:
-    """Take in a part, and delete it if it is complete; False where some of it is left."""
+    """Ingest a part, and delete it if it is complete. Return False if some of it remains."""
     try:
         with path.open("r+b") as file:
             status = os.fstat(file.fileno())
             header = waiting_file.read_header(file)
             if header is None and time.time() - status.st_mtime < _LIMITS.headerless_s:
                 return False
-            # First of all: what is written after the last look would be deleted unread.
+            # Checked first: lines written after the last read would otherwise be deleted unread.
             is_complete = waiting_file.lock(file.fileno())
             if header is not None and status.st_nlink:
                 identity = _identity(status, database)
@@ -282,9 +286,9 @@ def _ingest_part(
                 is_complete = is_complete and path not in _kept
             if is_complete and os.name != "nt":
                 path.unlink()
-        if is_complete and os.name == "nt":  # where an open file cannot be deleted
+        if is_complete and os.name == "nt":  # systems where an open file cannot be deleted
             path.unlink()
-    except FileNotFoundError:  # another process has taken in all of it
+    except FileNotFoundError:  # another process has ingested all of it
         return True
     except Exception as error:  # noqa: BLE001  (raised again where it is not the file's)
         _states.pop(uuid, None)
@@ -296,7 +300,7 @@ def _ingest_part(
 
 @dataclass
 class _Reading:
-    """Reads one part of a journal into the database."""
+    """Ingest one part of a journal into the database."""
 
     connection: sqlite3.Connection
     uuid: str
@@ -305,10 +309,10 @@ class _Reading:
     identity: tuple[int, ...]
     is_living: bool
     faults: _Faults = _NO_FAULTS
-    begun: tuple[str, ...] = ()  # lost runs that this transaction has made
+    begun: tuple[str, ...] = ()  # lost runs that this transaction has created
 
     def ingest(self, header: dict[str, Any], until_s: float) -> bool:
-        """Take in all complete lines from where it was left; False where time is up."""
+        """Ingest all complete lines from the last position. Return False when time is up."""
         start = self.file.tell()
         session_id, robot_id, number, *newest = self._enter(header)
         place = _places.get(self.path)
@@ -317,7 +321,7 @@ class _Reading:
             place = _JournalPosition(self.identity, offset, number, offset > start, self.faults)
             _states[self.uuid] = _JournalState(
                 *newest
-            )  # another process may have read on meanwhile
+            )  # another process may have read further meanwhile
         session_state = _states.get(self.uuid) or _states.setdefault(
             self.uuid, _JournalState(*newest)
         )
@@ -341,7 +345,7 @@ class _Reading:
         return True
 
     def _entries(self, lines: Sequence[_Line], session_id: int) -> list[WaitingEntry]:
-        """Their entries; the end of a session adds its count to what was dropped here."""
+        """Return their entries; the end of a session adds its own count of dropped lines."""
         entries = [each.entry for each in lines if each.entry]
         for entry in entries:
             if entry.kind == "session end" and isinstance(entry.values, dict):
@@ -352,7 +356,10 @@ class _Reading:
         return entries
 
     def _counted(self, session_id: int, place: _JournalPosition) -> _JournalPosition:
-        """Count what was dropped and no entry followed; a part of which nothing fits is kept."""
+        """Count what was dropped without a following entry.
+
+        A part of which nothing fits is kept.
+        """
         _kept.pop(self.path, None)
         if not place.faults.lines:
             return place
@@ -379,9 +386,9 @@ class _Reading:
         return place._replace(faults=_NO_FAULTS)
 
     def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
-        """The ids of session and robot, the number of the last entry, newest state and run."""
+        """Return the ids of session and robot, number of the last entry, newest state, run."""
         connection = self.connection
-        # A bridge recovers its own rows. Journals have no monotonic clock.
+        # Bridges recover their own rows. Journals have no monotonic clock.
         if connection.execute(
             "SELECT 1 FROM session WHERE uuid = ? AND last_seen_monotonic_s IS NOT NULL",
             (self.uuid,),
@@ -409,7 +416,7 @@ class _Reading:
         return connection.execute(_KNOWN, (self.uuid,)).fetchone()
 
     def _begin(self, session_state: _JournalState, entry: WaitingEntry) -> dict[str, Any] | None:
-        """The values of the run of an entry that none has begun, if its line was lost."""
+        """Return the values of the run of an entry whose own line was lost."""
         lost = session_state.lost_runs.get(entry.run or "", session_state.lost_runs.get(""))
         if lost is None or isinstance(entry.values, dict) or not entry.run:
             return None
@@ -425,10 +432,10 @@ class _Reading:
         runs: Mapping[str, tuple[float, float, int]],
         ends: Mapping[Kind, dict[str, Any]],
     ) -> None:
-        """Write when runs were seen last and how many rows they have, and which runs ended."""
+        """Write when runs last recorded, how many rows they have, and which runs ended."""
         for run, (sim, wall, rows) in runs.items():
             values = {"run": run, "sim": sim, "wall": wall, "rows": rows, "session": session_id}
-            # Rows of a run that has ended came late: it was ended as its process was found gone.
+            # Rows arrived late for a run that was ended because its process had disappeared.
             self.connection.execute(
                 "UPDATE run SET last_wall_time_s = max(last_wall_time_s, :wall), last_sim_time_s "
                 "= max(last_sim_time_s, :sim), ended_wall_time_s = max(ended_wall_time_s, "
@@ -455,7 +462,10 @@ class _Reading:
         lines: Sequence[_Line],
         taken: Ingested,
     ) -> None:
-        """Write what follows: names, changes, times, ends of runs, what was dropped."""
+        """Write what follows from the entries.
+
+        Names, changes, times, ends of runs, dropped lines.
+        """
         written = {entry.number for entry in taken.written}
         faults = list(taken.unfit)
         begun_here, self.begun = self.begun, ()
@@ -475,15 +485,16 @@ class _Reading:
                 if entry.run in begun_here:
                     ends["run"] = {"uuid": begins}
             changed = session_state.changes.compare(state) if state is not None else ()
-            if entry.number not in written:  # taken in by another process, or refused
+            if entry.number not in written:  # ingested by another process, or refused
                 continue
-            if isinstance(entry.values, dict):  # a run or an end, after which others are over
+            # A run or an end, after which the other runs are over.
+            if isinstance(entry.values, dict):
                 ends[entry.kind] = entry.values
                 continue
             last, run = entry, entry.run or ""
             sim_time_s, wall_time_s, *_ = entry.values
             _, _, rows = runs.get(run, (0.0, 0.0, 0))
-            seen_s = min(wall_time_s, time.time())  # what is dated later than now was seen now
+            seen_s = min(wall_time_s, time.time())  # Times in the future count as now.
             runs[run] = sim_time_s, seen_s, rows + (entry.kind == "state")
             if state is not None:
                 session_state.names.register(
@@ -528,18 +539,18 @@ class _Reading:
 def _described(
     header: Mapping[str, Any], uuid: str, modified_s: float
 ) -> tuple[str, dict[str, Any], list[str]]:
-    """The robot's name and the values of the session, from the first line of a journal.
+    """Return the robot's name and the values of the session, from the first line of a journal.
 
     Args:
-        header: What that line says.
-        uuid: Of the file's name.
-        modified_s: Of the file, Unix time: for one that does not say when it was begun.
+        header: The content of that line.
+        uuid: The UUID in the name of the file.
+        modified_s: Unix time of the file, used if the line does not say when the session began.
 
     Returns:
-        With what does not fit, for which there is null or what is known otherwise.
+        Values that do not fit are null or replaced by what is known otherwise.
 
     Raises:
-        ValueError: It has no robot, or another session than its name.
+        ValueError: The header has no robot, or names another session than the file.
     """
     name, session = _object(header.get("robot")).get("name"), _object(header.get("session"))
     if not (name and _fitted("s", name) and session.get("uuid") == uuid):
@@ -550,8 +561,9 @@ def _described(
     host, parent, file = given["host"] or host_name(), given["parent_pid"], given["controller"]
     is_here = host == host_name()
     started_s = modified_s if given["started_wall_time_s"] is None else given["started_wall_time_s"]
-    pid = given["pid"] or 0  # no process has that one
-    lives = processes.process_alive(pid, None, started_s)  # of one that is gone none can tell it
+    pid = given["pid"] or 0  # no process has this id
+    # a process that has ended cannot be asked
+    lives = processes.process_alive(pid, None, started_s)
     versions = {
         key: value
         for key, value in _object(given["versions"]).items()
@@ -584,7 +596,7 @@ def _object(value: object) -> dict[str, Any]:
 
 
 def _sha256(file: str, started_s: float) -> str | None:
-    """Of the program, if it is still the one that was started."""
+    """Return the digest of the program, if the file is still the one that was started."""
     with suppress(OSError, ValueError):
         status = Path(file).stat()
         is_program = stat.S_ISREG(status.st_mode) and status.st_size <= _LIMITS.program_bytes
@@ -597,13 +609,13 @@ def _sha256(file: str, started_s: float) -> str | None:
 
 
 def _until(lines: Sequence[_Line], number: int) -> Sequence[_Line]:
-    """The lines up to the last entry of no higher number."""
+    """Return the lines up to the last entry with this number or a lower one."""
     ends = [i for i, each in enumerate(lines, 1) if each.entry and each.entry.number <= number]
     return lines[: ends[-1]]
 
 
 def _skip(file: BinaryIO, offset: int, number: int) -> int:
-    """The byte after the last entry of no higher number, from that byte on."""
+    """Return the byte after the last entry with this number or a lower one, from an offset on."""
     file.seek(offset)
     at = offset
     while number and (line := file.readline(LONGEST_LINE_BYTES)).endswith(b"\n"):
@@ -617,17 +629,17 @@ def _skip(file: BinaryIO, offset: int, number: int) -> int:
 
 
 def _read_lines(file: BinaryIO, offset: int) -> list[_Line]:
-    """The next complete lines from that byte on, as many as are good to have in memory at once."""
+    """Return the next complete lines from an offset on, as many as should be in memory at once."""
     lines: list[_Line] = []
     file.seek(offset)
     until = offset + _LIMITS.batch_bytes
     while len(lines) < waiting_file.ENTRIES_AT_ONCE and offset < until:
         line = file.readline(LONGEST_LINE_BYTES)
         start, size, is_whole = line, len(line), len(line) < LONGEST_LINE_BYTES
-        while line and not line.endswith(b"\n"):  # too long: its end is found, and no more of it
+        while line and not line.endswith(b"\n"):  # The line is too long: only its end is searched.
             size += len(line := file.readline(LONGEST_LINE_BYTES))
         if not line:
-            break  # the rest of it may come
+            break  # the rest of the line may still follow
         offset += size
         lines.append(_line(start, offset) if is_whole else _too_long(start, size, offset))
     return lines
@@ -640,7 +652,7 @@ def _too_long(start: bytes, size: int, end: int) -> _Line:
 
 
 def _line(line: bytes, end: int) -> _Line:
-    """What a line says: an entry, or why it is none."""
+    """Parse a line into an entry, or into the reason why it is none."""
     line = line.removeprefix(codecs.BOM_UTF8)
     text = line.decode("utf-8", "replace")
     if not text.strip():
@@ -670,7 +682,10 @@ def _fault(text: str, why: object) -> str:
 
 
 def _lost_run(text: str, given: dict[str, Any] | None = None) -> dict[str, Any] | None:
-    """What is known of the run that a line without an entry may have begun; None of other lines."""
+    """Return what is known of the run that an unreadable line may have begun.
+
+    None for other lines.
+    """
     # A damaged line may still show that it held a row, and of which run.
     if re.match(r'\s*\[[^"]*"(?:state|event|log|run end|session end)"', text):
         return None
@@ -681,7 +696,7 @@ def _lost_run(text: str, given: dict[str, Any] | None = None) -> dict[str, Any] 
 
 
 def _fitted(letter: str, value: object) -> Any:
-    """A value as the database stores one of that type of `_FIELDS`; None for what is none."""
+    """Return a value as the database stores it for a type of `_FIELDS`; None if it does not fit."""
     if letter == "s":
         return value if isinstance(value, str) and _is_text(value) else None
     if letter == "o":
@@ -700,7 +715,7 @@ def _fitted(letter: str, value: object) -> Any:
 
 
 def _is_text(value: str) -> bool:
-    """Whether it can be stored: half a character cannot."""
+    """Return whether a text can be stored; half a surrogate pair cannot."""
     try:
         value.encode()
     except UnicodeEncodeError:
@@ -709,10 +724,10 @@ def _is_text(value: str) -> bool:
 
 
 def _checked(kind: Kind, values: Any) -> tuple[dict[str, Any], str]:
-    """The values of an entry by their names, and what does not fit and is null instead.
+    """Return the values of an entry by name, and which of them do not fit and become null.
 
     Raises:
-        ValueError: One does not fit that there is no row without, or there are too many.
+        ValueError: A required value does not fit, or there are too many.
     """
     fields = _FIELDS[kind]
     if kind not in _NAMED:
@@ -731,10 +746,10 @@ def _checked(kind: Kind, values: Any) -> tuple[dict[str, Any], str]:
 
 
 def _fit(fields: Iterable[str], values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    """Values by their names as they are stored, and the first that does not fit, for which is null.
+    """Return values by name as they are stored, and the first that does not fit and becomes null.
 
     Raises:
-        ValueError: One that is required does not fit.
+        ValueError: A required value does not fit.
     """
     given, unfit = dict[str, Any](), ""
     for field in fields:
@@ -752,10 +767,11 @@ def _fit(fields: Iterable[str], values: Mapping[str, Any]) -> tuple[dict[str, An
 
 
 def _shown(value: object) -> str:
-    """A value of any size, as far as a person reads it."""
+    """Return a value of any size in a length that a person can read."""
     if isinstance(value, (dict, list)):
         return "an object" if isinstance(value, dict) else "an array"
-    if isinstance(value, int) and not -(10**30) < value < 10**30:  # Python writes no longer ones
+    # Python does not convert longer integers to text
+    if isinstance(value, int) and not -(10**30) < value < 10**30:
         return "a number of more than 30 digits"
     return repr(value)[:80]
 
@@ -770,7 +786,7 @@ def _is_storable(value: dict[str, Any]) -> bool:
 
 
 def _require_shallow(value: object) -> None:
-    """See that objects and arrays in each other can be read by all that reads states.
+    """Refuse objects and arrays that are nested too deeply for readers of states.
 
     Raises:
         ValueError: There are more than 100 levels.
@@ -788,7 +804,10 @@ def _require_shallow(value: object) -> None:
 
 
 def _state(given: dict[str, Any], text: str, line: bytes) -> dict[str, Any]:
-    """The state, with objects for dotted names; texts that were no UTF-8 are named as replaced."""
+    """Return the state with objects for dotted names.
+
+    Texts that were not UTF-8 count as replaced.
+    """
     state = given["data"] = _nested(given["data"])
     _require_shallow(state)
     if "\ufffd" in text and line.decode("utf-8", "ignore") != text:
@@ -801,7 +820,10 @@ def _state(given: dict[str, Any], text: str, line: bytes) -> dict[str, Any]:
 
 
 def _nested(state: dict[str, Any]) -> dict[str, Any]:
-    """`{"front.m": 1}` as `{"front": {"m": 1}}`; a name stays whole where its parts are taken."""
+    """Turn `{"front.m": 1}` into `{"front": {"m": 1}}`.
+
+    A name stays whole if its parts are taken.
+    """
     if not any("." in name for name in state):
         return state
     nested: dict[str, Any] = {}
@@ -826,7 +848,7 @@ def _path(name: str) -> tuple[list[str], str]:
 
 
 def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any]:
-    """The values as the statement of that kind takes them."""
+    """Return the values in the order that the statement of that kind expects."""
     if kind in _NAMED:
         return _UNGIVEN | given | {"dropped": given.get("dropped") or 0}
     if kind == "log":
@@ -835,7 +857,7 @@ def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any
     texts = {name: _text(given[name]) for name in objects}
     for text in texts.values():
         if not text.isascii():
-            text.encode()  # half a character is none
+            text.encode()  # half a surrogate pair is no character
     return tuple((given | texts).values())
 
 

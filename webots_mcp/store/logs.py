@@ -1,4 +1,4 @@
-"""Log lines of a run, or of all runs of a robot; all that is recorded, as lines to follow.
+"""Read log lines of a run or a robot, follow a recording as lines, and store console lines.
 
 Lines of Webots' console become log rows here.
 """
@@ -19,10 +19,10 @@ from webots_mcp.contract import LOG_LEVELS, LogLevel, LogSource
 from webots_mcp.store.reading.ranges import Scope, moment_of
 from webots_mcp.store.run_rows import columns_of
 
-COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it is worth
+COUNT_LIMIT: Final = 10_000  # beyond it, counting would cost more than the count is worth
 OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
-# Of several robots in a simulation Webots does not show which one printed a line. Its lines
-# belong to none of them: they stand in the run of any of them, and are shown for all.
+# If a simulation has several robots, Webots does not show which one printed a line. Such lines
+# belong to no robot: they are stored in the run of any of them and shown for all.
 _COMPANIONS: Final = (
     "SELECT id FROM session WHERE robot_id <> :robot_id "
     "AND instance IN (SELECT instance FROM session WHERE robot_id = :robot_id)"
@@ -30,7 +30,7 @@ _COMPANIONS: Final = (
 _CONSOLE_OF: Final = f"(source IN {OF_CONSOLE} AND +run_id IN ({{}}))"
 _ASKED: Final = "'#' || t.id, t.action"
 _SETTLED_S: Final = "t.finished_wall_time_s"
-MOST_WAITING: Final = 500  # of one Webots; the newest are kept
+MOST_WAITING: Final = 500  # lines of one Webots; the newest are kept
 _NAMED: Final = re.compile(r"\[(.+?)\] (.*)", re.DOTALL)
 _CONSOLE_COLUMNS: Final = "wall_time_s, level, source, message, logger"
 _RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
@@ -84,10 +84,10 @@ _CONSOLE: Final = ConsoleLimits()
 
 @dataclass(frozen=True)
 class LogLine:
-    """A line that the controller or the bridge logged, or of Webots' console.
+    """A line that the controller or the bridge logged, or a line of Webots' console.
 
     Attributes:
-        run_id: None for a line of the console that waits for a run, as is its time.
+        run_id: None for a line of the console that waits for a run; the same holds for its time.
     """
 
     id: int
@@ -100,11 +100,8 @@ class LogLine:
     logger: str | None
 
 
-_COLUMNS: Final = columns_of(LogLine)
-
-
 def _news_of(source: str, cursor: str, columns: str, text: str) -> str:
-    """The rows after a cursor of one robot or all, with the time and the text of each."""
+    """Return the query for rows after a cursor, of one robot or all, with time and text of each."""
     return (
         f"SELECT {cursor}, {columns}, {text} FROM {source} WHERE {cursor} > :after "
         f"AND (:robot_id IS NULL OR r.id = :robot_id) ORDER BY {cursor} DESC LIMIT :limit"
@@ -125,9 +122,8 @@ def _cut(text: str) -> str:
     return f"substr({text}, 1, {_CONSOLE.followed_characters})"
 
 
-_OUTCOME: Final = _cut("coalesce(t.error, t.result)")
 _SAID: Final = f"iif(t.source IN {OF_CONSOLE}, t.source || ': ', '') || {_cut('t.message')}"
-# Kind of news: which cursor it moves, and the rows after that cursor.
+# By kind of news: the cursor that it moves, and the rows after that cursor.
 _NEWS: Final = {
     "state": _news_in("state", "'state'", _cut("t.data")),
     "log": _news_in("log", "t.level", _SAID),
@@ -139,17 +135,17 @@ _NEWS: Final = {
         _SETTLED_S,
         _SETTLED_S,
         "t.finished_sim_time_s",
-        f"concat_text({_ASKED}, t.status, {_OUTCOME})",
+        f"concat_text({_ASKED}, t.status, {_cut('coalesce(t.error, t.result)')})",
     ),
 }
 
 
 class LogWindow(NamedTuple):
-    """The part of a run whose log lines are asked for: from `start_s`, up to and without `end_s`.
+    """The part of a run whose log lines are wanted: from `start_s` up to but excluding `end_s`.
 
-    Its bounds are simulation seconds, compared as those of the ranges of `store.reading.ranges`.
-    Unlike them it is not bounded by the state rows: the last lines of a controller often come after
-    its last state, and some controllers only log.
+    The bounds are simulation seconds, compared like those of the ranges of `store.reading.ranges`.
+    Unlike ranges, a window is not bounded by state rows: the last lines of a controller often come
+    after its last state, and some controllers only log.
     """
 
     start_s: float
@@ -158,16 +154,16 @@ class LogWindow(NamedTuple):
 
 @dataclass(frozen=True)
 class LogFilter:
-    """Which lines are asked for.
+    """Which lines are wanted.
 
     Args:
         run_id: The run; None for all runs of the robot.
         window: Simulation time.
         text: Part of the message; ASCII letters match in either case.
-        lowest_level: This level and those above it.
-        before_id: Only lines with smaller ids, to page towards older ones.
-        robot_id: The robot, where no run is given.
-        source: Only lines of this one.
+        lowest_level: Only this level and those above it.
+        before_id: Only lines with smaller ids, to page towards older lines.
+        robot_id: The robot, if no run is given.
+        source: Only lines of this source.
     """
 
     run_id: int | None
@@ -180,10 +176,10 @@ class LogFilter:
 
 
 def window_of(scope: Scope, newest_s: float) -> LogWindow:
-    """The window that was asked for in simulation time; without any bound the whole run.
+    """Return the window that a scope means in simulation time; the whole run if it has no bounds.
 
     Args:
-        scope: Its `last_s` counts back from the newest row, which is included.
+        scope: The scope; its `last_s` counts back from the newest row, which is included.
         newest_s: Simulation time of the newest row of the run.
     """
     if scope.last_s is not None:
@@ -193,15 +189,18 @@ def window_of(scope: Scope, newest_s: float) -> LogWindow:
 
 
 def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
-    """The newest lines that match, oldest first; with a limit of -1 all of them."""
+    """Return the newest matching lines, oldest first; a limit of -1 returns all of them."""
     order = "id" if asked.run_id is None else "sim_time_s DESC, id"
-    query = f"SELECT {_COLUMNS} {_rows_of(connection, asked)} ORDER BY {order} DESC LIMIT :limit"
+    query = (
+        f"SELECT {columns_of(LogLine)} {_rows_of(connection, asked)} "
+        f"ORDER BY {order} DESC LIMIT :limit"
+    )
     rows = connection.execute(query, {**_values(asked), "limit": limit}).fetchall()
     return [LogLine(*row) for row in reversed(rows)]
 
 
 def waiting_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
-    """The newest lines of Webots' console that wait for a run, oldest first; of no run or time."""
+    """Return the newest lines of Webots' console that wait for a run, oldest first."""
     rows = connection.execute(
         "SELECT id, NULL, NULL, wall_time_s, level, source, message, logger FROM console_line "
         f"WHERE {_SAYING} ORDER BY id DESC LIMIT :limit",
@@ -211,13 +210,13 @@ def waiting_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) 
 
 
 def count_lines(connection: sqlite3.Connection, asked: LogFilter) -> int:
-    """How many lines match; `COUNT_LIMIT` stands for that many or more."""
+    """Return the number of matching lines; `COUNT_LIMIT` stands for that many or more."""
     query = f"SELECT count(*) FROM (SELECT 1 {_rows_of(connection, asked)} LIMIT {COUNT_LIMIT})"
     return int(connection.execute(query, _values(asked)).fetchone()[0])
 
 
 def _rows_of(connection: sqlite3.Connection, asked: LogFilter) -> str:
-    # The newest lines are at the end of the table, so it is not read run by run.
+    # The newest lines are at the end of the table, so the query does not go run by run.
     query = (
         f"SELECT o.id FROM run r JOIN run o ON o.session_id IN ({_COMPANIONS}) "
         "WHERE r.id = :run_id AND o.started_wall_time_s <= coalesce(r.ended_wall_time_s, 9e99) "
@@ -257,7 +256,7 @@ def _values(asked: LogFilter) -> dict[str, object]:
 
 
 class FollowedLine(NamedTuple):
-    """Something recorded. `kind` is state, event, command, or a log line's level."""
+    """A recorded item. `kind` is state, event, command, or the level of a log line."""
 
     wall_time_s: float
     robot: str
@@ -268,7 +267,7 @@ class FollowedLine(NamedTuple):
 
 
 class Follower:
-    """Reads what was recorded since it last looked.
+    """Read what was recorded since the last call.
 
     Args:
         connection: A reader connection.
@@ -298,21 +297,19 @@ def _joined(*parts: object) -> str:
     return " ".join(str(part) for part in parts if part is not None)
 
 
-# Lines of Webots' console as log rows: to whose run each belongs, and which are there already.
-#
-# A line belongs to the newest run of that Webots that had begun when the line came. What comes
-# after Webots has started, or has started a controller that records, and before the next run
-# begins, waits in a table of its own: it is most often what a controller printed before it
-# recorded, or why it never did.
+# Lines of Webots' console as log rows: the run that each belongs to, and which are stored already.
+# A line belongs to the newest run of that Webots that had begun when the line came. Lines between
+# the start of Webots, or of a controller that records, and the next run wait in a table of their
+# own. They are mostly what a controller printed before it recorded, or the reason why it never did.
 
 
 class Said(NamedTuple):
     """A line of the console.
 
     Attributes:
-        wall_time_s: When it came.
+        wall_time_s: When the line came.
         stream: `stdout` or `stderr`; None for a line about the lines.
-        is_old: It was said at an unknown time before it came.
+        is_old: Whether it was printed at an unknown time before it came.
     """
 
     wall_time_s: float
@@ -333,11 +330,11 @@ class _Run(NamedTuple):
 
 
 class ConsoleRows:
-    """Writes what one Webots says; a process at a time does, for all of them.
+    """Write what one Webots prints; only one process at a time does this, for all of them.
 
     Args:
-        instance: As its sessions name it.
-        started_wall_time_s: When it started: runs that began before are of another.
+        instance: The Webots, as its sessions name it.
+        started_wall_time_s: When it started; runs that began before belong to another Webots.
     """
 
     def __init__(self, instance: str, started_wall_time_s: float) -> None:
@@ -350,7 +347,7 @@ class ConsoleRows:
         self._left_out = 0
 
     def begin(self, connection: sqlite3.Connection) -> None:
-        """Forget what waits for runs that will not come."""
+        """Drop lines that wait for runs that will not come."""
         past = (
             self._instance,
             self._started_s - _CONSOLE.early_s,
@@ -362,16 +359,16 @@ class ConsoleRows:
         )
 
     def is_recorded(self, connection: sqlite3.Connection) -> bool:
-        """Whether lines of this Webots wait for a run: then a process follows its console."""
+        """Return whether lines of this Webots wait for a run; if so, a process follows it."""
         query = "SELECT EXISTS (SELECT 1 FROM console_line WHERE instance = ? AND wall_time_s >= ?)"
         return bool(connection.execute(query, (self._instance, self._started_s)).fetchone()[0])
 
     def write(self, connection: sqlite3.Connection, lines: Sequence[Said]) -> None:
-        """Write lines that no bridge has recorded, and those that have waited until now.
+        """Write lines that no bridge has recorded, and lines that have waited until now.
 
         Args:
-            connection: In a transaction.
-            lines: In their order.
+            connection: A connection in a transaction.
+            lines: The lines in order.
         """
         runs = self._runs(connection)
         self._recorded.catch_up(connection)
@@ -383,11 +380,11 @@ class ConsoleRows:
                 self._write(connection, line, runs)
 
     def may_go_on(self, connection: sqlite3.Connection) -> bool:
-        """Whether lines wait and a run has begun for them."""
+        """Return whether lines wait and a run for them has begun."""
         return self.waits and bool(self._fitting(self._runs(connection)))
 
     def _runs(self, connection: sqlite3.Connection) -> list[_Run]:
-        """The newest runs of this Webots, the newest of them first."""
+        """Return the newest runs of this Webots, newest first."""
         since_s = self._started_s - _CONSOLE.early_s
         query = (
             "SELECT id, robot_id, controller FROM session WHERE instance = ? "
@@ -403,7 +400,7 @@ class ConsoleRows:
         return [_Run(*row) for row in found]
 
     def _fitting(self, runs: list[_Run]) -> list[_Run]:
-        """Runs that began since, and those still running, whose start was reported late."""
+        """Return runs that began since, and running ones whose start was reported late."""
         since_s = self._runs_since_s
         return [
             run
@@ -413,7 +410,10 @@ class ConsoleRows:
         ]
 
     def _notice_start(self, line: Said, runs: list[_Run]) -> None:
-        """A controller that records is started: what follows is of the run that it begins."""
+        """Notice that a recording controller starts.
+
+        The following lines belong to the run that it begins.
+        """
         found = (
             None if line.is_old else re.match(r"INFO: (.+?): Starting controller: ", line.message)
         )
@@ -477,17 +477,17 @@ class ConsoleRows:
 
 
 class _Recorded:
-    """What bridges recorded of what is printed, each line until it is met in the console."""
+    """What bridges recorded of printed lines, each until the console shows it."""
 
     def __init__(self, instance: str, since_s: float) -> None:
         self._instance = instance
         self._since_s = since_s
         self._last_id = 0
-        self._robots: dict[str, str] = {}  # by its name and that of its controller
+        self._robots: dict[str, str] = {}  # by the name of the robot and of its controller
         self._texts: dict[str, _OfRobot] = {}
 
     def catch_up(self, connection: sqlite3.Connection) -> None:
-        """Look at what has been recorded since the last time."""
+        """Read what has been recorded since the last call."""
         asked = (self._last_id, self._since_s, self._instance)
         rows = connection.execute(
             "SELECT l.id, l.message, l.logger, b.name, s.controller FROM log l "
@@ -509,10 +509,10 @@ class _Recorded:
                 texts.lines.add(other.strip())
 
     def take(self, line: Said) -> bool:
-        """Whether a bridge recorded this line; it is then met no more.
+        """Return whether a bridge recorded this line, and count it as shown.
 
-        One that begins with the name of a robot or controller that records is looked for without
-        it, in what that robot's bridge recorded.
+        A line that begins with the name of a recording robot or controller is searched without it,
+        among what that robot's bridge recorded.
         """
         if line.stream is None:
             return False
@@ -536,17 +536,17 @@ class _OfRobot:
         self.logged = _Texts(_CONSOLE.logged_texts)
 
     def take(self, text: str) -> bool:
-        """Whether it recorded this text."""
+        """Return whether the bridge recorded this text, and count it as shown."""
         return self.lines.take(text) or self.logged.take(text) or self._take_handled(text)
 
     def _take_handled(self, text: str) -> bool:
-        """As a handler of Python's `logging` prints it: time, level or name before the message."""
+        """Search a text as a handler of `logging` prints it: after time, level or name."""
         said = next((each for each in self.logged if _ends_with(text, each)), None)
         return said is not None and self.logged.take(said)
 
 
 class _Texts:
-    """The newest texts of the last minute, from which they can be taken."""
+    """The newest texts of the last minute; each can be taken once."""
 
     def __init__(self, most: int) -> None:
         self._added: deque[tuple[float, str]] = deque(maxlen=most)
@@ -568,7 +568,7 @@ class _Texts:
 
 
 def _ends_with(text: str, said: str) -> bool:
-    """Whether a handler printed what was logged, with something before it: time, level, name."""
+    """Return whether a line is a logged text with a prefix of a handler: time, level or name."""
     if not said or not text.endswith(said):
         return False
     before = text[: -len(said)]
@@ -576,7 +576,7 @@ def _ends_with(text: str, said: str) -> bool:
 
 
 def _of_named(line: Said, runs: list[_Run]) -> tuple[Said, list[_Run]]:
-    """Where a line begins with the name of a controller or robot, it is of that one's runs."""
+    """Return the runs of the controller or robot whose name begins the line."""
     found = _NAMED.fullmatch(line.message) if line.source == "console" else None
     named = [run for run in runs if found and _is_called(run, found[1])]
     if not (found and named):
@@ -585,12 +585,12 @@ def _of_named(line: Said, runs: list[_Run]) -> tuple[Said, list[_Run]]:
 
 
 def _is_called(run: _Run, name: str) -> bool:
-    """Whether that is the run's robot or its controller, which Webots names in the line."""
+    """Return whether a name that Webots printed is that of the run's robot or controller."""
     return name in (run.robot, run.controller and PurePath(run.controller).stem)
 
 
 def _sim_time_s(connection: sqlite3.Connection, run: _Run, wall_time_s: float) -> float:
-    """Simulation time of a run at that wall time, as far as rows tell it."""
+    """Return the simulation time of a run at a wall time, as far as its rows show it."""
     if wall_time_s <= run.started_wall_time_s:
         return run.started_sim_time_s
     query = (

@@ -1,6 +1,6 @@
-"""Evidence of what a controller's loop does now: stacks, waiting rows, handlers, pauses.
+"""Collect evidence of what a controller's loop does now: stacks, waiting rows, handlers, pauses.
 
-`robot_status` decides and words what follows from it.
+`robot_status` decides what follows from it and words the result.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the signals of a robot mean: as declared, else as their device says, else as names tell."""
+"""Determine what a robot's signals mean: as declared, as known from devices, or by their names."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from webots_mcp.signals.meaning import (
 from webots_mcp.signals.naming import nearest_first
 from webots_mcp.store.registered_signals import RegisteredSignal, stored_roles
 
-OF_TOOLS: Final = ("mcp", "cli")  # a person or an assistant has set it, the newest counts
+OF_TOOLS: Final = ("mcp", "cli")  # set by a person or an assistant; the newest counts
 OF_PROJECT: Final = "project"
-_MOST_NEAR: Final = 5  # names in an error
+_MOST_NEAR: Final = 5  # names that an error lists
 OF_CODE: Final = "controller"
 OF_DEVICE: Final = "bridge"
 _STRENGTH: Final = {**dict.fromkeys(OF_TOOLS, 0), OF_PROJECT: 1, OF_CODE: 2, OF_DEVICE: 3}
@@ -47,7 +47,7 @@ class StoredMeaning(NamedTuple):
 
     Attributes:
         set_by: `mcp`, `cli`, `project`, `controller` or `bridge`.
-        stated: What it says; its name may be a pattern.
+        stated: The statement; its name may be a pattern.
     """
 
     set_by: str
@@ -55,10 +55,10 @@ class StoredMeaning(NamedTuple):
 
 
 def meanings_of(known: Mapping[str, RegisteredSignal]) -> dict[str, Meaning]:
-    """Return the meaning of each signal of a robot, by the strongest source that there is.
+    """Return the meaning of each signal of a robot, from the strongest available source.
 
     Args:
-        known: All its signals, or those of a run, with what was stated of them.
+        known: All its signals, or those of a run, with the statements about them.
     """
     kinds = {name: signal.kind for name, signal in known.items()}
     found = meanings_by_name(kinds, stored_roles(dict(known)))
@@ -71,7 +71,7 @@ def meanings_of(known: Mapping[str, RegisteredSignal]) -> dict[str, Meaning]:
 def with_stated(
     connection: sqlite3.Connection, robot_id: int, known: dict[str, RegisteredSignal]
 ) -> dict[str, RegisteredSignal]:
-    """Return the signals with what was declared of them, or is known from their devices."""
+    """Return the signals with what was declared about them or is known from their devices."""
     stored = stored_meanings(connection, robot_id)
     if not stored:
         return known
@@ -93,16 +93,16 @@ def with_stated(
 
 
 def _stated(signal: RegisteredSignal, stated: tuple[StatedMeaning, ...]) -> RegisteredSignal:
-    """The signal with what was stated of it: its unit is the one that was stated."""
+    """Return the signal with the unit that was stated."""
     found = replace(signal, stated=stated)
     return replace(found, unit=found.stated_unit or signal.unit)
 
 
 def stored_meanings(connection: sqlite3.Connection, robot_id: int) -> list[StoredMeaning]:
-    """Return all that is stored of a robot's signals, the strongest first.
+    """Return all stored meanings of a robot's signals, the strongest first.
 
-    Of equally strong ones, a name comes before patterns, and of those the longer one first. What no
-    version of webots-mcp writes is left out.
+    Among equally strong ones, names come before patterns, and longer patterns before shorter ones.
+    Rows that no version of webots-mcp writes are left out.
     """
     rows = connection.execute(
         f"SELECT set_by, source, why, name, {', '.join(MEANING_FIELDS)} FROM meaning WHERE "
@@ -124,12 +124,12 @@ def stored_meanings(connection: sqlite3.Connection, robot_id: int) -> list[Store
 def set_meanings(
     connection: sqlite3.Connection, robot_id: int, declared: Iterable[DeclaredMeaning], set_by: str
 ) -> None:
-    """Store what a person or an assistant says of signals, in place of what they said before.
+    """Store what a person or an assistant declares, replacing their earlier declaration.
 
     Args:
-        connection: In the role "writer".
+        connection: A connection in the role "writer".
         robot_id: The robot whose signals they are.
-        declared: What is said of each.
+        declared: The declaration of each signal.
         set_by: `mcp` or `cli`.
     """
     now_s = time.time()
@@ -145,22 +145,22 @@ def set_meanings(
 
 
 def undo_meanings(connection: sqlite3.Connection, robot_id: int, names: Iterable[str]) -> list[str]:
-    """Forget what was declared of signals; of each what counts most, so that the next one counts.
+    """Remove the strongest declaration of each signal, so that the next one counts.
 
-    First goes what a person or an assistant has set, then what the controller's code says, which
-    counts again from its next start on.
+    What a person or an assistant has set goes first, then what the controller's code declares,
+    which counts again from its next start on.
 
     Args:
-        connection: In the role "writer".
+        connection: A connection in the role "writer".
         robot_id: The robot whose signals they are.
-        names: As they were declared, or patterns of such names.
+        names: The names as declared, or patterns of such names.
 
     Returns:
-        The names of which something was forgotten.
+        The names of which a declaration was removed.
 
     Raises:
         InvalidInputError: A name has no declaration, or only one in the project's file. Then
-            nothing is forgotten.
+            nothing is removed.
     """
     with transaction(connection):
         known = [
@@ -202,7 +202,7 @@ def _place(stored: StoredMeaning) -> tuple[int, bool, int]:
 
 
 def _said(values: Sequence[Any]) -> DeclaredMeaning | None:
-    """What a row says; None where it holds values that no version writes: SQLite takes any."""
+    """Return the statement of a row; None if it holds values that no version writes."""
     name, quantity, role, unit, target_of, same_as, side, low, high = values
     texts, numbers = (unit, target_of, same_as, side), (low, high)
     is_ours = (

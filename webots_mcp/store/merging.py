@@ -1,9 +1,8 @@
-"""Taking in another recording: its sessions and runs, distinguished from existing ones by UUID.
+"""Merge another recording: its sessions and runs, which UUIDs distinguish from existing ones.
 
-Whatever is already there is left as it is, so merging may be repeated, and may be killed anywhere:
-what is new of a session comes in one transaction. Chunks are made anew from the rows; those of a
-run that has lost rows come as they are. A bundle is made the same way: an empty recording takes in
-one run.
+Existing rows stay unchanged, so merging can be repeated and can be killed at any moment: what is
+new of a session arrives in one transaction. Chunks are made anew from the rows; those of a run that
+has lost rows are copied. A bundle is made the same way: an empty recording merges one run.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Generator, Sequence
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, get_args
 
@@ -55,7 +55,7 @@ from webots_mcp.store.registered_signals import enter_signals
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.trial_sets import fetch_trial_set, is_at_work
 
-# With one run come those of its time, and those that its session's commands were sent for.
+# A run brings the rows of its time, and the commands that were sent for its session.
 _NEW_REQUESTS: Final = (
     "SELECT id FROM source.request s WHERE NOT EXISTS (SELECT 1 FROM main.request n "
     "WHERE n.uuid = s.uuid) AND (:run IS NULL OR run_id = :run OR id IN (SELECT request_id FROM "
@@ -65,23 +65,17 @@ _NEW_REQUESTS: Final = (
 _OF_MEANING: Final = ", ".join(
     ("name", "source", *MEANING_FIELDS, "set_wall_time_s", "set_by", "why")
 )
-# A trial that waits here and is over there: the set was gone on with in a copy of the recording.
+# A trial that waits here and is over there: the set was continued in a copy of the recording.
 _RESULT: Final = ", ".join(
     ("status", "score", "ended_by", "ended_sim_time_s", "error", "started_wall_time_s",
      "finished_wall_time_s")
 )  # fmt: skip
-_PIECE_BYTES: Final = 1_000_000
-# Rows that are all alike become a fiftieth of their size; who unpacks to far more wants to harm.
-_MOST_TIMES: Final = 100
-_HARMLESS_BYTES: Final = 100_000_000
-_LINK: Final = 0o120000  # of a file's type in Unix, as archives keep it
+_LINK: Final = 0o120000  # mask of the file type in Unix, as archives store it
 END_SESSIONS: Final = (  # with the last of their runs that is here
     "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run "
     "WHERE session_id = session.id), end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
 )
 _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
-# Ids between the first and the last row of a run; other robots could not have recorded more.
-_MOST_IDS: Final = 2**40
 _NEWEST_HERE: Final = "SELECT coalesce(max(id), 0) FROM main.state"
 _RESERVED_HERE: Final = "SELECT coalesce(max(reserved_state_id), 0) FROM main.recording"
 _GROUP: Final = (
@@ -91,6 +85,28 @@ _GROUP: Final = (
 )
 _PACKED: Final = "codec, numbers, codes, labels"
 _VALUES: Final = f"{', '.join(Statistics._fields)}, {_PACKED}"
+
+
+@dataclass(frozen=True)
+class BundleLimits:
+    """Limits of what is unpacked and copied; an archive beyond them is hostile.
+
+    Attributes:
+        piece_bytes: Bytes that are copied at a time.
+        times: Factor by which an archive may grow; identical rows shrink to a fiftieth of their
+            size.
+        harmless_bytes: Size up to which any archive is unpacked.
+        ids: Maximum distance between the first and last row id of a run; a real recording has no
+            more.
+    """
+
+    piece_bytes: int = 1_000_000
+    times: int = 100
+    harmless_bytes: int = 100_000_000
+    ids: int = 2**40
+
+
+_BUNDLE: Final = BundleLimits()
 
 
 def merge(
@@ -103,22 +119,23 @@ def merge(
     pictures: Path | None = None,
     is_export: bool = False,
 ) -> dict[str, int]:
-    """Take in all sessions of a recording that is over, and its trial sets; or one run of it.
+    """Merge all sessions of an ended recording and its trial sets, or one run of it.
 
     Args:
-        connection: In the role "writer".
+        connection: A connection in the role "writer".
         data_dir: The folder of the pictures.
         source: The other database, of the same schema.
-        run_id: Only this run, which has to be over, with its session, commands and trials.
-        address: How SQLite is to open it, where its path is not enough.
-        pictures: The folder of its pictures; None for the one that it lies in.
-        is_export: Whether a bundle is made of it, and nothing comes from elsewhere.
+        run_id: Only this run, which must be over, with its session, commands and trials.
+        address: How SQLite opens the source, if its path is not enough.
+        pictures: The folder of its pictures; None for the folder of the database.
+        is_export: Whether the result is a bundle of this recording, so that nothing comes from
+            elsewhere.
 
     Returns:
-        By their UUIDs, the ids that its runs have here.
+        The ids of its runs in this recording, by their UUIDs.
 
     Raises:
-        InvalidInputError: A controller still records there, or what is there is damaged.
+        InvalidInputError: A controller still records there, or the source is damaged.
     """
     with _attached(connection, address or str(source)):
         _require_fit(connection, source, run_id)
@@ -162,19 +179,20 @@ def merge(
 
 
 def settled(database: Path) -> RecordingAccess:
-    """A recording with all rows that waited next to it, and its sessions ended that are over.
+    """Copy a recording with all rows that waited next to it, and end the sessions that are over.
 
     A session of another host is over when its last heartbeat is more than 10 s old.
 
     Raises:
-        DatabaseError: There is none, or it is none of ours.
+        DatabaseError: The recording does not exist or has another format.
     """
     recording = RecordingAccess(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
         ingest_journals(connection, database)
         now_s = time.time()
-        silent = (host_name(), now_s - REMOTE_SILENCE_S)  # their processes cannot be asked
+        # processes of another host cannot be queried
+        silent = (host_name(), now_s - REMOTE_SILENCE_S)
         for (session_id,) in connection.execute(
             "SELECT id FROM session WHERE ended_wall_time_s IS NULL AND host IS NOT ? "
             "AND last_seen_wall_time_s < ?",
@@ -230,7 +248,7 @@ def _ingest_run_rows(
     robot_id: int,
     runs: list[tuple[int, str]],
 ) -> None:
-    """A session, unless it is here, and those of its runs that are not."""
+    """Copy a session, unless it is here already, and those of its runs that are not."""
     session_id = wanted["session"] or 0
     here = _id_of(connection, "session", uuid)
     is_new = here is None
@@ -264,11 +282,12 @@ def _ingest_run_rows(
 
 
 def _copy_meanings(connection: sqlite3.Connection, there: int, here: int) -> None:
-    """Copy what is said of a robot's signals, unless the same one has said something of it here.
+    """Copy what is declared of a robot's signals, unless the same source declared something here.
 
-    What the file of its project says is from now on said of this robot alone: here is another file.
+    What the project file of the other recording declares becomes a declaration for this robot
+    alone, because this recording has another file.
     """
-    # Of two meanings the robot's own is taken.
+    # Of two meanings, that of the robot itself is used.
     connection.execute(
         f"INSERT OR IGNORE INTO main.meaning (robot_id, {_OF_MEANING}) "
         f"SELECT :here, {_OF_MEANING} FROM source.meaning WHERE robot_id = :there "
@@ -279,11 +298,11 @@ def _copy_meanings(connection: sqlite3.Connection, there: int, here: int) -> Non
 
 
 def _ingest_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
-    """Trial sets and trials that are not there, each with its run as it is called here.
+    """Copy trial sets and trials that are missing here, each with the id that its run has here.
 
-    No process works on them here: their simulators and controllers have ended.
-    Trials of a set that is here as well keep their results; those that wait take the ones from
-    there, unless a process is about to run them.
+    No process works on them here: their simulators and controllers have ended. Trials of a set that
+    exists here keep their results. Waiting ones take the results of the other recording, unless a
+    process is about to run them.
     """
     missing: dict[str, Any] = dict.fromkeys(
         ("host", "pid", "process", "robot_id", "session_id", "former_values")
@@ -318,7 +337,10 @@ def _ingest_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
 
 
 def _robot(connection: sqlite3.Connection, robot_id: int) -> int:
-    """The robot of that name here; where one records just now, the next name as bridges take it."""
+    """Return the robot of that name.
+
+    If it is recording now, the next name that bridges would use.
+    """
     row = connection.execute("SELECT name FROM source.robot WHERE id = ?", (robot_id,)).fetchone()
     name, number = str(row[0]), 1
     while connection.execute(
@@ -341,11 +363,14 @@ def _copy_commands(
     *,
     is_new: bool,
 ) -> dict[int, int]:
-    """By their ids there, the ids that the commands have here; a key that is taken stays theirs."""
+    """Map the ids of commands there to their ids here.
+
+    A key that is already taken stays as it is.
+    """
     own = own | {"idempotency_key": None}
     ids: dict[int, int] = {}
     # The commands of a run set its parameters or were claimed during it. A waiting command is left
-    # out: a controller would claim it here, where no caller asked for it.
+    # out: a controller would claim it here, where no caller sent it.
     for old, *facts in connection.execute(
         "SELECT id, created_wall_time_s, action, params FROM source.command c WHERE session_id = "
         ":session AND status <> 'pending' AND (:run IS NULL OR id IN (SELECT command_id FROM "
@@ -374,7 +399,7 @@ def _copy_commands(
 
 
 def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id: int) -> None:
-    """The rows; where some are gone, with the chunks of all."""
+    """Copy the rows; if some were deleted, also the chunks of all."""
     (is_purged,) = connection.execute(
         "SELECT purged_rows > 0 FROM main.run WHERE id = ?", (run,)
     ).fetchone()
@@ -382,7 +407,7 @@ def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id
     if is_purged:
         shift = ingest_chunks(connection, run_id, run, robot_id)
     elif _number(connection, _RESERVED_HERE) > _number(connection, _NEWEST_HERE):
-        shift = _reserve_ids(connection, run_id)  # SQLite would give ids that other rows had
+        shift = _reserve_ids(connection, run_id)  # SQLite would reuse ids that other rows had
     _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)
 
 
@@ -394,16 +419,17 @@ def _insert(
     own: dict[str, Any],
     shift: int | None = None,
 ) -> int:
-    """Copy rows, with values of their own in some columns.
+    """Copy rows, with different values in some columns. Return the id of the last row.
 
-    Their ids are new ones, or those from there and so much more; returns that of the last one.
+    Their ids are new, or those of the source plus an offset.
     """
     listed = connection.execute("SELECT name FROM pragma_table_info(?)", (table,)).fetchall()
     columns = [name for (name,) in listed if name != "id" or shift is not None]
     named = {"id": f"id + {shift}"} | dict.fromkeys(own, "?")
     values = ", ".join(named.get(name, name) for name in columns)
     given = [own[name] for name in columns if name in own]
-    insert = "INSERT OR IGNORE" if table == "parameter" else "INSERT"  # as it is declared here
+    # in the type that is declared here
+    insert = "INSERT OR IGNORE" if table == "parameter" else "INSERT"
     cursor = connection.execute(
         f"{insert} INTO main.{table} ({', '.join(columns)}) "
         f"SELECT {values} FROM source.{table} WHERE {where} ORDER BY id",
@@ -426,7 +452,10 @@ def _images(connection: sqlite3.Connection, where: str, key: int) -> list[tuple[
 
 
 def _path_here(path: str, run_uuid: str) -> str:
-    """Under another name than any that a bridge gives; one that was taken in before keeps it."""
+    """Return a path with a name that no bridge uses.
+
+    A picture that was merged before keeps its path.
+    """
     folder, _, name = path.rpartition("/")
     return path if name.startswith(f"{run_uuid}.") else f"{folder}/{run_uuid}.{name}"
 
@@ -434,30 +463,31 @@ def _path_here(path: str, run_uuid: str) -> str:
 def _copy_pictures(
     connection: sqlite3.Connection, data_dir: Path, source_dir: Path, run_id: int, run_uuid: str
 ) -> None:
-    """Before their rows come: after a kill in between, the next attempt copies the missing ones.
+    """Copy pictures before their rows, so that a repeated attempt after a kill copies missing ones.
 
-    The other recording says how its pictures are called, which may be a lie: only pictures are
-    taken, into this folder, and in no other file's place.
+    The other recording names its pictures, possibly with malicious paths. Only pictures are copied,
+    into this folder, and never over another file.
     """
     for _, path, _ in _images(connection, "r.id = ?", run_id):
         try:
             file = inside(source_dir, path)
         except NothingRecordedError:
-            continue  # deleted since: its row stays as it was there, and says so when asked
+            # Deleted since: its row stays as it was and reports the missing file when asked.
+            continue
         target = data_dir / _path_here(path, run_uuid)
         if not target.resolve().is_relative_to(data_dir.resolve()):
             raise InvalidInputError(f"{path!r} lies outside the data folder and is not copied.")
         if target.suffix.lower() not in PICTURES:
             raise InvalidInputError(f"{path!r} is not the name of a picture and is not copied.")
         if target.exists():
-            continue  # a whole one, from an import that was killed
+            continue  # complete, from a merge that was killed
         make_folder(target.parent)
         with whole_file(target) as aside:
             shutil.copyfile(file, aside)
 
 
 def _copy_tape(data_dir: Path, source_dir: Path, session_uuid: str, *, imported: bool) -> None:
-    """Copy the tape of a session, which has all its runs; one that is there is the same."""
+    """Copy the tape of a session, which has all its runs; an existing tape is the same."""
     found = (each for each in tape_files(source_dir, session_uuid) if each.is_file())
     file = next((each for each in found if not each.is_symlink()), None)
     target = tape_file(data_dir, session_uuid, imported=imported)
@@ -485,20 +515,20 @@ def write_bundle(
     file: Path,
     progress: Progress | None = None,
 ) -> None:
-    """Write a run that is over: everything of it that `merge` takes in, and its pictures.
+    """Write everything of an ended run that `merge` copies, with its pictures, as a bundle.
 
-    Where its session still records, the session in the bundle ends with the run.
+    If its session still records, the session in the bundle ends with the run.
 
     Args:
         connection: A reader of the recording.
         database: The recording.
         data_dir: The folder of its pictures.
         run_id: The run.
-        file: To write to, in a folder with room for the rows that are not compressed.
-        progress: Called now and then with the bytes that are packed and that there are.
+        file: The file to write, in a folder with space for the uncompressed rows.
+        progress: Called now and then with the number of packed bytes and the total.
 
     Raises:
-        InvalidInputError: The run goes on, or has no UUID.
+        InvalidInputError: The run is still going on, or has no UUID.
     """
     with tempfile.TemporaryDirectory(prefix=".bundle-", dir=file.parent) as name:
         folder = Path(name)
@@ -515,20 +545,20 @@ def write_bundle(
 
 @contextmanager
 def small_recording(folder: Path) -> Generator[sqlite3.Connection]:
-    """A new recording to write in that folder, in one file, and not to keep."""
+    """Create a temporary recording in a folder, in one file."""
     with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as writer:
         create_schema(writer)
-        writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file, written once
+        writer.execute("PRAGMA journal_mode=DELETE")  # one file, written once
         writer.execute("PRAGMA synchronous=OFF")  # a killed process leaves nothing worth keeping
         yield writer
 
 
 def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
-    """Write only the database of a folder, which no process has open, and its pictures.
+    """Pack the database of a folder, which no process has open, and its pictures.
 
     Args:
-        folder: Of the recording.
-        file: To write to.
+        folder: The folder of the recording.
+        file: The file to write.
         progress: As in `write_bundle`.
     """
     found = [each for each in sorted(folder.rglob("*.*")) if _is_packed(each.relative_to(folder))]
@@ -539,7 +569,7 @@ def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
             is_compressed = each.suffix.lower() in (*PICTURES, TAPE_ENDING)
             entry.compress_type = zipfile.ZIP_STORED if is_compressed else zipfile.ZIP_DEFLATED
             with each.open("rb") as source, archive.open(entry, "w") as target:
-                while piece := source.read(_PIECE_BYTES):
+                while piece := source.read(_BUNDLE.piece_bytes):
                     target.write(piece)
                     packed += len(piece)
                     if progress is not None:
@@ -552,19 +582,23 @@ def _is_packed(path: Path) -> bool:
 
 
 def is_bundle(file: Path) -> bool:
-    """Whether a file is one, or says that it is: a damaged one is reported as such."""
+    """Return whether a file is a bundle, or claims to be one.
+
+    A damaged bundle is reported as such.
+    """
     return file.suffix.lower() == ".zip" or zipfile.is_zipfile(file)
 
 
 @contextmanager
 def unpacked(file: Path) -> Generator[Path]:
-    """The database of a bundle with its pictures next to it, for the duration of the block.
+    """Unpack a bundle for the duration of the block, with its pictures next to the database.
 
-    Nothing is trusted: what is no database of ours and no picture, leads out of the folder, is a
-    link or unpacks to far more than it holds is refused before anything is written.
+    Nothing is trusted. Before anything is written, the bundle is refused if it holds anything but
+    our database and pictures, a path out of the folder, a link, or far more data than its size
+    allows.
 
     Raises:
-        InvalidInputError: It is damaged or no bundle, or there is no room to unpack it.
+        InvalidInputError: The file is damaged or no bundle, or the disk has no space to unpack it.
     """
     with tempfile.TemporaryDirectory(prefix="webots-mcp-") as name:
         unpack(file, Path(name))
@@ -575,7 +609,7 @@ def unpack(file: Path, folder: Path) -> None:
     """Unpack a bundle as `unpacked` does; a process killed meanwhile leaves no database there.
 
     Raises:
-        InvalidInputError: As there.
+        InvalidInputError: As for `unpacked`.
     """
     aside = folder / f"{DATABASE_NAME}.part"
     try:
@@ -587,7 +621,7 @@ def unpack(file: Path, folder: Path) -> None:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, target.open("wb") as sink:
                     target.chmod(PRIVATE_FILE)
-                    shutil.copyfileobj(source, sink, _PIECE_BYTES)
+                    shutil.copyfileobj(source, sink, _BUNDLE.piece_bytes)
         aside.replace(folder / DATABASE_NAME)
     except _DAMAGED as error:
         raise InvalidInputError(f"{file} is damaged or not a ZIP archive: {error}.") from error
@@ -610,7 +644,7 @@ def _require_ours(file: Path, archive: zipfile.ZipFile) -> None:
     if len(set(names)) < len(names):
         raise InvalidInputError(f"{file} holds a name twice, which no bundle does")
     size = sum(entry.file_size for entry in entries)
-    if size > max(_HARMLESS_BYTES, _MOST_TIMES * file.stat().st_size):
+    if size > max(_BUNDLE.harmless_bytes, _BUNDLE.times * file.stat().st_size):
         raise InvalidInputError(
             f"{file} would unpack to {size:,} bytes, which no bundle of its size does"
         )
@@ -631,27 +665,26 @@ def _is_link(entry: zipfile.ZipInfo) -> bool:
     return entry.external_attr >> 16 & 0o170000 == _LINK
 
 
-# The chunks of a merged run: of one of another recording, whose rows are not all there any more.
-#
-# The other recording is attached as `source`. Its signals are found here by their names, or
-# entered. Row groups name state rows by ids, also those that are gone: so all ids of the run rise
-# alike here, beyond those that were ever given, and what came before what remains so.
+# The chunks of a merged run from a recording that has lost some of its rows. The other recording is
+# attached as `source`. Its signals are found here by name or registered. Row groups refer to state
+# rows by id, even to deleted ones. Therefore all ids of the run are raised by the same amount,
+# beyond all ids ever assigned here, which preserves their order.
 
 
 def ingest_chunks(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> int:
-    """Take in the row groups and chunks of a run, and the names of their signals.
+    """Copy the row groups and chunks of a run, and register its signals.
 
     Args:
-        connection: In a transaction; the other recording is attached.
-        there: The run's id in the other recording.
+        connection: A connection in a transaction, with the other recording attached.
+        there: The id of the run in the other recording.
         here: Its id here; none of its state rows is here yet.
         robot_id: Its robot here.
 
     Returns:
-        By how much the ids of its state rows rise here.
+        The amount by which the ids of its state rows are raised.
 
     Raises:
-        InvalidInputError: Its ids are spread as no bridge gives them.
+        InvalidInputError: Its ids are spread out as no bridge would assign them.
     """
     shift = _reserve_ids(connection, there)
     _ingest_signals(connection, there, robot_id)
@@ -721,7 +754,7 @@ def _ingest_state_ids(connection: sqlite3.Connection, values: dict[str, Any], ro
 
 
 def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
-    """A chunk of ids that are so much greater."""
+    """Return a chunk of ids raised by an offset."""
     numbers = decode(EncodedChunk(*packed), rows).numbers.tolist()
     ids = [int(number) + shift for number in numbers]
     return *statistics_of(decoded_of(ids)), *encode(ids)
@@ -738,7 +771,7 @@ def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
     ).fetchone()
     if first is None:
         return 0
-    if last - first > _MOST_IDS:
+    if last - first > _BUNDLE.ids:
         raise InvalidInputError(
             f"the ids of run {there}'s state rows reach from {first} to {last}, which no bridge "
             "gives: the recording is damaged"

@@ -1,8 +1,8 @@
-"""The tables. The one place where their columns are explained.
+"""Define the tables; this is the one place where their columns are explained.
 
-`sim_time_s` is simulation time, `wall_time_s` is Unix time, both in seconds. Ids never come back
+`sim_time_s` is simulation time, `wall_time_s` is Unix time, both in seconds. Ids are not reused
 after a deletion (by AUTOINCREMENT, or see `State`), so "after this id" is a safe cursor. The
-comments travel into the database: `.schema` in the `sqlite3` shell shows them.
+comments are part of the database: `.schema` in the `sqlite3` shell shows them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def _id() -> Any:
 def _to(
     table: str, comment: str | None = None, *, nullable: bool = False, on_delete: str | None = None
 ) -> Any:
-    """A reference to another table's id; what cannot be without it goes with it."""
+    """Return a reference to another table's id; a row that requires it is deleted with it."""
     on_delete = on_delete or ("SET NULL" if nullable else "CASCADE")
     key = ForeignKey(f"{table}.id", ondelete=on_delete)
     return Field(default=None, sa_column=Column(Integer, key, nullable=nullable, comment=comment))
@@ -67,13 +67,13 @@ def _count(comment: str | None = None) -> Any:
 
 
 def _partial(name: str, where: str) -> Index:
-    """Of commands: an index that holds only the few rows that are asked for all the time."""
+    """Return an index of commands that holds only the few rows that are queried all the time."""
     condition = text(where)
     return Index(name, "robot_id", "id", sqlite_where=condition, postgresql_where=condition)
 
 
 class Recording(SQLModel, table=True):
-    """This database: its one row is made with the tables."""
+    """This database: its one row is created with the tables."""
 
     uuid: str = Field(sa_column=Column(Text, primary_key=True, comment=_UUID))
     created_wall_time_s: float = _number(nullable=False)
@@ -83,7 +83,7 @@ class Recording(SQLModel, table=True):
 
 
 class RobotTable(SQLModel, table=True):
-    """A robot name that was ever seen."""
+    """The name of a robot that was ever recorded."""
 
     __tablename__: ClassVar[Any] = "robot"
     __table_args__ = (_KEEP_IDS,)
@@ -98,7 +98,7 @@ class RobotTable(SQLModel, table=True):
 
 
 class Session(SQLModel, table=True):
-    """One controller process, or one bridge in it."""
+    """A controller process, or one of several bridges in it."""
 
     __table_args__ = (Index(None, "robot_id", "id"), Index(None, "uuid", unique=True), _KEEP_IDS)
     id: int | None = _id()
@@ -135,7 +135,7 @@ class Session(SQLModel, table=True):
 
 
 class Run(SQLModel, table=True):
-    """A stretch of rising simulation time in a session; a reset or a reload begins the next."""
+    """An interval of rising simulation time in a session; a reset or a reload begins the next."""
 
     __table_args__ = (
         Index(None, "robot_id", "id"),
@@ -170,11 +170,10 @@ class Run(SQLModel, table=True):
 
 
 class State(SQLModel, table=True):
-    """What one publish() recorded.
+    """What one call of publish() recorded.
 
     AUTOINCREMENT would write another page of the file with each row. Instead, a trigger notes the
-    id of a newest state that is deleted in `recording.reserved_state_id`, and later states get
-    greater ones.
+    id of a deleted newest state in `recording.reserved_state_id`, and later states get greater ids.
     """
 
     __table_args__ = (Index(None, "run_id", "sim_time_s"),)
@@ -212,10 +211,10 @@ class Signal(SQLModel, table=True):
 
 
 class SignalMeaning(SQLModel, table=True):
-    """What is said of a signal's meaning: declared by somebody, or known from its device.
+    """A statement about the meaning of a signal, declared by somebody or known from its device.
 
-    Of what several say, the newest of `mcp` and `cli` counts, then `project`, `controller` and
-    `bridge`.
+    If several statements exist, the newest of `mcp` and `cli` counts, then `project`, `controller`
+    and `bridge`.
     """
 
     __tablename__: ClassVar[Any] = "meaning"
@@ -244,7 +243,7 @@ class SignalMeaning(SQLModel, table=True):
 
 
 class RowGroup(SQLModel, table=True):
-    """About 1,024 state rows of a run that follow each other, whose values stand in chunks.
+    """About 1,024 consecutive state rows of a run whose values are stored in chunks.
 
     The rows themselves may have been deleted since.
     """
@@ -270,7 +269,7 @@ class RowGroup(SQLModel, table=True):
 
 
 class Chunk(SQLModel, table=True):
-    """The values of one signal in a group of rows, compressed, and what they come to."""
+    """The values of one signal in a group of rows, compressed, with their statistics."""
 
     __table_args__ = (
         Index("ix_chunk_statistics", "run_id", "signal_id", "group_id", *STATISTICS),
@@ -303,14 +302,14 @@ class Chunk(SQLModel, table=True):
 
 
 class Watermark(SQLModel, table=True):
-    """Up to which state row all rows were looked at for a derived table, of all runs."""
+    """The state row up to which all rows of all runs were examined for a derived table."""
 
     name: str = Field(sa_column=Column(Text, primary_key=True, comment="chunk"))
     state_id: int = _column(Integer, nullable=False)
 
 
 class Log(SQLModel, table=True):
-    """A line that the controller or the bridge logged, or of Webots' console."""
+    """A line that the controller or the bridge logged, or a line of Webots' console."""
 
     __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
     id: int | None = _id()
@@ -324,7 +323,10 @@ class Log(SQLModel, table=True):
 
 
 class ConsoleLine(SQLModel, table=True):
-    """A line of Webots' console that waits for a run of its simulation; a log row after that."""
+    """A line of Webots' console that waits for a run of its simulation.
+
+    Afterwards it is a log row.
+    """
 
     __tablename__: ClassVar[Any] = "console_line"
     __table_args__ = (_KEEP_IDS,)
@@ -357,7 +359,7 @@ class EventTable(SQLModel, table=True):
 
 
 class Command(SQLModel, table=True):
-    """A request to a robot and its fate: claimed by one session, at most once."""
+    """A request to a robot and its outcome: claimed by one session, at most once."""
 
     __table_args__ = (
         _partial("ix_command_pending", "status = 'pending'"),
@@ -388,9 +390,9 @@ class Command(SQLModel, table=True):
 
 
 class ClientRequest(SQLModel, table=True):
-    """What was asked for that changes something, by whom, and whether it was allowed.
+    """A request that changes something: who sent it, and whether it was allowed.
 
-    No row is ever deleted, and what was asked for cannot be changed.
+    Rows are never deleted, and the request itself cannot be changed.
     """
 
     __tablename__: ClassVar[Any] = "request"
@@ -412,9 +414,9 @@ class ClientRequest(SQLModel, table=True):
 
 
 class Breakpoint(SQLModel, table=True):
-    """A condition that a robot's bridge asks of each published state, and what it does then.
+    """A condition that a robot's bridge checks for each published state, and what it does then.
 
-    An expectation is one as well: its condition is that it does not hold.
+    An expectation is stored as a breakpoint whose condition is that the expectation does not hold.
     """
 
     __table_args__ = (Index(None, "robot_id"), Index(None, "session_id"), _KEEP_IDS)
@@ -463,7 +465,7 @@ class KeptStretch(SQLModel, table=True):
 
 
 class KeptState(SQLModel, table=True):
-    """What a call of `publish` holds that only a kept stretch has; the others are in `state`."""
+    """A call of `publish` that only a full-rate segment has; the other calls are in `state`."""
 
     __tablename__: ClassVar[Any] = "kept_state"
     __table_args__ = (
@@ -538,7 +540,7 @@ class ParameterValue(SQLModel, table=True):
 
 
 class TrialSet(SQLModel, table=True):
-    """Runs with chosen parameters, each scored, of which the best is looked for."""
+    """Runs with chosen parameters, each scored, to find the best."""
 
     __tablename__: ClassVar[Any] = "trial_set"
     __table_args__ = (
@@ -589,7 +591,7 @@ class Trial(SQLModel, table=True):
 
 
 class Lease(SQLModel, table=True):
-    """Who alone may do a job (today: `maintainer`) until when."""
+    """The process that alone may do a job (today: `maintainer`), and until when."""
 
     name: str = Field(sa_column=Column(Text, primary_key=True))
     holder: str = _text(nullable=False)
@@ -597,7 +599,10 @@ class Lease(SQLModel, table=True):
 
 
 class RetentionLimit(SQLModel, table=True):
-    """How much of a kind is kept; without a number all of it, without a row the default."""
+    """How much of a kind is kept.
+
+    A limit without a number keeps all, a kind without a row has the default.
+    """
 
     __tablename__: ClassVar[Any] = "retention_limit"
     kind: str = Field(

@@ -72,12 +72,13 @@ TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "remove_node": ("webots_edit_scene", "webots_remove_node"),
 }
 ANY_ACTION: Final = (
-    "webots_send_command"  # the tool that sends any: it stands for none of the others
+    "webots_send_command"  # the tool that sends any action: it stands for none of the others
 )
 _PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
 ASKS: Final = "ask"
 _HOLDS_FOR: Final = ("everyone", "assistants")
-_OTHER_KEYS: Final = ("expect", "signals", "inspect", "tape")  # which others read
+# tables of the file that other modules read
+_OTHER_KEYS: Final = ("expect", "signals", "inspect", "tape")
 _KEYS: Final = (*_PATTERNS, "parameters", LAUNCH, "holds_for")
 _ASK: Final = (
     "Do not look for another way to the same: the person whose project it is can change that line, "
@@ -90,10 +91,10 @@ class Policy:
     """What a file allows.
 
     Attributes:
-        file: Where it stands.
-        text: All of the file, for the numbers of lines.
+        file: The file.
+        text: The whole file, from which line numbers are derived.
         allow: Its table.
-        agreed: Its rules that ask the person, to which the person has agreed.
+        agreed: The rules that ask the person, to which the person has agreed.
     """
 
     file: Path
@@ -106,12 +107,15 @@ class Policy:
         return replace(self, agreed=agreed)
 
     def holds_for(self, transport: str) -> bool:
-        """Whether it binds who asks that way: `stdio` and `http` are assistants'."""
+        """Return whether the policy binds callers of that transport.
+
+        `stdio` and `http` are assistants.
+        """
         everyone = self.allow.get("holds_for", _HOLDS_FOR[0]) == _HOLDS_FOR[0]
         return everyone or transport in ("stdio", "http")
 
     def require_tool(self, names: Sequence[str]) -> None:
-        """Refuse a tool, by its own name or that of the one that it is a part of.
+        """Refuse a tool by its own name or by the name of the tool that it is a part of.
 
         Raises:
             NotAllowedError: The file does not allow it.
@@ -120,15 +124,15 @@ class Policy:
         self._require("tools", names, f"{names[0]} is not allowed")
 
     def require(self, action: str, params: Mapping[str, Any], asked: Sequence[str] = ()) -> None:
-        """Refuse an action that the file does not allow, or not with these parameters.
+        """Refuse an action that the file does not allow, or does not allow with these parameters.
 
         Args:
-            action: As a command names it, or `LAUNCH`.
+            action: The action as a command names it, or `LAUNCH`.
             params: Its parameters.
-            asked: The names of the tool or command that was asked for.
+            asked: The names of the tool or command that the caller used.
 
         Raises:
-            NotAllowedError: Which line of it does not.
+            NotAllowedError: A line of the file forbids it; the error names the line.
             ConsentRequiredError: It does if the person agrees.
         """
         self._require_route(action, asked)
@@ -163,14 +167,14 @@ class Policy:
             self._require_values(values)
 
     def _require_not_forbidden(self, brought_about: str, action: str) -> None:
-        """Refuse what another action brings about, where a pattern forbids it."""
+        """Refuse an action if a pattern forbids another action that it causes."""
         patterns = cast("list[str]", self.allow.get("actions", []))
         if any(fits_pattern(_bare(each), brought_about) for each in patterns):
             said = f"{brought_about!r}, which this {action!r:.100} does as well, is not allowed"
             self._require("actions", [brought_about], said)
 
     def _require_route(self, action: str, asked: Sequence[str]) -> None:
-        """Refuse what the tools of an action may not do, also if another one is asked for it."""
+        """Refuse what the tools of an action may not do, whichever tool requested it."""
         tools = TOOLS_OF_ACTIONS.get(action, ())
         patterns = cast("list[str]", self.allow.get("tools", []))
         is_named = any(fits_pattern(_bare(p), tool) for p in patterns for tool in tools)
@@ -179,11 +183,12 @@ class Policy:
             self._require("tools", tools, by)
 
     def _require_world(self, world: object) -> None:
-        """By its path from the project or from its folder of worlds, with links followed."""
+        """Check a world by its path from the project or its folder of worlds, links resolved."""
         if "worlds" not in self.allow:
             return
         given = Path(str(world))
-        if not given.is_absolute():  # a controller would take it from another folder than this one
+        # a controller would load it from another folder than this process
+        if not given.is_absolute():
             said = f"{str(world)!r:.100} is no full path of a world, and so not allowed"
             raise self._refusal("worlds", said)
         try:
@@ -212,7 +217,7 @@ class Policy:
                 raise self._refusal("parameters", said, key)
 
     def _require(self, key: str, names: Sequence[str], said: str) -> None:
-        """The last pattern that fits one of the names decides."""
+        """Apply the last pattern that matches one of the names."""
         patterns = cast("list[str] | None", self.allow.get(key))
         if patterns is None:
             return
@@ -234,19 +239,19 @@ class Policy:
             raise ConsentRequiredError(asks, rule)
 
     def _rule(self, key: str, inside: str | None) -> str:
-        """Return the file, the line, and what stands there."""
+        """Return the file, the line and the text of a rule."""
         line = line_of(self.text, key, inside)
         shown = self.text.splitlines()[line - 1].partition("#")[0].strip()
         return f"{self.file}, line {line}: {shown:.200}"
 
 
 def _bare(pattern: str) -> str:
-    """Return a pattern without the mark that it forbids or asks."""
+    """Return a pattern without the mark for forbidding or asking."""
     return pattern[1:] if pattern[:1] in ("!", "?") else pattern
 
 
 def _brought_about(action: str, params: Mapping[str, Any]) -> Iterator[str]:
-    """The other actions whose effect an action has: a rule that forbids one of them holds for it.
+    """Return the other actions whose effect an action has, because a rule against one forbids it.
 
     A run with `reset` is not among them: it needs both to be allowed.
     """
@@ -267,11 +272,11 @@ def _is_within(value: object, rule: Any) -> bool:
     if isinstance(rule[0], str):
         return value in rule
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return is_number and rule[0] <= cast("float", value) <= rule[1]  # NaN is within nothing
+    return is_number and rule[0] <= cast("float", value) <= rule[1]  # NaN lies within no range
 
 
 def line_of(text: str, key: str, inside: str | None = None) -> int:
-    """Where a key of the table stands, or within it a name or a text; from 1."""
+    """Return the line of a key of the table, or of a name or text within it; from 1."""
     lines, table, found = text.splitlines(), "", 1
     parts = [re.escape(key)] + ([re.escape(inside)] if inside else [])
     for number, line in enumerate(lines, 1):
@@ -288,18 +293,21 @@ def line_of(text: str, key: str, inside: str | None = None) -> int:
 
 
 def policies_of(database: Database, data_dir: Path, files: Iterable[str]) -> Iterator[Policy]:
-    """Those of each `webots-mcp.toml` in or above the folders that a request is about; all hold.
+    """Return the policies of each `webots-mcp.toml` in or above the folders of a request.
 
-    Not only that of the project: which folder is one can be changed by making folders in it.
+    All apply.
+
+    The file of the project is not enough: creating folders inside a project changes which folder is
+    the project.
 
     Args:
-        database: Of the recording; the file beside it holds wherever its pictures are.
+        database: The recording; the file next to it applies wherever its pictures are.
         data_dir: The folder of its pictures.
-        files: Of the world that is started or opened, and of those that are live with their
-            controllers: what they record may lie outside of their project.
+        files: The world that is started or opened, and the worlds of running simulations with their
+            controllers, which may belong to other projects.
 
     Raises:
-        NotAllowedError: A file is invalid: as long as it is, nothing is allowed.
+        NotAllowedError: A file is invalid; nothing is allowed until it is corrected.
     """
     below = [database.parent] if isinstance(database, Path) else []
     below += [data_dir, *(Path(each).parent for each in files)]
@@ -311,15 +319,15 @@ def policies_of(database: Database, data_dir: Path, files: Iterable[str]) -> Ite
 
 
 def is_named(policies: Iterable[Policy], action: str) -> bool:
-    """Return whether a file allows an action by its name, and not by a pattern."""
+    """Return whether a file allows an action by its name and not by a pattern."""
     return any(action in policy.allow.get("actions", ()) for policy in policies)
 
 
 def read_policy(file: Path) -> Policy | None:
-    """What a project's file allows; None where it has no such table.
+    """Return what a project's file allows; None if it has no such table.
 
     Raises:
-        NotAllowedError: It is invalid: which line, and why.
+        NotAllowedError: The file is invalid; the error names the line and the reason.
     """
     try:
         text, content = load_toml(file)
@@ -343,7 +351,7 @@ def read_policy(file: Path) -> Policy | None:
 
 
 def _faults(allow: Any) -> Iterator[tuple[str, str]]:
-    """What is wrong with the table: its key, and why."""
+    """Yield the faults of the table: key and reason."""
     if not isinstance(allow, dict):
         yield ALLOW, "allow must be a table: [allow]"
         return
@@ -385,7 +393,7 @@ def _faults_of_parameters(rules: Any) -> Iterator[tuple[str, str]]:
 
 
 def _asks_behind_what_is_allowed(patterns: Sequence[str]) -> bool:
-    """Return whether another name of what asks could be one of what is allowed."""
+    """Return whether a name that asks, other than the allowed one, could match what is allowed."""
     marks = [pattern.startswith("?") for pattern in patterns]
     return marks != sorted(marks, reverse=True)
 

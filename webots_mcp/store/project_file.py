@@ -47,44 +47,48 @@ _OF_MEANING: Final = ("robot_name", "name", *MEANING_FIELDS)
 
 
 class Expected(NamedTuple):
-    """An entry of the file; `robot` is a name, or `ALL`."""
+    """An entry of the file; `robot` is a name or `ALL`."""
 
     expectation: Expectation
     robot: str
 
 
 class DescribedSignal(NamedTuple):
-    """An entry of the table `[signals]`; `robot` is a name, or `ALL`."""
+    """An entry of the table `[signals]`; `robot` is a name or `ALL`."""
 
     meaning: DeclaredMeaning
     robot: str
 
 
 class ProjectFile(NamedTuple):
-    """What the file of a project says of its robots."""
+    """What the file of a project declares about its robots."""
 
     expected: list[Expected]
     signals: list[DescribedSignal]
 
 
-NO_PROJECT: Final = ProjectFile([], [])  # of where there is no file
+NO_PROJECT: Final = ProjectFile([], [])  # stands for a missing file
 
 
 def file_of(data_dir: Path) -> Path | None:
-    """The file of the project that a data folder is of, or in that folder; None without one."""
+    """Return the project file that belongs to a data folder, or lies in it.
+
+    None if there is none.
+    """
     found = (each and each / PROJECT_FILE for each in (find_project(data_dir), data_dir))
     return next((file for file in found if file and file.is_file()), None)
 
 
 def read_project(file: Path) -> ProjectFile:
-    """Read what the file says of expectations and signals.
+    """Read expectations and signals from the file.
 
     Raises:
-        InvalidInputError: It cannot be read, or something in it is invalid: which line, and why.
+        InvalidInputError: The file cannot be read or has an invalid entry; the error names the line
+            and the reason.
     """
     text, content = load_toml(file)
-    content.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
-    check_table(file, content.pop(TABLE, {}))  # which bridges read themselves
+    content.pop("allow", None)  # Read by `policy`: each part is valid while the other is invalid.
+    check_table(file, content.pop(TABLE, {}))  # keys that bridges read themselves
     signals = content.pop("signals", {})
     if (tape := content.pop("tape", False)) not in (True, False, "images"):
         raise InvalidInputError(f'{file}: tape must be true, false or "images", not {tape!r:.80}')
@@ -106,7 +110,10 @@ def read_project(file: Path) -> ProjectFile:
 
 
 def _signals_in(file: Path, text: str, table: Any) -> list[DescribedSignal]:
-    """The entries of the table [signals]; a table of tables is of the robot of that name."""
+    """Return the entries of the table [signals].
+
+    A nested table belongs to the robot of that name.
+    """
     if not isinstance(table, dict):
         raise InvalidInputError(
             f"{file}, line {_signal_line(text)}: signals must be a table: [signals]"
@@ -137,7 +144,7 @@ def _is_table(value: Any) -> bool:
 
 
 def _signal_line(text: str, signal: str = "") -> int:
-    """The first line of the table, or behind it the first one that has the signal's name."""
+    """Return the first line of the table, or the first line after it that has the signal's name."""
     lines = text.splitlines()
     starts = (at for at, line in enumerate(lines) if re.match(r"\s*\[?\s*signals\b", line))
     start = next(starts, 0)
@@ -147,16 +154,16 @@ def _signal_line(text: str, signal: str = "") -> int:
 
 
 def load_toml(file: Path) -> tuple[str, dict[str, Any]]:
-    """The text of a file, and what it says.
+    """Return the text of a file and its parsed content.
 
     Raises:
         InvalidInputError: It cannot be read, or is not TOML.
     """
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
-        text = file.read_text("utf-8-sig")  # with the mark that editors of Windows put before it
+        text = file.read_text("utf-8-sig")  # with the byte order mark that editors of Windows write
         return text, cast("dict[str, Any]", toml.loads(text))
-    except (ValueError, RecursionError) as error:  # also what is not UTF-8
+    except (ValueError, RecursionError) as error:  # also for text that is not UTF-8
         raise InvalidInputError(f"{file} is not valid TOML: {error}") from error
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be read: {error.strerror}") from error
@@ -179,7 +186,7 @@ def _entry(file: Path, text: str, number: int, table: dict[str, Any]) -> Expecte
 
 
 def _line_of(text: str, number: int, why: str, table: dict[str, Any]) -> int:
-    """That of the key that is wrong, else where its table begins."""
+    """Return the line of the invalid key, else the line where its table begins."""
     lines = text.splitlines()
     starts = [at for at, line in enumerate(lines) if re.match(r"\s*\[\[\s*expect\s*\]\]", line)]
     if number >= len(starts):  # written as an array of inline tables
@@ -194,7 +201,7 @@ def _line_of(text: str, number: int, why: str, table: dict[str, Any]) -> int:
 
 
 def compile_project(connection: sqlite3.Connection, project: ProjectFile) -> None:
-    """Let the database say what the file says, and nothing that it does not say any more."""
+    """Replace what the database holds of the project file by its current content."""
     wanted = {(*each.expectation.asks, each.robot): each.expectation for each in project.expected}
     there = {
         tuple(row[:4]): row[4]
@@ -235,7 +242,7 @@ def compile_project(connection: sqlite3.Connection, project: ProjectFile) -> Non
 
 
 class ProjectWatch:
-    """Compiles the file of a recording's project again where it has changed."""
+    """Compile the file of a recording's project again when it changes."""
 
     def __init__(self, data_dir: Path) -> None:
         self._data_dir = data_dir

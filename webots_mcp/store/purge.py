@@ -1,9 +1,9 @@
-"""Carrying out a plan, a little at a time, so that no writer has to wait for it.
+"""Carry out a retention plan in small steps, so that no writer has to wait.
 
-Rows go in transactions of about a millisecond, as many at once as that allows; between two of them
-the caller rests for longer than the lock was held. The tables take turns, and space that became
-free goes back to the disk in between. Where another writer holds the lock, it is tried again later.
-State rows go only after their values were put into chunks.
+Rows are deleted in transactions of about a millisecond. Between two transactions the caller rests
+for longer than the lock was held. The tables take turns, and freed space returns to the disk in
+between. If another writer holds the lock, the write is retried later. State rows are deleted only
+after their values were put into chunks.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _COUNT_PURGED: Final = (
     "UPDATE run SET purged_rows = purged_rows + "
     "(SELECT count(*) FROM going WHERE run_id = run.id) WHERE id IN (SELECT run_id FROM going)"
 )
-# What goes from the states and lies in a kept stretch stays with it, under a limit of its own.
-# CROSS JOIN: SQLite would go through all states in their order rather than sort the few that go.
+# Deleted states within a full-rate segment stay in it, under a limit of its own. CROSS JOIN:
+# otherwise SQLite would scan all states in order instead of sorting the few that are deleted.
 _MOVE_KEPT: Final = (
     "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, replaced) "
     "SELECT s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.replaced FROM going g "
@@ -65,15 +65,15 @@ _BEFORE_DELETION: Final = {
     "run": (_FORGET_SESSIONS,),
 }
 _DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
-_PATHS: Final = {  # of the pictures that go with rows
+_PATHS: Final = {  # pictures that are deleted with rows
     "image": "SELECT path FROM image WHERE id IN (SELECT id FROM temp.going)",
     "run": "SELECT path FROM image WHERE run_id IN (SELECT id FROM temp.going)",
 }
-_TAPES: Final = (  # of the sessions that may go with runs
+_TAPES: Final = (  # sessions that may be deleted with runs
     "SELECT DISTINCT s.uuid FROM session s JOIN run r ON r.session_id = s.id "
     "WHERE r.id IN (SELECT id FROM temp.going)"
 )
-INTERVAL_S: Final = 60.0  # between two checks; one of ten million rows takes about a second
+INTERVAL_S: Final = 60.0  # between two checks; a check of ten million rows takes about a second
 BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
 
 
@@ -137,7 +137,7 @@ class Purged:
 
     @property
     def rest_s(self) -> float:
-        """How long to leave the lock to others now."""
+        """Return how long to leave the lock to other processes now."""
         return max(_LIMITS.rest_s, _LIMITS.rests * self.held_s)
 
 
@@ -150,15 +150,16 @@ def prune(
     rest: bool = True,
     progress: Callable[[int, int], object] | None = None,
 ) -> Purged:
-    """Delete what is beyond the limits, and give the space back to the disk.
+    """Delete everything beyond the limits, and return the space to the disk.
 
     Args:
-        connection: Of the role "writer", in autocommit mode, with a short busy timeout.
+        connection: A connection of the role "writer", in autocommit mode, with a short busy
+            timeout.
         data_dir: The folder that the paths of pictures are relative to.
         retention: The limits.
         now_s: Unix time, from which ages are counted; None for now.
-        rest: Leave the lock to others for longer than it was held; false where no robot records.
-        progress: Called after each batch with the rows deleted so far and in all.
+        rest: Leave the lock free for longer than it was held; false if no robot records.
+        progress: Called after each batch with the number of deleted rows and the total.
 
     Raises:
         DatabaseError: Another process held the write lock all the time.
@@ -178,20 +179,20 @@ def prune(
 def purge(
     connection: sqlite3.Connection, wanted: Plan, data_dir: Path, spare_pages: int = 0
 ) -> Iterator[Purged]:
-    """Carry out a plan, write by write; the caller rests wherever this yields.
+    """Carry out a plan write by write; the caller rests at each yield.
 
     Args:
         connection: As for `prune`.
         wanted: The plan.
         data_dir: The folder that the paths of pictures are relative to.
-        spare_pages: So many free pages stay in the file, for the rows to come.
+        spare_pages: Number of free pages that stay in the file for new rows.
 
     Yields:
-        What was deleted so far; always the same object, and once at least.
+        What was deleted so far: always the same object, at least once.
     """
     work = _Purge(connection, data_dir, spare_pages)
     yield work.purged
-    # Chunks go after the states that they stand for, and a run after all that it holds.
+    # Chunks are deleted after their states, and a run after everything that belongs to it.
     for tables in (
         ("state", "kept_state", "log", "event", "image", "command"),
         ("chunk",),
@@ -205,14 +206,14 @@ def purge(
 
 
 class _Pace:
-    """How many to take at once, so that they take about half the time that the lock may be held."""
+    """Number of items per write; a write takes about half the time that the lock may be held."""
 
     def __init__(self) -> None:
         self.count = 8
 
     def measure(self, count: int, held_s: float) -> None:
-        """Go on from what these have taken; twice as many at most."""
-        fitting = count * LONGEST_WRITE_S / 2 / max(held_s, 1e-6)  # some take twice as long
+        """Adapt to the duration of the last write; at most double the number."""
+        fitting = count * LONGEST_WRITE_S / 2 / max(held_s, 1e-6)  # some writes take twice as long
         self.count = max(1, min(int(fitting), 2 * self.count, BATCH_ROWS))
 
 
@@ -227,7 +228,7 @@ class _Purge:
         self.purged = Purged()
 
     def in_turn(self, tables: Sequence[Iterator[Purged]]) -> Iterator[Purged]:
-        """A write of each table, then some of the space back, until nothing is left to delete."""
+        """Yield writes of each table in turn and returns of space, until nothing remains."""
         left = list(tables)
         while left:
             for table in tuple(left):
@@ -239,12 +240,12 @@ class _Purge:
                 yield self.purged
 
     def give_back(self) -> Iterator[Purged]:
-        """Return what is free to the disk: many small transactions (SQLite, PRAGMA auto_vacuum)."""
+        """Return free space to the disk in many small transactions (SQLite, PRAGMA auto_vacuum)."""
         while self._give_some_back():
             yield self.purged
 
     def carry_out(self, steps: Sequence[Going]) -> Iterator[Purged]:
-        """Delete what has to go of a table."""
+        """Delete the steps of one table."""
         for step in steps:
             if step.portion is None:
                 yield from self._by_key(step)
@@ -254,12 +255,12 @@ class _Purge:
                 yield from self._in_no_group(step.portion)
             else:
                 group_id = step.portion.group_id
-                if step.table == "state":  # its rows are needed to make a damaged group anew
+                if step.table == "state":  # its rows are needed to remake a damaged group
                     group_id = remake_if_damaged(self._connection, group_id)
                 yield from self._rows(step.portion._replace(group_id=group_id))
 
     def _in_no_group(self, portion: Portion) -> Iterator[Purged]:
-        """Delete states that are in no group; they become one first."""
+        """Put states that are in no group into one, then delete them."""
         while not self._unless_locked(lambda: self._chunked(portion.run_id)):
             yield self.purged
         found = self._connection.execute(
@@ -269,16 +270,16 @@ class _Purge:
         ).fetchall()
         for group_id, rows in found:
             yield from self._rows(portion._replace(group_id=group_id, rows=rows))
-        yield from self._rows(portion)  # what no bridge writes is in no chunk
+        yield from self._rows(portion)  # rows that no bridge writes are in no chunk
 
     def _chunked(self, run_id: int) -> bool:
-        """Put rows into chunks for a moment; whether all rows of a run are in one."""
+        """Put rows into chunks for a moment. Return whether all rows of a run are in chunks."""
         if not make_chunks(self._connection, _LIMITS.chunked_rows).done:
             return False
         return chunk_whole_run(self._connection, run_id)
 
     def _rows(self, portion: Portion) -> Iterator[Purged]:
-        """Delete the rows of a portion, in the order of their ids, but none that came since."""
+        """Delete the rows of a portion in the order of ids, except rows added since."""
         ids = [row_id for row_id in ids_of(self._connection, portion) if row_id <= portion.last_id]
         yield from self._delete(
             portion.table, [(row_id, portion.run_id) for row_id in ids], portion.group_id
@@ -293,9 +294,9 @@ class _Purge:
             )
 
     def _chunks(self, step: Going, portion: Portion) -> Iterator[Purged]:
-        """The chunks of a group, which no reader sees any more."""
-        # Readers skip a group that is not complete. If this process ends now, the maker of chunks
-        # deletes the rest.
+        """Delete the chunks of a group that readers no longer use."""
+        # Readers skip an incomplete group. If this process ends now, the maker of chunks deletes
+        # the rest.
         if not self._execute(
             "UPDATE row_group SET is_complete = 0 WHERE id = ? AND is_complete = 1 "
             f"AND stored_row_count = 0 AND NOT EXISTS (SELECT 1 FROM run WHERE id = ? AND {KEPT})",
@@ -312,7 +313,7 @@ class _Purge:
         yield self.purged
 
     def forget_frames(self) -> Iterator[Purged]:
-        """Delete the frames of kept stretches that are gone, with their files."""
+        """Delete the camera frames of removed full-rate segments, with their files."""
         after = 0
         # These frames belong to no full-rate segment any more.
         while found := self._connection.execute(
@@ -326,7 +327,7 @@ class _Purge:
             yield from self._delete("image", found)
 
     def _by_key(self, step: Going) -> Iterator[Purged]:
-        """A run, or commands of a robot."""
+        """Delete a run, or commands of a robot."""
         keys = [(step.owner_id, step.owner_id)]
         if step.table == "command":
             before = {"robot_id": step.owner_id, "before_s": step.newest_s, "limit": step.rows}
@@ -339,16 +340,16 @@ class _Purge:
     def _delete(
         self, table: str, keys: Sequence[tuple[int, int]], group_id: int | None = None
     ) -> Iterator[Purged]:
-        """Rows by their ids, each with its run, which goes on if it was marked since the plan."""
+        """Delete rows by id, each with its run; a run that was marked since the plan is skipped."""
         while keys:
             keys = keys[self._unless_locked(partial(self._run_step, table, keys, group_id)) :]
             yield self.purged
 
     def _run_step(self, table: str, keys: Sequence[tuple[int, int]], group_id: int | None) -> int:
-        """One short transaction; returns how many of the keys are done."""
+        """Run one short transaction. Return how many of the keys are done."""
         pace = self._paces[table]
         some = keys[: pace.count]
-        # One statement deletes many rows at once, see `AtomicStatements`. Rows that are left in
+        # One statement deletes many rows at once, see `AtomicStatements`. Rows that remain in
         # `going` were deleted.
         self._connection.execute(
             "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
@@ -381,10 +382,10 @@ class _Purge:
         except OSError as error:
             self.purged.problems.append(f"{path}: {error}")
         except (InvalidInputError, NothingRecordedError):
-            pass  # a foreign path is not ours to delete, and a file that is gone need not be
+            pass  # A foreign path must not be deleted, and a missing file need not be.
 
     def _give_some_back(self) -> bool:
-        """One short transaction of it; whether there may be more."""
+        """Return some space in one short transaction. Return whether more may remain."""
         free = self._pragma("freelist_count")
         if self._pragma("auto_vacuum") != 2 or free <= self._spare_pages:
             return False
@@ -411,11 +412,14 @@ class _Purge:
         return row[0] if row else None
 
     def _execute(self, statement: str, *values: object) -> int:
-        """How many rows a short statement of its own changed; 0 where it was locked."""
+        """Run a short statement of its own.
+
+        Return how many rows changed; 0 if the database was locked.
+        """
         return self._unless_locked(lambda: self._connection.execute(statement, values).rowcount)
 
     def _unless_locked(self, write: Callable[[], int]) -> int:
-        """How many were written; 0 where another holds the write lock."""
+        """Return how many rows were written; 0 if another process holds the write lock."""
         try:
             written = write()
         except sqlite3.OperationalError as error:
@@ -436,7 +440,7 @@ class _Purge:
 
 
 class Upkeep:
-    """Retention as the work of a maintainer, which calls it once in each of its rounds.
+    """Run retention as part of a maintainer, which calls it once in each of its rounds.
 
         Maintainer(database, "server", work=Upkeep(data_dir))
 
@@ -465,7 +469,9 @@ class Upkeep:
         self._under_way: Iterator[Purged] | None = None
 
     def __call__(self, connection: sqlite3.Connection) -> None:
-        """Delete for a moment, if anything is beyond the limits.
+        """Delete for a moment, if anything exceeds the limits.
+
+        468.sqlite3.Error, DatabaseError: The next call starts with a new plan.
 
         Raises:
             sqlite3.Error, DatabaseError: The next call begins with a new plan.

@@ -1,7 +1,7 @@
-"""A recording as questions are asked of it: opened anew for each, but by a server.
+"""Give questions access to a recording, opened anew for each one, except by a server.
 
-Questions that fail over a row which no bridge writes are asked again without such rows, and jobs
-that one process at a time does in a recording hold a lease of it.
+Questions that fail because of a row that no bridge writes are repeated without such rows. Jobs that
+only one process at a time may do in a recording hold a lease of it.
 """
 
 from __future__ import annotations
@@ -73,13 +73,11 @@ GETTING_STARTED: Final = (
     "elsewhere, start the server with --data-dir or --database."
 )
 
-_MOST_IDLE: Final = 8  # connections: each may hold 2 MB of pages
 _ENDED: Final = {
     "crashed": "its controller crashed or was killed",
     "finished": "its controller finished",
     "superseded": "another bridge took its robot over",
 }
-_RENEW_EVERY_S: Final = 3.0
 _UNSTORABLE: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
     MalformedRowError,
@@ -87,15 +85,31 @@ _UNSTORABLE: Final = (
 
 
 @dataclass(frozen=True)
-class RobotView:
-    """One robot, one run, now: what an answer's header is made of.
+class ConnectionLimits:
+    """Connections and leases that a process keeps.
 
-    All of it was read in one moment, however long the answer takes to be put together: what comes
-    meanwhile would tell of a robot that stands still and yet has moved on.
+    Attributes:
+        idle: Idle connections, each of which may hold 2 MB of pages.
+        renew_every_s: Wall time between two renewals of a lease.
+    """
+
+    idle: int = 8
+    renew_every_s: float = 3.0
+
+
+_CONNECTIONS: Final = ConnectionLimits()
+
+
+@dataclass(frozen=True)
+class RobotView:
+    """One robot, one run, now: the content of an answer's header.
+
+    All of it was read at one moment, however long the answer takes to complete. Otherwise an answer
+    could describe a robot that stands still and yet has moved on.
 
     Attributes:
         state: The newest state of the run.
-        status: Whether time is moving in this run.
+        status: Whether time moves in this run.
     """
 
     connection: sqlite3.Connection
@@ -111,7 +125,7 @@ class RobotView:
         return self.robot.session
 
     def header(self) -> dict[str, Any]:
-        """The fields that every answer begins with."""
+        """Return the fields that every answer begins with."""
         sim_time_s, wall_time_s = self._newest_times()
         return {
             "robot": self.robot.name,
@@ -131,12 +145,12 @@ class RobotView:
         return {"newest_wall_time": utc(wall_time_s)}
 
     def _why(self) -> str | None:
-        """Why time stands still; of a robot that is gone also what a later start has said."""
+        """Return why time stands still; for an ended robot also what a later start reported."""
         trouble = None if self.robot.live else console_trouble(self.connection)
         return "; ".join(filter(None, (self.status.why, trouble))) or None
 
     def position_by(self) -> dict[str, Any]:
-        """Who saw where the robot is, where it does not know that itself: for what tells of it."""
+        """Return who saw where the robot is, if it does not know that itself."""
         if self.run is None or self.state is None:
             return {}
         newest, state = StateColumns(), self.state
@@ -154,7 +168,10 @@ class RobotView:
         )
 
     def _newest_times(self) -> tuple[float, float] | tuple[None, None]:
-        """Of the newest state; before the first one, of the run's last sign of life."""
+        """Return the times of the newest state.
+
+        Before the first one, of the run's last sign of life.
+        """
         if self.state is not None:
             return self.state.sim_time_s, self.state.wall_time_s
         if self.run is not None:
@@ -162,24 +179,25 @@ class RobotView:
         return None, None
 
     def age_s(self, wall_time_s: float) -> float:
-        """How long ago that was, to 10 ms; of what is over an hour old, to the second."""
+        """Age of the newest data, to 10 ms; to the second if over an hour."""
         age_s = max(self.now_s - wall_time_s, 0.0)
         return round(age_s, 2) if age_s <= LONG_AGO_S else round(age_s)
 
     def require_run(self) -> RunRecord:
-        """The run; see `subject.require_run`."""
+        """Return the run; see `subject.require_run`."""
         return require_run(self.robot, self.run)
 
     @property
     def subject(self) -> Subject:
-        """What a question about this robot and this run is about."""
+        """The subject of a question about this robot and this run."""
         return Subject(self.robot.id, self.robot.name, self.require_run().id)
 
 
 class OpenReaders:
-    """Connections that a server keeps open between its questions: a few, each with its cache.
+    """Connections that a server keeps open between its questions, each with its cache.
 
-    One is used again as long as its file is the one that it was opened to, and so is the schema.
+    A connection is used again if its file is still the one that it was opened for, and its schema
+    has not changed.
     """
 
     def __init__(self) -> None:
@@ -190,9 +208,10 @@ class OpenReaders:
     def taken(
         self, database: Path, open_one: Callable[[], sqlite3.Connection]
     ) -> Generator[sqlite3.Connection]:
-        """One for a question; it is closed where the question fails.
+        """Lend a connection for one question; it is closed if the question fails.
 
-        Those that leave out invalid rows are kept apart: their views take longer than a question.
+        Connections that leave out invalid rows are kept apart: their views take longer than a
+        question.
         """
         idle = self._idle[is_past_invalid_rows()]
         while True:
@@ -211,7 +230,7 @@ class OpenReaders:
         except BaseException:
             connection.close()
             raise
-        is_enough = len(idle) >= _MOST_IDLE
+        is_enough = len(idle) >= _CONNECTIONS.idle
         if known is None or is_enough or isinstance(connection, FrozenConnection):
             connection.close()
         else:
@@ -220,7 +239,7 @@ class OpenReaders:
             self.close()
 
     def close(self) -> None:
-        """Close all that are not in use, and those when they are given back."""
+        """Close all idle connections, and the others when they are returned."""
         self._is_closed = True
         for idle in self._idle.values():
             while idle:
@@ -228,7 +247,7 @@ class OpenReaders:
 
 
 def _identity(database: Path, connection: sqlite3.Connection) -> object:
-    """Of the files, and of the schema that SQLite counts the changes of; None of what is gone."""
+    """Return the identity of the files and the schema version of SQLite; None for missing files."""
     try:
         version = connection.execute("PRAGMA schema_version").fetchone()
         return identify_files(database), version, is_chunked_aside(connection, database)
@@ -238,14 +257,14 @@ def _identity(database: Path, connection: sqlite3.Connection) -> object:
 
 @dataclass(frozen=True)
 class RecordingAccess:
-    """A database, the folder of its pictures, and whether the asker may write.
+    """A database, the folder of its pictures, and whether the caller may write.
 
-    Nothing is created here: without a database every question is answered with how to get one.
+    Nothing is created here: without a database, every question is answered with how to create one.
 
     Attributes:
-        limits: Those of how much is kept that the asker would like to hold.
-        asker: By whom commands are requested: `mcp` or `cli`.
-        readers: Keeps connections open; None to open one for each question.
+        limits: The retention limits that the caller would like.
+        asker: The source of commands: `mcp` or `cli`.
+        readers: Keeps connections open; None opens one for each question.
     """
 
     database: Database
@@ -257,9 +276,9 @@ class RecordingAccess:
 
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
-        """A connection that cannot write, and that no other uses meanwhile.
+        """Lend a read-only connection that no other question uses meanwhile.
 
-        What controllers wrote into journals is taken in first.
+        What controllers wrote into journals is ingested first.
         """
         self.ingest()
         if self.readers is None or not isinstance(self.database, Path):
@@ -275,28 +294,28 @@ class RecordingAccess:
 
     @contextmanager
     def writer(self) -> Generator[sqlite3.Connection]:
-        """A connection of its own that waits up to 5 s for the write lock."""
+        """Open a connection that waits up to 5 s for the write lock."""
         with self._opened("writer") as connection:
             yield connection
 
     @contextmanager
     def view(self, robot: str | None = None, run_id: int | None = None) -> Generator[RobotView]:
-        """Look at a robot (the only live one if none is named) and at its current or that run.
+        """Read a robot (the only live one by default) and its current run or the given one.
 
         Raises:
-            NothingRecordedError: There is no database, or no robot in it.
-            InvalidInputError: There is no such robot or run, or several robots are possible.
+            NothingRecordedError: The database does not exist or holds no robot.
+            InvalidInputError: The robot or run does not exist, or several robots are possible.
         """
         with self.reader() as connection:
             seen = view_robot(connection, robot, run_id)
             may_ask = not self.read_only and run_id is None and not seen.status.is_moving
             if may_ask and seen.session and ask_stuck(connection, seen.session, seen.now_s):
-                # Of the moment before: the signal may have woken the loop.
+                # As of the moment before: the signal may have woken the loop.
                 seen = view_of(connection, seen.robot, seen.now_s)
             yield seen
 
     def settle(self) -> None:
-        """Settle the commands that no live process will finish, unless `read_only`."""
+        """Finish the commands that no live process will finish, unless `read_only`."""
         if self.read_only:
             return
         with self.writer() as connection:
@@ -306,15 +325,16 @@ class RecordingAccess:
                 session_cleanup.reap(connection, time.time())
 
     def ingest(self) -> None:
-        """Take in what controllers wrote into journals; nothing where the asker may not write."""
+        """Ingest what controllers wrote into journals, unless the caller may not write."""
         database = self.database
         if not isinstance(database, Path) or (self.read_only and self.asker == "mcp"):
             return
-        # A server's maintainer recovers what bridges left; where a command is alone, it does.
+        # A server's maintainer recovers what bridges left; without a server, the command does.
         left = self.asker == "cli" and waiting_paths(database)
         if left or has_news(database):
             until_s = time.monotonic() + BUDGET_S
-            with suppress(DatabaseError):  # a locked or unwritable one: `storage` says what waits
+            # a locked or unwritable database: `storage` reports what waits
+            with suppress(DatabaseError):
                 self.create()
                 with self.writer() as connection:
                     if left:
@@ -322,10 +342,10 @@ class RecordingAccess:
                     ingest_journals(connection, database, until_s - time.monotonic())
 
     def create(self) -> None:
-        """Make the database where there is none, with its folder; one that is there is kept.
+        """Create the database and its folder, unless they exist.
 
         Raises:
-            DatabaseError: It cannot be made or written, or is not ours.
+            DatabaseError: It cannot be created or written, or has another format.
         """
         with (
             self._explained(),
@@ -372,7 +392,7 @@ class RecordingAccess:
 def view_robot(
     connection: sqlite3.Connection, robot: str | None, run_id: int | None = None
 ) -> RobotView:
-    """A view over an open connection; see `RecordingAccess.view`."""
+    """Return a view over an open connection; see `RecordingAccess.view`."""
     now_s = time.time()
     try:
         chosen, run = choose(connection, robot, run_id, now_s)
@@ -385,7 +405,7 @@ def view_robot(
 def view_of(
     connection: sqlite3.Connection, robot: RobotRecord, now_s: float, run: RunRecord | None = None
 ) -> RobotView:
-    """A view of a robot that is already known, and of that run or its newest one."""
+    """Return a view of a robot that is already known, and of that run or its newest one."""
     current = current_run(connection, robot.id)
     run = run or current
     if run is None or run == current:
@@ -403,7 +423,7 @@ def _of_earlier_run(run: RunRecord, now_s: float) -> Status:
 
 
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:
-    """What an answer says of the file that it was read from, and of rows that are not in it."""
+    """Return what an answer reports about its file, and about rows that are not in it."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     if not file:
         return {}
@@ -431,7 +451,7 @@ def storage(connection: sqlite3.Connection) -> dict[str, Any]:
 
 
 def waiting_rows_note(connection: sqlite3.Connection) -> str:
-    """What waits next to a database although its controller has ended or there was time; or ""."""
+    """Return what waits next to a database although its controller has ended or had time; or ""."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     if not file:
         return ""
@@ -453,12 +473,12 @@ def waiting_rows_note(connection: sqlite3.Connection) -> str:
 
 
 def name_of(database: Database) -> str:
-    """The database as a person knows it."""
+    """Return the name of the database for a person."""
     return "(in memory)" if isinstance(database, MemoryDatabase) else str(database)
 
 
 def _explain(error: Exception, database: Database) -> str:
-    """What a person can do about it."""
+    """Return what a person can do about an error."""
     text, name = text_of(error), name_of(database)
     if is_busy(error):
         return (
@@ -504,8 +524,8 @@ class Job:
     """What this process does as long as it holds the lease.
 
     Attributes:
-        recording: In which the lease is.
-        lease: Which this process has taken.
+        recording: The recording of the lease.
+        lease: The lease of this process.
     """
 
     recording: RecordingAccess
@@ -513,7 +533,7 @@ class Job:
 
     @contextmanager
     def writer(self) -> Generator[sqlite3.Connection]:
-        """A connection in a transaction, for what only the holder may write.
+        """Open a connection in a transaction, for writes that only the holder may do.
 
         Raises:
             LeaseLostError: Another process has the lease; nothing is written.
@@ -522,17 +542,17 @@ class Job:
             yield connection
 
     def require_held(self) -> None:
-        """See that it is still this process that does it.
+        """Raise an error unless this process still holds the lease.
 
         Raises:
-            LeaseLostError: Another one does.
+            LeaseLostError: Another process has the lease.
         """
         with self.writer():
             pass
 
     @contextmanager
     def renewed(self) -> Generator[None]:
-        """While this lasts, the lease does not run out."""
+        """Keep the lease from expiring during the block."""
         over = threading.Event()
         thread = threading.Thread(target=self._renew, args=(over,), daemon=True)
         thread.start()
@@ -543,8 +563,8 @@ class Job:
             thread.join()
 
     def _renew(self, over: threading.Event) -> None:
-        while not over.wait(_RENEW_EVERY_S):
-            with suppress(LeaseLostError):  # the worker finds out when it writes
+        while not over.wait(_CONNECTIONS.renew_every_s):
+            with suppress(LeaseLostError):  # the worker notices when it writes
                 self._renew_now()
 
     def _renew_now(self) -> None:
@@ -554,12 +574,12 @@ class Job:
             _log.warning("%s is not renewed: %s", self.lease.name, error)
 
 
-# What no bridge writes. Other programs may write to a recording, and SQLite takes any value in any
-# column: a question that meets one is asked again past it (`invalid_rows`).
+# Values that no bridge writes. Other programs may write to a recording, and SQLite accepts any
+# value in any column. A question that meets one is repeated without it (`invalid_rows`).
 
 
 def is_over_a_value(error: Exception) -> bool:
-    """Whether work on rows failed over what no bridge writes, not over the file."""
+    """Return whether work on rows failed because of an invalid value, not because of the file."""
     if is_damage(error):
         return False
     return isinstance(error, _UNSTORABLE) or is_about_a_value(error)

@@ -1,4 +1,4 @@
-"""The register of signals: every dotted name that a robot's states ever held."""
+"""Register signals: every dotted name that a robot's states ever held."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from webots_mcp.store.chunks import StateColumns
 
 
-_TURNING: Final = ("heading", "roll", "pitch")  # in radians where no unit is known
+_TURNING: Final = ("heading", "roll", "pitch")  # unit of angles if none is known: radians
 _ANGLES: Final = (*_TURNING, "joint position")
 _NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
-_TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as it is
+_TYPES: Final[dict[Kind, frozenset[type]]] = {  # number of values that can leave a kind unchanged
     "null": _NO_VALUES,
     "bool": _NO_VALUES | {bool},
     "num": _NO_VALUES | {int, float, bool},
@@ -44,16 +44,16 @@ _TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as
 
 @dataclass(frozen=True)
 class RegisteredSignal:
-    """A signal of a robot, and where its value stands in a state row.
+    """A signal of a robot, and the place of its value in a state row.
 
     Attributes:
-        id: In the register; None for one that was seen only in rows after the watermark.
+        id: Its id in the register; None if it was seen only in rows after the watermark.
         path: For `json_extract(state.data, path)`.
-        reduction: None, or how the long array at `path` becomes one number.
-        role: What it tells of the robot's motion, as `signal_register` decides; None of most.
-        is_choice: Its whole numbers, of which there are few, name what a robot does.
-        wraps_at: A whole turn, where its values show that it is an angle: see `as_angle`.
-        stated: What was declared of its meaning, or is known from its device, the strongest first;
+        reduction: How the long array at `path` becomes one number; None for other signals.
+        role: What it describes of the robot's motion, as `signal_register` decides; mostly None.
+        is_choice: Whether its values are few whole numbers that name what the robot does.
+        wraps_at: A full turn, if its values show that it is an angle: see `as_angle`.
+        stated: What was declared of its meaning or is known from its device, the strongest first;
             filled in by `meanings.with_stated`.
     """
 
@@ -71,10 +71,9 @@ class RegisteredSignal:
 
     @property
     def turn(self) -> float | None:
-        """A whole turn of an angle, in its unit; None of what is no angle.
+        """A full turn of an angle in its unit; None if the signal is no angle.
 
-        What was declared or is known from the device counts most, then the name, then how its
-        values behave.
+        What was declared or is known from the device counts first, then the name, then the values.
         """
         if self.wraps_at is not None:
             return self.wraps_at
@@ -91,24 +90,24 @@ class RegisteredSignal:
 
     @property
     def stated_unit(self) -> str | None:
-        """The unit that was declared, or that its device has; None without any."""
+        """The unit that was declared or belongs to its device; None without one."""
         return next(filter(None, (each.said.unit for each in self.stated)), None)
 
     @property
     def metres(self) -> float:
-        """What one of its unit is in metres: 1 of a length without a unit."""
+        """Metres per unit of the signal: 1 for a length without a unit."""
         return METRES.get(self.stated_unit or "") or metres_in(self.name)
 
     @property
     def may_be_angle(self) -> bool:
-        """Whether nothing but its values can tell that it is an angle."""
+        """Whether only its values can show that it is an angle."""
         said = any(each.said.quantity not in (None, *_ANGLES) for each in self.stated)
         is_plain = self.kind == "num" and not (self.is_index or self.is_choice or said)
         return is_plain and self.wraps_at is None and self.turn is None
 
     @property
     def is_index(self) -> bool:
-        """Whether it says which item of an array, not how much: it leaps and rests by nature."""
+        """Whether it is the index of an array's item: such a value jumps and rests by nature."""
         return self.reduction == "argmin"
 
     @property
@@ -118,7 +117,7 @@ class RegisteredSignal:
 
 
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, RegisteredSignal]:
-    """The signals of a robot in the register, by name."""
+    """Return the registered signals of a robot by name."""
     rows = connection.execute(
         "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
         "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id",
@@ -134,21 +133,21 @@ def _registered(signal: RegisteredSignal) -> RegisteredSignal:
 
 
 def stored_roles(known: dict[str, RegisteredSignal]) -> dict[str, str]:
-    """The roles of signals that have one, by their names."""
+    """Return the roles of signals that have one, by their names."""
     return {name: signal.role for name, signal in known.items() if signal.role is not None}
 
 
 def roles_of(
     known: dict[str, RegisteredSignal], position: tuple[str, str] | None = None
 ) -> dict[str, str]:
-    """The roles that these signals have among each other; see `decide_roles`."""
+    """Return the roles that these signals have among each other; see `decide_roles`."""
     kinds: dict[str, Kind] = {name: signal.kind for name, signal in known.items()}
     choices = {name for name, signal in known.items() if signal.is_choice}
     return decide_roles(kinds, choices, position)
 
 
 def with_roles(known: dict[str, RegisteredSignal]) -> dict[str, RegisteredSignal]:
-    """These signals with the roles that they have among each other."""
+    """Return these signals with the roles that they have among each other."""
     roles = roles_of(known)
     return {
         name: signal if signal.role == roles.get(name) else replace(signal, role=roles.get(name))
@@ -159,23 +158,23 @@ def with_roles(known: dict[str, RegisteredSignal]) -> dict[str, RegisteredSignal
 def enter_signals(
     connection: sqlite3.Connection, robot_id: int, seen: Mapping[str, Seen]
 ) -> dict[str, RegisteredSignal]:
-    """Enter what values of a robot's signals tell; return all that are registered, by name.
+    """Register the signals of some values. Return all registered signals by name.
 
-    Names beyond `MAX_SIGNALS` of a robot stay out.
+    Names beyond `MAX_SIGNALS` of a robot are left out.
     """
     write_changes(connection, robot_id, find_changes(connection, robot_id, seen))
     return registered(connection, robot_id)
 
 
 def may_widen(signal: RegisteredSignal | None, values: Iterable[object]) -> bool:
-    """Whether values may widen what is known of their signal; of most a look at types shows it."""
+    """Return whether values may widen the kind of a signal, judged by their types first."""
     if signal is None or signal.kind == "angle" or signal.is_choice:
         return True
     return signal.kind != "text" and not _TYPES[signal.kind].issuperset(map(type, values))
 
 
 def seen_in(columns: StateColumns, names: Iterable[str]) -> dict[str, Seen]:
-    """What rows tell of some signals; without those whose values stand nowhere."""
+    """Return the signals of some rows, without those whose values have no place."""
     found: dict[str, Seen] = {}
     for name in names:
         row = next(row for row, value in enumerate(columns.values[name]) if value is not ABSENT)
@@ -189,13 +188,13 @@ def seen_in(columns: StateColumns, names: Iterable[str]) -> dict[str, Seen]:
     return found
 
 
-@lru_cache(maxsize=8)  # a row that brings one new name mostly brings several
+@lru_cache(maxsize=8)  # a row with one new name usually has several
 def _places_of(data: str) -> dict[str, Place]:
     return places(parse(data))
 
 
 def _kind_of(name: str, values: Sequence[Any], *, ends_pose: bool) -> Kind:
-    """One value of each type, and the extremes, tell the kind as well as all values do."""
+    """Return the kind, derived from one value of each type and the extremes."""
     by_type: dict[type, Any] = {type(value): value for value in values}
     numbers = [value for value in values if type(value) is float or type(value) is int]
     found: Kind = "null"
@@ -205,7 +204,7 @@ def _kind_of(name: str, values: Sequence[Any], *, ends_pose: bool) -> Kind:
 
 
 def _are_choices(name: str, values: Sequence[Any]) -> bool:
-    """Whether the values of what may be a mode are few whole numbers, as far as they are known."""
+    """Return whether the known values of a possible mode are few whole numbers."""
     if not find_mode([name]):
         return False
     numbers = [value for value in values if type(value) is int]
@@ -217,7 +216,7 @@ def _are_choices(name: str, values: Sequence[Any]) -> bool:
 def seen_with(
     known: dict[str, RegisteredSignal], robot_id: int, columns: StateColumns
 ) -> dict[str, RegisteredSignal]:
-    """Signals as they are known after these rows, also those that are not registered."""
+    """Return signals as known after these rows, including those that are not registered."""
     fresh = [name for name, each in columns.values.items() if may_widen(known.get(name), each)]
     found = dict(known)
     for name, seen in seen_in(columns, fresh).items():
@@ -232,7 +231,7 @@ def seen_with(
 
 
 def cleaned(signal: RegisteredSignal, values: Sequence[Any]) -> list[Value]:
-    """Every value of the type that the signal's kind promises."""
+    """Return values converted to the type of the signal's kind."""
     if signal.kind == "bool":
         return [None if value is None else value in (1, True) for value in values]
     if signal.kind == "text":

@@ -1,6 +1,6 @@
-"""How long ago something was, in the words in which a person thinks of it, and the time of day.
+"""Word how long ago something was, and the time of day.
 
-Sentences use it for wall time; the data of an answer have the seconds, and the time of day.
+Sentences use this for wall time; the data of an answer have the seconds and the time of day.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from datetime import datetime, timezone
 from typing import Final
 
-LONG_AGO_S: Final = 3_600.0  # from here on an answer says the time of day as well
+LONG_AGO_S: Final = 3_600.0  # from this age on, an answer also has the time of day
 _MINUTE_S: Final = 60.0
 _UNITS: Final = (  # each is used from twice its length on: 90 minutes, not 2 hours
     (365.25 * 86_400.0, "years"),
@@ -20,10 +20,10 @@ _UNITS: Final = (  # each is used from twice its length on: 90 minutes, not 2 ho
 
 
 def age_in_words(seconds: float) -> str:
-    """Return an age: 0.4 s, 42 s, 5 minutes, 3 hours, 2 days, 5 months, 3 years.
+    """Return an age in words: 0.4 s, 42 s, 5 minutes, 3 hours, 2 days, 5 months, 3 years.
 
     Args:
-        seconds: The age; a negative one, of a clock that runs ahead, counts as none.
+        seconds: The age; a negative one, from a clock that runs ahead, counts as 0.
     """
     age_s = max(seconds, 0.0)
     for unit_s, unit in _UNITS:
@@ -33,7 +33,7 @@ def age_in_words(seconds: float) -> str:
 
 
 def ago(seconds: float) -> str:
-    """Return an age with `ago` behind it."""
+    """Return an age followed by `ago`."""
     return f"{age_in_words(seconds)} ago"
 
 
@@ -41,7 +41,7 @@ def utc(wall_time_s: float) -> str:
     """Return a moment of wall time to the second, in UTC, as `since` of the tools takes it."""
     try:
         moment = datetime.fromtimestamp(wall_time_s, timezone.utc)
-    except (OverflowError, OSError, ValueError):  # no bridge has written this
+    except (OverflowError, OSError, ValueError):  # no bridge writes such a time
         return f"{wall_time_s}"
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
@@ -50,5 +50,5 @@ def wall_clock(wall_time_s: float) -> str:
     """Return a moment of wall time in this machine's zone, as ISO 8601 with that zone."""
     try:
         return datetime.fromtimestamp(wall_time_s).astimezone().isoformat("T", "milliseconds")
-    except (OverflowError, OSError, ValueError):  # no bridge has written this
+    except (OverflowError, OSError, ValueError):  # no bridge writes such a time
         return f"{wall_time_s}"

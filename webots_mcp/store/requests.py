@@ -1,8 +1,8 @@
-"""What was asked for: each request that changes something is a row, and is checked by the policy.
+"""Record requests that change something, and check each of them by the policy.
 
-A request is begun where a tool, the command line or the page is asked. Whatever carries out a part
-of it (queues a command, starts Webots, gives an order to it, stores a breakpoint) asks `permit`
-first, which finds the request of its task: so no route goes round either.
+A request begins with a tool, a command line or the page. Every part of it that has an effect (a
+queued command, a started Webots, an order to it, a stored breakpoint) calls `permit` first, which
+finds the request of its task. So no route avoids the policy.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _SECRET: Final = re.compile(
     r"(^|[_\W])(pwd|pass|auth)($|[_\W\d])|(^|[_\W])key|key$|apikey",
     re.IGNORECASE,
 )
-_PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")  # of an address
+# parts of an address that is an argument
+_PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")
 _LEFT_OUT: Final = "(left out)"
 AGREED: Final = "the person agreed"
 _ASKED: Final = "the person is asked"
@@ -57,7 +58,7 @@ _LIMITS: Final = RequestLimits()
 
 
 class Requester(NamedTuple):
-    """Who asks: a program by its name and version, and the way that it asks.
+    """The caller: a program by its name and version, and its transport.
 
     Attributes:
         transport: `stdio` or `http` of an MCP client, `cli` or `page`.
@@ -72,11 +73,11 @@ BY_COMMAND_LINE: Final = Requester("webots-mcp", VERSION, "cli")
 
 
 class Consent:
-    """The consent of a person, who can be asked as long as a call of a client goes on.
+    """The consent of a person, who can be asked during a call of a client.
 
     Attributes:
         agreed: The rules to which the person has agreed for this call.
-        can_ask: Whether somebody still waits for the answer, and asks the person.
+        can_ask: Whether a client waits for the answer and can ask the person.
     """
 
     def __init__(self, agreed: Collection[str], *, can_ask: bool = True) -> None:
@@ -85,7 +86,7 @@ class Consent:
 
     @contextmanager
     def given(self) -> Generator[None]:
-        """Let the requests that begin in the block know of it."""
+        """Make the consent available to requests that begin in the block."""
         token = _consent.set(self)
         try:
             yield
@@ -99,14 +100,14 @@ _consent: Final[ContextVar[Consent]] = ContextVar("consent", default=_NOBODY)
 
 
 class OpenRequest:
-    """A request, as long as the block goes on; a thread that works on for it runs in its context.
+    """A request during its block; a thread that continues it runs in its context.
 
     Args:
-        recording: What it changes, or whose simulation.
-        by: Who asks.
-        names: Of the tool or the command, and of what it is a part of.
-        arguments: As they were given.
-        reads: It changes nothing: then there is no row of it, unless it is refused.
+        recording: The recording that it changes, or whose simulation it changes.
+        by: The caller.
+        names: The name of the tool or command, and of the tool that it is a part of.
+        arguments: The arguments as given.
+        reads: Whether it changes nothing; then it has no row unless it is refused.
     """
 
     def __init__(
@@ -155,7 +156,7 @@ class OpenRequest:
                 await to_thread.run_sync(self._end, error)
 
     def enter(self, *, create: bool = False) -> None:
-        """See that there is a row; without a database only where one is to be made."""
+        """Ensure that the request has a row; without a database only if one is to be created."""
         if self.id is not None or self._reads or self.recording.read_only:
             return
         if create:
@@ -164,12 +165,12 @@ class OpenRequest:
             self._insert()
 
     def require(self, action: str, params: Mapping[str, Any], steered: Path | None = None) -> None:
-        """See that the policy allows an action; see `permit`.
+        """Check that the policy allows an action; see `permit`.
 
         Raises:
-            NotAllowedError: It does not; the row says so.
-            ConsentRequiredError: It does if the person agrees, who can be asked before anything
-                else of the request is done.
+            NotAllowedError: The policy forbids it; the row records that.
+            ConsentRequiredError: A rule needs the person's consent, which is requested before
+                anything else.
         """
         world = params.get("world") if action in (LAUNCH, "load_world") else None
         with self._refusing(is_first=self._permitted <= {action}):
@@ -183,7 +184,7 @@ class OpenRequest:
         self.enter()
 
     def _check(self, policies: Sequence[Policy], require: Callable[[Policy], None]) -> None:
-        """Check all rules: nobody is asked about what another rule forbids."""
+        """Check all rules first, so that nobody is asked about what another rule forbids."""
         needed: dict[str, ConsentRequiredError] = {}
         while True:
             try:
@@ -198,8 +199,8 @@ class OpenRequest:
         self._used_consent |= bool(needed)
 
     def _policies(self, *files: str) -> list[Policy]:
-        """Those that bind who asks; what only reads goes on while one is invalid."""
-        if not self._reads:  # which is begun in the event loop
+        """Return the policies that bind the caller; a reading request ignores invalid ones."""
+        if not self._reads:  # which began in the event loop
             with suppress(NoDatabaseError), self.recording.reader() as connection:
                 query = (
                     "SELECT world FROM run WHERE ended_wall_time_s IS NULL AND world IS NOT NULL "
@@ -217,9 +218,9 @@ class OpenRequest:
 
     @contextmanager
     def _refusing(self, *, is_first: bool = True) -> Generator[None]:
-        """Record a refusal, also of a request that has been answered while trials went on.
+        """Record a refusal, also for a request that was answered while trials continued.
 
-        Who is asked has the request made again, so that nothing of it may have been done before.
+        A person's consent leads to a repeated request, so nothing of it may have been done before.
         """
         try:
             yield
@@ -245,7 +246,7 @@ class OpenRequest:
             raise raise_as from error
 
     def _note_question(self, error: ConsentRequiredError) -> None:
-        """Record that the person is asked, before that is done."""
+        """Record that the person is asked, before asking."""
         self.outcome = _ASKED
         with suppress(DatabaseError):
             if self.id is None:
@@ -280,11 +281,12 @@ class OpenRequest:
 
     def _end(self, error: BaseException | None) -> None:
         if self.id is None and error is None:
-            self.enter()  # the database was made meanwhile
+            self.enter()  # the database was created meanwhile
         if self.id is None or self.outcome in ("refused", _ASKED):
             return
         if error is not None:
-            known = isinstance(error, Exception)  # else the client has cancelled it, or left
+            # otherwise the client has cancelled the request or left
+            known = isinstance(error, Exception)
             self.outcome = f"{type(error).__name__}: {error}" if known else "cancelled"
         if self._used_consent:
             self.outcome = f"{AGREED}: {self.outcome}"
@@ -306,22 +308,22 @@ def permit(
     create: bool = False,
     steered: Path | None = None,
 ) -> int | None:
-    """See that what is about to be done is allowed, and that there is a row of who asked for it.
+    """Check that an action is allowed, and that the request behind it has a row.
 
     Args:
-        recording: Whose simulation it is.
-        action: As a command names it, or `policy.LAUNCH`.
+        recording: The recording whose simulation is changed.
+        action: The action as a command names it, or `policy.LAUNCH`.
         params: Its parameters.
-        create: Make the database if there is none: it is done without one.
-        steered: The world of the Webots that does it, which may be of another project.
+        create: Whether to create the database if there is none; otherwise the action has no row.
+        steered: The world of the Webots that acts, which may belong to another project.
 
     Returns:
-        The id of the request's row; None where it only reads, or where there is no database yet.
+        The id of the request's row; None if it only reads, or without a database.
 
     Raises:
-        NotAllowedError: A rule of the project's file forbids it.
-        ConsentRequiredError: A rule has the person asked first.
-        LookupError: Nobody has begun a request, which is a defect.
+        NotAllowedError: A rule of the project's file forbids the action.
+        ConsentRequiredError: A rule needs the person's consent first.
+        LookupError: No request has begun, which is a defect of the program.
     """
     request = _open.get()
     request.require(action, params, steered)
@@ -332,11 +334,11 @@ def permit(
 def note_answer(
     recording: RecordingAccess, error: ConsentRequiredError, declined: str | None
 ) -> None:
-    """Record what the person answered, in the row of the request for which one was asked.
+    """Record what the person answered, in the row of the request that asked.
 
     Args:
-        recording: As of the request.
-        error: What was asked.
+        recording: The recording of the request.
+        error: The question.
         declined: Why the request is refused; None if the person agreed.
     """
     if error.request_id is None:
@@ -353,7 +355,7 @@ def note_answer(
 def newest_requests(
     connection: sqlite3.Connection, limit: int, *, refused: bool = False
 ) -> list[dict[str, Any]]:
-    """The newest requests, newest first, with the commands that they have sent."""
+    """Return the newest requests, newest first, with the commands that they sent."""
     cursor = connection.execute(
         "SELECT id, wall_time_s, sim_time_s, run_id, client, client_version, transport, tool, "
         "arguments, rule, outcome, (SELECT json_group_array(json_array(id, action, status)) FROM "
@@ -374,7 +376,7 @@ def newest_requests(
     ]
 
 
-# -- what is recorded of arguments: no secrets, and not all of what is long --
+# -- recorded arguments: without secrets, and cut where they are long --
 
 
 def recorded_arguments(arguments: Mapping[str, Any]) -> str:
@@ -402,7 +404,7 @@ def _without_secrets(value: Any) -> Any:
 
 
 def _secrets_in(value: Any, *, is_secret: bool = False) -> Generator[str]:
-    """The texts that are left out: an error may repeat them."""
+    """Yield the secret texts, which an error may repeat."""
     if isinstance(value, Mapping):
         for name, each in cast("Mapping[Any, Any]", value).items():
             yield from _secrets_in(each, is_secret=is_secret or bool(_SECRET.search(str(name))))

@@ -1,4 +1,4 @@
-"""How much of a recording is kept: the limits of each kind of row, and how a person writes them."""
+"""Define how much of a recording is kept: the limits of each kind of row, and their spelling."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.run_rows import fetch_run
 
-# A run that a person named, described or marked is not retention's to judge.
-# Trials are labelled by the hundred without anybody's having judged them: their scores stay.
+# Retention leaves runs alone that a person named, described or marked. Trials are labelled by the
+# hundred without a person's judgement, but their scores stay.
 KEPT: Final = (
     "(keep <> 0 OR coalesce(note, '') <> '' "
     "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *'))"
@@ -26,15 +26,15 @@ _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
 _BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
-NO_LIMIT: Final = "all"  # is kept
+NO_LIMIT: Final = "all"  # condition of a run that is kept
 
 
 @dataclass(frozen=True)
 class Limit:
-    """How much of one kind is kept. None means no limit. The oldest goes first.
+    """How much of one kind is kept. None means no limit. The oldest is deleted first.
 
-    What goes are whole row groups, or blocks of rows. The newest of them stays even if it exceeds
-    the limit alone, unless the limit is 0.
+    Whole row groups or blocks of rows are deleted. The newest one stays even if it exceeds the
+    limit alone, unless the limit is 0.
 
     Attributes:
         size_bytes: Size on the disk, with indexes and what is free on the pages; for pictures the
@@ -64,7 +64,7 @@ class Limit:
     def is_exceeded(
         self, *, size_bytes: float, rows: float, age_s: float = 0, times: float = 1
     ) -> bool:
-        """Whether one of these is more than so many times its limit."""
+        """Return whether a value exceeds N times its limit."""
         found = ((size_bytes, self.size_bytes), (rows, self.rows), (age_s, self.age_s))
         return any(limit is not None and value > times * limit for value, limit in found)
 
@@ -73,21 +73,21 @@ class Limit:
 class Retention:
     """The limits of each kind of row.
 
-    They hold for the whole database, over all robots: rows go in the order in which they were
-    recorded, whatever their run. Runs that a person labelled (trials do not count), described or
-    marked lose nothing and are not counted.
+    They hold for the whole database, over all robots: rows are deleted in the order in which they
+    were recorded, whatever their run. Runs that a person labelled (trials do not count), described
+    or marked lose nothing and do not count.
 
     Attributes:
-        state: State rows. They go only after their values were put into chunks.
-        chunk: The values of each signal, compressed, in groups of about 1,024 states. A group goes
-            only after its states, and with it what answers say of that time.
+        state: State rows. They are deleted only after their values were put into chunks.
+        chunk: The values of each signal, compressed, in groups of about 1,024 states. A group is
+            deleted only after its states; answers then report that time as missing.
         log: Log lines.
         event: Events. Their age also holds for finished commands.
         image: Pictures, with their files.
-        outlive: What is left of a run goes once this many times the limits of `chunk` and `state`
-            was recorded after it, or it ended this many times their age ago and as many states as
-            an age spares were recorded since. Its commands go with the last run of that time. 0
-            keeps runs for ever.
+        outlive: When the rest of a run is deleted: once this many times the limits of `chunk` and
+            `state` were recorded after it. Or once it ended this many times their age ago, and at
+            least the number of states that an age spares were recorded since. Its commands are
+            deleted with the last run of that time. 0 keeps runs for ever.
         kept_state: Rows of full-rate segments: those that the throttle dropped, and those that were
             deleted from `state`. A segment that loses a row is removed.
     """
@@ -111,10 +111,10 @@ DEFAULT: Final = Retention()
 
 
 def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: bool = True) -> None:
-    """Let retention keep these runs for good, or no longer; all of them or, on an error, none.
+    """Mark runs to be kept, or no longer; either all of them or, on an error, none.
 
     Raises:
-        UnknownRunError: There is no such run.
+        UnknownRunError: A run does not exist.
     """
     with transaction(connection):
         for run_id in run_ids:
@@ -124,10 +124,9 @@ def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: b
         )
 
 
-# The limits of a database belong to it, not to who maintains it: set once, they hold for all.
-#
-# `prune` and `retain` set what a person asks for. A server sets limits that no person has set, and
-# reports those that hold.
+# The limits belong to the database, not to the process that maintains it: they are set once for
+# all. `prune` and `retain` set what a person wants. A server sets limits that no person has set,
+# and reports the limits in force.
 
 
 Asked = Mapping[str, "Limit | float | None"]
@@ -143,7 +142,7 @@ class StoredLimit(NamedTuple):
 
 
 def read_settings(connection: sqlite3.Connection) -> dict[str, StoredLimit]:
-    """What was set, by the names that it has in `Retention`; of the others the defaults hold.
+    """Return what was set, by its name in `Retention`; defaults apply to the others.
 
     Raises:
         InvalidInputError: The table holds something that is not a limit.
@@ -170,7 +169,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, StoredLimit]:
 
 
 def in_force(connection: sqlite3.Connection, asked: Asked | None = None) -> Retention:
-    """The limits of a database; with `asked` as they would be after `set_limits`."""
+    """Return the limits of a database, or with `asked` those that `set_limits` would lead to."""
     values: dict[str, Any] = {
         name: setting.value for name, setting in read_settings(connection).items()
     }
@@ -202,7 +201,7 @@ def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> Non
 
 
 def ask(connection: sqlite3.Connection, asked: Asked) -> list[str]:
-    """Set what a server may set: what no person has; returns for each other limit what holds."""
+    """Set the limits that no person has set. Return what applies instead of each other limit."""
     settings = read_settings(connection)
     mine = {
         name: value
@@ -214,7 +213,7 @@ def ask(connection: sqlite3.Connection, asked: Asked) -> list[str]:
 
 
 def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
-    """What was asked for and does not hold: what does, who set it, and how to change it."""
+    """Return which requested limits do not apply, what applies, who set it and how to change it."""
     settings = read_settings(connection)
     found: list[str] = []
     for name, value in asked.items():
@@ -230,7 +229,7 @@ def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
 
 
 def described(connection: sqlite3.Connection) -> dict[str, str]:
-    """Each limit in force as a person reads it, with who set it and when."""
+    """Return each limit in force as text, with who set it and when."""
     settings, retention = read_settings(connection), in_force(connection)
     return {
         f"{kind}s": _said(settings[name])
@@ -251,23 +250,23 @@ def _text(value: Limit | float) -> str:
     return f"{value:g} times as long as chunks" if value else NO_LIMIT
 
 
-# Limits as a person writes them: `500MB,30d`, `100000rows`, `all`.
+# Spelling of limits: `500MB,30d`, `100000rows`, `all`.
 
 
 def option_of(kind: str) -> str:
-    """The option of the command line that limits a kind of row."""
+    """Return the command-line option that limits a kind of row."""
     return "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s"
 
 
 def parse_limit(text: str, default: Limit) -> Limit:
-    """A limit from its parts, separated by commas; what is not named has no limit.
+    """Parse a limit from its parts, separated by commas; omitted parts are unlimited.
 
     Args:
         text: Sizes (kB, MB, GB), ages (min, h, d, w) and rows; or `all`, without any limit.
-        default: What a current run is spared comes from here.
+        default: The limit that spares a running run by default.
 
     Raises:
-        InvalidInputError: A part is none of these, or named twice.
+        InvalidInputError: A part is unknown or repeated.
     """
     limit: dict[str, Any] = {"size_bytes": None, "rows": None, "age_s": None}
     for part in [] if text.strip().lower() == NO_LIMIT else text.split(","):
@@ -298,7 +297,7 @@ def _parse_part(part: str, text: str) -> tuple[str, float]:
 
 
 def limit_text(limit: Limit) -> str:
-    """A limit as `parse_limit` reads it; a size is rounded."""
+    """Return a limit in the form that `parse_limit` reads; a size is rounded."""
     parts = [size_text(limit.size_bytes)] if limit.size_bytes is not None else []
     parts += [f"{limit.age_s:g}s"] if limit.age_s is not None else []
     parts += [f"{limit.rows}rows"] if limit.rows is not None else []
@@ -306,7 +305,7 @@ def limit_text(limit: Limit) -> str:
 
 
 def size_text(size_bytes: float) -> str:
-    """A size as a person reads it, in the units that `parse_limit` takes."""
+    """Return a size in the units that `parse_limit` reads."""
     for unit in ("B", "kB", "MB"):
         if size_bytes < 1000:
             return f"{size_bytes:.0f} {unit}" if unit == "B" else f"{size_bytes:.1f} {unit}"

@@ -1,7 +1,7 @@
-"""What a recording holds, and which parts of it are beyond the limits.
+"""Plan retention: what a recording holds, and which parts exceed the limits.
 
-States and chunks go by whole row groups, other rows by blocks of rows that follow each other. The
-newest are counted first: what no longer fits a limit goes, and everything older with it.
+States and chunks are deleted by whole row groups, other rows by blocks of consecutive rows. The
+newest are counted first: what no longer fits a limit is deleted, and everything older with it.
 """
 
 from __future__ import annotations
@@ -26,19 +26,17 @@ _BLOCK_IDS: Final = {
     "log": 512,
     "event": 512,
     "image": 16,
-}  # ids that go together
-_SAMPLE: Final = 100  # rows of mean size, from which the size of a block is estimated
-_COMMAND_BYTES: Final = 400
+}  # ids that are deleted together
 
 # A damaged time (after the year 5000) must not keep the rows around it.
 _WALL_TIME: Final = (
     "max(CASE WHEN CAST(wall_time_s AS REAL) < 1e11 THEN CAST(wall_time_s AS REAL) END)"
 )
 _SUMS: Final = f"run_id, min(id), max(id), {{payloads}}, count(*), {_WALL_TIME}"
-# The frames of full-rate segments count with their rows, and go with them.
+# The frames of full-rate segments count with their rows, and are deleted with them.
 _OWN: Final = f"AND kind <> '{KEPT_FRAME}'"
 _FILE_BYTES: Final = "iif(size_bytes BETWEEN 0 AND 1e12, size_bytes, 0)"
-# Those that were created during a kept run stay with it.
+# Commands that were created during a kept run stay with it.
 OLD_COMMANDS: Final = (
     f"FROM command c WHERE robot_id = :robot_id AND status IN {FINAL_STATUSES} "
     "AND created_wall_time_s < :before_s AND NOT EXISTS (SELECT 1 FROM run "
@@ -47,8 +45,24 @@ OLD_COMMANDS: Final = (
 )
 
 
+@dataclass(frozen=True)
+class SizeEstimates:
+    """How the sizes of rows are estimated.
+
+    Attributes:
+        rows: Rows of mean size, from which the size of a block is estimated.
+        command_bytes: Size of a command.
+    """
+
+    rows: int = 100
+    command_bytes: int = 400
+
+
+_ESTIMATES: Final = SizeEstimates()
+
+
 class RetainedRun(NamedTuple):
-    """A run as retention sees it."""
+    """A run from the viewpoint of retention."""
 
     id: int
     robot_id: int
@@ -61,15 +75,15 @@ class RetainedRun(NamedTuple):
 
 
 class Portion(NamedTuple):
-    """Rows of one run in one table that follow each other, and go together.
+    """Consecutive rows of one run in one table that are deleted together.
 
     Attributes:
         group_id: The row group of states and chunks; 0 for states that are in none.
         first_id: The lowest id; `last_id` is the highest. Chunks have those of their states.
         rows: The number of rows; for chunks that of the states they stand for.
-        size_bytes: What all of it takes on the disk.
+        size_bytes: Their size on the disk.
         newest_s: Wall time of the newest row.
-        is_held: For chunks: the states they stand for are there as well.
+        is_held: For chunks: whether the states they stand for exist as well.
     """
 
     table: str
@@ -85,15 +99,15 @@ class Portion(NamedTuple):
 
 @dataclass(frozen=True)
 class Going:
-    """A portion that goes; or a run, or commands of a robot.
+    """A portion to delete; or a run, or commands of a robot.
 
     Attributes:
-        table: From which rows go; a row of `chunk` is a state that the chunks stand for.
+        table: The table of the rows; a row of `chunk` is a state that the chunks stand for.
         owner_id: The run; for commands the robot.
         rows: The number of rows.
-        size_bytes: About what they take on the disk; for pictures their files.
-        newest_s: About when the newest of them was written, in wall time; commands are older.
-        portion: Which rows; None for runs and commands.
+        size_bytes: Approximate size on the disk; for pictures that of their files.
+        newest_s: Approximate wall time of the newest of them; commands are older.
+        portion: The rows; None for runs and commands.
     """
 
     table: str
@@ -106,7 +120,7 @@ class Going:
 
 @dataclass(frozen=True)
 class Spared:
-    """What is beyond a limit, and stays."""
+    """What exceeds a limit and stays."""
 
     table: str
     rows: int
@@ -116,15 +130,15 @@ class Spared:
 
 @dataclass(frozen=True)
 class Plan:
-    """What would go now.
+    """What would be deleted now.
 
     Attributes:
-        steps: What goes, the oldest of each table first.
-        held_bytes: About what each kind takes now, of all runs.
-        spared: What would have to go as well, and why it does not.
+        steps: What is deleted, the oldest of each table first.
+        held_bytes: Approximate size of each kind now, of all runs.
+        spared: What would have to be deleted as well, and why it stays.
         kept_run_ids: Runs that a person named, described or marked. They lose nothing and do not
             count.
-        kept_bytes: About what those runs take.
+        kept_bytes: Approximate size of those runs.
     """
 
     steps: tuple[Going, ...]
@@ -135,18 +149,18 @@ class Plan:
 
     @property
     def rows(self) -> int:
-        """The number of all rows that go."""
+        """The number of all rows to delete."""
         return sum(step.rows for step in self.steps)
 
     def rows_by_table(self) -> Counter[str]:
-        """Return how many rows of each table go."""
+        """Return the number of rows to delete by table."""
         rows = Counter[str]()
         for step in self.steps:
             rows[step.table] += step.rows
         return rows
 
     def size_of(self, table: str) -> int:
-        """Return about what the rows of a table that go take."""
+        """Return the approximate size of the rows of a table to delete."""
         return sum(step.size_bytes for step in self.steps if step.table == table)
 
     def runs_of(self, table: str) -> list[int]:
@@ -159,10 +173,10 @@ class Plan:
 def plan(
     connection: sqlite3.Connection, retention: Retention = DEFAULT, now_s: float | None = None
 ) -> Plan:
-    """Find what is beyond the limits; nothing is changed.
+    """Find what exceeds the limits, without changing anything.
 
     Args:
-        connection: Any.
+        connection: An open database.
         retention: The limits.
         now_s: Unix time, from which ages are counted; None for now.
     """
@@ -188,7 +202,7 @@ def read_runs(connection: sqlite3.Connection) -> dict[int, RetainedRun]:
 
 
 def ids_of(connection: sqlite3.Connection, portion: Portion) -> list[int]:
-    """Return the ids of the rows of a portion, in order; the oldest of a group go first."""
+    """Return the ids of the rows of a portion in order; the oldest of a group come first."""
     if portion.group_id:
         (rows,) = connection.execute(
             "SELECT row_count FROM row_group WHERE id = ?", (portion.group_id,)
@@ -205,7 +219,7 @@ def ids_of(connection: sqlite3.Connection, portion: Portion) -> list[int]:
 
 
 def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:
-    """Return the bytes of the database on the disk: the file, what is free in it, and its log."""
+    """Return the bytes of the database on the disk: the file, its free space, and its log."""
     page_bytes, pages, free_pages = (
         int(connection.execute(f"PRAGMA {name}").fetchone()[0])
         for name in ("page_size", "page_count", "freelist_count")
@@ -286,7 +300,9 @@ def _portion(connection: sqlite3.Connection, table: str, row: Sequence[Any]) -> 
     size_bytes = float(payloads)
     if table != "image":
         (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
-        row_bytes = disk_bytes([round(payloads / rows)] * _SAMPLE, page_bytes) / _SAMPLE
+        row_bytes = (
+            disk_bytes([round(payloads / rows)] * _ESTIMATES.rows, page_bytes) / _ESTIMATES.rows
+        )
         size_bytes = rows * (row_bytes + INDEX_BYTES)
     return Portion(table, run_id, 0, first_id, last_id, rows, size_bytes, newest_s)
 
@@ -295,7 +311,7 @@ def _payloads(connection: sqlite3.Connection, table: str) -> str:
     """Return the SQL for the bytes of the records of a table, or of the files of pictures."""
     if table == "image":
         return f"sum({_FILE_BYTES})"
-    parts = ["2"]  # each column takes a byte or two in the head of the record too
+    parts = ["2"]  # each column takes a byte or two in the header of the record too
     for name, kind, is_key in connection.execute(
         "SELECT name, type, pk FROM pragma_table_info(?)", (table,)
     ).fetchall():
@@ -353,13 +369,14 @@ class _Planner:
         )
 
     def _kept(self, table: str, *, is_kept: bool) -> list[Portion]:
-        """Portions of the runs that are retention's to judge, or of those that are not."""
+        """Return portions of the runs that retention may delete, or of those that it keeps."""
         return [each for each in self._held[table] if self._runs[each.run_id].is_kept == is_kept]
 
     def _find_forgotten(self) -> set[int]:
-        """Finished runs after which `outlive` times the limits of chunks and states was recorded.
+        """Find finished runs after which `outlive` times the limits of chunks and states was
+        recorded.
 
-        As of these, age alone does not do it where few were recorded since.
+        Age alone does not suffice if few states were recorded since.
         """
         limits = [(getattr(self._retention, table), self._row_bytes(table))
                   for table in ("chunk", "state")]  # fmt: skip
@@ -385,11 +402,11 @@ class _Planner:
         return _size_of(held) / max(sum(portion.rows for portion in held), 1)
 
     def _beyond(self, table: str, groups: set[int]) -> Iterator[Going]:
-        """Yield what goes of a table, the newest first; of runs that are forgotten everything.
+        """Yield what is deleted of a table, the newest first; everything of outlived runs.
 
         Args:
-            table: Which.
-            groups: The groups whose states go.
+            table: The table.
+            groups: The groups whose states are deleted.
         """
         limit: Limit = getattr(self._retention, table)
         before_s = -math.inf if limit.age_s is None else self._now_s - limit.age_s
@@ -413,13 +430,15 @@ class _Planner:
                 yield _going(portion)
 
     def _spare(self, portion: Portion, why: str) -> None:
-        """Note what stays beyond a limit, by table and reason."""
+        """Note what exceeds a limit and stays, by table and reason."""
         sums = self._spared.setdefault((portion.table, why), [0, 0.0])
         sums[0] += portion.rows
         sums[1] += portion.size_bytes
 
     def _commands(self, robot_id: int) -> Iterator[Going]:
-        """Finished commands from before all runs of the robot that stay, or older than events."""
+        """Yield finished commands from before all remaining runs of the robot, or older than
+        events.
+        """
         runs = [run for run in self._runs.values() if run.robot_id == robot_id]
         staying = [run.started_wall_time_s for run in runs if run.id not in self._forgotten]
         before_s = min(staying) if len(staying) < len(runs) else -math.inf
@@ -428,7 +447,7 @@ class _Planner:
         values = {"robot_id": robot_id, "before_s": before_s}
         query = f"SELECT count(*) {OLD_COMMANDS}"
         if rows := int(self._connection.execute(query, values).fetchone()[0]):
-            yield Going("command", robot_id, rows, rows * _COMMAND_BYTES, before_s)
+            yield Going("command", robot_id, rows, rows * _ESTIMATES.command_bytes, before_s)
 
 
 def _going(portion: Portion) -> Going:

@@ -1,4 +1,4 @@
-"""The state of a robot, decided and worded: running, starting, paused, stopped, ended, hanging.
+"""Decide and word the state of a robot: running, starting, paused, stopped, ended, hanging.
 
 `decide_status` says which it is and why. `find_block` says what keeps a loop from commands.
 """
@@ -53,7 +53,7 @@ from webots_mcp.store.why_ended import unseen_report, why_ended
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
 STARTING: Final = "starting"
-# These causes look the same from inside the simulation; `setup.doctor` tells them apart.
+# These causes are indistinguishable from inside the simulation; `setup.doctor` distinguishes them.
 SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
     "breakpoint, another controller looping, or an extern controller missing; from inside the "

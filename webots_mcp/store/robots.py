@@ -1,4 +1,7 @@
-"""Robots that were ever recorded: their rows, the one a name means, and what an observer saw."""
+"""Find robots that were ever recorded.
+
+Their rows, the one a name means, and what an observer saw.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ _SHOWN_NAMES: Final = 20
 
 @dataclass(frozen=True)
 class RobotRecord:
-    """A robot name that was ever seen, with its latest session."""
+    """The name of a robot that was ever recorded, with its latest session."""
 
     id: int
     name: str
@@ -44,8 +47,8 @@ class WorldSeen:
 
     Attributes:
         observer: Its name.
-        content: What there is: title, robots, solids.
-        places: Where each is, by the word that it has in signals; its newest of the run.
+        content: Its content: title, robots, solids.
+        places: The newest position of each in the run, by its name in signals.
     """
 
     observer: str
@@ -54,7 +57,7 @@ class WorldSeen:
 
 
 def list_robots(connection: sqlite3.Connection, now_s: float) -> list[RobotRecord]:
-    """Every robot ever seen, in the order in which they first appeared."""
+    """Return every recorded robot, in the order of first appearance."""
     return [
         _robot(connection, row, now_s)
         for row in connection.execute(
@@ -65,10 +68,10 @@ def list_robots(connection: sqlite3.Connection, now_s: float) -> list[RobotRecor
 
 
 def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
-    """The name of the robot of that id.
+    """Return the name of the robot with an id.
 
     Raises:
-        NothingRecordedError: Its row is not there, or cannot be read.
+        NothingRecordedError: Its row is missing or cannot be read.
     """
     row = connection.execute("SELECT name FROM robot WHERE id = ?", (robot_id,)).fetchone()
     if row is None:
@@ -77,20 +80,21 @@ def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
 
 
 def nothing_recorded(connection: sqlite3.Connection) -> str:
-    """Return that no robot was ever seen, with what Webots' console says about it."""
+    """Return that no robot was ever recorded, with what Webots' console says about it."""
     text = "No robot has been recorded in this database yet"
     trouble = console_trouble(connection)
     return f"{text}. {trouble}" if trouble else text
 
 
 def console_trouble(connection: sqlite3.Connection) -> str | None:
-    """Return the newest warnings of Webots' console that belong to no run; None without any.
+    """Return the newest warnings of Webots' console that belong to no run, or None.
 
-    A controller that fails before its bridge exists leaves nothing else. What was said before the
-    newest session began is left out: a controller has recorded since.
+    A controller that fails before its bridge exists leaves nothing else. Lines from before the
+    newest session are left out, because a controller has recorded since.
     """
-    # Of the newest Webots, unless a controller has begun to record since. What a controller printed
-    # comes first: its traceback ends with the reason, and Webots itself only says that it exited.
+    # Lines of the newest Webots, unless a controller has started recording since. Lines of
+    # controllers come first: a traceback ends with the reason, and Webots itself only says that it
+    # exited.
     said = [
         repr(message)
         for (message,) in connection.execute(
@@ -111,14 +115,14 @@ def console_trouble(connection: sqlite3.Connection) -> str | None:
 
 
 def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> RobotRecord:
-    """The robot of that name; without a name the only live one, else the only one ever seen.
+    """Return the robot of that name; by default the only live one, else the only recorded one.
 
-    An observer is meant without a name only where there is no other robot.
+    Without a name, an observer is meant only if there is no other robot.
 
     Raises:
-        NothingRecordedError: No robot was ever seen.
-        UnknownRobotError: None has that name; the text offers near ones.
-        AmbiguousRobotError: No name was given and several are possible; the text lists them.
+        NothingRecordedError: No robot was ever recorded.
+        UnknownRobotError: No robot has that name; the text offers similar names.
+        AmbiguousRobotError: No name was given and several robots are possible; the text lists them.
     """
     robots = list_robots(connection, now_s)
     if not robots:
@@ -139,7 +143,7 @@ def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float
 
 
 def without_observers(robots: list[RobotRecord]) -> list[RobotRecord]:
-    """Those that do something; the observers where there are no others."""
+    """Return the robots that act, or the observers if there are no others."""
     return [robot for robot in robots if robot.kind != OBSERVER] or robots
 
 
@@ -179,7 +183,7 @@ def _robot(
 def live_observer(
     connection: sqlite3.Connection, session: SessionRecord | None, now_s: float
 ) -> RobotRecord | None:
-    """The observer of a session's simulation; without a session the only one that lives."""
+    """Return the observer of a session's simulation; without a session the only live one."""
     robots = [robot for robot in list_robots(connection, now_s) if robot.live]
     found = [robot for robot in robots if robot.kind == OBSERVER and robot.session is not None]
     if session is not None:
@@ -189,7 +193,7 @@ def live_observer(
 
 
 def world_seen(connection: sqlite3.Connection, run: RunRecord) -> WorldSeen | None:
-    """What an observer saw while that run lasted, last of all; None where none was there."""
+    """Return what an observer saw last during a run; None without an observer."""
     values = {
         "session": run.session_id,
         "first": run.started_wall_time_s,

@@ -1,4 +1,4 @@
-"""The parameters that a controller declares, and the values that they had in its runs."""
+"""Read the parameters that a controller declares, and their values in its runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COLUMNS: Final = (
     "command_id", "doc",
 )  # fmt: skip
 
-# Of a run `r`, and with the JSON object :parameters: whether it had all these values at some time.
+# For a run `r` and the JSON object :parameters: whether it had all these values at some time.
 HAD_VALUES: Final = (
     "NOT EXISTS (SELECT 1 FROM json_each(:parameters) wanted WHERE NOT EXISTS ("
     "SELECT 1 FROM parameter_value v WHERE v.run_id = r.id AND v.name = wanted.key AND "
@@ -29,7 +29,7 @@ class Declared(NamedTuple):
     """A parameter of a controller.
 
     Attributes:
-        next_value: Which it takes with the next reset; None without one.
+        next_value: The value that the next reset sets; None without one.
     """
 
     declaration: Declaration
@@ -41,7 +41,7 @@ class ParameterSetting(NamedTuple):
 
     Attributes:
         set_by: `code`, `environment`, `command` or `trial`.
-        command_id: By which command; None where it was none.
+        command_id: The command that set it; None without a command.
     """
 
     sim_time_s: float
@@ -53,7 +53,7 @@ class ParameterSetting(NamedTuple):
 
 @dataclass(frozen=True)
 class RunParameter:
-    """What a parameter was in a run: its settings in order, each unlike the one before."""
+    """A parameter in a run: its settings in order, each different from the one before."""
 
     settings: list[ParameterSetting] = field(default_factory=list[ParameterSetting])
 
@@ -69,12 +69,12 @@ class RunParameter:
 
     @property
     def is_default(self) -> bool:
-        """Whether it was never another than the code declared."""
+        """Whether it always had the value that the code declared."""
         return all(setting.is_default for setting in self.settings)
 
     @property
     def described(self) -> Value | str:
-        """The value; one that changed in the middle of the run with the times of its changes."""
+        """The value, with the times of changes if it changed in the middle of the run."""
         if len(self.settings) == 1:
             return self.value
         first, *changes = self.settings
@@ -83,7 +83,7 @@ class RunParameter:
         return f"{_text(first.value)}, then {left_out}{', '.join(steps)}"
 
     def add(self, setting: ParameterSetting) -> None:
-        """The next row; one that repeats the value says nothing new."""
+        """Add the next row, unless it repeats the value."""
         last = self.settings[-1] if self.settings else None
         if last is None or (last.value, type(last.value)) != (setting.value, type(setting.value)):
             self.settings.append(setting)
@@ -93,7 +93,7 @@ RunParameters = Mapping[str, RunParameter]
 
 
 def declared_by(connection: sqlite3.Connection, session_id: int) -> dict[str, Declared]:
-    """The parameters that the controller of a session declares, in its order."""
+    """Return the parameters that the controller of a session declares, in its order."""
     return {
         row[0]: _declared(row)
         for row in connection.execute(
@@ -107,7 +107,7 @@ def declared_by(connection: sqlite3.Connection, session_id: int) -> dict[str, De
 def parameters_of(
     connection: sqlite3.Connection, run_ids: Iterable[int]
 ) -> dict[int, dict[str, RunParameter]]:
-    """What the parameters were in each of these runs."""
+    """Return the parameters of each of these runs."""
     found: dict[int, dict[str, RunParameter]] = {run_id: {} for run_id in run_ids}
     for run_id, name, sim_time_s, value, *rest in connection.execute(
         "SELECT run_id, name, sim_time_s, value, is_default, set_by, command_id "
@@ -120,9 +120,9 @@ def parameters_of(
 
 
 def described(connection: sqlite3.Connection, run: RunRecord) -> list[dict[str, Any]]:
-    """Each parameter of a run, under `COLUMNS`: its last value, and how it is declared now.
+    """Return each parameter of a run under `COLUMNS`: its last value and its current declaration.
 
-    What a controller does not declare any more, or a later one declared, has only its values.
+    A parameter that is no longer declared, or only by a later controller, has only its values.
     """
     values = parameters_of(connection, [run.id])[run.id]
     declared = declared_by(connection, run.session_id)
@@ -133,7 +133,7 @@ def described(connection: sqlite3.Connection, run: RunRecord) -> list[dict[str, 
 def notable_parameters(
     connection: sqlite3.Connection, run_ids: Iterable[int]
 ) -> dict[int, dict[str, Value | str]]:
-    """Of each run the parameters that are not as declared, or not the same in all these runs.
+    """Return of each run the parameters that are not as declared, or differ between these runs.
 
     Those in which the runs differ come first. A value that changed within its run is a text with
     the time.
@@ -147,7 +147,7 @@ def notable_parameters(
 
 
 def differing(runs: Sequence[RunParameters]) -> list[str]:
-    """The names of which not all runs that have them had the same values, each at any time."""
+    """Return the names whose values, at any time, differ between the runs that have them."""
     names = dict.fromkeys(name for run in runs for name in run)
     return [name for name in names if len({run[name].values for run in runs if name in run}) > 1]
 
@@ -158,12 +158,12 @@ def _ordered(had: RunParameters, unlike: Sequence[str]) -> list[str]:
 
 
 def kinds_of(connection: sqlite3.Connection) -> dict[str, str]:
-    """The kinds of all parameters by name, each as it was declared last."""
+    """Return the kinds of all parameters by name, as declared last."""
     return dict(connection.execute("SELECT name, kind FROM parameter ORDER BY id").fetchall())
 
 
 def as_filter(connection: sqlite3.Connection, values: Mapping[str, Value]) -> str:
-    """Values by name as JSON, for a query that asks which runs had them.
+    """Return values by name as JSON, for a query for runs that had them.
 
     Raises:
         InvalidInputError: No controller ever declared one of the names, or a value is not finite.

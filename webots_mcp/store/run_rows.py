@@ -1,4 +1,4 @@
-"""Runs and what is recorded in them: published states, events that the bridge noticed, pictures."""
+"""Read runs and what is recorded in them: published states, events of the bridge, pictures."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
-# A blob is greater than any number or text: a time that is not a number is found too, and reported.
+# A blob is greater than any number or text, so a time that is not a number is found and reported.
 _LATER_THAN_ANY: Final = b"\xff"
-# Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
+# Mean wall time of a round of the loop, in its own code and in `step`; null if few were seen.
 _ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
 OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
 STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
@@ -69,13 +69,13 @@ _LIMITS: Final = RowLimits()
 
 
 def columns_of(row: type[Any]) -> str:
-    """What to select so that a row is the arguments of this dataclass."""
+    """Return the columns to select so that a row has the arguments of this dataclass."""
     return ", ".join(field.name for field in fields(row))
 
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A stretch of rising simulation time in one session. Columns as in `store.models`."""
+    """An interval of rising simulation time in one session. Columns as in `store.models`."""
 
     id: int
     session_id: int
@@ -105,14 +105,14 @@ class StateRecord:
     replaced: str | None
 
     def value(self) -> dict[str, Any]:
-        """The published dict, with "nan", "inf" and the like where JSON has to say null."""
+        """Return the published dict, with "nan", "inf" and the like where JSON has null."""
         value = cast("dict[str, Any]", _decoded(self, self.data))
         for path, kind in self.replaced_paths().items():
             put_back(value, path.split("."), kind)
         return value
 
     def replaced_paths(self) -> dict[str, str]:
-        """Path of every replaced value, and what it was."""
+        """Return the path of every replaced value, and what it was."""
         return _decoded(self, self.replaced) if self.replaced else {}
 
 
@@ -129,12 +129,12 @@ class EventRecord:
     data: str | None
 
     def details(self) -> Any:
-        """What was noticed, decoded; None where nothing was added."""
+        """Return the decoded details; None if nothing was added."""
         return _decoded(self, self.data) if self.data else None
 
 
 def _decoded(row: StateRecord | EventRecord, text: str) -> Any:
-    """The value of JSON text of a row; a MalformedRowError says which row has none."""
+    """Return the value of a row's JSON text; a MalformedRowError names a row without valid JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -154,7 +154,7 @@ def _text_or_bytes(stored: bytes) -> str | bytes:
 def reading_texts(
     connection: sqlite3.Connection, read: Callable[[bytes], Any] = _text_or_bytes
 ) -> Generator[None]:
-    """Inside, a text that is no UTF-8 is read as bytes: SQLite would not say of which row."""
+    """Read texts that are not UTF-8 as bytes: SQLite's error would not name the row."""
     before, connection.text_factory = connection.text_factory, read
     try:
         yield
@@ -164,7 +164,7 @@ def reading_texts(
 
 _RUN_COLUMNS: Final = columns_of(RunRecord)
 _STATE_COLUMNS: Final = columns_of(StateRecord)
-# Of a crash only a kept stretch has the newest state; it has a negative id.
+# After a crash only a full-rate segment has the newest state; it has a negative id.
 _NEWEST_STATE: Final = (
     "SELECT * FROM (SELECT * FROM (SELECT {columns} FROM state WHERE run_id = :run "
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1) UNION ALL "
@@ -172,11 +172,10 @@ _NEWEST_STATE: Final = (
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1)) "
     "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
 ).format(columns=_STATE_COLUMNS, kept=_STATE_COLUMNS.partition(", ")[2])
-_EVENT_COLUMNS: Final = columns_of(EventRecord)
 
 
 def current_run(connection: sqlite3.Connection, robot_id: int) -> RunRecord | None:
-    """The robot's newest run, going on or not."""
+    """Return the robot's newest run, ended or not."""
     row = connection.execute(
         f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1", (robot_id,)
     ).fetchone()
@@ -186,15 +185,15 @@ def current_run(connection: sqlite3.Connection, robot_id: int) -> RunRecord | No
 def fetch_run(
     connection: sqlite3.Connection, run_id: int, robot_id: int | None = None
 ) -> RunRecord:
-    """The run of that id.
+    """Return the run with an id.
 
     Args:
         connection: An open database.
         run_id: The run.
-        robot_id: Whose run it has to be; None for anybody's.
+        robot_id: The robot of the run; None for any.
 
     Raises:
-        UnknownRunError: There is no such run, or it is another robot's.
+        UnknownRunError: The run does not exist, or belongs to another robot.
     """
     row = connection.execute(f"SELECT {_RUN_COLUMNS} FROM run WHERE id = ?", (run_id,)).fetchone()
     if row is None or robot_id not in (None, RunRecord(*row).robot_id):
@@ -203,7 +202,7 @@ def fetch_run(
 
 
 def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[RunRecord]:
-    """All runs of the robot, oldest first."""
+    """Return all runs of the robot, oldest first."""
     return [
         RunRecord(*row)
         for row in connection.execute(
@@ -213,7 +212,7 @@ def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[RunRecord]:
 
 
 def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
-    """How many runs of the robot were recorded."""
+    """Return how many runs of the robot were recorded."""
     return int(
         connection.execute("SELECT count(*) FROM run WHERE robot_id = ?", (robot_id,)).fetchone()[0]
     )
@@ -249,7 +248,7 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
 
 
 def newest_state(connection: sqlite3.Connection, run_id: int) -> StateRecord | None:
-    """The latest row of a run; None where retention has deleted it."""
+    """Return the latest row of a run; None if retention has deleted it."""
     state = _state_up_to(connection, run_id, _LATER_THAN_ANY)
     if state is None or state.id > 0:
         return state
@@ -260,7 +259,7 @@ def newest_state(connection: sqlite3.Connection, run_id: int) -> StateRecord | N
 
 
 def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> StateRecord | None:
-    """The latest row of a run up to that simulation time."""
+    """Return the latest row of a run up to that simulation time."""
     return _state_up_to(connection, run_id, sim_time_s)
 
 
@@ -273,14 +272,14 @@ def _state_up_to(
 
 
 def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:
-    """Median wall time between the latest rows of a run, in seconds; None with fewer than two."""
+    """Return the median wall time between the latest rows of a run in seconds; None if unknown."""
     times = connection.execute(_RECENT_TIMES, (run_id, _LIMITS.pace_rows)).fetchall()
     gaps = sorted(newer[1] - older[1] for newer, older in itertools.pairwise(times))
     return gaps[len(gaps) // 2] if gaps else None
 
 
 def real_time_factor(connection: sqlite3.Connection, run_id: int) -> float | None:
-    """Simulation time per wall time over the last few seconds that were recorded."""
+    """Return simulation time per wall time over the last few recorded seconds."""
     times = connection.execute(_RECENT_TIMES, (run_id, _LIMITS.pace_window_rows)).fetchall()
     recent = [time for time in times if times[0][1] - time[1] <= _LIMITS.pace_window_s]
     if len(recent) < 2 or recent[0][1] <= recent[-1][1]:
@@ -289,7 +288,7 @@ def real_time_factor(connection: sqlite3.Connection, run_id: int) -> float | Non
 
 
 def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | None:
-    """Who sets the pace of a run, in a sentence; None where too few of its steps were seen."""
+    """Return a sentence on what sets the pace of a run; None if too few of its steps were seen."""
     own_ms, wait_ms, steps = connection.execute(
         f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?", (run_id,)
     ).fetchone()
@@ -310,10 +309,10 @@ def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | No
 
 
 def select(value: Any, path: str) -> Any:
-    """The part of a state at a dotted path; `""` is all of it.
+    """Return the part of a state at a dotted path; `""` is all of it.
 
     Raises:
-        InvalidInputError: Nothing is there; the text names the part that is missing.
+        InvalidInputError: The path leads nowhere; the text names the part that is missing.
     """
     parts = path.split(".") if path else []
     while parts:
@@ -323,9 +322,9 @@ def select(value: Any, path: str) -> Any:
 
 
 def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
-    """The key or index that the path starts with, and how many of its parts that takes.
+    """Return the key or index that the path starts with, and its number of parts.
 
-    A key may itself hold dots, so the longest one that fits is taken.
+    A key may itself hold dots, so the longest match is used.
     """
     if isinstance(value, dict):
         members = cast("dict[str, Any]", value)
@@ -355,7 +354,7 @@ def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
 
 
 def put_back(value: Any, parts: list[str], replaced: object) -> None:
-    """Put what was replaced (or its kind) where null stands for it; a value that was kept stays.
+    """Put replaced values (or their kind) back where null stands for them, but not over values.
 
     The last part `*` stands for every null in an array.
     """
@@ -364,7 +363,7 @@ def put_back(value: Any, parts: list[str], replaced: object) -> None:
         return
     try:
         key, taken = _key(value, parts, "")
-    except InvalidInputError:  # the path leads to what was replaced as a whole
+    except InvalidInputError:  # the path leads to a value that was replaced as a whole
         return
     if taken < len(parts):
         put_back(value[key], parts[taken:], replaced)
@@ -373,12 +372,14 @@ def put_back(value: Any, parts: list[str], replaced: object) -> None:
 
 
 def count_dropped(connection: sqlite3.Connection, run: RunRecord, of_session: int) -> int:
-    """How many rows of a run were dropped; of its session's last run also those not noted yet.
+    """Return how many rows of a run were dropped.
+
+    For the last run of a session, drops that no event reports yet are included.
 
     Args:
-        connection: Any.
+        connection: An open database.
         run: The run.
-        of_session: Rows of all its session's runs that were dropped, as the session counts them.
+        of_session: Dropped rows of all runs of its session, as the session counts them.
     """
     runs = connection.execute(
         "SELECT r.id, coalesce(sum(coalesce(json_extract(e.data, '$.row_count'), "
@@ -392,10 +393,10 @@ def count_dropped(connection: sqlite3.Connection, run: RunRecord, of_session: in
 
 
 def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[EventRecord]:
-    """The latest events of a run, oldest first; with a limit of -1 all of them."""
+    """Return the latest events of a run, oldest first; a limit of -1 returns all of them."""
     rows = connection.execute(
-        f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC "
-        "LIMIT ?",
+        f"SELECT {columns_of(EventRecord)} FROM event WHERE run_id = ? "
+        "ORDER BY sim_time_s DESC, id DESC LIMIT ?",
         (run_id, limit),
     ).fetchall()
     return [EventRecord(*row) for row in reversed(rows)]
@@ -420,19 +421,16 @@ class StoredImage:
     size_bytes: int
 
     def file(self, data_dir: Path) -> Path:
-        """The file itself; see `inside` for the errors."""
+        """Return the file itself; see `inside` for the errors."""
         return inside(data_dir, self.path)
 
 
-_COLUMNS: Final = columns_of(StoredImage)
-
-
 def inside(data_dir: Path, path: str) -> Path:
-    """The file at a recorded path.
+    """Return the file at a recorded path.
 
     Raises:
         InvalidInputError: The path leads out of the data folder, or to no regular file.
-        NothingRecordedError: The file is gone.
+        NothingRecordedError: The file was deleted.
     """
     try:
         file = (data_dir / path).resolve()
@@ -458,9 +456,9 @@ def inside(data_dir: Path, path: str) -> Path:
 
 @contextlib.contextmanager
 def opened(file: Path) -> Generator[Image]:
-    """A picture, not decoded yet; errors of its user inside the block are reported alike.
+    """Open a picture without decoding it, and report errors inside the block as errors of its file.
 
-    Pillow is imported here, at the first picture: it would add to the server's start.
+    Pillow is imported with the first picture, because it would slow down the server's start.
 
     Args:
         file: A regular file.
@@ -476,7 +474,7 @@ def opened(file: Path) -> Generator[Image]:
         with picture:
             _require_at_most(_LIMITS.max_pixels, "pixels", picture.width * picture.height)
             yield picture
-    except Exception as error:  # Pillow raises nearly anything about a file that is damaged
+    except Exception as error:  # Pillow may raise anything for a damaged file
         raise InvalidInputError(f"{file} is not a usable PNG or JPEG: {error}") from error
 
 
@@ -493,19 +491,19 @@ def camera_frames(
     at_s: float | None = None,
     count: int = 1,
 ) -> list[StoredImage]:
-    """Frames of one camera in a run, those of kept stretches too, in order of time.
+    """Return frames of one camera in a run, in order of time, including full-rate segments.
 
     Args:
-        connection: Any.
+        connection: An open database.
         run_id: The run.
-        device: Of this camera; None is the one that has the frame that is looked for.
-        at_s: The frames nearest to this simulation time; None is the newest.
-        count: The most to return, of one kind.
+        device: The camera; None for the one with the nearest frame.
+        at_s: Simulation time to which the frames are nearest; None for the newest.
+        count: Maximum number of frames of one kind.
     """
     order = "sim_time_s DESC" if at_s is None else "abs(sim_time_s - :at_s)"
     values = {"run_id": run_id, "device": device, "kind": None, "at_s": at_s, "count": 1}
     frames_query = (
-        f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
+        f"SELECT {columns_of(StoredImage)} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
         "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
         "ORDER BY {order}, id DESC LIMIT :count"
     )
@@ -518,9 +516,10 @@ def camera_frames(
 
 
 def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | None:
-    """The newest picture of a run, of whatever kind."""
+    """Return the newest picture of a run of any kind."""
     row = connection.execute(
-        f"SELECT {_COLUMNS} FROM image WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1",
+        f"SELECT {columns_of(StoredImage)} FROM image WHERE run_id = ? "
+        "ORDER BY sim_time_s DESC, id DESC LIMIT 1",
         (run_id,),
     ).fetchone()
     return StoredImage(*row) if row else None
@@ -529,7 +528,7 @@ def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | N
 def count_kept_frames(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> int:
-    """How many camera frames a kept stretch has, from its start to its end."""
+    """Return the number of camera frames of a full-rate segment, from its start to its end."""
     return int(
         connection.execute(
             f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
@@ -540,7 +539,7 @@ def count_kept_frames(
 
 
 def cameras(connection: sqlite3.Connection, robot_id: int) -> dict[int, str]:
-    """The cameras whose frames there are, by run of the robot, the newest run first."""
+    """Return the cameras that have frames, by run of the robot, the newest run first."""
     return dict(
         connection.execute(
             f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} "

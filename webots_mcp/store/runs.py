@@ -1,4 +1,4 @@
-"""`list_runs` and `annotate_run`: what was run, with which code, and how it ended."""
+"""Answer `list_runs` and `annotate_run`: which runs exist, with which code, and how they ended."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ from webots_mcp.store.run_parameters import HAD_VALUES, as_filter, notable_param
 from webots_mcp.store.run_rows import OWN_MS, STEP_WAIT_MS, fetch_run
 
 MOST_RUNS: Final = 200
-MAX_LABEL: Final = 100
-MAX_NOTE: Final = 4000
 
 _RUNS: Final = (
     "SELECT r.id, b.name, r.session_id, s.controller, s.controller_sha256, s.git_commit, r.world, "
     "r.start_reason, r.end_reason, r.label, r.note, r.purged_rows, "
     f"{OWN_MS}, {STEP_WAIT_MS}, "
-    # Rows, times and what was said last are those of a heartbeat, which newer rows may follow.
+    # Rows, times and the last report are those of a heartbeat, which newer rows may follow.
     "r.row_count + CASE WHEN r.ended_wall_time_s IS NULL THEN (SELECT count(*) FROM state "
     "WHERE run_id = r.id AND sim_time_s > CASE WHEN r.row_count > 0 THEN r.last_sim_time_s "
     "ELSE -9e999 END) ELSE 0 END, "
@@ -44,20 +42,37 @@ _WHAT: Final = (
 
 
 @dataclass(frozen=True)
+class AnnotationLimits:
+    """Limits of what a person writes about a run, in characters.
+
+    Attributes:
+        label: Maximum length of a label.
+        note: Maximum length of a note.
+    """
+
+    label: int = 100
+    note: int = 4000
+
+
+_ANNOTATION: Final = AnnotationLimits()
+
+
+@dataclass(frozen=True)
 class RunInfo:
     """A run.
 
     Attributes:
-        end_reason: None while it goes on; where its process is gone, how that will be judged.
+        end_reason: None while it is running; if its process has ended, the reason that will be
+            recorded.
         duration_s: Simulated seconds.
-        own_ms: Mean wall time of a step in the controller's own code; None where few were seen.
-        step_wait_ms: Likewise in `step` itself.
-        held_s: Of the wall time, that for which the simulation was paused by a command.
-        row_count: State rows; retention has deleted `purged_rows` of them.
-        notable: How often what needs attention was stored: warnings, errors, dropped rows,
-            failed or lost commands, trouble with storage.
-        parameters: Those that are not as the code declared them, or differ between the runs that
-            were asked for together; a text names changes in the middle of the run.
+        own_ms: Mean wall time of a step in the controller's own code; None if few were seen.
+        step_wait_ms: Mean wall time in `step` itself.
+        held_s: Wall time during which a command paused the simulation.
+        row_count: Number of state rows; retention has deleted `purged_rows` of them.
+        notable: Number of stored problems: warnings, errors, dropped rows, failed or lost commands,
+            storage trouble.
+        parameters: Parameters that are not as declared, or differ between the listed runs; a text
+            describes changes in the middle of the run.
     """
 
     run_id: int
@@ -84,17 +99,17 @@ class RunInfo:
 
     @property
     def real_time_factor(self) -> float | None:
-        """Simulated seconds per second of wall time, but for the time it was held."""
+        """Simulated seconds per second of wall time, without the time it was held."""
         return pace(self.duration_s, self.wall_duration_s - self.held_s)
 
 
 @dataclass(frozen=True)
 class RunList:
-    """Runs, the newest first.
+    """Runs, newest first.
 
     Attributes:
-        total: How many there are in all.
-        cursor: Give it as `before_id` for older ones; None after the oldest.
+        total: The number of all runs.
+        cursor: The `before_id` of older runs; None after the oldest.
     """
 
     runs: tuple[RunInfo, ...]
@@ -114,8 +129,8 @@ def list_runs(
     """List runs, the newest first.
 
     Args:
-        connection: Any.
-        robot: Whose; None for all robots.
+        connection: An open database.
+        robot: The robot; None for all robots.
         limit: 1 to 200.
         before_id: Only runs with smaller ids: the `cursor` of the page before.
         parameters: Only runs in which these parameters had these values at some time.
@@ -143,7 +158,7 @@ def list_runs(
 
 
 def run_info(connection: sqlite3.Connection, run_id: int) -> RunInfo:
-    """One run.
+    """Return one run.
 
     Raises:
         UnknownRunError: No run has that id.
@@ -153,10 +168,10 @@ def run_info(connection: sqlite3.Connection, run_id: int) -> RunInfo:
 
 
 def run_infos(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list[RunInfo]:
-    """Several runs, in this order.
+    """Return several runs in the given order.
 
     Raises:
-        UnknownRunError: One of these ids is no run's.
+        UnknownRunError: One of these ids does not exist.
     """
     ids = [fetch_run(connection, run_id).id for run_id in run_ids]
     return _infos(
@@ -172,13 +187,13 @@ def annotate_run(
     label: str | None = None,
     note: str | None = None,
 ) -> None:
-    """Give a run a label (short, to find it by) or a note; an empty text takes it away.
+    """Give a run a label (short, to find it by) or a note; an empty text removes it.
 
     Args:
-        connection: In the role "writer".
-        run_id: Which run.
-        label: At most 100 characters; None leaves it as it is.
-        note: At most 4,000 characters; None leaves it as it is.
+        connection: A connection in the role "writer".
+        run_id: The run.
+        label: At most 100 characters; None leaves it unchanged.
+        note: At most 4,000 characters; None leaves it unchanged.
 
     Raises:
         UnknownRunError: No run has that id.
@@ -188,25 +203,28 @@ def annotate_run(
         raise InvalidInputError(
             "Nothing to store. Give a label, a note or both, for example label='baseline'."
         )
-    for name, text, longest in (("label", label, MAX_LABEL), ("note", note, MAX_NOTE)):
+    for name, text, longest in (
+        ("label", label, _ANNOTATION.label),
+        ("note", note, _ANNOTATION.note),
+    ):
         if text is not None and len(text) > longest:
             raise InvalidInputError(
                 f"The {name} has {len(text)} characters, and at most {longest} are kept. "
                 "Shorten it."
             )
     values = {"run": run_id, "label": label, "note": note}
-    with transaction(connection):  # it waits for the lock, and Ctrl-C ends that
+    with transaction(connection):  # the write waits for the lock, and Ctrl-C ends that
         if not connection.execute(
             "UPDATE run SET label = CASE WHEN :label IS NULL THEN label ELSE nullif(:label, '') "
             "END, note = CASE WHEN :note IS NULL THEN note ELSE nullif(:note, '') END WHERE id = "
             ":run",
             values,
         ).rowcount:
-            fetch_run(connection, run_id)  # says which there are
+            fetch_run(connection, run_id)  # the error lists the existing runs
 
 
 def pace(duration_s: float, wall_s: float) -> float | None:
-    """The real-time factor; None where the wall time is too short: under a second."""
+    """Return the real-time factor; None if the wall time is under a second."""
     return duration_s / wall_s if wall_s >= 1 else None
 
 
@@ -222,7 +240,7 @@ def _info(
     ended: dict[int, str],
     parameters: dict[str, Value | str],
 ) -> RunInfo:
-    """One run; `ended` says how sessions ended that still look open."""
+    """Return the info of a run; `ended` has the outcome of sessions that still seem open."""
     *what, started_wall_s, last_wall_s, started_s, last_s = row
     named = dict(zip(_WHAT, what, strict=True))
     named["end_reason"] = named["end_reason"] or ended.get(named["session_id"])
@@ -250,7 +268,7 @@ def _info(
     )
 
 
-# What whole runs came to, in groups: the way, the modes and the events of a stretch.
+# Statistics of whole runs in groups: path, modes and events of an interval.
 
 
-# -- `score_run`: what a finished run comes to, by an expression over signals and events -----------
+# -- `score_run`: the score of a finished run, by an expression over signals and events ------------

@@ -1,4 +1,4 @@
-"""Sessions: the controller processes of robots, and whether they still live.
+"""Read sessions: the controller processes of robots, and whether they still live.
 
 The row of a session is the heartbeat of its bridge.
 """
@@ -70,7 +70,7 @@ class SessionRecord:
     def silent_s(self, now_s: float) -> float:
         """Return the time since its newest heartbeat, in seconds.
 
-        For a process of this machine, a clock counts that cannot be set.
+        For a process of this machine, a clock is used that cannot be set.
         """
         beat_s = self.last_seen_monotonic_s
         if beat_s is None or self.process is None or not self._is_of_this_boot():
@@ -78,7 +78,7 @@ class SessionRecord:
         return time.monotonic() - beat_s
 
     def age_s(self, wall_time_s: float, now_s: float) -> float:
-        """Return how long ago the bridge stamped a time, which may use another clock."""
+        """Return how long ago the bridge stamped a time, possibly with another clock."""
         return self.silent_s(now_s) + self.last_seen_wall_time_s - wall_time_s
 
     def heartbeat_is_fresh(self, now_s: float) -> bool:

@@ -1,4 +1,4 @@
-"""`query_history`: signals over a range of any length, in buckets."""
+"""Answer `query_history`: signals over a range of any length, in buckets."""
 
 from __future__ import annotations
 
@@ -37,28 +37,28 @@ from webots_mcp.store.registered_signals import RegisteredSignal, cleaned
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
-MOST_NAMED: Final = 5  # signals that there was no time for
+MOST_NAMED: Final = 5  # signals that an error lists as unread
 TURNS_COUNTED: Final = (
     "angles: extremes, last values and slopes count turns (unwrapped); means are circular"
 )
 WEIGHTED: Final = "means and deviations are weighted by time"
-STATES_SHARE: Final = 0.5  # of the time, where numbers are asked for as well
+STATES_SHARE: Final = 0.5  # share of the time, if numbers are requested as well
 
 MOST_ROWS: Final = 1000
 
 
 @dataclass(frozen=True)
 class NumberColumns:
-    """A numeric signal: one item per bucket in each list, None where the bucket has no value.
+    """A numeric signal: one item per bucket in each list, None if the bucket has no value.
 
     Attributes:
-        turn: A whole turn in its unit, of an angle; else None.
-        is_turned: Its values are those of an angle whose turns are counted, which differ from the
-            recorded ones by whole turns.
-        mean: Of an angle the circular mean.
+        turn: A full turn in its unit if it is an angle, else None.
+        is_turned: Whether its values are those of an angle with counted turns, which differ from
+            the recorded ones by full turns.
+        mean: The mean; the circular mean for an angle.
         whole: The same for the whole range, with the times of its extremes.
-        too_large: How many values are beyond 1e100, where there is no other.
-        replaced: How often a value stood there that JSON cannot hold ("nan", "inf").
+        too_large: The number of values beyond 1e100, if there are no others.
+        replaced: How often each value that JSON cannot hold ("nan", "inf") occurred.
     """
 
     name: str
@@ -82,11 +82,11 @@ class ChangeColumns:
 
     Attributes:
         points: The newest of its changes, [from then on, value]; the first of all is the value in
-            force when the range begins.
+            force at the start of the range.
         total: How many points there are; `points` are the last of them.
         time_by_value_s: Simulated seconds in each value, the longest first.
-        since_before: The first of all points was in force before its time.
-        cut_at_s: The deadline passed; what was after that is not in the points.
+        since_before: Whether the first of all points was in force before its time.
+        cut_at_s: Where the deadline passed; later points are missing.
     """
 
     name: str
@@ -100,15 +100,15 @@ class ChangeColumns:
 
 @dataclass(frozen=True)
 class RunHistory:
-    """The part of an answer that is about one run.
+    """The part of an answer about one run.
 
     Attributes:
         step_s: Length of a bucket; None where each row is one.
-        sim_time_s: Begin of each bucket.
-        rows: Rows of the range that were read.
+        sim_time_s: Start of each bucket.
+        rows: Number of rows of the range that were read.
         interval_s: Median simulated time between rows.
-        gaps: Where rows are missing.
-        cut_at_s: The deadline passed; from there on something is missing in the answer.
+        gaps: Intervals without rows.
+        cut_at_s: Where the deadline passed; the answer is incomplete from there on.
         unread: What else was not read, and why.
         age_s: Wall time since the run's newest row.
     """
@@ -148,21 +148,23 @@ def query_history(
     least_step_s: float = 0.0,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> History:
-    """Signals over a range, in columns of at most `max_points` buckets.
+    """Return signals over a range, in columns of at most `max_points` buckets.
 
     Buckets begin at multiples of their length. An extreme is never lost: each bucket has its
-    minimum and maximum. Of a long range only the chunks are opened that a border of a bucket cuts:
-    what the others come to is known.
+    minimum and maximum. In a long range, only the chunks at edges of buckets are opened, because
+    the statistics of the others suffice.
 
     Args:
-        connection: Any.
+        connection: An open database.
         time_range: From `find_range`; over several runs each gets its share of the points.
         names: Signals, with `*`.
         max_points: 1 to 500.
-        max_changes: The most changes of a text or flag in a run; None for as many as points.
-        least_step_s: The least length of a bucket, so that runs of unlike length can be drawn over
+        max_changes: Maximum number of changes of a text or flag in a run; None for `max_points`.
+        least_step_s: Minimum length of a bucket, so that runs of different length can be drawn over
             each other; 0 leaves it open.
-        deadline_s: After it, what was read so far is the answer, and says so.
+        deadline_s: Time after which the answer consists of what was read, and reports that.
+            151.UnknownSignalError, InvalidInputError: A name matches nothing; `max_points` is out
+            of bounds.
 
     Raises:
         UnknownSignalError, InvalidInputError: A name meets nothing; `max_points` is out of bounds.
@@ -184,7 +186,7 @@ def query_history(
 
 
 def _weighted(runs: Sequence[RunHistory]) -> Iterator[str]:
-    """That means are weighted by time, where some are shown."""
+    """Note that means are weighted by time, if some are shown."""
     if any(run.numbers and run.step_s is not None for run in runs):
         yield WEIGHTED
     if any(columns.is_turned for run in runs for columns in run.numbers):
@@ -245,12 +247,12 @@ def _run_history(
 
 
 def _unread(frame: Frame) -> Iterator[str]:
-    """What the frame could not read, but for what `cut_at_s` says."""
+    """Return what the frame could not read, except what `cut_at_s` reports."""
     return (str(each) for each in frame.unread if each.end_s < (frame.cut_at_s or math.inf))
 
 
 def signals_left(names: Sequence[str]) -> Iterator[str]:
-    """That there was no time for some signals, if so."""
+    """Note which signals there was no time for."""
     if names:
         yield f"time limit reached, {len(names)} signals left: ask for {listed(names, MOST_NAMED)}"
 
@@ -288,7 +290,7 @@ def _columns(
 def _turned_summary(
     frame: Frame, signal: RegisteredSignal, turned: Array, whole: Summary, kept: Frame | None
 ) -> Summary:
-    """The figures of an angle whose turns are counted; its mean is that of the directions."""
+    """Return the summary of an angle whose turns are counted; its mean is the circular one."""
     assert signal.turn is not None
     there = ~np.isnan(turned)
     weights = frame.usable_weights(signal.name)
@@ -327,11 +329,11 @@ class StatePage:
     """State rows as columns, in order.
 
     Attributes:
-        values: Per signal one value per row; None where the row has none.
-        replaced: Per signal, how often each value that JSON cannot hold.
-        cursor: Give it as `after_id` for the next page; None after the last row, or where the time
-            was over before any was read.
-        cut: The time was over: there may be more rows even where none is here.
+        values: One value per row and signal; None if the row has none.
+        replaced: How often each value that JSON cannot hold occurred, by signal.
+        cursor: The `after_id` of the next page; None after the last row, or if time ran out before
+            any was read.
+        cut: Whether time ran out: more rows may exist even if none is here.
     """
 
     robot: str
@@ -356,16 +358,18 @@ def query_rows(
     after_id: int = 0,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> StatePage:
-    """The rows of a range with the values of some signals, at most `limit` of them.
+    """Return the rows of a range with the values of some signals, at most `limit` of them.
 
     Args:
-        connection: Any.
+        connection: An open database.
         time_range: From `find_range`.
         names: Signals, with `*`.
         limit: 1 to 1,000.
-        after_id: The `cursor` of the page before. Ids never come back, so rows that are recorded
-            or deleted meanwhile make no page repeat or miss one.
-        deadline_s: After it the page ends early; its cursor goes on from there.
+        after_id: The `cursor` of the previous page. Ids are not reused, so pages neither repeat nor
+            miss a row when rows are recorded or deleted meanwhile.
+        deadline_s: Time after which the page ends early; its cursor continues from there.
+            359.UnknownSignalError, InvalidInputError: A name matches nothing; `limit` is out of
+            bounds.
 
     Raises:
         UnknownSignalError, InvalidInputError: A name meets nothing; `limit` is out of bounds.
@@ -375,7 +379,7 @@ def query_rows(
     signals = signals_of(connection, time_range, names)
     deadline = Deadline(deadline_s)
     parts: list[Frame] = []
-    budget, cut = limit + 1, False  # one more, to know whether there is a next page
+    budget, cut = limit + 1, False  # one more, to know whether another page follows
     for segment in time_range.segments:
         if budget <= 0 or cut:
             break
@@ -388,7 +392,7 @@ def query_rows(
 
 
 def _place_after(frame: Frame, after_id: int) -> int:
-    """The place of the row after that one; where it is gone, of the first one with a greater id."""
+    """Return the index of the row after an id; if it was deleted, of the next greater id."""
     if after_id == 0:
         return 0
     ids = frame.ids
@@ -418,7 +422,7 @@ def _page(
     for signal in signals:
         name = signal.name
         held = [value for part in shown for value in part.values(name)]
-        exact = [  # as recorded, where the rows are there
+        exact = [  # as recorded, if the rows still exist
             states[row_id].get(name) if row_id in states else value
             for row_id, value in zip(ids, held, strict=True)
         ]

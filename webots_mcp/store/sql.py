@@ -1,10 +1,10 @@
-"""`query_sql`: reading by SQL, for what the other questions do not cover.
+"""Answer `query_sql`: reading by SQL, for what the other questions do not cover.
 
-What keeps it harmless: an authorizer that lets a statement read and call functions and nothing
-else, one statement, a deadline by a progress handler, and limits on rows, bytes and the length of
-a value. The deadline is looked at between the steps of SQLite's virtual machine; where one step
-must not outlast it either, a process of its own runs the statement. The connection may be any; one
-in the role "reader" cannot write anyway.
+Several limits keep it harmless: an authorizer that only lets a statement read and call functions, a
+single statement, a deadline by a progress handler, and limits on rows, bytes and the length of a
+value. The deadline is checked between the steps of SQLite's virtual machine. If a single step must
+not exceed it either, a separate process runs the statement. The connection may be any; one in the
+role "reader" cannot write anyway.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from webots_mcp.store.run_rows import reading_texts
 MOST_ROWS: Final = 1000
 MAX_BYTES: Final = 20_000  # about 5,000 tokens
 MAX_TEXT: Final = 200  # characters of one value
-MAX_COLUMNS: Final = 100  # a row of so many such values still fits into memory
+MAX_COLUMNS: Final = 100  # a row of that many such values still fits into memory
 _READING: Final = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
@@ -45,16 +45,16 @@ _REFUSED_FUNCTIONS: Final = frozenset(
     {"load_extension", "fts3_tokenizer", "zeroblob", "randomblob"}
 )
 TOO_LARGE: Final = "it needs too much memory: read fewer or shorter values at a time"
-_MOST_NAMED: Final = 2  # tables whose columns are offered, even if none is like it
+_MOST_NAMED: Final = 2  # tables whose columns an error lists, even if none is similar
 LINE: Final = (sys.executable, "-m", __name__)
-# Modules are looked for here first, so that no file of the user's folder is taken for one.
-FOLDER: Final = Path(__file__).parents[2]  # which holds the package
-_TIMED_OUT: Final = 124  # the exit code of timeout(1): no other end of the process has it
+# Modules are searched here first, so that no file of the user's folder replaces one.
+FOLDER: Final = Path(__file__).parents[2]  # contains the package
+_TIMED_OUT: Final = 124  # the exit code of timeout(1), which no other end of the process has
 _OBJECTS: Final = (
     "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "
     "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
 )
-# What serves the recording itself: a question needs the names at most.
+# Tables that serve the recording itself: a question needs their names at most.
 _BOOKKEEPING: Final = (
     "console_line",
     "lease",
@@ -126,15 +126,15 @@ def query_sql(
     """Run one SELECT (or WITH ... SELECT, VALUES, EXPLAIN of one) and return its first rows.
 
     Args:
-        connection: Any.
+        connection: An open database.
         statement: One SQL statement.
         max_rows: 1 to 1,000.
-        max_bytes: The most bytes of values to return.
+        max_bytes: Maximum size of the returned values.
         deadline_s: Wall time after which it is interrupted.
 
     Raises:
-        InvalidInputError: It is no single SELECT, would do more than read, is wrong, or took too
-            long to give its first row; the text says what to do.
+        InvalidInputError: It is no single SELECT, would do more than read, is invalid, or took too
+            long to produce its first row; the text says what to do.
     """
     require_max_rows(max_rows)
     require_select(statement)
@@ -155,7 +155,8 @@ def query_sql(
             cursor.close()
     except MemoryError as error:
         raise InvalidInputError(TOO_LARGE) from error
-    except (sqlite3.Error, sqlite3.Warning, ValueError) as error:  # ValueError: a NUL, on 3.10
+    # ValueError: a NUL character, on 3.10
+    except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
         if not (deadline.passed and "interrupted" in str(error)):
             raise InvalidInputError(_explain(connection, statement, error)) from error
         if not rows:
@@ -168,17 +169,17 @@ def require_max_rows(max_rows: int) -> None:
     """Refuse more rows than an answer may have.
 
     Raises:
-        InvalidInputError: The text says how many those are.
+        InvalidInputError: The text states the maximum.
     """
     if not 1 <= max_rows <= MOST_ROWS:
         raise InvalidInputError(f"max_rows={max_rows} must be from 1 to {MOST_ROWS}.")
 
 
 def require_select(statement: str) -> None:
-    """Refuse what does not even begin as a reading statement.
+    """Refuse statements that do not begin with a reading keyword.
 
     Raises:
-        InvalidInputError: The text says with what it begins.
+        InvalidInputError: The text states how the statement begins.
     """
     if not statement.strip():
         raise InvalidInputError(
@@ -196,20 +197,20 @@ def require_select(statement: str) -> None:
 
 @contextlib.contextmanager
 def _only_reading(connection: sqlite3.Connection) -> Generator[None]:
-    """Refuse all but reading, and values beyond 10 MB, until the end of the block."""
-    # The first use on a connection defines these functions, which an authorizer takes for writing.
+    """Refuse everything but reading, and values beyond 10 MB, until the end of the block."""
+    # The first use on a connection defines these functions, which the authorizer counts as writing.
     connection.execute("SELECT 1 FROM json_each('[]'), json_tree('[]')").fetchall()
     before = _limit_values(connection, (_LIMITS.value_bytes, MAX_COLUMNS))
     connection.set_authorizer(_authorize)
     try:
         yield
     finally:
-        connection.set_authorizer(_allow)  # None is understood from Python 3.11 on only
+        connection.set_authorizer(_allow)  # None is accepted only from Python 3.11 on
         _limit_values(connection, before)
 
 
 def _limit_values(connection: sqlite3.Connection, limits: tuple[int, int]) -> tuple[int, int]:
-    """Set the longest value and the longest row that SQLite may build; what they were before."""
+    """Set the longest value and row that SQLite may build. Return the previous limits."""
     if sys.version_info < (3, 11):
         return limits
     max_bytes, max_columns = limits
@@ -231,18 +232,18 @@ def _allow(*_: object) -> int:
 
 
 class Budget:
-    """Bytes that are left for values, and how many of these were shortened."""
+    """Bytes that remain for values, and how many of these were shortened."""
 
     def __init__(self, max_bytes: int) -> None:
         self.left = max_bytes
         self.shortened = 0
 
     def shortening(self, connection: sqlite3.Connection) -> AbstractContextManager[None]:
-        """Cut texts as they are read: the whole row is never in memory; bad UTF-8 is shown."""
+        """Cut texts while reading, so that a long row is never in memory; show invalid UTF-8."""
         return reading_texts(connection, self._text)
 
     def take(self, row: Iterable[object]) -> tuple[Cell, ...]:
-        """The values of a row as an answer has them; they are paid for."""
+        """Return the values of a row for an answer, and subtract their size."""
         cells = tuple(self._shown(value) for value in row)
         self.left -= sum(len(str(cell).encode("utf-8", "replace")) + 1 for cell in cells)
         return cells
@@ -268,7 +269,7 @@ def fetch_rows(
     max_rows: int,
     budget: Budget,
 ) -> str | None:
-    """Fill `rows`; why there are more, or None."""
+    """Fill `rows`. Return why there are more, or None."""
     for row in found:
         if len(rows) == max_rows:
             return f"only the first {max_rows} rows; narrow the question, or count and aggregate"
@@ -279,7 +280,7 @@ def fetch_rows(
 
 
 def too_slow(deadline_s: float) -> str:
-    """What to do about a statement that gave no row in time."""
+    """Return what to do about a statement that gave no row in time."""
     return (
         f"no row within {deadline_s:g} s; narrow it by run_id and sim_time_s (there is an index), "
         "use robot_statistics for long ranges, and end every recursion"
@@ -303,7 +304,7 @@ def _explain(connection: sqlite3.Connection, statement: str, error: Exception) -
 
 
 def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) -> str:
-    """Say that it is missing, and which tables or columns there are, the nearest first."""
+    """Return that it is missing, with the tables or columns that exist, the most similar first."""
     tables = columns_by_table(connection)
     wanted = name.rpartition(".")[2]
     if what == "table":
@@ -329,17 +330,12 @@ def _by_likeness(wanted: str, names: Iterable[str]) -> list[str]:
     return [*dict.fromkeys([*difflib.get_close_matches(wanted, names, 4, 0.4), *names])]
 
 
-# -- a process of its own, which the deadline ends whatever the engine is doing --------------------
-#
-# SQLite looks at its deadline between the steps of its virtual machine, and one call of `replace`
-# on long texts is one step of half a minute; DuckDB is no quicker. A process can be ended inside
-# it, and takes its memory along. It gets one request as JSON on stdin and gives one answer as
-# JSON on stdout.
+# -- a separate process, which the deadline ends whatever the engine is doing ----------------------
 
 
 @dataclass(frozen=True)
 class Statement:
-    """What is asked; see `query_sql`. The database is a file, or the URL of a pool."""
+    """A statement to run; see `query_sql`. The database is a file, or the URL of a pool."""
 
     database: str
     sql: str
@@ -348,21 +344,21 @@ class Statement:
     deadline_s: float
 
     def encoded(self) -> bytes:
-        """The request as the process takes it."""
-        return json.dumps(asdict(self), ensure_ascii=False).encode()  # what is no text fails here
+        """Return the request in the form that the process reads."""
+        return json.dumps(asdict(self), ensure_ascii=False).encode()  # fails here if it is no text
 
 
 def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = None) -> SqlResult:
-    """What the process answered; one that ended itself before it could answer took too long.
+    """Return what the process answered; one that ended before answering took too long.
 
     Args:
         answer: What it wrote to stdout.
-        exit_code: Its own.
-        asked: What it was asked.
-        slow: What to do about a statement that takes too long, where it is not asked of SQLite.
+        exit_code: Its exit code.
+        asked: The statement.
+        slow: What to do about a slow statement, if it was not for SQLite.
 
     Raises:
-        InvalidInputError: As `query_sql`.
+        InvalidInputError: As for `query_sql`.
         WebotsMCPError: The process ended for another reason, not because of the statement.
     """
     if exit_code == _TIMED_OUT:
@@ -384,7 +380,7 @@ def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = N
 
 @contextlib.contextmanager
 def as_file(database: Database) -> Generator[Path]:
-    """The database as a file that another process can open; one in memory is copied to a file."""
+    """Return the database as a file for another process; a database in memory is copied."""
     if isinstance(database, Path):
         yield database
         return
@@ -423,7 +419,7 @@ def _ask(asked: Statement) -> SqlResult:
 
 
 def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
-    """The columns of each table and view of ours; those of a person are not looked into."""
+    """Return the columns of our tables and views; those of other programs are left out."""
     return {
         name: [
             column
@@ -437,10 +433,9 @@ def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
 
 
 def describe_schema(connection: sqlite3.Connection) -> str:
-    """One line for tables and views with the same columns: those of the first, with comments.
+    """Return one line per group of tables and views with the same columns, with their comments.
 
-    What is said of a column is not repeated for one of the same name in a later table. Bookkeeping
-    is named only.
+    The comment of a column is not repeated in later tables. Bookkeeping tables are only named.
     """
     columns = columns_by_table(connection)
     names: dict[frozenset[str], list[str]] = {}

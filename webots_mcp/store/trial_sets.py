@@ -1,4 +1,4 @@
-"""Trial sets and their trials: what is planned, what is running, and the scores so far."""
+"""Store trial sets and their trials: what is planned, what is running, and the scores so far."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?
 
 @dataclass(frozen=True)
 class TrialSetRecord:
-    """Runs with chosen parameters. Columns as in `store.models`; two are JSON text."""
+    """Runs with chosen parameters. Columns as in `store.models`; two of them are JSON text."""
 
     id: int
     uuid: str
@@ -44,7 +44,7 @@ class TrialSetRecord:
 
     @property
     def is_left(self) -> bool:
-        """Whether the process that worked on it is known to be gone, without waiting."""
+        """Return whether the process that worked on it is known to have ended, without waiting."""
         if self.pid is None:
             return True
         return self.host == host_name() and not process_alive(self.pid, self.process, time.time())
@@ -77,18 +77,18 @@ class TrialRecord:
 
     @property
     def is_over(self) -> bool:
-        """Whether it need not be run any more."""
+        """Whether it need not run any more."""
         return self.status in ("done", "failed", "pruned")
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What became of a trial: a score, or an error.
+    """The outcome of a trial: a score or an error.
 
     Attributes:
         error: Why there is no score.
-        ended_by: `for_s`, `until` or `prune`; None where it did not come to an end.
-        pruned: It was ended early because it was not worth going on with.
+        ended_by: `for_s`, `until` or `prune`; None if it was not completed.
+        pruned: Whether it was ended early because its score could no longer be good.
     """
 
     run_id: int | None
@@ -100,7 +100,7 @@ class TrialResult:
 
     @property
     def status(self) -> str:
-        """Of the trial, with this."""
+        """The status of a trial with this result."""
         if self.pruned:
             return "pruned"
         return "failed" if self.score is None else "done"
@@ -112,13 +112,13 @@ def create_trial_set(
     parameters: list[dict[str, Any]],
     robot_id: int | None = None,
 ) -> int:
-    """Enter a set and its trials, in the order in which they are to be run; returns its id.
+    """Create a set and its trials, in the order in which they will run. Return its id.
 
     Args:
-        connection: In the role "writer".
-        plan: JSON text.
-        parameters: Of each trial.
-        robot_id: In whose simulation they run; None where each has one of its own.
+        connection: A connection in the role "writer".
+        plan: The plan as JSON text.
+        parameters: The parameters of each trial.
+        robot_id: The robot in whose simulation they run; None if each has its own.
 
     Raises:
         CommandRefusedError: Another set of that robot is not over.
@@ -140,7 +140,7 @@ def create_trial_set(
 
 
 def add_trial(connection: sqlite3.Connection, set_id: int, values: dict[str, Any]) -> TrialRecord:
-    """Enter one more trial of a set that is searched as it goes on."""
+    """Add one more trial to a set whose search continues."""
     _enter(connection, set_id, len(trials_of(connection, set_id)) + 1, values)
     return trials_of(connection, set_id)[-1]
 
@@ -157,7 +157,7 @@ def _enter(
 
 
 def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
-    """In one simulation one set at a time."""
+    """Refuse a second set in one simulation."""
     for (set_id,) in connection.execute(
         "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC", (robot_id,)
     ).fetchall():
@@ -177,17 +177,17 @@ def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
 
 
 def find_trial_set(connection: sqlite3.Connection, plan: str | None = None) -> int | None:
-    """The newest set with exactly this plan; without one the newest of all."""
+    """Return the newest set with exactly this plan; without one the newest of all."""
     return connection.execute(
         "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)", (plan,)
     ).fetchone()[0]
 
 
 def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetRecord:
-    """The set of that id.
+    """Return the set with an id.
 
     Raises:
-        InvalidInputError: There is none.
+        InvalidInputError: The set does not exist.
     """
     row = connection.execute(
         f"SELECT {columns_of(TrialSetRecord)} FROM trial_set WHERE id = ?", (set_id,)
@@ -206,12 +206,12 @@ def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSetReco
 
 
 def is_at_work(connection: sqlite3.Connection, found: TrialSetRecord) -> bool:
-    """Whether a process works on a set: it is alive, as far as is known, and renews its lease."""
+    """Return whether a process works on a set: it seems alive and renews its lease."""
     return not found.is_left and holder_of(connection, found.job) is not None
 
 
 def next_trial(connection: sqlite3.Connection, set_id: int) -> TrialRecord | None:
-    """The trial that is to be run next, or was begun; None where all are over."""
+    """Return the trial that is next, or was begun; None if all are over."""
     row = connection.execute(
         f"SELECT {columns_of(TrialRecord)} FROM trial WHERE trial_set_id = ? "
         "AND status IN ('running', 'waiting') ORDER BY status = 'waiting', number LIMIT 1",
@@ -221,14 +221,14 @@ def next_trial(connection: sqlite3.Connection, set_id: int) -> TrialRecord | Non
 
 
 def stop_trial_set(connection: sqlite3.Connection, set_id: int, reason: str | None) -> None:
-    """Say why a set does not go on after its current trial; None has it go on."""
+    """Record why a set stops after its current trial; None lets it continue."""
     connection.execute("UPDATE trial_set SET stop_reason = ? WHERE id = ?", (reason, set_id))
 
 
 def borrow_parameters(
     connection: sqlite3.Connection, set_id: int, session_id: int, former: dict[str, Any] | None
 ) -> None:
-    """Note what the parameters of a controller were before; None once they are so again."""
+    """Store the original parameters of a controller; None once they are restored."""
     text = None if former is None else json.dumps(former, ensure_ascii=False)
     connection.execute(
         "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?",
@@ -237,10 +237,10 @@ def borrow_parameters(
 
 
 def trials_of(connection: sqlite3.Connection, set_id: int) -> list[TrialRecord]:
-    """The trials of a set, in order.
+    """Return the trials of a set, in order.
 
     Raises:
-        InvalidInputError: There is no such set.
+        InvalidInputError: The set does not exist.
     """
     fetch_trial_set(connection, set_id)
     return [
@@ -256,7 +256,7 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> JobLease:
     """Become the process that works on a set, as long as it renews the lease.
 
     Raises:
-        CommandRefusedError: Another one does.
+        CommandRefusedError: Another process works on it.
     """
     with transaction(connection):
         found = fetch_trial_set(connection, set_id)
@@ -276,7 +276,7 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> JobLease:
 
 
 def lay_down(connection: sqlite3.Connection, set_id: int, lease: JobLease) -> None:
-    """Let others work on a set: at once, where this is in the transaction of a `Job`."""
+    """Release a set to other processes: at once, if this is in the transaction of a `Job`."""
     connection.execute(_WORK, (None, None, None, set_id))
     give_back(connection, lease)
 
@@ -284,7 +284,7 @@ def lay_down(connection: sqlite3.Connection, set_id: int, lease: JobLease) -> No
 def begin_trial(
     connection: sqlite3.Connection, trial: TrialRecord, pid: int | None = None
 ) -> TrialRecord:
-    """It runs: in a simulator of that pid, or in that of a live controller."""
+    """Record that a trial runs: in a simulator with that pid, or in that of a live controller."""
     process = None if pid is None else process_identity(pid)
     now_s = time.time()
     connection.execute(
@@ -296,7 +296,7 @@ def begin_trial(
 
 
 def put_back(connection: sqlite3.Connection, trial: TrialRecord) -> None:
-    """It was not run to its end, and waits again."""
+    """Record that a trial did not run to its end and waits again."""
     connection.execute(
         "UPDATE trial "
         "SET status = 'waiting', started_wall_time_s = NULL, pid = NULL, process = NULL "
@@ -306,7 +306,7 @@ def put_back(connection: sqlite3.Connection, trial: TrialRecord) -> None:
 
 
 def finish_trial(connection: sqlite3.Connection, trial: TrialRecord, result: TrialResult) -> None:
-    """Enter what became of it; its run gets a label, unless it has one."""
+    """Record the outcome of a trial; its run gets a label unless it has one."""
     label = f"trial {trial.number} of set {trial.trial_set_id}: {spelled(trial.values)}"[:100]
     now = {"id": trial.id, "status": result.status, "now": time.time()}
     connection.execute(
@@ -321,16 +321,16 @@ def finish_trial(connection: sqlite3.Connection, trial: TrialRecord, result: Tri
 
 
 def spelled(values: Mapping[str, Any]) -> str:
-    """Values of parameters in one line."""
+    """Return values of parameters in one line."""
     return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
 def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[int]]:
-    """The runs that have a score by their parameters in one line, the best set first.
+    """Return the runs with a score by their parameters in one line, the best first.
 
     Raises:
-        InvalidInputError: There is no such set.
-        NothingRecordedError: No run of it is there that has a score.
+        InvalidInputError: The set does not exist.
+        NothingRecordedError: None of its runs has a score.
     """
     trials = trials_of(connection, set_id)
     plan = json.loads(fetch_trial_set(connection, set_id).plan)
@@ -348,17 +348,17 @@ def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[i
 
 
 def best_of(plan: Mapping[str, Any]) -> Best:
-    """Which scores of a stored plan are the best."""
+    """Return which scores of a stored plan are the best."""
     return "lowest" if plan.get("best") == "lowest" else "highest"
 
 
 def count_planned(plan: Mapping[str, Any], trials: Sequence[TrialRecord]) -> int:
-    """How many trials a set has in the end; those of a search are entered as it goes on."""
+    """Return how many trials a set will have; those of a search are added as it continues."""
     return max(len(trials), int(plan.get("sets") or 0) * int(plan.get("repeats") or 1))
 
 
 def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:
-    """How many trials of a set are over, of how many, and a word."""
+    """Return how many trials of a set are over, the total, and a status word."""
     over, of, last = connection.execute(
         "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial "
         "WHERE trial_set_id = t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) "
@@ -369,7 +369,7 @@ def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, flo
 
 
 def ranking_of(trials: list[TrialRecord], best: Best) -> Ranking:
-    """The parameter sets of the trials that are over, the best first."""
+    """Return the parameter sets of the finished trials, the best first."""
     return rank(
         [
             Outcome(each.values, each.score, each.error, pruned=each.status == "pruned")

@@ -21,7 +21,7 @@ _ENDED: Final = {
     "crashed": "its controller process is gone without having finished (killed or crashed)",
     "superseded": "a newer session took its place",
 }
-_MAX_ERROR_CHARACTERS: Final = 300  # of the exception that ended a controller
+_MAX_ERROR_CHARACTERS: Final = 300  # characters of the exception that ended a controller
 
 
 def why_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | None:
@@ -35,7 +35,8 @@ def why_ended(connection: sqlite3.Connection, session: SessionRecord) -> str | N
             "robot is gone"
         )
     if session.end_reason is None and (ended := _run_ended(connection, session)) == "finished":
-        return _ENDED[ended]  # it noted that of its run, and had no time left to note it of itself
+        # the event describes the run; the session had no time left to record its own end
+        return _ENDED[ended]
     if session.end_reason == "reload" and session.extern:
         return f"the world was reloaded, which ended its controller; {EXTERN}"
     if session.end_reason == "finished" and (unseen := unseen_report(session)):

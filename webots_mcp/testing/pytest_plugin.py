@@ -67,7 +67,7 @@ def _require_declared(values: dict[str, Any], databases: Iterable[Database]) -> 
 def webots_database(
     webots_parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[MemoryDatabase]:
-    """A database in memory, empty.
+    """Yield a database in memory, empty.
 
     While it is there, a bridge in the test's process raises what it could not do, and each
     `get_command()` looks for commands (otherwise at most every 5 ms).
@@ -108,7 +108,7 @@ def webots_bridge(
     webots_database: MemoryDatabase,
     webots_parameters: dict[str, Any],
 ) -> Iterator[MCPBridge]:
-    """A bridge that records each `publish` of `webots_robot` into `webots_database`."""
+    """Yield a bridge that records each `publish` of `webots_robot` into `webots_database`."""
     from webots_mcp import MCPBridge
 
     with MCPBridge(webots_robot, throttle_interval=1, database=webots_database) as bridge:
@@ -119,7 +119,7 @@ def webots_bridge(
 
 @pytest.fixture
 def webots_recording(webots_database: MemoryDatabase) -> RobotRecording:
-    """The recording in `webots_database`, with functions to send commands."""
+    """Return the recording in `webots_database`, with functions to send commands."""
     from webots_mcp.testing import RobotRecording
 
     return RobotRecording(webots_database)

@@ -280,7 +280,7 @@ def test_what_is_no_scheduler_is_refused_before_anything_is_written(
     address: str,
     said: str,
 ) -> None:
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(cluster, "_TIMES", cluster.ClusterTimes(connect_s=0.5))
     plan(GRID.format(1))
 
     assert said in refused("--scheduler", address)
@@ -290,7 +290,7 @@ def test_what_is_no_scheduler_is_refused_before_anything_is_written(
 def test_a_server_that_is_no_scheduler_is_not_waited_for(
     plan: Write, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(cluster, "_TIMES", cluster.ClusterTimes(connect_s=0.5))
     plan(GRID.format(1))
 
     with socket.create_server(("127.0.0.1", 0)) as silent:

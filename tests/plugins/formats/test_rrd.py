@@ -19,6 +19,7 @@ from tests.recordings.rows import Recorded as RecordedOnDisk
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import STATES, expected, publish, recorded_run, same
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins.formats.rrd import RerunExport
 from webots_mcp.store.export import export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
 
@@ -162,7 +163,7 @@ def test_several_runs_have_branches_of_their_own(recorded: Recorded, tmp_path: P
 def test_groups_of_rows_follow_each_other(
     recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.plugins.formats.rrd._GROUP_ROWS", 7)
+    monkeypatch.setattr("webots_mcp.plugins.formats.rrd._EXPORT", RerunExport(group_rows=7))
     for i in range(30):
         recorder.publish(float(i), {"x": i, "mode": "ab"[i // 15]})
     read = exported(recorder, tmp_path)

@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,11 +15,25 @@ from webots_mcp.contract import PROJECT_DATA_FOLDER
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import InvalidInputError
 
-MOST_SOURCE_BYTES: Final = 4_000_000
-MOST_SOURCE_FILES: Final = 500
 _FOREIGN: Final = frozenset(
     {"site-packages", "dist-packages", ".venv", "venv", "__pycache__", PROJECT_DATA_FOLDER}
 )
+
+
+@dataclass(frozen=True)
+class SourceFileLimits:
+    """Limits of the source files that a tape holds.
+
+    Attributes:
+        bytes: Total size.
+        files: Number of files.
+    """
+
+    bytes: int = 4_000_000
+    files: int = 500
+
+
+LIMITS: Final = SourceFileLimits()
 
 
 def root_of(controller: Path) -> Path:
@@ -72,14 +87,14 @@ def read_sources(files: Iterable[Path], root: Path, known: set[str]) -> dict[str
         name = relative_source(file, root)
         if name is None or file.suffix != ".py" or name in known:
             continue
-        if len(known) >= MOST_SOURCE_FILES:
+        if len(known) >= LIMITS.files:
             break
         try:
             content = file.read_bytes()
         except OSError:
             continue
         size += len(content)
-        if size > MOST_SOURCE_BYTES:
+        if size > LIMITS.bytes:
             break
         known.add(name)
         texts[name] = content.decode("utf-8", "surrogateescape")

@@ -10,19 +10,33 @@ import base64
 import ctypes
 from array import array
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import chain
 from types import SimpleNamespace
 from typing import Any, Final, cast
 
-MOST_NUMBERS: Final = 256
-"""Numbers in an answer that is not a picture: beyond it, an answer needs `tape_images`."""
 MOST_BYTES: Final = 4096
-_PACKED_FROM: Final = 16  # floats in a list, from which they are packed
 _PLAIN: Final = frozenset({type(None), bool, int, float, str})
 _VECTORS: Final = ("getValues", ".values", ".value", "getEmitterDirection", ".emitter_direction")
 
 NameOf = Callable[[Any], "str | None"]
 """Returns the path of an object of Webots' package; None for any other object."""
+
+
+@dataclass(frozen=True)
+class PackedValues:
+    """Sizes of values on a tape.
+
+    Attributes:
+        numbers: Maximum numbers of an answer that is not a picture; more needs `tape_images`.
+        packed_from: Number of floats in a list from which they are packed.
+    """
+
+    numbers: int = 256
+    packed_from: int = 16
+
+
+_PACKED: Final = PackedValues()
 
 
 class UnrecordedValueError(Exception):
@@ -75,12 +89,12 @@ def encode_value(value: Any, member: str, name_of: NameOf, *, images: bool) -> A
 
 
 def _encode_items(items: Any, member: str, name_of: NameOf, *, images: bool) -> Any:
-    if len(items) <= _PACKED_FROM and items.__class__ is list and all(map(_is_float, items)):
+    if len(items) <= _PACKED.packed_from and items.__class__ is list and all(map(_is_float, items)):
         return items[:]
     count = _count_numbers(items)
-    if count > MOST_NUMBERS and not images:
+    if count > _PACKED.numbers and not images:
         return {"$large": f"{count:,} numbers"}
-    if len(items) > _PACKED_FROM and all(type(each) is float for each in items):
+    if len(items) > _PACKED.packed_from and all(type(each) is float for each in items):
         single = array("f", items)
         exact = single.tolist() == list(items)  # not where one is NaN
         packed = single if exact else array("d", items)

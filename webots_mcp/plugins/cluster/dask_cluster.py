@@ -46,15 +46,30 @@ from webots_mcp.store.trial_sets import TrialResult
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000
 """Size of a packed recording that a worker returns, because it passes through the scheduler."""
-_CONNECT_S: Final = 10.0
 _PATIENCE_S: Final = 0.5  # Between two checks for a request to stop.
-_COUNT_EVERY_S: Final = 2.0
-_WITHOUT_WORKERS_S: Final = 60.0
 _BUNDLE: Final = "recording.zip"
 _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
 
 
 # -- functions that workers run ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ClusterTimes:
+    """Times of working with a scheduler, in seconds.
+
+    Attributes:
+        connect_s: For a connection.
+        count_every_s: Between two counts of the workers.
+        without_workers_s: Without a worker, before that is reported.
+    """
+
+    connect_s: float = 10.0
+    count_every_s: float = 2.0
+    without_workers_s: float = 60.0
+
+
+_TIMES: Final = ClusterTimes()
 
 
 @dataclass(frozen=True)
@@ -232,7 +247,7 @@ class _Cancellation:
         return self._worker.status.name in ("closing", "closed", "failed")
 
     def as_dask_says(self) -> Exception:
-        """Return the exception that tells Dask to run the task elsewhere, or to end it."""
+        """Return the exception that makes Dask run the task elsewhere, or end it."""
         from distributed import Reschedule
 
         return Reschedule() if self._closes else StoppedError()
@@ -274,11 +289,11 @@ class ClusterSimulators:
         """
         now_s = time.monotonic()
         if now_s >= self._look_again_s:
-            self._look_again_s = now_s + _COUNT_EVERY_S
+            self._look_again_s = now_s + _TIMES.count_every_s
             self._count = sum(_simulators_of(self._client, self._address).values())
         if self._count:
             self._seen_s = now_s
-        elif now_s > self._seen_s + _WITHOUT_WORKERS_S:
+        elif now_s > self._seen_s + _TIMES.without_workers_s:
             raise CommandRefusedError(_no_workers(self._address, "any more"))
         return max(1, min(self._count, self._most or self._count))
 
@@ -390,13 +405,15 @@ def _connected(address: str) -> Generator[Any]:
         )
     nobody = f"no Dask scheduler answers at {address}"
     try:
-        kind = asyncio.run(asyncio.wait_for(_kind_of_server(distributed, address), 2 * _CONNECT_S))
+        kind = asyncio.run(
+            asyncio.wait_for(_kind_of_server(distributed, address), 2 * _TIMES.connect_s)
+        )
     except Exception as error:
         why = str(error) or "what listens there is something else"
         raise CommandRefusedError(f"{nobody}: {why}") from error
     if kind != "Scheduler":
         raise CommandRefusedError(f"{nobody}, but a {kind.lower()}")
-    client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
+    client = distributed.Client(address, timeout=_TIMES.connect_s, set_as_default=False)
     try:
         yield client
     finally:
@@ -406,7 +423,9 @@ def _connected(address: str) -> Generator[Any]:
 async def _kind_of_server(distributed: Any, address: str) -> str:
     """Return `Scheduler` or `Worker`. A `Client` would wait for ever for any other server."""
     security = distributed.Security().get_connection_args("client")
-    async with distributed.rpc(address, timeout=_CONNECT_S, connection_args=security) as server:
+    async with distributed.rpc(
+        address, timeout=_TIMES.connect_s, connection_args=security
+    ) as server:
         return (await server.identity())["type"]
 
 
@@ -443,7 +462,7 @@ def _other_pythons(client: Any) -> list[str]:
     """Return notes on workers with another minor version of Python, which may change scores."""
     here, workers = python_version(), client.get_versions()["workers"]
     minor = here.split(".")[:2]
-    pythons = {each: str(told["host"]["python"]) for each, told in workers.items()}
+    pythons = {each: str(info["host"]["python"]) for each, info in workers.items()}
     others = {each: said for each, said in pythons.items() if said.split(".")[:2] != minor}
     if not others:
         return []
@@ -458,8 +477,8 @@ def _simulators_of(client: Any, address: str) -> dict[str, int]:
     except Exception as error:
         raise CommandRefusedError(_LOST.format(address)) from error
     found = {
-        each: min(int(told["resources"].get(RESOURCE, 0)), told["nthreads"])
-        for each, told in workers.items()
+        each: min(int(info["resources"].get(RESOURCE, 0)), info["nthreads"])
+        for each, info in workers.items()
     }
     return {each: number for each, number in found.items() if number}
 
@@ -474,7 +493,7 @@ def _no_workers(address: str, when: str) -> str:
 def _call(*arguments: Any) -> Callable[[str], Any]:
     """Return a function that calls a function by its name with these arguments.
 
-    The scheduler unpickles what it passes on, and may lack this package. Only a worker resolves
+    The scheduler unpickles what it passes on, and may not have this package. Only a worker resolves
     the name.
     """
     toolz: Any = import_module("toolz")  # A dependency of Dask.

@@ -14,6 +14,7 @@ import shlex
 import sys
 import time
 from collections.abc import AsyncGenerator, Generator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -38,9 +39,6 @@ if TYPE_CHECKING:
 
 
 DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
-_START_TIMEOUT_S: Final = 30.0
-_ANSWER_LINES: Final = 24
-_ROWS: Final = 6  # Of a table.
 
 Turn = tuple[str, str, dict[str, Any]]
 # What a person would say, and the tool call that an assistant would make.
@@ -80,6 +78,24 @@ CONVERSATION: Final[tuple[Turn, ...]] = (
     ),
 )
 _JOB: Final = "demo"  # One process at a time does this job in a folder.
+
+
+@dataclass(frozen=True)
+class DemoLimits:
+    """How long the demo waits, and how much it shows.
+
+    Attributes:
+        start_timeout_s: Wall time for the first state.
+        answer_lines: Lines of an answer.
+        rows: Rows of a table.
+    """
+
+    start_timeout_s: float = 30.0
+    answer_lines: int = 24
+    rows: int = 6
+
+
+_LIMITS: Final = DemoLimits()
 
 
 def demo(
@@ -184,7 +200,7 @@ def _wait_for_rows(simulation: Simulation, data_dir: Path) -> None:
     """
     before = _newest_image(data_dir)
     try:
-        simulation.wait_for(lambda: _newest_image(data_dir) > before, _START_TIMEOUT_S)
+        simulation.wait_for(lambda: _newest_image(data_dir) > before, _LIMITS.start_timeout_s)
     except TimeoutError as error:
         raise NothingRecordedError(f"the demo's controller recorded nothing: {error}") from error
 
@@ -282,11 +298,11 @@ def _texts_of(result: CallToolResult) -> list[str]:
 
 def _show_answer(answer: Mapping[str, Any]) -> None:
     """Print the first lines of an answer, and the number of further lines."""
-    lines = list(answer_lines(answer, most_rows=_ROWS))
-    for line in lines[:_ANSWER_LINES]:
+    lines = list(answer_lines(answer, most_rows=_LIMITS.rows))
+    for line in lines[: _LIMITS.answer_lines]:
         _say(f"    {line}")
-    if len(lines) > _ANSWER_LINES:
-        _say(f"    ... and {len(lines) - _ANSWER_LINES} more lines")
+    if len(lines) > _LIMITS.answer_lines:
+        _say(f"    ... and {len(lines) - _LIMITS.answer_lines} more lines")
 
 
 def _save_plot(result: CallToolResult, file: Path) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.plugins.formats.contents import Contents
 from webots_mcp.plugins.formats.mcap_topics import WORLD_FRAME, Topics
 from webots_mcp.store.registered_signals import RegisteredSignal
 
-_MOST_PLOTTED: Final = 8
-_MOST_CAMERAS: Final = 4
 _GRID: Final = {
     "layerId": "foxglove.Grid",
     "instanceId": "grid",
@@ -23,6 +22,22 @@ _GRID: Final = {
 }
 
 
+@dataclass(frozen=True)
+class LayoutLimits:
+    """How much a layout shows.
+
+    Attributes:
+        plotted: Signals in a plot.
+        cameras: Cameras.
+    """
+
+    plotted: int = 8
+    cameras: int = 4
+
+
+_LIMITS: Final = LayoutLimits()
+
+
 def layout(contents: Contents) -> dict[str, Any]:
     """Return panels for the main signals, the mode, the path, the pictures and the log."""
     topics, panels = Topics(contents), dict[str, dict[str, Any]]()
@@ -31,7 +46,7 @@ def layout(contents: Contents) -> dict[str, Any]:
     if contents.motion.position is not None:
         panels["3D!way"] = _path_panel(contents, topics)
     cameras = {topics.image(image): None for image in contents.images()}
-    for number, topic in enumerate([*cameras][:_MOST_CAMERAS]):
+    for number, topic in enumerate([*cameras][: _LIMITS.cameras]):
         panels[f"Image!{number}"] = {"imageMode": {"imageTopic": topic}}
     newest = contents.run_ids[-1]
     panels["RosOut!log"] = {"topicToRender": topics.topic(newest, "log"), "minLogLevel": 1}
@@ -50,7 +65,7 @@ def main_signals(contents: Contents) -> list[RegisteredSignal]:
     """Return the signals of the robot's motion, else the first numbers that it published."""
     numbers = [signal for signal in contents.signals.values() if signal.kind in ("num", "angle")]
     moving = [signal for signal in contents.motion.evidence if signal in numbers]
-    return (moving or numbers)[:_MOST_PLOTTED]
+    return (moving or numbers)[: _LIMITS.plotted]
 
 
 def _add_signals(panels: dict[str, dict[str, Any]], contents: Contents, topics: Topics) -> None:

@@ -12,6 +12,7 @@ import sys
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import chain, groupby, islice
 from operator import attrgetter
@@ -48,11 +49,25 @@ from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import EventRecord
 
-_COPY_BYTES: Final = 1 << 16
-_GROUP_ROWS: Final = 10_000  # About 10 MB of rows in memory at a time.
 _MEDIA_TYPES: Final = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg"}
 _WORLD: Final = "world"
 _Item = TypeVar("_Item", bound=Item)
+
+
+@dataclass(frozen=True)
+class RerunExport:
+    """How much is copied or in memory at a time.
+
+    Attributes:
+        copy_bytes: Bytes that are copied at a time.
+        group_rows: Rows in memory at a time: about 10 MB.
+    """
+
+    copy_bytes: int = 1 << 16
+    group_rows: int = 10_000
+
+
+_EXPORT: Final = RerunExport()
 
 
 def export_rrd(
@@ -156,7 +171,7 @@ class _PipedFile:
         except OSError as error:
             self._error = error
         finally:
-            while os.read(self._end, _COPY_BYTES):  # Rerun waits until everything was read.
+            while os.read(self._end, _EXPORT.copy_bytes):  # Rerun waits until everything was read.
                 pass
 
 
@@ -351,7 +366,7 @@ def _times(group: Sequence[Any]) -> _Times:
 
 def _groups(rows: Iterable[_Item]) -> Iterator[list[_Item]]:
     going = iter(rows)
-    while group := list(islice(going, _GROUP_ROWS)):
+    while group := list(islice(going, _EXPORT.group_rows)):
         yield group
 
 

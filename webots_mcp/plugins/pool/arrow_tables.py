@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
@@ -20,10 +21,26 @@ from webots_mcp.plugins.pool.pool_interface import (
 from webots_mcp.plugins.pool.storage import package
 from webots_mcp.signals.naming import unit_in
 
-_APPENDED_GROUP_ROWS: Final = 20_000
-_CHANGING_GROUP_ROWS: Final = 4_000  # Groups of many files are read in parallel.
-_VALUES_LEVEL: Final = 9  # Of zstd: 97 bytes for a row of 39 numbers instead of 128, in 6 us.
-_ROWS_AT_ONCE: Final = 1000
+
+@dataclass(frozen=True)
+class ParquetLayout:
+    """The layout of Parquet files.
+
+    Attributes:
+        appended_group_rows: Rows of a group in tables that only grow.
+        changing_group_rows: Rows of a group in other tables; groups of many files are read in
+            parallel.
+        values_level: Level of zstd: 97 bytes for a row of 39 numbers instead of 128, in 6 us.
+        rows_at_once: Rows in memory while a file is searched.
+    """
+
+    appended_group_rows: int = 20_000
+    changing_group_rows: int = 4_000
+    values_level: int = 9
+    rows_at_once: int = 1000
+
+
+_LAYOUT: Final = ParquetLayout()
 
 
 @cache
@@ -63,10 +80,12 @@ def encoded(table: ShippedTable, arrow_table: Any) -> bytes:
     JSON and measured values differ from row to row, so they are stored without a dictionary.
     """
     sink = io.BytesIO()
-    options: dict[str, Any] = {"use_dictionary": False, "compression_level": _VALUES_LEVEL}
+    options: dict[str, Any] = {"use_dictionary": False, "compression_level": _LAYOUT.values_level}
     if table.name != CHUNK:
         alike = [name for name in table.columns if name not in table.json_columns]
-        group_rows = _APPENDED_GROUP_ROWS if table.time_column else _CHANGING_GROUP_ROWS
+        group_rows = (
+            _LAYOUT.appended_group_rows if table.time_column else _LAYOUT.changing_group_rows
+        )
         options = {"use_dictionary": alike, "row_group_size": group_rows}
     package("pyarrow.parquet").write_table(arrow_table, sink, compression="zstd", **options)
     return sink.getvalue()
@@ -101,7 +120,7 @@ def matching_rows(
         chosen &= dataset.field(name).isin(arrow.array(values, arrow.int64()))
     with _clear_damage(path):
         fragment = dataset.ParquetFileFormat().make_fragment(arrow.BufferReader(content))
-        options = {"batch_size": _ROWS_AT_ONCE, "filter": chosen if count is None else None}
+        options = {"batch_size": _LAYOUT.rows_at_once, "filter": chosen if count is None else None}
         for batch in fragment.to_batches(schema=schema_of(table), **options):
             piece = arrow.Table.from_batches([batch])
             if count is not None:

@@ -2,7 +2,7 @@
 
 The runs are written into a temporary recording with the same ids, which is merged like any other:
 by UUIDs, each run completely or not at all. Fetching can therefore be killed at any time, and
-repeated. A run that lacks rows comes as one whose rows were purged.
+repeated. A run with missing rows arrives as one whose rows were purged.
 """
 
 from __future__ import annotations
@@ -32,13 +32,28 @@ from webots_mcp.store.merging import END_SESSIONS, merge, small_recording
 from webots_mcp.store.run_rows import PICTURES
 
 _FOLDER: Final = ".fetch-"
-_MOST_RUNS: Final = 100  # In one temporary recording.
-_MOST_ROWS: Final = 200_000  # In one temporary recording, unless a single run has more.
-_PAUSE_S: Final = 0.002  # Between two short writes, for robots that record here.
 _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value", "image")
 _OF_GROUP: Final = {
     "stored_row_count": "0", "stored_row_bytes": "0", "chunk_bytes": "0", "is_complete": "1",
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FetchLimits:
+    """Limits of one temporary recording.
+
+    Attributes:
+        runs: Maximum number of runs.
+        rows: Maximum number of rows, unless a single run has more.
+        pause_s: Pause between two short writes, for robots that record here.
+    """
+
+    runs: int = 100
+    rows: int = 200_000
+    pause_s: float = 0.002
+
+
+_LIMITS: Final = FetchLimits()
 
 
 @dataclass
@@ -116,7 +131,7 @@ def _parts(runs: Sequence[PooledRun]) -> Iterator[list[PooledRun]]:
     for _, group in groupby(runs, lambda run: run.recording_uuid):
         part, rows = list[PooledRun](), 0
         for run in group:
-            if part and (len(part) >= _MOST_RUNS or rows + run.row_count > _MOST_ROWS):
+            if part and (len(part) >= _LIMITS.runs or rows + run.row_count > _LIMITS.rows):
                 yield part
                 part, rows = [], 0
             part.append(run)
@@ -177,7 +192,7 @@ class _Fetcher:
                         self._found.unchunked[run.uuid] = chunked
             here = merge(self._connection, self._data_dir, folder / DATABASE_NAME)
         for run_id in here.values():
-            chunk_whole_run(self._connection, run_id, _PAUSE_S)
+            chunk_whole_run(self._connection, run_id, _LIMITS.pause_s)
 
     def take_trials(self, meant: ChosenRuns) -> None:
         """Fetch the trials of fetched runs, and all other trials of the chosen sets."""
@@ -200,7 +215,7 @@ class _Fetcher:
         """Store the number of missing rows of each run, and drop runs that are still shipped.
 
         Returns:
-            The runs that lack rows.
+            The runs with missing rows.
         """
         lacking: list[int] = []
         uuids = {run.run_id: run.uuid for run in runs}
@@ -244,7 +259,9 @@ class _Copy:
 
     def __init__(self, pool: Pool, recording_uuid: str, small: sqlite3.Connection) -> None:
         self._pool, self._recording_uuid, self._small = pool, recording_uuid, small
-        small.execute("PRAGMA foreign_keys=OFF")  # A pool may lack rows that others refer to.
+        small.execute(
+            "PRAGMA foreign_keys=OFF"
+        )  # Rows that others refer to may be missing in a pool.
 
     def context(self, run_ids: Collection[int]) -> None:
         """Copy the runs, their robots and signals, and what belongs to their sessions."""

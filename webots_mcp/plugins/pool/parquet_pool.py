@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Final
 
@@ -54,10 +55,25 @@ from webots_mcp.store.sql import SqlResult
 # A part is closed when its file or its rows in memory are large, or when additions are so small in
 # comparison that rewriting the file costs too much.
 PART_BYTES: Final = 8_000_000
-_PART_MEMORY_BYTES: Final = 64_000_000
-_SMALL_PART_BYTES: Final = 1_000_000
-_MOST_TIMES: Final = 16
 _HALF_WRITTEN_S: Final = 3600.0
+
+
+@dataclass(frozen=True)
+class PartSizes:
+    """When a part of a table is closed. Rewriting it for small additions costs too much.
+
+    Attributes:
+        memory_bytes: Size of its rows in memory.
+        small_bytes: Size from which small additions count.
+        times: How many times larger than an addition the file may be.
+    """
+
+    memory_bytes: int = 64_000_000
+    small_bytes: int = 1_000_000
+    times: int = 16
+
+
+_PARTS: Final = PartSizes()
 
 
 class ParquetShipment:
@@ -312,8 +328,8 @@ def _replaced(table: ShippedTable, held: Any | None, rows: Iterable[PoolRow]) ->
 def _is_over(content: bytes, whole: Any, rows_before: int) -> bool:
     """Return whether the part of a file that had `rows_before` rows has to be closed."""
     added_share = 1 - rows_before / max(1, whole.num_rows)
-    is_seldom_more = len(content) > _SMALL_PART_BYTES and added_share * _MOST_TIMES < 1
-    return len(content) > PART_BYTES or whole.nbytes > _PART_MEMORY_BYTES or is_seldom_more
+    is_seldom_more = len(content) > _PARTS.small_bytes and added_share * _PARTS.times < 1
+    return len(content) > PART_BYTES or whole.nbytes > _PARTS.memory_bytes or is_seldom_more
 
 
 def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[ShippedTable, list[PoolRow]]]:

@@ -23,11 +23,25 @@ from webots_mcp.plugins.pool.pool_interface import LISTED, Pool, require_no_secr
 from webots_mcp.signals.naming import nearest_first
 from webots_mcp.store.reading.ranges import parse_wall_time
 
-_MOST_OFFERED: Final = 3
-_MOST_COMPARED: Final = 2000  # Names or UUIDs to search for similar ones.
 _CONNECTION_STRING: Final = re.compile(
     r"(^|\s)(host|hostaddr|dbname|user|password|passfile|service)\s*=", re.IGNORECASE
 )
+
+
+@dataclass(frozen=True)
+class SimilarNames:
+    """How similar names are searched.
+
+    Attributes:
+        offered: Similar names that an error offers.
+        compared: Names or UUIDs to compare with.
+    """
+
+    offered: int = 3
+    compared: int = 2000
+
+
+_SIMILAR: Final = SimilarNames()
 
 
 def open_pool(url: str, *, ships: bool = False) -> Pool:
@@ -293,13 +307,13 @@ def _named(what: str, asked: str, uuids: Sequence[str]) -> str:
     if found and resolve_filter:
         raise InvalidInputError(
             f"{len(found)} of the {what}s have a UUID that begins with {asked!r} "
-            f"({', '.join(found[:_MOST_OFFERED])}, ...): give more of it"
+            f"({', '.join(found[: _SIMILAR.offered])}, ...): give more of it"
         )
     raise _unknown(f"{what} whose UUID begins with", asked, uuids)
 
 
 def _unknown(what: str, asked: str, known: Sequence[str]) -> InvalidInputError:
-    newest = list(dict.fromkeys(reversed(known)))[:_MOST_COMPARED]
-    offered = nearest_first(asked, newest)[:_MOST_OFFERED]
+    newest = list(dict.fromkeys(reversed(known)))[: _SIMILAR.compared]
+    offered = nearest_first(asked, newest)[: _SIMILAR.offered]
     hint = f"; nearest are {', '.join(map(repr, offered))}" if offered else ""
     return InvalidInputError(f"the pool holds no {what} {asked!r}{hint}")

@@ -275,7 +275,7 @@ class Shipment(Protocol):
 class Pool(Protocol):
     """A pool to ship to or to read: a context manager, connected as long as it is open.
 
-    `run.purged_rows` is the last value of the recording. How many states a pool lacks is counted.
+    `run.purged_rows` is the last value of the recording. Missing states are counted.
 
     Attributes:
         address: The URL without secrets, for messages and logs.

@@ -39,7 +39,7 @@ _IN_ORDER: Final = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was seen, and what mends it where it is not as it should be."""
+    """What was found, and how to fix it if something is wrong."""
 
     verdict: Verdict
     seen: str
@@ -68,12 +68,12 @@ def unclear(seen: str) -> Diagnosis:
 
 @dataclass(frozen=True)
 class Examined:
-    """What is looked at.
+    """What is checked.
 
     Attributes:
         recording: Read only: a diagnosis changes nothing.
         chosen_by: The rule that chose its folder.
-        project: The folder in which the files of clients are looked for.
+        project: The folder that is searched for the files of clients.
         connection: To the recording; None where it cannot be read.
         unread: Why it cannot be read.
         server: The command that starts this package's own server.
@@ -128,7 +128,7 @@ class DoctorCheck:
         name: In one word or a few; the heading of its part of the page.
         run: Yields what it finds.
         well: What is seen where it finds nothing.
-        needs_recording: It is not looked at where there is no recording that can be read.
+        needs_recording: Skip the check without a readable recording.
         starts_process: It takes seconds: a server does not ask it of itself.
     """
 
@@ -152,7 +152,7 @@ class Checked(NamedTuple):
 
     @property
     def is_well(self) -> bool:
-        """Whether there is nothing to mend."""
+        """Whether there is nothing to fix."""
         return self.finding.verdict == "ok"
 
 

@@ -36,7 +36,7 @@ _NO_PROJECT: Final = (
 
 @check("Controllers")
 def controllers(subject: Examined) -> Iterator[Diagnosis]:
-    """Which record, which lack the two lines, and whose Python lacks the package."""
+    """Report which record, which need the two lines, and whose Python needs the package."""
     project = find_project(subject.project)
     if project is None:
         yield unclear(_NO_PROJECT)
@@ -91,7 +91,7 @@ def _of_other_language(controller: ProjectController, file: str, *, is_observed:
 
 
 def _of_python(python: Interpreter, file: str) -> Iterator[Diagnosis]:
-    """Whether Webots, where it is installed, can start the controller with the bridge."""
+    """Check whether Webots, where it is installed, can start the controller with the bridge."""
     if python.error is not None:
         seen = (
             f"Webots starts {file} with {python.command} ({python.chosen_by}), where the bridge "
@@ -103,7 +103,7 @@ def _of_python(python: Interpreter, file: str) -> Iterator[Diagnosis]:
 
 @check("Supervisor", well="no robot was found that lacks a supervisor's rights")
 def supervisor(subject: Examined) -> Iterator[Diagnosis]:
-    """What cannot be done with a plain Robot, and that an observer would do it."""
+    """Report what cannot be done with a plain Robot, and that an observer would do it."""
     recording = [] if subject.connection is None else subject.live
     for view in recording:
         if view.session is not None and view.session.has_bridge and not view.session.supervisor:
@@ -118,7 +118,7 @@ def supervisor(subject: Examined) -> Iterator[Diagnosis]:
 
 
 def _of_project(project: Path) -> Iterator[Diagnosis]:
-    """Which of its robots lack a supervisor's rights, by its code, else by its worlds."""
+    """Report which of its robots have no supervisor's rights, by its code, else by its worlds."""
     known = controllers_of(project)
     for each in known:
         if each.is_python and is_plain_robot(each.file):
@@ -133,7 +133,7 @@ def _of_project(project: Path) -> Iterator[Diagnosis]:
 
 
 def _of_robot(view: RobotView) -> Diagnosis:
-    """Return what a robot that records now lacks."""
+    """Return what is missing for a robot that records now."""
     name = view.robot.name
     observer = live_observer(view.connection, view.session, view.now_s)
     if observer is not None:

@@ -68,7 +68,7 @@ _LIMITS: Final = MachineLimits()
 
 @check("Python")
 def python(_: Examined) -> Iterator[Diagnosis]:
-    """The Python that runs this; `Recording now` has that of the controllers."""
+    """Report the Python that runs this; `Recording now` has that of the controllers."""
     seen = f"{platform.python_version()} at {sys.executable}"
     if sys.version_info[:2] < _LIMITS.oldest_python:
         yield wrong(seen, "use Python 3.10 or newer")
@@ -80,7 +80,7 @@ def python(_: Examined) -> Iterator[Diagnosis]:
 
 @check("Packages", well="all that the server needs are installed")
 def packages(_: Examined) -> Iterator[Diagnosis]:
-    """What the server and most commands need; a bridge does without."""
+    """Report what the server and most commands need; a bridge does without."""
     if missing := missing_requirements():
         seen = f"missing: {', '.join(map(package_of, missing))} (a bridge does without)"
         yield wrong(seen, f"run {install_line(missing)}")
@@ -88,7 +88,7 @@ def packages(_: Examined) -> Iterator[Diagnosis]:
 
 @check("SQLite")
 def sqlite(_: Examined) -> Iterator[Diagnosis]:
-    """The SQLite of this Python."""
+    """Report the SQLite of this Python."""
     yield judge_sqlite(sqlite3.sqlite_version_info)
 
 
@@ -109,7 +109,7 @@ def judge_sqlite(version: tuple[int, ...]) -> Diagnosis:
 
 @check("Data folder", well=_IN_MEMORY)
 def data_folder(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether it is there, and may be written."""
+    """Check whether it is there, and may be written."""
     if subject.file is None:
         return
     folder = subject.file.parent
@@ -144,7 +144,7 @@ class Mount(NamedTuple):
 
 @check("File system", well=_IN_MEMORY)
 def file_system(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether processes can share memory there, which WAL needs."""
+    """Check whether processes can share memory there, which WAL needs."""
     if subject.file is None:
         return
     import psutil
@@ -202,7 +202,7 @@ def _is_in(path: str, point: str) -> bool:
 
 @check("Free space", well=_IN_MEMORY)
 def free_space(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether there is room for what will be recorded."""
+    """Check whether there is space for what will be recorded."""
     if subject.file is None:
         return
     folder = next(folder for folder in subject.file.parents if folder.exists())

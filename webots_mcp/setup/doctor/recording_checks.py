@@ -1,4 +1,4 @@
-"""Checks of a recording: whether it can be read, who writes to it, and what waits in it.
+"""Check a recording: whether it can be read, which processes write to it, and what waits in it.
 
 Each check names the robot or the file that it is about.
 """
@@ -42,7 +42,7 @@ _NOT_POLLED_S: Final = 5.0
 
 @check("Database", well="in memory")
 def database(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether there is one that can be read, and that readers and writers can share."""
+    """Check whether there is one that can be read, and that readers and writers can share."""
     if isinstance(subject.unread, NoDatabaseError):
         seen = f"nothing was recorded at {name_of(subject.recording.database)} yet"
         yield warning(seen, GETTING_STARTED)
@@ -64,7 +64,7 @@ def database(subject: Examined) -> Iterator[Diagnosis]:
 
 @check("Schema", well=f"{SCHEMA_VERSION}")
 def schema(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether the database has the tables of this version."""
+    """Check whether the database has the tables of this version."""
     if subject.unread is not None and not _is_about_schema(subject):
         yield unclear("there is no recording that can be read")
     elif subject.file is not None and is_there(subject.file):
@@ -106,7 +106,7 @@ def recording_now(subject: Examined) -> Iterator[Diagnosis]:
 
 @check("Rows", needs_recording=True, well="none wait or are dropped")
 def rows(subject: Examined) -> Iterator[Diagnosis]:
-    """What was recorded and is not in the database."""
+    """Report what was recorded and is not in the database."""
     waiting_in: list[object] = []
     for view in subject.views:
         if (session := view.session) is None:
@@ -179,7 +179,7 @@ class _Unfinished(NamedTuple):
 
 @check("Commands", needs_recording=True)
 def commands(subject: Examined) -> Iterator[Diagnosis]:
-    """What waits for a controller, and for how long."""
+    """Report what waits for a controller, and for how long."""
     unfinished = [
         _Unfinished(*row)
         for row in subject.opened.execute(
@@ -227,7 +227,7 @@ def _named(command: _Unfinished, view: RobotView) -> str:
 
 @check("get_command", needs_recording=True, well="no controller lives that could be asked")
 def get_command(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether the loops of the living controllers ask for commands."""
+    """Check whether the loops of the living controllers ask for commands."""
     for view in subject.live:
         if (session := view.session) is None:
             continue

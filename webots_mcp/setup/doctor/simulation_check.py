@@ -65,7 +65,7 @@ _LIMITS: Final = WatchLimits()
 
 @check("Simulation", needs_recording=True, well="no robot has been recorded yet")
 def simulation(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether time moves, and why it does not.
+    """Check whether time moves, and why it does not.
 
     Of the robots that stand silent in the same simulation one is watched for them all.
     """
@@ -115,7 +115,7 @@ def _judged(view: RobotView) -> Diagnosis:
 
 
 def _narrowed(subject: Examined, view: RobotView) -> Diagnosis:
-    """Of the reasons that look alike from inside, the one that shows from outside."""
+    """Return which of the reasons that are indistinguishable from inside shows from outside."""
     session = view.session
     assert session is not None
     head, why = f"{view.robot.name}: {view.status.text}", view.status.why or ""
@@ -191,7 +191,7 @@ class _Others(NamedTuple):
     Attributes:
         pids: Their processes, and what these have started.
         silent: Of them, the controllers that record nothing.
-        is_all: Those that record nothing were looked for as well.
+        is_all: Whether the ones that record nothing were searched as well.
     """
 
     pids: set[int]

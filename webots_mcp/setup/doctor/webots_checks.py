@@ -10,6 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from http import HTTPStatus
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -45,13 +46,27 @@ if TYPE_CHECKING:
 
 
 _INIT: Final = "run 'webots-mcp init' in the project"
-_TIMEOUT_S: Final = 30.0
-_SHOWN_CHARACTERS: Final = 300
+
+
+@dataclass(frozen=True)
+class ProbeLimits:
+    """Limits of a command that is run as a check.
+
+    Attributes:
+        timeout_s: Wall time.
+        shown_characters: Length at which its output is cut.
+    """
+
+    timeout_s: float = 30.0
+    shown_characters: int = 300
+
+
+_PROBE: Final = ProbeLimits()
 
 
 @check("Webots")
 def installed(_: Examined) -> Iterator[Diagnosis]:
-    """Which Webots there are."""
+    """Report which Webots there are."""
     try:
         find_webots()
     except CommandRefusedError as error:
@@ -71,7 +86,7 @@ def installed(_: Examined) -> Iterator[Diagnosis]:
 
 @check("Running Webots", well="no Webots runs on this machine")
 def running(subject: Examined) -> Iterator[Diagnosis]:
-    """Which of them run, and whether they can be steered from outside."""
+    """Report which of them run, and whether they can be steered from outside."""
     for each in subject.running_webots:
         world = f", {each.world.name}" if each.world else ""
         seen = f"port {each.port} (process {each.pid}{world}, mode {each.mode or 'of its own'})"
@@ -87,7 +102,7 @@ def running(subject: Examined) -> Iterator[Diagnosis]:
 
 @check("WSL", well="this is not WSL: Webots, controllers and server are on one side")
 def sides(subject: Examined) -> Iterator[Diagnosis]:
-    """What there is in WSL and what on Windows, and whether they meet."""
+    """Report what there is in WSL and what on Windows, and whether they meet."""
     if not is_wsl():
         return
     here = installations()
@@ -106,7 +121,7 @@ def sides(subject: Examined) -> Iterator[Diagnosis]:
 
 @check("Clients")
 def clients(subject: Examined) -> Iterator[Diagnosis]:
-    """Each file that is there, and whether its server can start on this recording."""
+    """Report each file that is there, and whether its server can start on this recording."""
     known = [*clients_of(subject.project), claude_desktop()]
     findings = [each for client in known for each in _servers_of(subject, client)]
     yield from findings
@@ -117,7 +132,7 @@ def clients(subject: Examined) -> Iterator[Diagnosis]:
 
 
 def _servers_of(subject: Examined, client: Client) -> Iterator[Diagnosis]:
-    """What a file says of our server: nothing where it names only others."""
+    """Report what a file says of our server: nothing where it names only others."""
     if not client.file.exists():
         return
     try:
@@ -179,7 +194,7 @@ def _other_place(subject: Examined, arguments: list[str]) -> str | None:
 
 @check("Server", starts_process=True)
 def server(subject: Examined) -> Iterator[Diagnosis]:
-    """Whether a server starts, names its tools and answers."""
+    """Check whether a server starts, names its tools and answers."""
     if subject.file is None:
         yield unclear("a recording in memory belongs to one process")
         return
@@ -193,7 +208,7 @@ def server(subject: Examined) -> Iterator[Diagnosis]:
         except Exception as error:  # noqa: BLE001  (it is reported)
             complaints.seek(0)
             wrote = complaints.read().strip().splitlines()
-            last = f"; it wrote: {wrote[-1][:_SHOWN_CHARACTERS]}" if wrote else ""
+            last = f"; it wrote: {wrote[-1][: _PROBE.shown_characters]}" if wrote else ""
             yield wrong(
                 f"'{' '.join(line)}' did not answer: {_why(error)}{last}",
                 "run the same command in a shell, see what it prints, and install webots-mcp again "
@@ -202,7 +217,7 @@ def server(subject: Examined) -> Iterator[Diagnosis]:
             return
     started = f"started over stdio, {tools} tools that only read"  # by --read-only
     if refused:
-        seen = f"{started}, and answers: {refused[:_SHOWN_CHARACTERS]}"
+        seen = f"{started}, and answers: {refused[: _PROBE.shown_characters]}"
         yield warning(seen, "mend the recording: see Database and Schema")
     else:
         yield ok(f"{started}, one answer, {time.monotonic() - started_s:.1f} s in all")
@@ -216,7 +231,7 @@ async def _converse(line: list[str], complaints: TextIO) -> tuple[int, str]:
 
     command, *arguments = line
     parameters = StdioServerParameters(command=command, args=arguments, env=dict(os.environ))
-    with anyio.fail_after(_TIMEOUT_S):
+    with anyio.fail_after(_PROBE.timeout_s):
         async with Client(stdio_client(parameters, complaints)) as client:
             tools = (await client.list_tools()).tools
             answer = await client.call_tool("webots_list_robots", {})
@@ -230,5 +245,5 @@ def _why(error: BaseException) -> str:
     if parts:
         return _why(parts[0])
     if isinstance(error, TimeoutError):
-        return f"nothing came within {_TIMEOUT_S:g} s"
-    return f"{error or type(error).__name__}"[:_SHOWN_CHARACTERS]
+        return f"nothing came within {_PROBE.timeout_s:g} s"
+    return f"{error or type(error).__name__}"[: _PROBE.shown_characters]

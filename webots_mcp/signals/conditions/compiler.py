@@ -40,9 +40,6 @@ from webots_mcp.signals.conditions.syntax import (
 from webots_mcp.signals.naming import NO_POSITION, Value, find_position, flatten, nearest_first
 
 POSITION: Final = "the position"  # what a displacement reads, whatever its signals are called
-_MOST_OFFERED: Final = 3
-MAX_DURATION_S: Final = 3600.0
-_MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a place that is so many times as old
 
 Number: TypeAlias = "int | float"
 
@@ -57,6 +54,24 @@ _NO_COMPARISON: Final = (ast.LShift, ast.RShift, ast.BitAnd, ast.BitOr, ast.BitX
 _COMPARE: Final = (
     "compare with < <= > >= == or !=; instead of `in` write mode == 'a' or mode == 'b'"
 )
+
+
+@dataclass(frozen=True)
+class CompilerLimits:
+    """Limits of conditions.
+
+    Attributes:
+        offered: Similar names that an error offers.
+        duration_s: Maximum of a duration.
+        times_as_old: Age of the position that a displacement takes, as a factor.
+    """
+
+    offered: int = 3
+    duration_s: float = 3600.0
+    times_as_old: float = 2.0
+
+
+_LIMITS: Final = CompilerLimits()
 
 
 def _as_it_is(value: Any) -> Any:
@@ -93,7 +108,7 @@ class Condition:
         return Evaluator(Compiler(self.scanned, self.tree, plain), plain)
 
     def describe_unknown(self, known: Collection[str]) -> list[str]:
-        """A sentence for each of its signals, and the position, not among the known ones."""
+        """Return a sentence for each of its signals, and the position, not among the known ones."""
         unknown = [name for name in self.signals if name not in known]
         return [
             *(f"No signal {name!r} is published. {self._instead(name, known)}" for name in unknown),
@@ -169,7 +184,7 @@ class Evaluator:
         return values | dict(zip(names, place or (None, None), strict=True)) if names else values
 
     def missing_names(self, state: State) -> set[str]:
-        """What the condition reads and a state has no value of: signals, and `POSITION`."""
+        """Return what the condition reads and a state has no value of: signals, and `POSITION`."""
         state = self._as_dict(state)
         lacking = {name for name, read in self._readers.items() if read(state) is None}
         if self._position is not None and self._position.read(state) is None:
@@ -177,7 +192,7 @@ class Evaluator:
         return lacking
 
     def names_in(self, state: State) -> list[str]:
-        """The names of all values of a state, null or not."""
+        """Return the names of all values of a state, null or not."""
         return list(flatten(self._plain(self._as_dict(state))))
 
     def _as_dict(self, state: State) -> dict[Any, Any]:
@@ -205,7 +220,7 @@ def parse_condition(text: str) -> Condition:
 def _nearest(name: str, known: Collection[str]) -> str:
     if not known:
         return "Nothing is published yet"
-    near = ", ".join(nearest_first(name, known)[:_MOST_OFFERED])
+    near = ", ".join(nearest_first(name, known)[: _LIMITS.offered])
     return f"The nearest of {len(known)} signals: {near}"
 
 
@@ -314,7 +329,7 @@ class Compiler(Nodes):
                 code.line(f"raise {code.refer_to(fail)}({left}, {right}) from None")
 
     def _lasting(self, node: ast.Tuple) -> str:
-        """A pair whose comma is a `for`; no other comma stands outside a call."""
+        """Return a pair whose comma is a `for`; no other comma stands outside a call."""
         places = self._durations_between(node)
         if not places:
             self._refuse(
@@ -334,7 +349,7 @@ class Compiler(Nodes):
         return self._keep(Changed(self._code.function(lambda: self._value(value))))
 
     def _flag(self, node: ast.expr) -> str:
-        """A signal by itself: a flag that is true, or a number other than 0."""
+        """Return a signal by itself: a flag that is true, or a number other than 0."""
         value = self._text_refused(node, "{} is not a condition; compare it, as in mode == 'turn'")
         return f"({value} is not None and {value} != 0)"
 
@@ -352,7 +367,7 @@ class Compiler(Nodes):
     # -- values --------------------------------------------------------------------------------
 
     def _value(self, node: ast.expr) -> str:
-        """A number, a flag, a text or None."""
+        """Return a number, a flag, a text or None."""
         if isinstance(node, ast.Name) and node.id in FLAGS:
             return str(FLAGS[node.id])
         if isinstance(node, ast.Constant):
@@ -461,9 +476,9 @@ class Compiler(Nodes):
         if type(value) not in (int, float):
             self._refuse(node, f"`{of}` takes a plain number of seconds, such as 0.5")
         seconds = cast("int | float", value)
-        if not 0 < seconds <= MAX_DURATION_S:
-            self._refuse(node, f"seconds must be above 0 and at most {MAX_DURATION_S:g}")
-        self.remembers_s += _MOST_TIMES_AS_OLD * seconds
+        if not 0 < seconds <= _LIMITS.duration_s:
+            self._refuse(node, f"seconds must be above 0 and at most {_LIMITS.duration_s:g}")
+        self.remembers_s += _LIMITS.times_as_old * seconds
         return float(seconds)
 
     def _unknown_function(self, node: ast.Call) -> str:

@@ -27,7 +27,7 @@ class Expectation:
         name: As it is reported.
         expected: What shall hold.
         during: Only while this holds; None: always.
-        within_s: It shall hold once, so many seconds after the run began at the latest; None: in
+        within_s: It must hold once, at most N seconds after the run began; None: in
             each state.
     """
 
@@ -132,12 +132,12 @@ class Violated:
             each.forget()
 
     def values(self, state: State) -> dict[str, Value]:
-        """The signals of both conditions as they are in a state."""
+        """Return the signals of both conditions as they are in a state."""
         during = {} if self._during is None else self._during.values(state)
         return during | self._expected.values(state)
 
     def names_in(self, state: Any) -> list[str]:
-        """The names of all values of a state."""
+        """Return the names of all values of a state."""
         return self._expected.names_in(state)
 
 

@@ -1,4 +1,4 @@
-"""The functions and operators of conditions, and what those that look back in time remember."""
+"""Define the functions and operators of conditions, and what those about the past remember."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Rate(Memory["int | float | None"]):
 
 
 class Displacement(Memory["tuple[float, float] | None"]):
-    """Metres between where the robot is and where it was so many seconds ago."""
+    """Metres between where the robot is and where it was N seconds ago."""
 
     def __init__(
         self, place: Callable[[State], tuple[float, float] | None], seconds: float
@@ -143,7 +143,7 @@ class Displacement(Memory["tuple[float, float] | None"]):
 
 
 class Lasting(Memory[bool]):
-    """Whether a condition held in every state of at least so many seconds."""
+    """Whether a condition held in every state for at least N seconds."""
 
     def __init__(self, condition: Callable[[State], bool], seconds: float) -> None:
         self._seconds = seconds

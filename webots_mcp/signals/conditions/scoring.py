@@ -88,7 +88,7 @@ class Score:
     _root: _Term = field(repr=False, compare=False)
 
     def of(self, facts: Facts) -> Scored:
-        """The score of a run."""
+        """Return the score of a run."""
         try:
             value = float(self._root(facts))
         except _NoValueError as error:
@@ -112,7 +112,7 @@ class Score:
                 )
 
     def place(self, column: int) -> str:
-        """The score and a place in it, for messages."""
+        """Return the score and a place in it, for messages."""
         return self._scanned.place(column)
 
 
@@ -232,7 +232,7 @@ class _Compiler(Nodes):
         return value
 
     def _condition_in(self, node: ast.Call) -> ast.expr:
-        """The condition in `time(...)`: `c for 2` has become two arguments."""
+        """Return the condition in `time(...)`: `c for 2` has become two arguments."""
         if len(node.args) != 2:
             return self._only(node)
         pair = ast.Tuple(elts=node.args, ctx=ast.Load())

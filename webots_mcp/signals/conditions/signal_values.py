@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, Final, TypeAlias, TypeVar
 
 from webots_mcp.signals.conditions.function_writer import FunctionWriter
@@ -34,16 +35,33 @@ Plain: TypeAlias = Callable[[Any], Any]
 _MISSING: Final = "Ellipsis"  # stands for a key that is not there
 _LEAVES: Final = frozenset((float, int, str, bool, type(None)))
 _NUMBERS: Final = frozenset((float, int))
-_LONGEST_TEXT: Final = 10_000  # characters; a row may hold less of a longer one
-_LONGEST_ARRAY: Final = 4000  # items; a row may hold nothing of a longer one
-_MOST_NAMES: Final = 2000
-_LOOKS_APART: Final = 16
 _INFINITY: Final = math.inf
 _NUMERIC: Final = frozenset("-0123456789")
-_LONGEST_NUMBER: Final = 30  # characters
 _CONSTANT_KEYS: Final[dict[str, object]] = {"null": None, "true": True, "false": False}
 
 Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class ReadLimits:
+    """How much of a state a condition reads.
+
+    Attributes:
+        text_characters: Length up to which a text is compared; a row may hold less of a longer one.
+        array_items: Length up to which an array is read; a row may hold nothing of a longer one.
+        names: Names of a state that are remembered.
+        searches_apart: Searches from which all names of a state are collected at once.
+        number_characters: Length of a number in a key.
+    """
+
+    text_characters: int = 10_000
+    array_items: int = 4000
+    names: int = 2000
+    searches_apart: int = 16
+    number_characters: int = 30
+
+
+_LIMITS: Final = ReadLimits()
 
 
 def reader(name: str, plain: Plain) -> Read:
@@ -159,7 +177,7 @@ def _keys_written(text: str) -> Iterable[object]:
     """Yield the keys that are not strings and that JSON writes as this text."""
     if text in _CONSTANT_KEYS:
         yield _CONSTANT_KEYS[text]
-    if text[:1] in _NUMERIC and len(text) < _LONGEST_NUMBER:
+    if text[:1] in _NUMERIC and len(text) < _LIMITS.number_characters:
         with suppress(ValueError):
             yield float(text)  # equals an integer key too
 
@@ -173,7 +191,7 @@ def _leaf(value: Any, plain: Plain) -> Value:
         return value
     if kind is int:
         return value if -(2**63) <= value < 2**63 else _nearest_float(value)
-    if kind is str and value.isascii() and len(value) <= _LONGEST_TEXT:
+    if kind is str and value.isascii() and len(value) <= _LIMITS.text_characters:
         return value
     if kind in (dict, list, tuple):
         return None
@@ -192,7 +210,7 @@ def _nearest_float(number: int) -> float | None:
 
 def _reduced(array: list[Any] | tuple[Any, ...], reduction: str, plain: Plain) -> Value:
     """Return one reduction of a long array; an array of ordinary numbers takes a fast path."""
-    if len(array) <= _LONGEST_ARRAY and _is_usual(array):
+    if len(array) <= _LIMITS.array_items and _is_usual(array):
         return _REDUCE[reduction](array)
     as_in_row = plain(array)
     if as_in_row.__class__ is not list:
@@ -251,9 +269,11 @@ class PositionReader:
     def _read(self, state: State) -> None:
         """Find out the names, at first and when there are keys that were not there before."""
         self._looks += 1
-        if self._looks % _LOOKS_APART != 1 or (self.names and self._keys.issuperset(state)):
+        if self._looks % _LIMITS.searches_apart != 1 or (
+            self.names and self._keys.issuperset(state)
+        ):
             return
-        if len(self._numeric) >= _MOST_NAMES or len(self._keys) >= _MOST_NAMES:
+        if len(self._numeric) >= _LIMITS.names or len(self._keys) >= _LIMITS.names:
             return
         self._keys.update(state)
         values = flatten(self._plain(state))

@@ -83,7 +83,7 @@ class Scanned:
 
 
 def refusal(scanned: Scanned, column: int, why: str) -> InvalidConditionError:
-    """The error of a text, at a column of its `source` that is counted from 0."""
+    """Return the error of a text, at a column of its `source` that is counted from 0."""
     return InvalidConditionError(f"{scanned.place(column)}: {why}")
 
 
@@ -131,7 +131,7 @@ def _as_item(unread: Scanned, place: int, token: str) -> str:
 
 
 def _stripped(text: object, what: str) -> str:
-    """The text without the spaces around it, if it is one of a possible length."""
+    """Return the text without the spaces around it, if it is one of a possible length."""
     if not isinstance(text, str):
         raise InvalidConditionError(
             f"A {what} must be a text such as {_SUCH_AS[what]!r}, not {text!r}."
@@ -317,14 +317,14 @@ class Nodes:
 
 
 def is_signal(node: ast.expr) -> bool:
-    """Whether it names a signal."""
+    """Return whether it names a signal."""
     if isinstance(node, ast.Name):
         return node.id not in FLAGS
     return isinstance(node, (ast.Attribute, ast.Subscript)) or function_of(node) == "signal"
 
 
 def function_of(node: ast.expr) -> str | None:
-    """The name of the function that is called; None where none is."""
+    """Return the name of the function that is called; None where none is."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         return node.func.id
     return None

@@ -1,1 +1,1 @@
-"""Ranges resolved once, and what was recorded in them: frames of rows, changes and gaps."""
+"""Resolve ranges once, and read what was recorded in them: frames of rows, changes and gaps."""

@@ -1,4 +1,4 @@
-"""Which signals there are, and which of them a question means."""
+"""List the signals of a robot, and resolve the names that a question uses."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from webots_mcp.store.reading.segment import (
 from webots_mcp.store.reading.unchunked_rows import has_few_new_rows, rows_in_no_chunk
 from webots_mcp.store.registered_signals import RegisteredSignal, cleaned, registered, seen_with
 
-SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
+SAMPLED_ROWS: Final = 200  # rows in no chunk yet that are searched for new names and kinds
 _MOST_OFFERED: Final = 5
 _ONLY_FIRST: Final = f"Only the first {MAX_SIGNALS} names of a robot are kept"
 
 
 @dataclass(frozen=True)
 class SignalInfo:
-    """What is known of a signal in a run (or a part of it).
+    """What is known of a signal in a run or a part of it.
 
     Attributes:
-        rows: State rows that held it.
-        missing: Of the run's rows, those without a value.
-        first_s: Simulation time of the first value; `last_s` of the last one.
-        last: The value in the run's newest row; None where that has none.
-        meaning: What it means, and where that is known from.
+        rows: Number of state rows that held it.
+        missing: Number of the run's rows without a value.
+        first_s: Simulation time of the first value; `last_s` is that of the last one.
+        last: The value in the run's newest row, or None.
+        meaning: Its meaning, and the source of that.
     """
 
     name: str
@@ -65,9 +65,9 @@ class SignalList:
     """The signals of a run.
 
     Attributes:
-        rows: State rows of the run.
-        total: How many match; `signals` are the first of them.
-        notes: What the asker should know.
+        rows: Number of state rows of the run.
+        total: Number of matching signals; `signals` are the first of them.
+        notes: What the caller should know.
     """
 
     robot: str
@@ -79,14 +79,17 @@ class SignalList:
 
 
 def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, RegisteredSignal]:
-    """Every signal of the subject's robot: the registered, and those in rows in no chunk."""
+    """Return every signal of the subject's robot.
+
+    Registered ones, and those in rows in no chunk.
+    """
     return _signals_in(connection, subject.robot_id, [subject.run_id])
 
 
 def known_signals(
     connection: sqlite3.Connection, time_range: TimeRange
 ) -> dict[str, RegisteredSignal]:
-    """Every signal of a range's robot: the registered, and those in rows in no chunk."""
+    """Return every signal of a range's robot: registered ones, and those in rows in no chunk."""
     runs = [segment.run_id for segment in time_range.segments]
     return _signals_in(connection, time_range.robot_id, runs)
 
@@ -104,7 +107,7 @@ def _signals_in(
 
 
 def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
-    """Return a run's rows in no chunk; if they are many, the oldest and newest of them."""
+    """Return a run's rows in no chunk; of many rows the oldest and newest."""
     at = reached(connection, run_id)
     if has_few_new_rows(connection, run_id, at):
         return rows_in_no_chunk(connection, run_id, (-math.inf, math.inf), at, Deadline())[0]
@@ -125,7 +128,10 @@ def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
 def signals_of_frame(
     connection: sqlite3.Connection, subject: Subject, frame: Frame
 ) -> dict[str, RegisteredSignal]:
-    """Every signal of the subject's robot: the registered, and those in all rows of a frame."""
+    """Return every signal of the subject's robot.
+
+    Registered ones, and those in the rows of a frame.
+    """
     known = registered(connection, subject.robot_id)
     known = _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
     return with_stated(connection, subject.robot_id, known)
@@ -134,13 +140,13 @@ def signals_of_frame(
 def held_by(
     connection: sqlite3.Connection, frame: Frame, known: dict[str, RegisteredSignal]
 ) -> dict[str, RegisteredSignal]:
-    """Of the signals of a robot those that the run of a frame holds."""
+    """Return those signals of a robot that the run of a frame holds."""
     stored, here = signals_in(connection, frame.run_id), frame.new_rows.values
     return {name: each for name, each in known.items() if each.id in stored or name in here}
 
 
 def _without_placeholders(known: dict[str, RegisteredSignal]) -> dict[str, RegisteredSignal]:
-    """Without names that only ever held null and have others below them.
+    """Remove names that only ever held null and have other names below them.
 
     `lidar: null` before the first scan is the missing value of `lidar.min` and the others.
     """
@@ -155,9 +161,9 @@ def _without_placeholders(known: dict[str, RegisteredSignal]) -> dict[str, Regis
 def other_form(
     known: dict[str, RegisteredSignal], signal: RegisteredSignal
 ) -> RegisteredSignal | None:
-    """A signal that has a value where the same array is longer, or shorter; None without any.
+    """Return a signal with a value from a longer or shorter version of the same array, or None.
 
-    Of more than 16 items an array is `lidar.min` and others, of fewer `lidar.0` and so on.
+    An array of more than 16 items is `lidar.min` and others, a shorter one `lidar.0` and so on.
     """
     branch, _, last = signal.name.rpartition(".")
     if signal.reduction is not None:
@@ -169,13 +175,13 @@ def other_form(
 def resolve_signals(
     known: dict[str, RegisteredSignal], names: Sequence[str]
 ) -> list[RegisteredSignal]:
-    """The signals that the names mean, in the order of the names.
+    """Return the signals that the names mean, in the order of the names.
 
-    A name may hold `*` (any characters, also dots). The name of a branch means all below it:
-    `pose` is `pose.*`.
+    A name may hold `*` (any characters, also dots). The name of a branch means all below it: `pose`
+    is `pose.*`.
 
     Raises:
-        UnknownSignalError: A name or pattern meets nothing; the text offers near ones.
+        UnknownSignalError: A name or pattern matches nothing; the text offers similar names.
         InvalidInputError: No name is given.
     """
     if not names:
@@ -194,7 +200,7 @@ def resolve_signals(
 def signals_of(
     connection: sqlite3.Connection, time_range: TimeRange, names: Sequence[str]
 ) -> list[RegisteredSignal]:
-    """The signals of the range's robot that the names mean.
+    """Return the signals of the range's robot that the names mean.
 
     Raises:
         UnknownSignalError, InvalidInputError: See `resolve_signals`.
@@ -203,11 +209,11 @@ def signals_of(
 
 
 def one_signal(known: dict[str, RegisteredSignal], name: str) -> RegisteredSignal:
-    """The one signal that a name means.
+    """Return the one signal that a name means.
 
     Raises:
-        UnknownSignalError: There is none.
-        InvalidInputError: There are several.
+        UnknownSignalError: No signal has that name.
+        InvalidInputError: The name means several signals.
     """
     signal, *more = resolve_signals(known, [name])
     if more:
@@ -220,9 +226,9 @@ def one_signal(known: dict[str, RegisteredSignal], name: str) -> RegisteredSigna
 
 
 def item_signal(known: Mapping[str, RegisteredSignal], name: str) -> RegisteredSignal | None:
-    """Return a single item of a long array, which is not registered: `scan.117`; else None.
+    """Return a single item of a long array, which is not registered (`scan.117`), or None.
 
-    Its values are read from the state rows, as long as those are kept.
+    Its values are read from the state rows as long as those are kept.
     """
     if name in known or (item := array_item(name)) is None:
         return None
@@ -246,7 +252,7 @@ def _meant(known: dict[str, RegisteredSignal], name: str) -> Iterable[Registered
 
 
 def say_unknown(known: dict[str, RegisteredSignal], name: str) -> str:
-    """That there is no such signal, and which are near."""
+    """Return the sentence that no signal has that name, with similar names."""
     if not known:
         return (
             f"No signal {name!r} is recorded, because no values have been published yet. "
@@ -267,18 +273,18 @@ def list_signals(
     limit: int = 100,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> SignalList:
-    """List the signals of a run, by name, with what is known of their values.
+    """List the signals of a run by name, with what is known of their values.
 
     Args:
-        connection: Any.
-        robot: Whose; may be left out where only one is meant.
-        run_id: Which run; None for the robot's newest.
-        pattern: Which names, with `*`.
-        limit: At most so many.
-        deadline_s: After it, rows that are in no chunk yet are left out, and a note says so.
+        connection: An open database.
+        robot: The robot; may be omitted if only one is possible.
+        run_id: The run; None for the robot's newest.
+        pattern: Pattern of names, with `*`.
+        limit: Maximum number of signals.
+        deadline_s: Time after which rows that are in no chunk yet are left out, which a note says.
 
     Raises:
-        UnknownSignalError: The pattern meets no name.
+        UnknownSignalError: The pattern matches no name.
         UnknownRobotError, AmbiguousRobotError, UnknownRunError, NothingRecordedError: As they say.
     """
     subject = find_subject(connection, robot, run_id)
@@ -323,7 +329,7 @@ def _info(frame: Frame, signal: RegisteredSignal, meaning: Meaning) -> SignalInf
 
 
 def _bound(frame: Frame, name: str, held: Indexes, at: int) -> float | None:
-    """When a signal first, or last, had a value; a chunk is opened where not all of it has one."""
+    """Return when a signal first or last had a value; open a chunk only if values are missing."""
     if not len(held):
         return None
     zones, place = frame.zone_map(name), int(held[at])

@@ -1,8 +1,8 @@
-"""The one reader of the past: rows of a run over a stretch, as arrays, and what was not read.
+"""Read the past: rows of a run over an interval as arrays, and what was not read.
 
-A frame has the times of its rows, and gives the values of each signal that is asked for: from
-chunks, which are decompressed then, and from the newest rows, which are in no chunk yet. What a
-chunk comes to (`Frame.zone_map`) is known without opening it.
+A frame has the times of its rows and returns the values of any signal on request. They come from
+chunks, which are decompressed then, and from the newest rows, which are in no chunk yet. The
+statistics of a chunk (`Frame.zone_map`) are known without opening it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ from webots_mcp.store.reading.segment import (
 from webots_mcp.store.reading.unchunked_rows import read_rows, rows_in_no_chunk
 from webots_mcp.store.reading.unread import Unread
 
-_FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
+# Up to this many chunks of times are opened one by one; otherwise all of them at once.
+_FEW: Final = 4
 
 _IN: Final = "run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 _KEPT: Final = (
@@ -62,8 +63,8 @@ class Coded(NamedTuple):
     """The values of any signal as codes.
 
     Attributes:
-        codes: One for each row: the place of its value among the labels.
-        labels: The values; the first is None, for null and for a key that is not there.
+        codes: One per row: the index of its value among the labels.
+        labels: The values; the first is None, for null and for a missing key.
     """
 
     codes: Indexes
@@ -72,16 +73,16 @@ class Coded(NamedTuple):
 
 @dataclass(frozen=True)
 class ZoneMap:
-    """What the chunks of a signal come to, those of the newest rows included, in order.
+    """Statistics of the chunks of a signal in order, those of the newest rows included.
 
-    All are arrays with an item for each chunk; NaN where a chunk has no usable number.
+    All are arrays with one item per chunk; NaN if a chunk has no usable number.
 
     Attributes:
-        first_row: Place of its first row in the frame.
-        row_count: Its rows, also those that lack the signal.
-        held_count: Of them, those whose state has the signal, be it null.
-        value_count: Of them, those with a usable number; of a text with a text.
-        start_s: Simulation time of its first row; `end_s` of its last one.
+        first_row: Index of its first row in the frame.
+        row_count: Number of its rows, with or without the signal.
+        held_count: Number of rows whose state has the signal, even if null.
+        value_count: Number of rows with a usable number, or with a text.
+        start_s: Simulation time of its first row; `end_s` is that of its last one.
     """
 
     first_row: Indexes
@@ -103,7 +104,7 @@ class ZoneMap:
         return len(self.first_row)
 
     def spans(self, wanted: Flags) -> list[tuple[int, int]]:
-        """Rows [start, stop) of the chunks that are wanted; those side by side are one span."""
+        """Return the rows [start, stop) of the wanted chunks; adjacent ones form one span."""
         if not wanted.any():
             return []
         return _spans(np.append(self.first_row, self.first_row[-1:] + self.row_count[-1:]), wanted)
@@ -113,9 +114,9 @@ class Frame:
     """Rows of one run in order of simulation time; equal times in the order of their ids.
 
     Attributes:
-        run_id: Of which run.
-        cut_at_s: The deadline passed after this row, or before any where it is the begin of what
-            was to be read; None where all was read.
+        run_id: The run.
+        cut_at_s: The time of the last row before the deadline passed, or the start of the range if
+            none was read; None if all was read.
     """
 
     def __init__(
@@ -131,36 +132,36 @@ class Frame:
         return self._stop - self._start
 
     def __contains__(self, name: str) -> bool:
-        """Whether a row may have a value of that signal."""
+        """Return whether a row may have a value of that signal."""
         source = self._source
         is_held = name in source.ids or name in source.columns.values or name in source.derived
         return is_held or source.is_item(name)
 
     @property
     def new_rows(self) -> StateColumns:
-        """The rows that are in no chunk yet."""
+        """Return the rows that are in no chunk yet."""
         return self._source.columns
 
     @property
     def derived(self) -> Derived:
-        """The signals that no row holds: the pose by an observer, where there is no other."""
+        """The signals that no row holds, such as a pose by an observer."""
         return self._source.derived
 
     @property
     def unread(self) -> tuple[Unread, ...]:
-        """What is not in it, as far as its values were asked for."""
+        """What could not be read of the values requested so far."""
         return tuple(self._source.unread)
 
     def unread_of(self, name: str) -> tuple[Unread, ...]:
-        """The same, without what concerns other signals alone."""
+        """Return what could not be read, without parts that concern only other signals."""
         found = self._source.unread.items()
         return tuple(part for part, of in found if of == name or not isinstance(of, str))
 
     def was_read(self, name: str | None = None) -> Flags:
-        """Which rows lie in no part that could not be read, of the values asked for so far.
+        """Return which rows are free of unreadable parts, for the values requested so far.
 
         Args:
-            name: Of which signal, where the damage of others does not matter.
+            name: The signal, to ignore damage of other signals.
         """
         read = np.ones(len(self), np.bool_)
         for part in self.unread if name is None else self.unread_of(name):
@@ -169,33 +170,36 @@ class Frame:
 
     @property
     def is_as_stored(self) -> bool:
-        """Whether its rows lie in the order of their chunks: none came late, none is kept."""
+        """Whether its rows are in the order of their chunks.
+
+        None came late or only in full-rate segments.
+        """
         return self._source.order is None
 
     @property
     def cuts_chunks(self) -> bool:
-        """Whether its first or last chunk may have rows that are not in it."""
+        """Whether its first or last chunk may have rows outside the frame."""
         return len(self) < self._source.rows
 
     def parts(self, column: Column) -> Iterator[tuple[int, Decoded]]:
-        """The values of each chunk with the place of its first row, in no order.
+        """Return the values of each chunk with the index of its first row, in no order.
 
-        Only of a frame that is as stored. Chunks without the signal are left out.
+        The frame must be as stored. Chunks without the signal are left out.
         """
         return self._source.values(column, self._start, self._stop)
 
     def forget(self) -> None:
-        """Forget what was read so far, where it will not be asked for again."""
+        """Drop the values read so far, if they will not be requested again."""
         self._source.forget()
 
     @cached_property
     def times(self) -> Array:
-        """Simulation time of each row, in s."""
+        """Simulation time of each row in s."""
         return self._decoded(SIM_TIMES).numbers
 
     @cached_property
     def weights(self) -> Array | None:
-        """How much of the time each row stands for, the mean being 1; None where all count alike.
+        """Share of the time that each row stands for, with a mean of 1; None if all count equally.
 
         See `time_weights`.
         """
@@ -209,46 +213,46 @@ class Frame:
 
     @cached_property
     def wall_times(self) -> Array:
-        """Unix time of each row, in s."""
+        """Unix time of each row in s."""
         return self._decoded(WALL_TIMES).numbers
 
     @cached_property
     def ids(self) -> Indexes:
-        """The id of each state row; negative of those that only a kept stretch has."""
+        """The id of each state row; negative for rows that only a full-rate segment has."""
         return self._decoded(STATE_IDS).numbers.astype(np.intp)
 
     def numbers(self, name: str) -> Array:
-        """The number of a signal in each row: NaN where it has none; flags are 0 and 1."""
+        """Return the number of a signal in each row: NaN where it has none; flags are 0 and 1."""
         return self._decoded(name).numbers
 
     def usable(self, name: str) -> tuple[Array, Array]:
-        """Times and numbers of the rows that have a usable one: not NaN, not beyond 1e100."""
+        """Return times and numbers of the rows with a usable one: not NaN and not beyond 1e100."""
         return usable_part(self.times, self.numbers(name))
 
     def recorded(self, name: str) -> Decoded:
-        """The values as they were recorded: absent, null and what was replaced are told apart."""
+        """Return the values as recorded, with absent, null and replaced ones distinguished."""
         return self._decoded(name)
 
     def coded(self, name: str) -> Coded:
-        """The values of a signal, whatever they are, as codes."""
+        """Return the values of any signal as codes."""
         return self._coded(name, numbers=True)
 
     def texts(self, name: str) -> Coded:
-        """As `coded`, of texts alone: numbers and flags have the code of None."""
+        """Return codes of texts alone, like `coded`: numbers and flags have the code of None."""
         return self._coded(name, numbers=False)
 
     def held(self, name: str) -> Flags:
-        """In which rows the state has the signal, be it null."""
+        """Return the rows whose state has the signal, even if null."""
         codes = self._decoded(name).codes
         return np.ones(len(self), np.bool_) if codes is None else codes != IS_ABSENT
 
     def values(self, name: str) -> list[Value]:
-        """The values as Python has them; slow, for a few rows. What was replaced is None."""
+        """Return the values as Python objects, slowly, for a few rows. Replaced values are None."""
         codes, labels = self.coded(name)
         return [labels[code] for code in codes.tolist()]
 
     def values_at(self, name: str, rows: Indexes) -> list[Value]:
-        """The values in some rows, in order, of which each chunk is opened once."""
+        """Return the values in some rows, in order; each chunk is opened once."""
         edges = self._edges
         chunks = np.searchsorted(edges, rows, "right") - 1
         found: list[Value] = []
@@ -259,7 +263,7 @@ class Frame:
         return found
 
     def replaced(self, name: str) -> Counter[str]:
-        """How often each value that JSON cannot hold (nan, inf, ...) stood there."""
+        """Return how often each value that JSON cannot hold (nan, inf, ...) stood there."""
         zones, found = self.zone_map(name), Counter[str]()
         for span in zones.spans(zones.held_count > zones.value_count):
             values = self.rows(*span)._decoded(name)
@@ -269,19 +273,22 @@ class Frame:
         return +found
 
     def zone_map(self, name: str) -> ZoneMap:
-        """What the chunks of a signal come to; those that the frame cuts come to what is in it."""
+        """Return the statistics of a signal's chunks.
+
+        Chunks that the frame cuts are recalculated.
+        """
         key = ("zones", name, self._start, self._stop)
         return self._source.cached(key, lambda: self._make_zone_map(name))
 
     def whole_statistics(self) -> dict[str, Statistics] | None:
-        """Return the statistics of all signals of a short run, which one group of chunks holds.
+        """Return the statistics of all signals of a short run that one group of chunks holds.
 
-        None of other frames, and of those that do not hold the whole group.
+        Return None for other frames and for those that do not hold the whole group.
         """
         return None if self.cuts_chunks else self._source.whole_statistics()
 
     def opened(self, name: str, wanted: Flags) -> Iterator[tuple[int, Array]]:
-        """The numbers of some of its chunks, each with its first row; of those that have any."""
+        """Yield the numbers of those chunks that have any, each with its first row."""
         if self._source.order is None and np.count_nonzero(wanted) * _FEW < len(wanted):
             first = self._source.parts(self._start, self._stop).start
             parts = first + np.flatnonzero(wanted)
@@ -293,12 +300,12 @@ class Frame:
 
     @property
     def bounds_s(self) -> tuple[float, float]:
-        """Simulation time of its first and last row; only of a frame that has rows."""
+        """Simulation time of its first and last row; the frame must have rows."""
         first, last = self.rows(0, 1), self.rows(len(self) - 1, len(self))
         return float(first.times[0]), float(last.times[0])
 
     def places(self, times_s: Array | Sequence[float]) -> Indexes:
-        """The places of the first rows at or after some times; few chunks of times are opened."""
+        """Return the indexes of the first rows at or after some times, opening few chunks."""
         wanted: Array = np.asarray(times_s, np.float64)
         source = self._source
         parts = np.searchsorted(source.ends_s, wanted)
@@ -314,7 +321,7 @@ class Frame:
         return np.minimum(np.maximum(found - self._start, 0), len(self))
 
     def rows(self, start: int, stop: int) -> Frame:
-        """Some of its rows by their places; only the chunks that they touch are opened."""
+        """Return some of its rows by index; only the chunks that they touch are opened."""
         start, stop = max(0, start), min(len(self), stop)
         part = Frame(self._source, self._start + start, self._start + max(start, stop))
         if "times" in self.__dict__:
@@ -322,12 +329,15 @@ class Frame:
         return part
 
     def between(self, start_s: float, end_s: float) -> Frame:
-        """Its rows in [start_s, end_s) of simulation time."""
+        """Return its rows in [start_s, end_s) of simulation time."""
         start, stop = self.places([start_s, end_s]).tolist()
         return self.rows(start, stop)
 
     def bounds_of_wall_times(self) -> tuple[Indexes, Array, Array]:
-        """The edges of its chunks, and the least and greatest wall time of each; NaN: not known."""
+        """Return the edges of its chunks, and the minimum and maximum wall time of each (NaN.
+
+        Unknown).
+        """
         edges, source = self._edges, self._source
         if source.order is not None:
             unknown: Array = np.full(len(edges) - 1, np.nan)
@@ -337,7 +347,7 @@ class Frame:
         return edges, table[:, least], table[:, greatest]
 
     def _decoded(self, column: Column) -> Decoded:
-        """All values; those of several chunks share their labels."""
+        """Return all values; those of several chunks share their labels."""
         if (part := self._part_of_whole(column)) is not None:
             return part
         key = ("values", column, self._start, self._stop)
@@ -348,7 +358,7 @@ class Frame:
         start, stop = (self._start, self._stop) if order is None else (0, source.rows)
         numbers, plain = np.empty(stop - start), list[slice]()
         coded: list[tuple[slice, Indexes]] = []
-        known: dict[object, int] = {}  # a flag equals a number, so that the type is in the key
+        known: dict[object, int] = {}  # a flag equals a number, so the key contains the type
         labels: list[Value | Replaced] = []
         for at, values in source.values(column, start, stop, into=numbers):
             inside = slice(at, at + len(values.numbers))
@@ -378,10 +388,10 @@ class Frame:
         return Decoded(numbers, codes, labels)
 
     def _part_of_whole(self, column: Column) -> Decoded | None:
-        """The numbers out of those of all rows of a frame, where they are known already.
+        """Return the numbers from those of all rows of the source, if they are known already.
 
-        Of another frame than its own they have to be whole: what could not be read may lie in rows
-        that only the other one has.
+        The whole must have been read without errors for a frame with fewer rows: what could not be
+        read may lie in rows that only the other frame has.
         """
         source, own = self._source, (self._start, self._stop)
         for first, stop in source.frames:
@@ -395,14 +405,14 @@ class Frame:
         return None
 
     def _coded(self, name: str, *, numbers: bool) -> Coded:
-        """Codes from 1 on; numbers get labels as well, where they are wanted."""
+        """Return codes from 1 on; numbers get labels as well if they are wanted."""
         key = ("coded", name, numbers, self._start, self._stop)
         values = self._decoded(name)
         return self._source.cached(key, lambda: _coded(values, numbers=numbers))
 
     @property
     def _edges(self) -> Indexes:
-        """The first row of each chunk that it touches, and behind the last; else every 1,024th."""
+        """Return the first row of each chunk that it touches and the end, or every 1,024th row."""
         if self._source.order is not None:
             return np.append(np.arange(0, len(self), chunk_making.GROUP_ROWS), len(self))
         parts = self._source.parts(self._start, self._stop)
@@ -411,7 +421,7 @@ class Frame:
 
     @cached_property
     def _chunks(self) -> tuple[Indexes, Array, Array, list[int]]:
-        """The edges of its chunks, when they begin and end, and which of them it cuts."""
+        """Return the edges of its chunks, their first and last times, and which of them it cuts."""
         source, edges = self._source, self._edges
         if source.order is not None:
             starts_s, ends_s = self.times[edges[:-1]], self.times[edges[1:] - 1]
@@ -452,14 +462,14 @@ def read_frame(
     full_rate: bool = True,
     every_call: bool = False,
 ) -> Frame:
-    """Read a segment of a run; values are read when they are asked for.
+    """Read a segment of a run; values are read on request.
 
     Args:
-        connection: Any; it is used as long as the frame is.
-        segment: Which rows.
-        deadline: Rows that are in no chunk yet are read until then; the frame says what is left.
-        full_rate: Of a segment that is kept at full rate, each call of `publish` is a row.
-        every_call: Of any segment each call is a row that is in a kept stretch.
+        connection: An open database, used for as long as the frame is.
+        segment: The segment.
+        deadline: Until when rows in no chunk are read; the frame reports what is left.
+        full_rate: Whether each call of `publish` is a row, for a segment kept at full rate.
+        every_call: Whether each call is a row in full-rate segments, for any segment.
     """
     asked = (segment.start_s, segment.end_s, segment.full_rate and full_rate)
     memo = read_so_far(connection).setdefault(("frames", segment.run_id), {})
@@ -479,7 +489,7 @@ def _wider(
     asked: tuple[float, float, bool],
     every_call: bool,
 ) -> FrameSource | None:
-    """Return what a longer segment of the run was read from, where that is the same."""
+    """Return the source of a longer segment of the run, if it reads the same."""
     start_s, end_s, at_full_rate = asked
     if at_full_rate or every_call:
         return None
@@ -498,7 +508,7 @@ def _source_of(
     full_rate: bool,
     every_call: bool,
 ) -> tuple[FrameSource, float | None]:
-    """Return what a segment is read from, and where the deadline cut it."""
+    """Return the source of a segment, and where the deadline cut it."""
     run_id, span = segment.run_id, (segment.start_s, segment.end_s)
     groups: Array = np.zeros((0, 5))
     if full_rate and segment.full_rate:
@@ -533,7 +543,7 @@ def _source_of(
 def _observed_pose(
     connection: sqlite3.Connection, segment: Segment, columns: StateColumns, deadline: Deadline
 ) -> Derived:
-    """The pose of the robot by an observer, where its run has none of its own."""
+    """Return the pose of the robot by an observer, if its run has none of its own."""
     found = find_observed(connection, segment.run_id, columns)
     if found is None:
         return {}
@@ -542,7 +552,7 @@ def _observed_pose(
 
 
 def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> float | None:
-    """Where the deadline cut a segment, if it did; what is behind it is noted as unread."""
+    """Return where the deadline cut a segment, and note the part after it as unread."""
     if cut_at_s is None or cut_at_s >= segment.end_s:
         return None
     reached_s = max(cut_at_s, segment.start_s)
@@ -551,8 +561,8 @@ def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> 
 
 
 def deleted_part(connection: sqlite3.Connection, segment: Segment) -> Unread | None:
-    """The part of a segment whose rows and chunks retention has deleted."""
-    # Where a run begins, and where what is left of it does: what is oldest goes first.
+    """Return the part of a segment whose rows and chunks retention has deleted."""
+    # The start of the run, and the start of what is left of it: the oldest rows are deleted first.
     row = connection.execute(
         "SELECT started_sim_time_s, (SELECT min(start_sim_time_s) FROM row_group "
         "WHERE run_id = r.id AND is_complete = 1), (SELECT min(sim_time_s) FROM state "
@@ -567,9 +577,9 @@ def deleted_part(connection: sqlite3.Connection, segment: Segment) -> Unread | N
 
 
 def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame | None:
-    """The rows of a segment that only kept stretches have; None where there are none.
+    """Return the rows of a segment that only full-rate segments have; None if there are none.
 
-    Of a segment that is at full rate itself none: `read_frame` has them among the others.
+    Return None also for a segment that is at full rate itself: `read_frame` includes these rows.
     """
     if segment.full_rate:
         return None
@@ -585,7 +595,7 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
 
 
 def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Frame:
-    """The rows of a source that lie in a segment, in order."""
+    """Return the rows of a source that lie in a segment, in order."""
     source.bounds = 0, source.rows
     whole = Frame(source, 0, source.rows, cut_at_s)
     if not source.is_in_order and source.order is None:
@@ -603,17 +613,17 @@ def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Fr
 
 
 def _in_wall_time(rows: Frame, segment: Segment, at: int) -> tuple[int, int]:
-    """From the first to the last row that was recorded in the wall time of a segment.
+    """Return the rows from the first to the last one in the wall time of a segment.
 
-    Only the chunks at both ends are opened, as far as the statistics of the others say enough.
+    Only the chunks at both ends are opened, if the statistics of the others suffice.
 
     Args:
         rows: The rows of its simulation time.
-        segment: Which wall time.
-        at: The place of their first one.
+        segment: The segment, with its wall time.
+        at: The index of their first row.
     """
     edges, first_s, last_s = rows.bounds_of_wall_times()
-    # Where nothing is known of a chunk, it may have such rows.
+    # A chunk without known times may have such rows.
     possible = np.flatnonzero(~((last_s < segment.wall_start_s) | (first_s >= segment.wall_end_s)))
 
     def inside(part: int) -> Indexes:
@@ -629,7 +639,7 @@ def _in_wall_time(rows: Frame, segment: Segment, at: int) -> tuple[int, int]:
 
 
 def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:
-    """Rows [start, stop) between edges where it is wanted; those side by side are one span."""
+    """Return the rows [start, stop) between edges that are wanted; adjacent ones form one span."""
     if not wanted.any():
         return []
     if wanted.all():

@@ -1,7 +1,7 @@
-"""The values of a frame before a range and an order are laid over them, part by part.
+"""Read the values of a frame part by part, before a range and an order are applied.
 
 A row group is one part, and so are 1,024 rows that are in no chunk. A chunk that cannot be read
-costs its part of the range, which is noted by the name of the signal.
+costs its part of the range, which is noted under the name of the signal.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import sqlite3
 from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, TypeVar, cast
 
@@ -38,23 +39,38 @@ from webots_mcp.store.chunks import (
 from webots_mcp.store.reading.observed_pose import Derived
 from webots_mcp.store.reading.unread import Unread
 
-MOST_CACHED_BYTES: Final = 160_000_000  # of arrays that one frame keeps
 _OF_ITEMS: Final = (
     "SELECT id, json_extract(data, ?), json_array_length(data, ?) FROM {} "
     "WHERE run_id = ? AND id BETWEEN ? AND ? AND json_valid(data)"
 )
 _ITEMS: Final = _OF_ITEMS.format("state")
 _KEPT_ITEMS: Final = _OF_ITEMS.format("kept_state")
-_FEW_COLUMNS: Final = 4  # of a short run are read one by one
-_MOST_GROUP_ROWS: Final = 2**20  # far more than any maker puts into a group
 _NAMES: Final[dict[Column, str]] = {
     SIM_TIMES: "simulation times",
     WALL_TIMES: "wall times",
     STATE_IDS: "row ids",
 }
 
-Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
+Column = str | int  # the name of a signal, or a number for other chunks (SIM_TIMES, ...)
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SourceLimits:
+    """Limits of reading the values of a frame.
+
+    Attributes:
+        cached_bytes: Size of the arrays that one frame caches.
+        few_columns: Columns of a short run that are read one by one.
+        group_rows: Rows of a group; far more than any process puts into one.
+    """
+
+    cached_bytes: int = 160_000_000
+    few_columns: int = 4
+    group_rows: int = 2**20
+
+
+_SOURCE: Final = SourceLimits()
 
 
 class FrameSource:
@@ -62,13 +78,13 @@ class FrameSource:
 
     Attributes:
         columns: The rows that are in no group.
-        first_rows: The first row of each part, followed by the number of all rows; `edges` is the
-            same as a list.
+        first_rows: The first row of each part, followed by the number of rows; `edges` is the same
+            as a list.
         starts_s: Simulation time of the first row of each part; `ends_s` of the last one.
-        order: The rows in order of time; None if they are.
-        unread: What could not be read so far, each with its column: None for all of them.
-        derived: Signals that no row holds, by name: their values at some times.
-        bounds: The rows [start, stop) that were asked for.
+        order: The rows ordered by time; None if they already are.
+        unread: What could not be read so far, each with its column; None stands for all columns.
+        derived: Values at given times of signals that no row holds, by name.
+        bounds: The requested rows [start, stop).
         frames: The bounds of all frames that share the arrays of this source.
     """
 
@@ -104,7 +120,8 @@ class FrameSource:
         self.starts_s: Array = np.append(groups[:, 1], times[new])
         self.ends_s: Array = np.append(groups[:, 2], times[ends - 1])
         steps = np.diff(times)
-        rising = (steps == 0) & (np.diff(np.array(columns.ids)) > 0)  # those of kept rows fall
+        # ids of rows from full-rate segments descend
+        rising = (steps == 0) & (np.diff(np.array(columns.ids)) > 0)
         self.is_in_order = bool(
             (self.starts_s[1:] >= self.ends_s[:-1]).all()
             and ((steps > 0) | rising).all()
@@ -116,7 +133,7 @@ class FrameSource:
     def _sound(self, groups: Array) -> Array:
         """Return the groups whose row says something possible; the others are noted as unread."""
         counts, starts_s, ends_s = groups[:, 3], groups[:, 1], groups[:, 2]
-        sound = (counts >= 1) & (counts <= _MOST_GROUP_ROWS) & (starts_s <= ends_s)
+        sound = (counts >= 1) & (counts <= _SOURCE.group_rows) & (starts_s <= ends_s)
         for _, start_s, end_s, *_ in groups[~sound].tolist():
             self.note(Unread(start_s, end_s, "its row group is damaged"), None)
         return groups[sound]
@@ -142,12 +159,12 @@ class FrameSource:
         """Yield the values in rows [start, stop), a part at a time, each with its first row.
 
         Args:
-            column: Which values.
-            start: The first row, from which places are counted.
+            column: The values to read.
+            start: The first row, from which indexes are counted.
             stop: The row after the last.
-            wanted: Which of the parts; None for all. Parts without values are left out.
-            into: Takes the numbers of the rows, as far as they can be decoded right into it: then
-                those that are yielded are a part of it.
+            wanted: The parts to read; None for all. Parts without values are left out.
+            into: Receives the numbers of the rows if they can be decoded directly; the yielded
+                arrays are then parts of it.
         """
         parts = self.parts(start, stop)
         places = range(parts.start, parts.stop)
@@ -263,7 +280,7 @@ class FrameSource:
     ) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
         """Yield what `values_in` does; of a short run all chunks are read once many are wanted."""
         self._columns_read += 1
-        if len(self._ids_of_groups) > 1 or self._columns_read <= _FEW_COLUMNS:
+        if len(self._ids_of_groups) > 1 or self._columns_read <= _SOURCE.few_columns:
             yield from values_in(self.connection, self.run_id, signal_id, wanted, targets)
             return
         chunk = self._chunks_of_one_group.get(signal_id)
@@ -274,7 +291,7 @@ class FrameSource:
 
     @cached_property
     def _chunks_of_one_group(self) -> dict[int, EncodedChunk]:
-        """The chunks of all signals of a short run, read at once."""
+        """Return the chunks of all signals of a short run, read at once."""
         return chunks_by_signal(self.connection, self.run_id, self._ids_of_groups[0])
 
     def _signal_id(self, column: Column) -> int | None:
@@ -283,7 +300,10 @@ class FrameSource:
     def _without_chunk(
         self, place: int, column: Column, error: DamagedChunkError
     ) -> Decoded | None:
-        """Note a chunk that cannot be read; of times and ids return what keeps rows in order."""
+        """Note a chunk that cannot be read.
+
+        For times and ids return values that keep rows in order.
+        """
         span = (float(self.starts_s[place]), float(self.ends_s[place]))
         why = f"the chunk of {_NAMES.get(column, column)} is {error}"
         self.note(Unread(*span, why), column)
@@ -340,7 +360,7 @@ class FrameSource:
 
     @cached_property
     def _of_one_group(self) -> dict[int, Statistics]:
-        """The statistics of all signals of a short run, read at once."""
+        """Return the statistics of all signals of a short run, read at once."""
         return statistics_by_signal(self.connection, self.run_id, int(self._group_ids[0]))
 
     @property
@@ -348,7 +368,7 @@ class FrameSource:
         return int(self._group_ids.min()), int(self._group_ids.max())
 
     def _places_of(self, group_ids: Array) -> tuple[Indexes, Flags]:
-        """Return the places of groups, and which of the groups have one."""
+        """Return the indexes of groups, and which of the groups have one."""
         order = np.argsort(self._group_ids, kind="stable")
         ids = self._group_ids[order]
         at = np.searchsorted(ids, group_ids)
@@ -398,11 +418,11 @@ class FrameSource:
             notes[part] = column
 
     def may_serve(self, start_s: float, end_s: float) -> bool:
-        """Return whether a source of [start_s, end_s) alone would read the same, as sparingly.
+        """Return whether a source of [start_s, end_s) alone would read the same, at the same cost.
 
-        The source has the rows of a longer time. Rows in no chunk count in parts from the first
-        one on, so that all of them have to be asked for. The statistics of a signal are read for
-        all groups: at least half of them have to be asked for.
+        This source covers a longer time. Rows in no chunk are divided into parts from the first one
+        on, so all of them must be requested. The statistics of a signal are read for all groups, so
+        at least half of them must be requested.
         """
         if self.unread or self.derived or self.order is not None or not self.is_in_order:
             return False
@@ -413,7 +433,7 @@ class FrameSource:
         return 2 * int(touched) >= len(self.starts_s)
 
     def twin(self) -> FrameSource:
-        """Return one that shares all arrays, and knows only of what itself could not read."""
+        """Return a source that shares all arrays but only reports what itself could not read."""
         other = copy.copy(self)
         other.unread = {part: of for part, of in self.unread.items() if of is None}
         other._noting = []
@@ -421,9 +441,9 @@ class FrameSource:
 
 
 class _ArrayCache:
-    """Arrays by key, up to `MOST_CACHED_BYTES`; the least recently used are dropped.
+    """Arrays by key, up to `_SOURCE.cached_bytes`; the least recently used are dropped.
 
-    Each with what could not be read for it.
+    Each is stored with what could not be read for it.
     """
 
     def __init__(self) -> None:
@@ -444,7 +464,7 @@ class _ArrayCache:
         size = _bytes_of(made)
         self._made[key] = made, notes, size
         self._bytes += size
-        while self._bytes > MOST_CACHED_BYTES and len(self._made) > 1:
+        while self._bytes > _SOURCE.cached_bytes and len(self._made) > 1:
             _, (_, _, freed) = self._made.popitem(last=False)
             self._bytes -= freed
 

@@ -1,4 +1,4 @@
-"""What the rows of a frame come to: counts, extremes, means, in all and in buckets, and gaps."""
+"""Summarise the rows of a frame: counts, extremes, means, in all and in buckets, and gaps."""
 
 from __future__ import annotations
 
@@ -38,17 +38,34 @@ from webots_mcp.store.reading.frame import Frame, Unread, ZoneMap, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, full_rate_parts, just_after
 from webots_mcp.store.registered_signals import RegisteredSignal
 
-_MAY_TURN: Final = frozenset((None, *ANGLES))  # quantities of what may be an angle by its values
-FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
-_ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
-_DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before a border is behind
+_MAY_TURN: Final = frozenset((None, *ANGLES))  # quantities whose values may be angles
+# frames with at most this many values are read completely; more have at least 100 chunks
+FULL_ROWS: Final = 120_000
 MOST_VALUES: Final = 20
-_FIRST_ROWS_BACK: Final = 1024  # that are looked at before a row, then each time more before those
-_MORE_BACK: Final = 4
+
+
+@dataclass(frozen=True)
+class SummaryReading:
+    """How much is read around a place, and the tolerance of bucket edges.
+
+    Attributes:
+        rows_around: Rows before and after a segment that show the usual interval.
+        edge_share: Tolerance for rounding at bucket edges, as a share of the bucket's length.
+        first_rows_back: Rows that are searched before a row at first.
+        growth: Factor by which each further search is longer.
+    """
+
+    rows_around: int = 20
+    edge_share: float = 1e-9
+    first_rows_back: int = 1024
+    growth: int = 4
+
+
+_READING: Final = SummaryReading()
 
 
 def reads_values(frame: Frame, signal: RegisteredSignal) -> bool:
-    """Whether every value is looked at: of few rows, and where turns of an angle are counted."""
+    """Return whether every value is read, for few rows and to count the turns of an angle."""
     if len(frame) <= FULL_ROWS or signal.turn is None:
         return len(frame) <= FULL_ROWS
     zones = frame.zone_map(signal.name)
@@ -62,12 +79,12 @@ def reads_values(frame: Frame, signal: RegisteredSignal) -> bool:
 
 
 def as_angle(frame: Frame, signal: RegisteredSignal, found: Summary) -> RegisteredSignal:
-    """Return a signal as an angle, where its values show that it is one; else as it is.
+    """Return a signal as an angle if its values show that it is one, else unchanged.
 
     Args:
         frame: The rows.
         signal: A numeric one.
-        found: What its values come to.
+        found: The summary of its values.
     """
     if not signal.may_be_angle or found.min is None or found.max is None:
         return signal
@@ -80,8 +97,8 @@ def as_angle(frame: Frame, signal: RegisteredSignal, found: Summary) -> Register
 def unwrapped(frame: Frame, signal: RegisteredSignal) -> Array | None:
     """Return an angle in each row with its turns counted, NaN where it has no value.
 
-    None of what is no angle, of one that never goes over the end of its scale, and of one that
-    leaps so far from row to row that its turns cannot be counted.
+    Return None if the signal is no angle, never crosses the end of its scale, or changes so much
+    between rows that its turns cannot be counted.
     """
     if signal.turn is None or not reads_values(frame, signal):
         return None
@@ -99,12 +116,12 @@ def unwrapped(frame: Frame, signal: RegisteredSignal) -> Array | None:
 
 
 def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None) -> Summary:
-    """Counts, extremes, mean and deviation of all rows; those of an angle are circular as well.
+    """Return counts, extremes, mean and deviation of all rows; circular ones as well for angles.
 
     Args:
         frame: The rows.
         signal: A numeric one.
-        kept: Rows that only kept stretches have: they count for extremes.
+        kept: Rows that only full-rate segments have; they count for extremes.
     """
     if kept is not None and signal.name in kept:
         return with_extremes(summary_of(frame, signal), summary_of(kept, signal))
@@ -124,7 +141,7 @@ def summary_of(frame: Frame, signal: RegisteredSignal, kept: Frame | None = None
 
 
 def _summary_of_zone_map(frame: Frame, name: str) -> Summary:
-    """The same from chunks; only those with the ends and the extremes are opened.
+    """Summarise from chunks, opening only those with the ends and the extremes.
 
     The squares are combined by the formula of T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms
     for computing the sample variance", The American Statistician 37 (1983): each chunk's own plus
@@ -160,10 +177,10 @@ def _summary_of_zone_map(frame: Frame, name: str) -> Summary:
 
 
 def weighted_sums(frame: Frame, name: str, zones: ZoneMap) -> tuple[Array, Array, Array]:
-    """Weights, weighted sums and weighted squares of the deviations from the mean, by chunk.
+    """Return weights, weighted sums and weighted squares of the deviations from the mean, by chunk.
 
-    Chunks whose rows follow each other evenly come to what their statistics say, times the weight
-    of a row. Others are opened.
+    If the rows of a chunk are evenly spaced, its statistics are multiplied by the weight of a row.
+    Other chunks are opened.
     """
     weight, is_even = weights_of_chunks(frame, zones)
     found = (
@@ -191,7 +208,7 @@ def weighted_sums(frame: Frame, name: str, zones: ZoneMap) -> tuple[Array, Array
 
 
 def weights_of_chunks(frame: Frame, zones: ZoneMap) -> tuple[Array, Flags]:
-    """Return the mean weight of a row in each chunk, and in which chunks all rows count alike."""
+    """Return the mean weight of a row in each chunk, and in which chunks all rows count equally."""
     chunks = len(zones)
     if frame.weights is None or not chunks:
         return np.ones(chunks), np.ones(chunks, np.bool_)
@@ -205,7 +222,7 @@ def weights_of_chunks(frame: Frame, zones: ZoneMap) -> tuple[Array, Flags]:
 def _time_of(
     frame: Frame, name: str, zones: ZoneMap, place: int, value: float | None, *, last: bool = False
 ) -> float:
-    """When a chunk first had a value, or any; or its last one."""
+    """Return when a chunk first or last had a value."""
     start = int(zones.first_row[place])
     times, numbers = frame.rows(start, start + int(zones.row_count[place])).usable(name)
     rows = np.flatnonzero(numbers == value) if value is not None else np.arange(len(times))
@@ -213,15 +230,15 @@ def _time_of(
 
 
 def frame_around(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame:
-    """A segment with some rows before and after it: a gap at its end, or all around it, shows."""
+    """Return a segment with some rows around it, so that a gap at its end or around it shows."""
     run = read_frame(connection, Segment(segment.run_id, -math.inf, math.inf), deadline)
     return rows_around(run, segment)
 
 
 def rows_around(run: Frame, segment: Segment) -> Frame:
-    """The same of a frame that has all rows of the run."""
+    """Return a part of a frame with some rows around it."""
     start, stop = run.places([segment.start_s, segment.end_s]).tolist()
-    return run.rows(start - _ROWS_AROUND, stop + _ROWS_AROUND)
+    return run.rows(start - _READING.rows_around, stop + _READING.rows_around)
 
 
 def rhythm_in(frame: Frame) -> Rhythm:
@@ -231,13 +248,12 @@ def rhythm_in(frame: Frame) -> Rhythm:
 
 @dataclass(frozen=True)
 class Buckets:
-    """Buckets that begin at multiples of their length, the empty ones as well.
+    """Buckets that begin at multiples of their length, including empty ones.
 
     Attributes:
-        step_s: Length of a bucket; None where each row is one.
-        starts_s: Begin of each.
-        edges: Place of the first row of each in the frame, and after the last one how many rows
-            there are.
+        step_s: Length of a bucket; None if each row is one.
+        starts_s: Start of each bucket.
+        edges: Index of the first row of each in the frame, followed by the number of rows.
     """
 
     step_s: float | None
@@ -246,10 +262,10 @@ class Buckets:
 
 
 class BucketFigures(NamedTuple):
-    """What a signal comes to in each bucket; NaN where it has no usable number there.
+    """Statistics of a signal in each bucket; NaN if it has no usable number there.
 
     Attributes:
-        mean: Of an angle the circular one, in its unit: below 0 only where its values are.
+        mean: For an angle the circular mean in its unit; below 0 only if its values are.
     """
 
     counts: Indexes
@@ -260,12 +276,12 @@ class BucketFigures(NamedTuple):
 
 
 def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buckets:
-    """At most so many buckets for the rows of a frame; a row is one where they are as few.
+    """Return at most N buckets for the rows of a frame; each row is one if there are few.
 
     Args:
-        frame: Whose rows.
-        max_points: The most buckets.
-        least_step_s: No bucket is shorter; above 0 no row is a bucket of its own.
+        frame: The frame.
+        max_points: Maximum number of buckets.
+        least_step_s: Minimum length of a bucket; above 0, no row is a bucket of its own.
     """
     rows = len(frame)
     if not rows or (least_step_s <= 0 and rows <= max_points):
@@ -275,7 +291,7 @@ def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buck
     numbers: Array = np.arange(
         _number(first_s, step_s), _number(last_s, step_s) + 2, dtype=np.float64
     )
-    borders_s: Array = (numbers - _DUST) * step_s
+    borders_s: Array = (numbers - _READING.edge_share) * step_s
     edges = frame.places(borders_s)
     edges[0], edges[-1] = 0, rows
     starts_s: Array = np.round(numbers[:-1] * step_s, 9)
@@ -283,12 +299,12 @@ def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buck
 
 
 def _number(time_s: float, step_s: float) -> int:
-    """Which bucket holds a time."""
-    return math.floor(time_s / step_s + _DUST)
+    """Return the number of the bucket that holds a time."""
+    return math.floor(time_s / step_s + _READING.edge_share)
 
 
 def _step(first_s: float, last_s: float, max_points: int, least_s: float) -> float:
-    """The shortest round bucket length that needs no more buckets."""
+    """Return the shortest round bucket length that needs no more buckets."""
     for step_s in _round_steps(max(least_s, (last_s - first_s) / max_points / 10, 1e-9)):
         if step_s >= least_s and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
             return step_s
@@ -304,13 +320,13 @@ def _round_steps(at_least_s: float) -> Iterator[float]:
 def cells_of(
     frame: Frame, signal: RegisteredSignal, buckets: Buckets, kept: Frame | None
 ) -> BucketFigures:
-    """What a signal comes to in each bucket.
+    """Return the statistics of a signal in each bucket.
 
     Args:
         frame: The rows.
         signal: A numeric one.
-        buckets: From `buckets_of` of the same frame.
-        kept: Rows that only kept stretches have: they count for extremes.
+        buckets: Buckets from `buckets_of` of the same frame.
+        kept: Rows that only full-rate segments have; they count for extremes.
     """
     turned = unwrapped(frame, signal)
     cells = _cells(_parts(frame, signal, buckets, turned), signal.turn, buckets.edges)
@@ -329,17 +345,17 @@ def cells_of(
 
 
 def beside(frame: Frame, turned: Array, turn: float, times: Array, angles: Array) -> Array:
-    """Return angles of other rows in as many turns as those of the frame's rows around them."""
+    """Return angles of other rows in the turns of the frame's rows around them."""
     there = ~np.isnan(turned)
     near = np.interp(times, frame.times[there], turned[there])
     return np.asarray(angles + turn * np.rint((near - angles) / turn), np.float64)
 
 
 class _Parts(NamedTuple):
-    """Rows, and chunks that lie within one bucket, in order: what each comes to.
+    """Rows, and chunks within one bucket, in order, with the statistics of each.
 
     Attributes:
-        weights: How much of the time each stands for; `sum` is weighted by it.
+        weights: Share of the time that each stands for; `sum` is weighted by it.
     """
 
     first_row: Indexes
@@ -354,7 +370,7 @@ class _Parts(NamedTuple):
 def _parts(
     frame: Frame, signal: RegisteredSignal, buckets: Buckets, turned: Array | None
 ) -> _Parts:
-    """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
+    """Return the parts; chunks within one bucket are not opened if there are many rows."""
     name = signal.name
     if len(frame) <= FULL_ROWS or signal.turn is not None:
         return _of_rows(frame, 0, frame.numbers(name) if turned is None else turned)
@@ -386,7 +402,7 @@ def _in_order(some: Sequence[_Parts]) -> _Parts:
 
 
 def _of_rows(frame: Frame, start: int, numbers: Array) -> _Parts:
-    """Each row that has a usable number."""
+    """Return one part per row with a usable number."""
     rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
     held = numbers if len(rows) == len(numbers) else numbers[rows]
     ones = np.ones(len(rows))
@@ -413,7 +429,7 @@ def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> BucketFigures:
     high = np.maximum.reduceat(parts.max, starts)
     if turn is None:
         mean = _weighted_means(parts, starts)
-        mean = np.minimum(np.maximum(mean, low), high)  # sums round
+        mean = np.minimum(np.maximum(mean, low), high)  # sums are rounded
     else:
         mean = _circular_means(parts, starts, turn, low)
     count_of: Indexes = np.zeros(cells, np.intp)
@@ -428,7 +444,7 @@ def _weighted_means(parts: _Parts, starts: Indexes) -> Array:
 
 
 def _circular_means(parts: _Parts, starts: Indexes, turn: float, low: Array) -> Array:
-    """The direction of the resultant vector; NaN where the vectors cancel out.
+    """Return the direction of the resultant vector; NaN if the vectors cancel out.
 
     K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.2.1.
     """
@@ -456,14 +472,13 @@ class ChangePoints:
     """The change points of signals in a segment.
 
     Attributes:
-        points: By signal, in order; the first is the value in force when the segment begins, its
-            time may lie before. Of a signal whose value then is not known there are only later
-            ones, or none.
-        since_before: Those whose first value was in force before the time of its point:
-            since when was not found.
-        unread_from_s: The deadline passed: no point lies behind this, and the last of each signal
-            need not be its last. None where all was read.
-        unread: Parts of the segment that could not be read, and why; no point lies in them.
+        points: By signal, in order. The first is the value in force when the segment begins; its
+            time may be earlier. If that value is unknown, there are only later points, or none.
+        since_before: Signals whose first value was in force before the time of its point, for an
+            unknown time.
+        unread_from_s: Where the deadline passed: there are no later points, and the last point of a
+            signal need not be its last change. None if all was read.
+        unread: Parts of the segment that could not be read, and why; they contain no points.
     """
 
     segment: Segment
@@ -473,18 +488,21 @@ class ChangePoints:
     unread: tuple[Unread, ...] = ()
 
     def read_to_s(self, end_s: float) -> float:
-        """How far before `end_s` the values are known."""
+        """Return up to when before `end_s` the values are known."""
         return end_s if self.unread_from_s is None else min(end_s, self.unread_from_s)
 
     def cut(self, unread_from_s: float | None) -> ChangePoints:
-        """Those of them that were read up to there, for an answer that ends there."""
+        """Return the points up to a time, for an answer that ends there."""
         if unread_from_s is None or self.read_to_s(unread_from_s) < unread_from_s:
             return self
         points = {name: _until(each, unread_from_s) for name, each in self.points.items()}
         return replace(self, points=points, unread_from_s=unread_from_s)
 
     def longest_values(self, name: str, end_s: float) -> dict[str, float]:
-        """Seconds in each value up to `end_s`, of what was read; see `longest_values`."""
+        """Return the seconds in each value up to `end_s`, of what was read.
+
+        See `longest_values`.
+        """
         return longest_values(self.points[name], self.segment.start_s, self.read_to_s(end_s))
 
 
@@ -497,19 +515,19 @@ def change_points(
     frame: Frame | None = None,
     since: bool = True,
 ) -> ChangePoints:
-    """The change points of signals in a segment, at any length of it.
+    """Return the change points of signals in a segment of any length.
 
     Args:
-        connection: Any.
-        segment: Which stretch.
-        signals: Texts, flags and numbers; of a number each value counts as its text.
-        deadline: For all reading; that since when is found out last.
-        frame: The rows of the segment, where they were read already.
-        since: Whether it matters when the value in force at the begin began; without it the time of
-            that point may be any before.
+        connection: An open database.
+        segment: The segment.
+        signals: Texts, flags and numbers; each value of a number counts as its text.
+        deadline: For all reading; the start of the first values is searched last.
+        frame: The rows of the segment, if they were read already.
+        since: Whether to find out when the value in force at the start began; otherwise the time of
+            that point may be any earlier time.
     """
     frame = frame or read_frame(connection, segment, deadline)
-    before: Frame | None = None  # it is read only where it is looked at
+    before: Frame | None = None  # read only on access
     points: dict[str, list[Point]] = {}
     since_before = set[str]()
     for signal in signals:
@@ -541,13 +559,13 @@ def change_points(
 def _in_force(
     before: Frame, signal: RegisteredSignal, at_begin: Point | None, *, since: bool
 ) -> Point | None:
-    """The point of the value in force when a segment begins; None where it is not found.
+    """Return the point of the value in force when a segment begins; None if it is not found.
 
     Args:
         before: The rows before the segment.
-        signal: Of which.
-        at_begin: What the row at the begin says; None without such a row.
-        since: Whether to look for the time at which that value began.
+        signal: The signal.
+        at_begin: The value in the row at the start; None without such a row.
+        since: Whether to search the time at which that value began.
     """
     rows = len(before)
     if before.cut_at_s is not None or not rows:
@@ -563,26 +581,26 @@ def _in_force(
 
 
 def _is_hidden(before: Frame, signal: RegisteredSignal, time_s: float) -> bool:
-    """Whether the row before a time is one whose value could not be read."""
+    """Return whether the value of the row before a time could not be read."""
     row = int(before.places([time_s])[0])
     return row > 0 and not before.rows(row - 1, row).was_read(signal.name).all()
 
 
 def _first_of_last_equal(frame: Frame, signal: RegisteredSignal, value: str | bool | None) -> int:
-    """The first of the last rows that all have this value; the number of rows if none has it."""
-    stop, rows = len(frame), _FIRST_ROWS_BACK
+    """Return the first of the last rows that all have this value, or the number of rows."""
+    stop, rows = len(frame), _READING.first_rows_back
     while stop > 0:
         start = max(0, stop - rows)
         values, codes = _valued(frame.rows(start, stop), signal)
         unlike = np.flatnonzero(codes != (values.index(value) if value in values else -1))
         if len(unlike):
             return start + int(unlike[-1]) + 1
-        stop, rows = start, rows * _MORE_BACK
+        stop, rows = start, rows * _READING.growth
     return 0
 
 
 def _points_in(frame: Frame, signal: RegisteredSignal) -> list[Point]:
-    """The first value of a frame, and each that is unlike the one before."""
+    """Return the first value of a frame, and each that differs from the one before."""
     values, codes = _valued(frame, signal)
     times = frame.times
     if frame.unread:
@@ -594,7 +612,7 @@ def _points_in(frame: Frame, signal: RegisteredSignal) -> list[Point]:
 
 
 def _valued(frame: Frame, signal: RegisteredSignal) -> tuple[list[str | bool | None], Indexes]:
-    """The values of a signal as its kind has them, and of each row which one it has."""
+    """Return the distinct values of a signal, and the index of the value of each row."""
     codes, labels = frame.coded(signal.name)
     of_label = [_value(signal, label) for label in labels]
     values = list(dict.fromkeys(of_label))
@@ -619,7 +637,7 @@ def _splice_kept(
     deadline: Deadline,
     points: dict[str, list[Point]],
 ) -> None:
-    """In kept stretches the points are those of each call: to the very step, none missed."""
+    """Replace the points within full-rate segments by those of each call, which miss no step."""
     for each in full_rate_parts(connection, segment.run_id, segment.start_s, segment.end_s):
         start_s = max(each.start_s, segment.start_s)
         end_s = min(just_after(each.end_s), segment.end_s)
@@ -639,12 +657,12 @@ def _splice_kept(
 
 
 def _until(points: list[Point], end_s: float) -> list[Point]:
-    """Those that lie not behind a time."""
+    """Return the points up to a time."""
     return [point for point in points if point.sim_time_s <= end_s]
 
 
 def time_by_value(points: Sequence[Point], start_s: float, end_s: float) -> dict[str, float]:
-    """Simulated seconds in each value within [start_s, end_s), the longest first.
+    """Return simulated seconds in each value within [start_s, end_s), the longest first.
 
     Between two rows the value of the earlier one is in force; null counts as "null".
     """
@@ -658,10 +676,10 @@ def time_by_value(points: Sequence[Point], start_s: float, end_s: float) -> dict
 
 
 def longest_values(points: Sequence[Point], start_s: float, end_s: float) -> dict[str, float]:
-    """The same for at most 20 values: a text that is no mode has too many."""
+    """Return the seconds in the 20 longest values: a text that is no mode has too many."""
     return dict(list(time_by_value(points, start_s, end_s).items())[:MOST_VALUES])
 
 
 def spelled(value: str | bool | None) -> str:
-    """A value as a name: true, false, null, or the text."""
+    """Return the text of a value: true, false, null, or the text itself."""
     return value if isinstance(value, str) else {True: "true", False: "false", None: "null"}[value]

@@ -1,16 +1,17 @@
-"""Where an observer saw a robot that publishes no position of its own.
+"""Provide the pose that an observer saw for a robot that publishes no position of its own.
 
-A robot with a bridge records what it knows of itself: a plain `Robot` without a GPS does not know
-where it is. An observer in the same simulation does. Its poses of that robot are then signals of
-the robot, `observer.x_m` and so on, so that each question about it has a position and shows whose.
-Nothing is copied in the recording: the poses are read from the observer's run, and lie between two
-of its rows on the straight line between them.
+A robot with a bridge records what it knows of itself, and a plain `Robot` without a GPS does not
+know where it is. An observer in the same simulation does. Its poses of that robot become signals of
+the robot, `observer.x_m` and so on. So each question about the robot has a position and shows its
+source. Nothing is copied in the recording: the poses are read from the observer's run and
+interpolated linearly between two of its rows.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, median, np
@@ -23,11 +24,25 @@ from webots_mcp.store.registered_signals import RegisteredSignal, registered, se
 Derived = Mapping[str, Callable[[Array], Decoded]]
 """Signals that no row of a run holds, by name: their values at some simulation times."""
 
-MARGIN_S: Final = 1.0  # of the observer's rows around what is asked for
+MARGIN_S: Final = 1.0  # rows of the observer before and after the requested time
 _ANGLES: Final = ("heading_rad", "roll_rad", "pitch_rad")
 _PARTS: Final = ("x_m", "y_m", "z_m", *_ANGLES)
-_LONGEST_GAP_S: Final = 1.0  # between two rows of an observer; more of one that looks seldom
-_GAP_INTERVALS: Final = 3.0
+
+
+@dataclass(frozen=True)
+class ObservedGaps:
+    """How far apart the rows of an observer may be.
+
+    Attributes:
+        longest_s: Simulation time between two rows between which poses are interpolated.
+        intervals: The same in usual intervals, for an observer that records less often.
+    """
+
+    longest_s: float = 1.0
+    intervals: float = 3.0
+
+
+_GAPS: Final = ObservedGaps()
 
 
 class ObservedRobot(NamedTuple):
@@ -36,7 +51,7 @@ class ObservedRobot(NamedTuple):
     Attributes:
         observer: The name of the observer.
         run_id: Its run.
-        key: The robot's word in the observer's signals: `world.KEY.x_m`.
+        key: The robot's name in the observer's signals: `world.KEY.x_m`.
     """
 
     observer: str
@@ -52,10 +67,10 @@ def find_observed(
     Args:
         connection: Any.
         run_id: The robot's run.
-        columns: Rows of it that are in no chunk.
+        columns: Its rows that are in no chunk.
 
     Returns:
-        None where the run has a position, or no observer saw the robot meanwhile.
+        None if the run has a position, or no observer saw the robot during it.
     """
     if (
         connection.execute(f"SELECT 1 FROM robot WHERE kind = '{OBSERVER}' LIMIT 1").fetchone()
@@ -79,8 +94,8 @@ def find_observed(
         return None
     observer, observer_run_id, name = row
     asked = {"run": observer_run_id, "name": name}
-    # The newest description of the world that has the robot; a name is left out where it is the
-    # key.
+    # The newest description of the world that contains the robot; a name is omitted if it equals
+    # the key.
     key, count = connection.execute(
         "SELECT min(r.value ->> '$.key'), count(*) FROM event e, "
         "json_each(CASE WHEN json_valid(e.data) THEN e.data ELSE '{}' END, '$.robots') r "
@@ -116,10 +131,10 @@ def with_observed_pose(
     """Add the pose by an observer to what is known of a robot, where a run has only that.
 
     Args:
-        connection: Any.
+        connection: An open database.
         robot_id: The robot.
         known: Its own signals.
-        runs: Of it, each with its rows that are in no chunk.
+        runs: Runs of the robot, each with its rows that are in no chunk.
     """
     if not any(find_observed(connection, run_id, columns) for run_id, columns in runs):
         return known
@@ -159,14 +174,14 @@ def pose_at(derived: Derived, sim_time_s: float) -> dict[str, float]:
 
 
 def _between(seen_s: Array, values: Array, times: Array, *, turns: bool) -> Array:
-    """Values at times between those that were seen; NaN where none was seen near enough.
+    """Interpolate values between observed times; NaN if none was observed near enough.
 
-    Before the first and after the last one it stays as it is for the usual interval.
+    Before the first and after the last one, the value holds for the usual interval.
     """
     if not len(seen_s):
         return np.full(len(times), np.nan)
     usual_s = median(np.diff(seen_s)) if len(seen_s) > 1 else 0.0
-    longest_s = max(_LONGEST_GAP_S, _GAP_INTERVALS * usual_s)
+    longest_s = max(_GAPS.longest_s, _GAPS.intervals * usual_s)
     if turns:
         values = np.unwrap(values)
     found: Array = np.interp(times, seen_s, values)

@@ -1,4 +1,4 @@
-"""The one place where it is defined what a question is about: robot, run and stretch of time.
+"""Define what a question is about: robot, run and time range. No other module does.
 
 A `Scope` says what was asked for, a `TimeRange` what that is in a recording. A range is half-open,
 [start, end), and given in one of three ways:
@@ -44,9 +44,8 @@ from webots_mcp.store.reading.segment import (
     shown_time,
 )
 
-_MOST_HITS: Final = 1000
-_LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
-# What was stored just before a bound and is shown as of it; commands know no run but their robot's.
+# What was stored just before a bound and is shown with its time; commands belong to no run, only to
+# their robot.
 _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
     " UNION ALL ".join(
         f"SELECT min({time}) AS time_s FROM {table} WHERE {subject} "
@@ -60,12 +59,29 @@ _SHOWN_AS_BOUND: Final = "SELECT min(time_s) FROM ({})".format(
     )
 )
 USE_EVERY_ROW: Final = "; ask for such a segment alone to use every row"
-MOST_RUNS: Final = 1000  # that one range in wall time may hold
-_LONGEST_SHOWN: Final = 80
+MOST_RUNS: Final = 1000  # number of runs in one range of wall time
+
+
+@dataclass(frozen=True)
+class NoteLimits:
+    """When and how a range is annotated.
+
+    Attributes:
+        hits: Hits of a breakpoint up to which they are counted.
+        rows_per_hit: Rows for each hit above which hits hardly move a mean (below 0.5 %).
+        shown_characters: Length at which an error cuts a time.
+    """
+
+    hits: int = 1000
+    rows_per_hit: int = 200
+    shown_characters: int = 80
+
+
+_NOTES: Final = NoteLimits()
 
 
 def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
-    """The time of a run's newest row before a time; None where there is none."""
+    """Return the time of a run's newest row before a time; None without such a row."""
     if (run := frame_of_purged(connection, run_id)) is not None:
         place = int(run.places([sim_time_s])[0])
         return float(run.rows(place - 1, place).times[0]) if place else None
@@ -77,7 +93,7 @@ def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -
 
 
 def _row_from(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
-    """The time of a run's oldest row from a time on; None where there is none."""
+    """Return the time of a run's oldest row from a time on; None without such a row."""
     if (run := frame_of_purged(connection, run_id)) is not None:
         place = int(run.places([sim_time_s])[0])
         return float(run.rows(place, place + 1).times[0]) if place < len(run) else None
@@ -94,7 +110,7 @@ def coverage_notes(
     span: tuple[float, float],
     recorded: tuple[float, float],
 ) -> Iterator[str]:
-    """Notes on [start, end) of a run that was recorded from the first to the newest time."""
+    """Return notes on [start, end) of a run that was recorded from the first to the newest time."""
     (start_s, end_s), (first_s, newest_s) = span, recorded
     run = f"run {run_id}"
     if end_s <= first_s:
@@ -112,7 +128,7 @@ def coverage_notes(
 def _gap_notes(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> Iterator[str]:
-    """That the range lies between two rows."""
+    """Note that the range lies between two rows."""
     after_s = _row_from(connection, run_id, start_s)
     if after_s is None or after_s < end_s:
         return
@@ -124,7 +140,7 @@ def _gap_notes(
 def hit_notes(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> Iterator[str]:
-    """That means lean towards the rows that a breakpoint's hits have added to a throttled run."""
+    """Note that hits of a breakpoint add rows to a throttled run, which biases means."""
     if (
         connection.execute(
             "SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
@@ -134,16 +150,16 @@ def hit_notes(
         is None
     ):
         return
-    values = {"run": run_id, "start": start_s, "end": end_s, "most": _MOST_HITS}
-    # Of the rows of a throttled recording those that a breakpoint's hit let through: so many at
-    # least, and how many rows there are, counted no further than matters.
+    values = {"run": run_id, "start": start_s, "end": end_s, "most": _NOTES.hits}
+    # The number of rows that a breakpoint's hit added to a throttled recording, and the number of
+    # all rows, each counted no further than necessary.
     (hits,) = connection.execute(
         "SELECT count(*) FROM (SELECT 1 FROM event WHERE run_id = :run AND sim_time_s >= :start "
         "AND sim_time_s < :end AND kind IN ('breakpoint', 'violation') "
         "GROUP BY sim_time_s LIMIT :most)",
         values,
     ).fetchone()
-    most = _LEAST_ROWS_PER_HIT * hits
+    most = _NOTES.rows_per_hit * hits
     rows = rows_in("state", connection, run_id, (start_s, end_s), most)
     if (run := frame_of_purged(connection, run_id)) is not None:
         first, last = run.places([start_s, end_s]).tolist()
@@ -156,18 +172,18 @@ def hit_notes(
 
 
 def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
-    """How many of the published states a run's rows are, in a sentence."""
+    """Return a sentence with the share of the published states that the run's rows contain."""
     return unrecorded(connection, run_id) or "every publish() call is a row, so nothing was missed"
 
 
 def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
-    """What of the published states is not in a run's rows; None where all of them are."""
+    """Return which published states are not in a run's rows; None if none are missing."""
     row = connection.execute(
         "SELECT s.throttle_interval, EXISTS (SELECT 1 FROM event WHERE run_id = r.id "
         "AND kind = 'dropped') FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?",
         (run_id,),
     ).fetchone()
-    interval, dropped = row or (None, False)  # of a robot that cannot be read nothing is known
+    interval, dropped = row or (None, False)  # nothing is known of an unreadable robot
     if interval == 1:
         return "rows were dropped, so their values are missing" if dropped else None
     fewer = "rows may be fewer than publish() calls"
@@ -178,12 +194,12 @@ def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
 
 @dataclass(frozen=True)
 class TimeRange:
-    """A range that was found in the recording.
+    """A range as found in the recording.
 
     Attributes:
-        segments: One per run, in the order of the runs.
-        notes: What the asker should know: where the range reaches outside the recording, or into
-            what was purged or never recorded.
+        segments: One per run, in order.
+        notes: What the caller should know: where the range exceeds the recording, or covers what
+            was purged or never recorded.
     """
 
     robot_id: int
@@ -195,15 +211,15 @@ class TimeRange:
 
 @dataclass(frozen=True, kw_only=True)
 class Scope:
-    """What a question is about, as it was asked; nothing given is the whole newest run.
+    """What a question is about, as the caller gave it; by default the whole newest run.
 
     Attributes:
-        robot: May be left out where only one is meant.
-        run_id: None for the robot's newest run; in wall time for all of its runs.
-        start_s: In one of three ways, as this module says.
+        robot: May be omitted if only one robot is possible.
+        run_id: None for the robot's newest run, or in wall time for all of its runs.
+        start_s: Bound in one of three forms, as described in this module.
 
     Raises:
-        InvalidRangeError: Reversed, empty, not finite, or given in two ways at once.
+        InvalidRangeError: The range is reversed, empty, not finite, or given in two forms at once.
     """
 
     robot: str | None = None
@@ -247,12 +263,12 @@ class Scope:
 def find_range(
     connection: sqlite3.Connection, scope: Scope, subject: Subject | None = None
 ) -> TimeRange:
-    """Find what a scope means in the recording.
+    """Find the part of the recording that a scope means.
 
     Args:
-        connection: Any.
-        scope: What was asked for.
-        subject: Its robot and run, where they are known already.
+        connection: An open database.
+        scope: The scope.
+        subject: Its robot and run, if they are known already.
 
     Raises:
         InvalidRangeError: See `Scope`.
@@ -286,9 +302,9 @@ def _seconds(time_s: float) -> str:
 
 
 def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
-    """Simulation times between which a run recorded; None if it has no row.
+    """Return the simulation times between which a run recorded; None if it has no row.
 
-    Rows that retention deleted count: their chunks are there, or a frame says what is not.
+    Rows that retention deleted count: their chunks remain, or a frame reports what does not.
     """
     rows = _row_bounds(connection, run_id)
     lost = connection.execute(
@@ -301,7 +317,7 @@ def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float,
 
 
 def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
-    """Simulation times of a run's first and newest row; None without any."""
+    """Return simulation times of a run's first and newest row; None without rows."""
     query = (
         "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state "
         "WHERE run_id = :run UNION ALL SELECT {0}(sim_time_s) FROM kept_state "
@@ -316,7 +332,7 @@ def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, flo
 
 
 def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
-    """All rows of a run; None without any."""
+    """Return all rows of a run; None without rows."""
     bounds = recorded_bounds(connection, run_id)
     if bounds is None:
         return None
@@ -325,9 +341,9 @@ def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
 
 
 def _rated(connection: sqlite3.Connection, segment: Segment) -> Segment:
-    """The segment, which knows whether it is kept at full rate.
+    """Return the segment, marked if it is kept at full rate.
 
-    It is where it holds nothing but rows of one stretch, and not too many of them.
+    It is marked if it holds only rows of one full-rate segment, and not too many of them.
     """
     run_id, span = segment.run_id, (segment.start_s, segment.end_s)
     for each in full_rate_parts(connection, run_id, *span):
@@ -340,7 +356,7 @@ def _rated(connection: sqlite3.Connection, segment: Segment) -> Segment:
 
 
 def _has_rows(connection: sqlite3.Connection, run_id: int, span: tuple[float, float]) -> bool:
-    """Whether a row lies in [start, end), be it that it is left in a chunk alone."""
+    """Return whether a row lies in [start, end), even if it is left only in a chunk."""
     if span[0] >= span[1] or rows_in("state", connection, run_id, span, 1):
         return span[0] < span[1]
     return len(read_frame(connection, Segment(run_id, *span), Deadline())) > 0
@@ -363,7 +379,7 @@ def _in_simulation_time(
     if last_s is not None:
         start_s = newest_s - last_s if last_s < newest_s - first_s else None
     start = first_s if start_s is None else _bound(connection, subject, start_s)
-    # An end that is left out holds the newest row, also where the start lies beyond it.
+    # An open end includes the newest row, even if the start lies after it.
     end = just_after(max(newest_s, start)) if end_s is None else _bound(connection, subject, end_s)
     if start_s is None and end <= first_s:
         raise InvalidRangeError(
@@ -381,7 +397,7 @@ def _in_simulation_time(
 
 
 def _rate_notes(connection: sqlite3.Connection, segment: Segment) -> list[str]:
-    """Where more than what the throttle lets through is a row."""
+    """Note where rows exist in addition to those that the throttle let through."""
     span = (segment.run_id, segment.start_s, segment.end_s)
     kept = kept_notes(connection, *span)
     if segment.full_rate:
@@ -393,7 +409,7 @@ def _rate_notes(connection: sqlite3.Connection, segment: Segment) -> list[str]:
 def _too_young(
     connection: sqlite3.Connection, subject: Subject, last_s: float | None, age_s: float
 ) -> list[str]:
-    """That the run has not lasted for `last_s`, and which run came before it."""
+    """Note that the run has not lasted for `last_s`, and which run came before it."""
     if last_s is None or moment_of(last_s) <= age_s:
         return []
     before, began_by = connection.execute(
@@ -406,7 +422,7 @@ def _too_young(
 
 
 def _bound(connection: sqlite3.Connection, subject: Subject, time_s: float) -> float:
-    """Where a bound lies: at the first thing that is shown as of this time, or of a later one."""
+    """Return the place of a bound: the first thing that is shown with this time or a later one."""
     names = {"run": subject.run_id, "robot": subject.robot_id}
     times = {"moment": moment_of(time_s), "bound": shown_time(time_s)}
     (before_s,) = connection.execute(_SHOWN_AS_BOUND, names | times).fetchone()
@@ -446,7 +462,7 @@ def _in_wall_time(
 def _cut(
     connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
 ) -> Segment | None:
-    """The part of a run from its first to its last row in [wall_start_s, wall_end_s)."""
+    """Return the part of a run from its first to its last row in [wall_start_s, wall_end_s)."""
     recorded = recorded_bounds(connection, run_id)
     if recorded is None:
         return None
@@ -454,7 +470,7 @@ def _cut(
         run_id, recorded[0], just_after(recorded[1]), wall_start_s, wall_end_s,
         open_start=True, open_end=True,
     )  # fmt: skip
-    # Whether all rows of a run that has ended were recorded within these wall times.
+    # Whether all rows of an ended run were recorded within these wall times.
     if connection.execute(
         "SELECT coalesce(started_wall_time_s >= ? AND ended_wall_time_s < ? "
         "AND last_wall_time_s <= ended_wall_time_s, 0) FROM run WHERE id = ?",
@@ -462,7 +478,7 @@ def _cut(
     ).fetchone()[0]:
         return _rated(connection, whole)
     frame = read_frame(connection, whole, Deadline())
-    if frame.cut_at_s is not None:  # who reads the rows says what there is no time for
+    if frame.cut_at_s is not None:  # the reader of the rows reports what there is no time for
         return _rated(connection, whole)
     if not len(frame):
         return None
@@ -474,12 +490,12 @@ def _cut(
 
 
 def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> float:
-    """Unix seconds of a wall time, given as such or in ISO 8601.
+    """Return the Unix seconds of a wall time, given as a number or in ISO 8601.
 
-    Without an offset ISO times are local times of this machine.
+    ISO times without an offset are local times of this machine.
 
     Raises:
-        InvalidRangeError: Neither a finite number nor ISO 8601.
+        InvalidRangeError: It is neither a finite number nor ISO 8601.
     """
     if value is None:
         return default_s
@@ -497,13 +513,14 @@ def _iso_seconds(text: str) -> float:
         return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
     except (ValueError, OverflowError, OSError) as error:
         raise InvalidRangeError(
-            f"{text[:_LONGEST_SHOWN]!r} is not a time. Give Unix seconds or ISO 8601 such as "
+            f"{text[: _NOTES.shown_characters]!r} is not a time. "
+            "Give Unix seconds or ISO 8601 such as "
             "2026-05-04T13:30:00+02:00."
         ) from error
 
 
 def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None:
-    """All rows of a run that has lost some from `state`; None where that table has all of them."""
+    """Return all rows of a run that has lost some from `state`; None if it has lost none."""
     if not connection.execute(
         "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0", (run_id,)
     ).fetchone():
@@ -517,6 +534,6 @@ def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None
 def find_subject(
     connection: sqlite3.Connection, robot: str | None = None, run_id: int | None = None
 ) -> Subject:
-    """The subject of a question; see `choose` and `require_run`."""
+    """Return the subject of a question; see `choose` and `require_run`."""
     chosen, run = choose(connection, robot, run_id, time.time())
     return Subject(chosen.id, chosen.name, require_run(chosen, run).id)

@@ -1,6 +1,6 @@
-"""What every reader of the past takes: a segment of one run, a deadline, one state of the database.
+"""Define what every reader of the past takes: a segment of one run, a deadline, a snapshot.
 
-And which parts of a run are kept at full rate.
+It also finds the parts of a run that are kept at full rate.
 """
 
 from __future__ import annotations
@@ -20,16 +20,12 @@ from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.robots import RobotRecord, resolve_robot, robot_name
 from webots_mcp.store.run_rows import RunRecord, current_run, fetch_run
 
-_DECIMALS: Final = 3
-HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is left
+HAS_LOST_ROWS: Final = (  # for a run `r`: rows were deleted whose chunks are deleted, too
     "r.purged_rows > coalesce((SELECT sum(row_count - stored_row_count) FROM row_group "
     "WHERE run_id = r.id AND is_complete = 1), 0)"
 )
 QUESTION_DEADLINE_S: Final = 2.0
-_STEPS_PER_CHECK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
-MOST_FULL_RATE_SEGMENTS: Final = 200  # newest of a range that are looked at
-MOST_ROWS: Final = 30_000  # of a range that is answered from each call
-_NAMED: Final = 2
+MOST_ROWS: Final = 30_000  # rows of a range that is answered from each call
 _IS_NUMBER: Final = "IN ('real', 'integer')"
 _FULL_RATE_SEGMENTS: Final = (
     "SELECT start_sim_time_s, end_sim_time_s, CAST(reason AS TEXT), wall_time_s FROM kept_stretch "
@@ -40,15 +36,36 @@ _FULL_RATE_SEGMENTS: Final = (
 _IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 
 
+@dataclass(frozen=True)
+class SegmentReading:
+    """How segments are read and named.
+
+    Attributes:
+        decimals: Decimals of a shown time in seconds.
+        steps_per_check: Instructions of SQLite's virtual machine between two checks of a deadline:
+            about 0.5 ms.
+        full_rate_segments: Newest segments of a range that are checked.
+        named: Segments that a note names.
+    """
+
+    decimals: int = 3
+    steps_per_check: int = 20_000
+    full_rate_segments: int = 200
+    named: int = 2
+
+
+_READING: Final = SegmentReading()
+
+
 def shown_time(time_s: float) -> float:
-    """A simulation time as answers show it: to the millisecond."""
-    return round(time_s, _DECIMALS)
+    """Return a simulation time as answers show it, rounded to the millisecond."""
+    return round(time_s, _READING.decimals)
 
 
 def moment_of(time_s: float) -> float:
-    """The earliest time that is shown like this one: where a bound of a range really lies."""
+    """Return the earliest time that is shown like this one: the real place of a bound."""
     shown_s = shown_time(time_s)
-    moment_s = shown_s - 0.5 / 10**_DECIMALS
+    moment_s = shown_s - 0.5 / 10**_READING.decimals
     while shown_time(moment_s) < shown_s:
         moment_s = math.nextafter(moment_s, math.inf)
     while shown_time(before_s := math.nextafter(moment_s, -math.inf)) >= shown_s:
@@ -57,7 +74,7 @@ def moment_of(time_s: float) -> float:
 
 
 def just_after(time_s: float) -> float:
-    """The end of a half-open range that holds `time_s` as its last moment."""
+    """Return the end of a half-open range that includes `time_s` as its last moment."""
     return math.nextafter(time_s, math.inf)
 
 
@@ -65,13 +82,13 @@ def just_after(time_s: float) -> float:
 class Segment:
     """The part of a range that lies in one run: [start_s, end_s) of simulation time.
 
-    The limits in wall time matter where simulation time stood still (a paused simulation).
+    The limits in wall time matter while simulation time stood still (a paused simulation).
 
     Attributes:
-        open_start: The start is that of the first row: what was stored before it (the begin of
-            the run, a log line) is in the range as well.
-        open_end: The same at the newest row: a last log line, the end of the run.
-        full_rate: It lies in a kept stretch: each call of `publish` is a row of it.
+        open_start: Whether the start is that of the first row; the range then includes what was
+            stored before it (the start of the run, a log line).
+        open_end: The same for the newest row: a last log line, the end of the run.
+        full_rate: Whether it lies in a full-rate segment, so that each call of `publish` is a row.
     """
 
     run_id: int
@@ -84,11 +101,11 @@ class Segment:
     full_rate: bool = False
 
     def until(self, end_s: float) -> Segment:
-        """Its part before that time."""
+        """Return its part before a time."""
         return replace(self, end_s=end_s, open_end=False)
 
     def through(self, last_s: float) -> Segment:
-        """Its part up to that time, with what is shown as of it."""
+        """Return its part up to a time, including what is shown with that time."""
         return self.until(moment_of(shown_time(last_s) + 0.001))
 
     @property
@@ -106,7 +123,7 @@ class Segment:
 
 
 class Deadline:
-    """When a question has to be answered with what is known by then."""
+    """The time by which a question is answered with what is known."""
 
     def __init__(
         self, limit_s: float = QUESTION_DEADLINE_S, clock: Callable[[], float] = time.monotonic
@@ -115,7 +132,7 @@ class Deadline:
         self._until_s = clock() + limit_s
 
     def part(self, share: float) -> Deadline:
-        """One for a part of the work: after that share of the time that is left."""
+        """Return a deadline for a part of the work: that share of the remaining time."""
         return Deadline(share * self.left_s, self._clock)
 
     @property
@@ -125,17 +142,13 @@ class Deadline:
 
     @property
     def left_s(self) -> float:
-        """Seconds that are left; 0 once it has passed."""
+        """Remaining seconds; 0 once it has passed."""
         return max(0.0, self._until_s - self._clock())
 
     @contextlib.contextmanager
     def interrupting(self, connection: sqlite3.Connection) -> Generator[None]:
-        """Interrupt the connection's statements once the time is over.
-
-        An interrupted statement raises `sqlite3.OperationalError`; `passed` distinguishes it from
-        other errors. A connection has one progress handler, so these blocks do not nest.
-        """
-        connection.set_progress_handler(lambda: self.passed, _STEPS_PER_CHECK)
+        """Interrupt the connection's statements once the time is over."""
+        connection.set_progress_handler(lambda: self.passed, _READING.steps_per_check)
         try:
             yield
         finally:
@@ -152,11 +165,11 @@ T = TypeVar("T")
 def in_one_snapshot(
     question: Callable[Concatenate[sqlite3.Connection, P], T],
 ) -> Callable[Concatenate[sqlite3.Connection, P], T]:
-    """Let a question that takes several statements see one state of the database.
+    """Let the statements of a question see one state of the database.
 
-    Without it rows could be put into chunks between two of its statements, and be counted twice. It
-    neither waits nor makes another process wait (write-ahead log); a transaction that is already
-    open is used as it is.
+    Otherwise rows could move into chunks between two of its statements and count twice. It neither
+    waits nor makes another process wait (write-ahead log). A transaction that is already open is
+    used.
     """
 
     @functools.wraps(question)
@@ -180,7 +193,7 @@ _readings: ContextVar[tuple[sqlite3.Connection, dict[Any, Any]] | None] = Contex
 
 @contextlib.contextmanager
 def one_reading(connection: sqlite3.Connection) -> Generator[None]:
-    """Let the parts of a question share what they read; inside of another one, with all of it."""
+    """Let the parts of a question share what they read, also with an enclosing question."""
     known = _readings.get()
     if known is not None and known[0] is connection:
         yield
@@ -193,21 +206,20 @@ def one_reading(connection: sqlite3.Connection) -> Generator[None]:
 
 
 def read_so_far(connection: sqlite3.Connection) -> dict[Any, Any]:
-    """Return what the question that is being answered has read; outside of any, nothing."""
+    """Return what the current question has read; nothing outside of a question."""
     known = _readings.get()
     return known[1] if known is not None and known[0] is connection else {}
 
 
-# -- kept stretches: seconds of a run of which each call of `publish` is a row ---------------------
+# -- full-rate segments: seconds of a run of which each call of `publish` is a row -----------------
 #
-# The rows that only they have stand in `kept_state`, apart from those that the throttle let
-# through. A range inside a stretch is answered from both. In a longer one means and counts are
-# those of the rows that were let through, of which there are equally many in each second; what
-# is about single states (extremes, changes, conditions) takes in both.
+# Rows that only they have are in `kept_state`, apart from those that the throttle let through. A
+# range inside such a segment is answered from both. In a longer range, means and counts use the
+# rows that were let through, which are evenly spaced; extremes, changes and conditions use both.
 
 
 class FullRateSegment(NamedTuple):
-    """From when to when, and why; `wall_time_s` is when it was asked for."""
+    """A full-rate segment with its reason; `wall_time_s` is when it was requested."""
 
     start_s: float
     end_s: float
@@ -216,22 +228,22 @@ class FullRateSegment(NamedTuple):
 
     @property
     def after_s(self) -> float:
-        """Beyond what simulation times differ by where a clock adds up steps."""
+        """Return a time just after the end, beyond the rounding of clocks that add up steps."""
         return self.end_s + 1e-9
 
 
 def full_rate_segments(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[FullRateSegment]:
-    """The stretches that touch [start_s, end_s) of a run, in order, as far as they are written."""
+    """Return the full-rate segments that overlap [start_s, end_s) of a run, as far as written."""
     rows = connection.execute(
-        _FULL_RATE_SEGMENTS, (run_id, start_s, end_s, MOST_FULL_RATE_SEGMENTS)
+        _FULL_RATE_SEGMENTS, (run_id, start_s, end_s, _READING.full_rate_segments)
     ).fetchall()
     return [_as_written(connection, run_id, FullRateSegment(*row)) for row in reversed(rows)]
 
 
 def newest_kept(connection: sqlite3.Connection, run_id: int) -> FullRateSegment | None:
-    """The stretch of a run that begins last."""
+    """Return the full-rate segment of a run that begins last."""
     row = connection.execute(_FULL_RATE_SEGMENTS, (run_id, -math.inf, math.inf, 1)).fetchone()
     return row and _as_written(connection, run_id, FullRateSegment(*row))
 
@@ -239,11 +251,14 @@ def newest_kept(connection: sqlite3.Connection, run_id: int) -> FullRateSegment 
 def _as_written(
     connection: sqlite3.Connection, run_id: int, stretch: FullRateSegment
 ) -> FullRateSegment:
-    """A controller that is killed leaves a stretch whose first rows are there, and not the last."""
+    """Return full-rate segments up to their last row.
+
+    A killed controller writes only the first rows.
+    """
     values = {"run": run_id, "start": stretch.start_s, "end": stretch.end_s}
-    # Of a stretch that was not ended, up to when its rows are there, which are written in order;
-    # and whether rows that the throttle let through follow each other after that. NULL where it is
-    # whole.
+    # For a segment that was not ended: up to when its rows exist, which are written in order, and
+    # whether rows that the throttle let through follow each other after that. NULL if it is
+    # complete.
     (until_s,) = connection.execute(
         "SELECT CASE WHEN (SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run "
         "AND sim_time_s > time_s AND sim_time_s <= :end LIMIT 2)) = 2 THEN time_s END FROM ("
@@ -262,35 +277,38 @@ def _as_written(
 def full_rate_parts(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[FullRateSegment]:
-    """Of those the ones that have rows of their own."""
+    """Return those parts of full-rate segments that have rows of their own."""
     found = full_rate_segments(connection, run_id, start_s, end_s)
-    spans = [(each, (each.start_s, each.after_s)) for each in found]  # the last row is in it
+    spans = [(each, (each.start_s, each.after_s)) for each in found]  # includes the last row
     return [each for each, span in spans if rows_in("kept_state", connection, run_id, span, 1)]
 
 
 def kept_notes(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[str]:
-    """Which parts of a range are kept at full rate, and why."""
+    """Note which parts of a range are kept at full rate, and why."""
     found = full_rate_parts(connection, run_id, start_s, end_s)
     if not found:
         return []
-    named = [f"{each.start_s:.3f}-{each.end_s:.3f} s ({each.reason})" for each in found[-_NAMED:]]
-    more = f", and {len(found) - _NAMED} before" if len(found) > _NAMED else ""
+    named = [
+        f"{each.start_s:.3f}-{each.end_s:.3f} s ({each.reason})"
+        for each in found[-_READING.named :]
+    ]
+    more = f", and {len(found) - _READING.named} before" if len(found) > _READING.named else ""
     return [f"run {run_id} is kept at full rate: {', '.join(named)}{more}"]
 
 
 def rows_in(
     table: str, connection: sqlite3.Connection, run_id: int, span: tuple[float, float], most: int
 ) -> int:
-    """How many rows of a run lie in [start, end), counted no further than matters.
+    """Return how many rows of a run lie in [start, end), counted only up to a limit.
 
     Args:
         table: `state` or `kept_state`.
         connection: Any.
-        run_id: Which.
+        run_id: The run.
         span: Simulation times in s.
-        most: Where counting ends.
+        most: The number at which counting ends.
     """
     asked = (run_id, *span, most)
     query = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
@@ -299,7 +317,7 @@ def rows_in(
 
 @dataclass(frozen=True)
 class Subject:
-    """A robot, and the run that is meant unless a question is about all of them."""
+    """A robot, and the run that a question means unless it is about all runs."""
 
     robot_id: int
     robot: str
@@ -309,9 +327,9 @@ class Subject:
 def choose(
     connection: sqlite3.Connection, robot: str | None, run_id: int | None, now_s: float
 ) -> tuple[RobotRecord, RunRecord | None]:
-    """The run that was named, or the newest run of the robot that was named or is the only one.
+    """Return the given run, or the newest run of the given robot or of the only one.
 
-    Without a run the robot's controller has never recorded.
+    The run is None if the robot's controller has never recorded.
 
     Raises:
         UnknownRobotError, AmbiguousRobotError: As they say.
@@ -327,10 +345,10 @@ def choose(
 
 
 def require_run(robot: RobotRecord, run: RunRecord | None) -> RunRecord:
-    """The run.
+    """Return the run.
 
     Raises:
-        NothingRecordedError: The robot's controller has begun none.
+        NothingRecordedError: The robot's controller has not begun one.
     """
     if run is None:
         raise NothingRecordedError(

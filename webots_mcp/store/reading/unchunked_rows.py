@@ -1,7 +1,7 @@
-"""State rows that are in no chunk: the newest of a run, and those that arrived late.
+"""Read state rows that are in no chunk: the newest of a run, and those that arrived late.
 
-They are parsed for each question. A maintainer puts rows into chunks in groups of 1,024, so that
-there are few of them while it works.
+They are parsed for each question. A maintainer puts rows into chunks in groups of 1,024, so few
+rows are left while it works.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.run_rows import reading_texts
 
 FEW_ROWS: Final = 4096  # without a maintainer there may be more; those are sampled for new names
-ROWS_AT_ONCE: Final = 1024  # between two checks of the deadline
+ROWS_AT_ONCE: Final = 1024  # rows between two checks of the deadline
 _IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
 _LATE: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
@@ -33,7 +33,7 @@ def rows_in_no_chunk(
     """Read the rows of a run in [start, end) that are in no chunk, in order of time.
 
     Args:
-        connection: Any.
+        connection: An open database.
         run_id: The run.
         span: Start and end, simulation times in s.
         at: Up to where the run is in chunks.
@@ -44,9 +44,10 @@ def rows_in_no_chunk(
     """
     place = (at.end_s, at.last_state_id)
     columns, cut_s = StateColumns(), None
-    if at.end_s != float("-inf"):  # without a chunk no row is late, and this would read the file
+    # without a chunk no row is late, and this would read the whole file
+    if at.end_s != float("-inf"):
         late = (run_id, at.max_state_id, *span, *place)
-        # how many ids each of the two ways to find late rows goes through
+        # number of ids that each of the two methods for late rows searches
         ids, rows = connection.execute(
             "SELECT coalesce((SELECT max(id) "
             "FROM state), 0) - ?, (SELECT coalesce(sum(row_count), 0) FROM row_group "
@@ -56,7 +57,7 @@ def rows_in_no_chunk(
         query = _LATE if ids <= rows else _LATE_BY_TIME
         cut_s = read_rows(connection, query, late, columns, deadline)
     if cut_s is None and span[1] >= at.end_s:
-        # SQLite would go through all rows from the start of the range rather than from the place.
+        # SQLite would otherwise scan all rows from the start of the range.
         after = (max(span[0], at.end_s), span[1])
         cut_s = read_rows(
             connection,
@@ -92,15 +93,14 @@ def read_rows(
     """Add the rows of a query to some columns.
 
     Args:
-        connection: Any.
+        connection: An open database.
         query: Selects `STATE_COLUMNS`.
-        values: Of the query; the first is the run.
-        columns: To which the rows are added.
+        values: Parameters of the query; the first is the run.
+        columns: Receives the rows.
         deadline: Checked after every 1,024 rows.
 
     Returns:
-        None if all rows were read. Otherwise the time of the last one that was, which is minus
-        infinity if there was none.
+        None if all rows were read, else the time of the last one, or minus infinity without any.
     """
     with reading_texts(connection):
         cursor = connection.execute(query, values)

@@ -1,4 +1,4 @@
-"""Parts of a range that an answer does not cover, each with the reason."""
+"""Describe parts of a range that an answer does not cover, each with the reason."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ that spreads evenly over the series, so that what was reached in time is a fair 
 
 from __future__ import annotations
 
-import ast
 import math
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +14,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import np
+from webots_mcp.analysis.arrays import Array, np
 from webots_mcp.analysis.level_changes import level_changes
 from webots_mcp.contract import EPISODE_EVENT
 from webots_mcp.errors import (
@@ -30,9 +29,9 @@ from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import search_events
 from webots_mcp.judging.run_measures import goals_of
 from webots_mcp.judging.run_score import require_kinds, score_run
-from webots_mcp.signals.conditions.compiler import Compiler, Condition, parse_condition
-from webots_mcp.signals.conditions.scoring import Aggregate, Facts, Score, Scored, parse_score
-from webots_mcp.signals.conditions.syntax import Scanned, is_signal
+from webots_mcp.judging.run_statistics import RunStatistics
+from webots_mcp.signals.conditions.compiler import Condition, parse_condition
+from webots_mcp.signals.conditions.scoring import Score, Scored, parse_score
 from webots_mcp.signals.naming import nearest_first
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import read_frame
@@ -42,26 +41,8 @@ from webots_mcp.store.registered_signals import RegisteredSignal
 
 MOST_RUNS: Final = 20_000
 FEWEST_RUNS: Final = 3
-REWARD: Final = "reward of the episode event"
+REWARD_NAME: Final = "reward"  # by which one asks for the reward that was published
 _UNSCORED: Final = Scored(None, "not scored before the deadline")
-_OF_CHUNKS: Final = {  # what an aggregate of a signal is in the statistics of a run's chunks
-    "min": "min(k.min)",
-    "max": "max(k.max)",
-    "first": "k.first, min(CASE WHEN k.value_count > 0 THEN g.start_sim_time_s END)",
-    "last": "k.last, max(CASE WHEN k.value_count > 0 THEN g.start_sim_time_s END)",
-}
-# Means are weighted by time up to the next row: of even rows the mean of all values but the last.
-_MEANS: Final = (
-    "SELECT k.run_id, max((k.sum - k.last) / (k.row_count - 1)) FROM chunk k JOIN chunk t "
-    "ON t.run_id = k.run_id AND t.signal_id = 0 AND t.group_id = k.group_id "
-    "WHERE k.signal_id = ? AND k.run_id BETWEEN ? AND ? GROUP BY k.run_id "
-    "HAVING count(*) = 1 AND k.row_count > 1 AND k.value_count = t.row_count "
-    "AND abs(t.largest_step * (t.row_count - 1) - (t.last - t.first)) < 1e-9 * t.row_count "
-    "AND (SELECT count(*) FROM row_group g WHERE g.run_id = k.run_id) = 1"
-)
-_OF_NUMBERS: Final = ("num", "bool", "angle")
-_HOLDS_IF: Final = {ast.Lt: ("min", "<"), ast.LtE: ("min", "<="), ast.Gt: ("max", ">"),
-                    ast.GtE: ("max", ">=")}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -77,6 +58,7 @@ class SeriesSettings:
             change then says that the level moved, not why.
         ends: How many of the best and of the worst runs are listed and compared.
         kinds: Events whose share of runs is reported.
+        recent_share: Share of the runs at the end in which a rise is searched.
         score_share: Of the time for what is computed run by run, the share that scores may take.
     """
 
@@ -85,6 +67,7 @@ class SeriesSettings:
     false_alarms: float = 0.01
     ends: int = 10
     kinds: tuple[str, ...] = ("stuck", "fall")
+    recent_share: float = 1 / 3
     score_share: float = 0.5
 
 
@@ -99,7 +82,8 @@ class ScoredRun(NamedTuple):
     why: str | None = None
 
 
-class Level(NamedTuple):
+@dataclass(frozen=True)
+class Level:
     """Consecutive runs whose scores have the same level.
 
     Attributes:
@@ -141,8 +125,8 @@ class RunSeries:
         runs: All of them, with their scores.
         sampled: Whether only a part of the runs was scored before the deadline.
         levels: Levels of the score; one if it never changed.
-        is_rising: Whether scores still rise within the last level (Mann-Kendall test at the rate
-            of false alarms of the settings).
+        is_rising: Whether the scores of the last `recent` runs rise (Mann-Kendall test at the rate
+            of false alarms of the settings): those of the last level, and at least a third of all.
         known: Of each outcome, how many runs it is known of.
         unknown: Outcomes that are not known, with the reason.
     """
@@ -153,6 +137,7 @@ class RunSeries:
     curve: tuple[Point, ...]
     levels: tuple[Level, ...]
     is_rising: bool
+    recent: int
     known: dict[str, int]
     unknown: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -192,8 +177,8 @@ def score_series(
         robot_id: Whose runs.
         robot: Its name.
         run_ids: Which of them; None for all that recorded a state.
-        score: As for trials: `max(pose.x) - count(stuck)`; more is better. None for the reward
-            that bridges sum up in `episode` events.
+        score: As for trials: `max(pose.x) - count(stuck)`; more is better. None or "reward" for
+            the sum of the rewards that each run published.
         goal: A condition that holds at some time of a run which reached its goal. None for the
             goals of run commands, else what episodes say of `success`.
         deadline_s: Wall time for what is computed run by run.
@@ -209,10 +194,10 @@ def score_series(
     subject = Subject(robot_id, robot, ids[-1])
     known = catalogue(connection, subject)
     condition = None if goal is None else _condition(goal, known)
-    facts = _ChunkFacts(connection, robot_id, ids, known)
-    if score is None:
+    facts = RunStatistics(connection, robot_id, ids, known)
+    if score is None or score.strip() == REWARD_NAME:
         scored = _rewards(connection, ids)
-        text = REWARD
+        text = REWARD_NAME
     else:
         parsed = parse_score(score)
         parsed.require_known(known)
@@ -221,14 +206,18 @@ def score_series(
         text = parsed.text
     runs = tuple(ScoredRun(run_id, *scored.get(run_id, _UNSCORED)) for run_id in ids)
     outcomes, unknown = _outcomes(connection, subject, facts, ids, condition, deadline)
-    levels = _levels([run for run in runs if run.value is not None])
+    scored_runs = [run for run in runs if run.value is not None]
+    levels = levels_of(scored_runs)
+    in_last_level = levels[-1].count if levels else 0
+    recent = max(in_last_level, math.ceil(len(scored_runs) * SETTINGS.recent_share))
     return RunSeries(
         text,
         runs,
         any(scored.get(run_id, _UNSCORED) is _UNSCORED for run_id in ids),
         tuple(_curve(runs, outcomes)),
         tuple(levels),
-        _is_rising([run for run in runs if levels and run.run_id >= levels[-1].first_run]),
+        _is_rising(scored_runs[-recent:]),
+        recent,
         {name: len(found) for name, found in outcomes.items()},
         unknown,
     )
@@ -279,6 +268,35 @@ def _runs_of(
 # -- the score of each run -------------------------------------------------------------------------
 
 
+def score_each(
+    connection: sqlite3.Connection, run_ids: Sequence[int], score: str, deadline_s: float
+) -> dict[int, Scored]:
+    """Return the score of some runs, of whichever robots; see `score_series` for its text.
+
+    Raises:
+        InvalidConditionError: The text is no score.
+    """
+    if score.strip() == REWARD_NAME:
+        return _rewards(connection, sorted(run_ids)) if run_ids else {}
+    parse_score(score)
+    deadline, scored = Deadline(deadline_s), dict[int, Scored]()
+    for run_id in run_ids:
+        scored[run_id] = _score_of(connection, run_id, score, deadline)
+    return scored
+
+
+def _score_of(
+    connection: sqlite3.Connection, run_id: int, score: str, deadline: Deadline
+) -> Scored:
+    if deadline.passed:
+        return _UNSCORED
+    try:
+        found = score_run(connection, run_id, score, deadline_s=deadline.left_s)
+    except WebotsMCPError as error:
+        return Scored(None, str(error))
+    return Scored(found.value, found.why)
+
+
 def _rewards(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[int, Scored]:
     """Return the rewards that bridges summed up, by run."""
     found = {  # a controller that goes on after its last step leaves a second event
@@ -302,7 +320,7 @@ def _rewards(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[int
 def _scored(
     connection: sqlite3.Connection,
     score: Score,
-    facts: _ChunkFacts,
+    facts: RunStatistics,
     run_ids: Sequence[int],
     deadline: Deadline,
 ) -> dict[int, Scored]:
@@ -313,12 +331,7 @@ def _scored(
             continue
         if deadline.passed:
             break
-        try:
-            found = score_run(connection, run_id, score.text, deadline_s=deadline.left_s)
-        except WebotsMCPError as error:
-            scored[run_id] = Scored(None, str(error))
-        else:
-            scored[run_id] = Scored(found.value, found.why)
+        scored[run_id] = _score_of(connection, run_id, score.text, deadline)
     return scored
 
 
@@ -334,122 +347,6 @@ def evenly(items: Sequence[int]) -> Iterator[int]:
             yield items[place]
 
 
-class _ChunkFacts:
-    """What the statistics of chunks tell of runs that have ended and whose rows are all in chunks.
-
-    Rows that only full-rate segments have are in no chunk, and in no score.
-    """
-
-    def __init__(
-        self,
-        connection: sqlite3.Connection,
-        robot_id: int,
-        run_ids: Sequence[int],
-        known: Mapping[str, RegisteredSignal],
-    ) -> None:
-        self._connection = connection
-        self._known = known
-        self._signal_ids = {
-            str(name): int(signal_id)
-            for name, signal_id in connection.execute(
-                "SELECT name, id FROM signal WHERE robot_id = ?", (robot_id,)
-            )
-        }
-        self._bounds = (run_ids[0], run_ids[-1])
-        self._found: dict[tuple[str, str], dict[int, float | None]] = {}
-        wanted = set(run_ids)
-        self.durations_s = {
-            int(run_id): end_s - (0.0 if reason == "reset" else start_s)
-            for run_id, reason, start_s, end_s in connection.execute(
-                "SELECT id, start_reason, started_sim_time_s, last_sim_time_s FROM run r "
-                "WHERE robot_id = ? AND id BETWEEN ? AND ? AND is_chunked = 1 "
-                "AND ended_wall_time_s IS NOT NULL AND NOT EXISTS (SELECT 1 FROM row_group g "
-                "WHERE g.run_id = r.id AND (g.is_complete = 0 OR g.lost_value_count > 0))",
-                (robot_id, *self._bounds),
-            )
-            if run_id in wanted
-        }
-
-    def scores(self, score: Score) -> dict[int, Scored]:
-        """Return the scores of the runs that statistics tell; none if it asks for more."""
-        names = [self._signal_in(each) for each in score.aggregates]
-        if score.kinds or None in names:
-            return {}
-        pairs = list(zip(names, [each.function for each in score.aggregates], strict=True))
-        columns = [self._values(str(name), function) for name, function in pairs]
-        means = [c for c, (_, function) in zip(columns, pairs, strict=True) if function == "mean"]
-        return {
-            run_id: score.of(Facts(duration_s, {}, [column.get(run_id) for column in columns]))
-            for run_id, duration_s in self.durations_s.items()
-            if all(run_id in column for column in means)
-        }
-
-    def holds(self, condition: Condition) -> dict[int, bool]:
-        """Return whether a condition holds at some time of a run, where statistics tell."""
-        tree = condition.tree
-        if is_signal(tree):
-            name = self._name_in(condition.scanned, tree, number=False)
-            if name is None or self._known[name].kind != "bool":
-                return {}
-            values = self._values(name, "max")
-            return {run_id: bool(values.get(run_id)) for run_id in self.durations_s}
-        if not isinstance(tree, ast.Compare) or len(tree.ops) != 1 or not is_signal(tree.left):
-            return {}
-        limit, compared = tree.comparators[0], _HOLDS_IF.get(type(tree.ops[0]))
-        name = self._name_in(condition.scanned, tree.left, number=True)
-        if (
-            compared is None
-            or name is None
-            or not isinstance(limit, ast.Constant)
-            or not isinstance(limit.value, (int, float))
-        ):
-            return {}
-        function, sign = compared
-        values, bound = self._values(name, function), float(limit.value)
-        return {
-            run_id: value is not None and _compare(value, sign, bound)
-            for run_id in self.durations_s
-            for value in (values.get(run_id),)
-        }
-
-    def _signal_in(self, aggregate: Aggregate) -> str | None:
-        """Return the signal of which an aggregate is plainly an extreme, first or last value."""
-        is_told = aggregate.function == "mean" or aggregate.function in _OF_CHUNKS
-        if not is_told or not is_signal(aggregate.tree):
-            return None
-        return self._name_in(aggregate.scanned, aggregate.tree, number=True)
-
-    def _name_in(self, scanned: Scanned, tree: ast.expr, *, number: bool) -> str | None:
-        """Return the name of a signal of numbers that has chunks."""
-        names = list(Compiler(scanned, tree, lambda value: value, number=number).columns)
-        name = names[0] if len(names) == 1 else ""
-        is_number = name in self._known and self._known[name].kind in _OF_NUMBERS
-        return name if is_number and name in self._signal_ids else None
-
-    def _values(self, name: str, function: str) -> dict[int, float | None]:
-        """Return an aggregate of a signal by run."""
-        key = (name, function)
-        if key not in self._found:
-            query = (
-                _MEANS
-                if function == "mean"
-                else (
-                    f"SELECT k.run_id, {_OF_CHUNKS[function]} FROM chunk k "
-                    "JOIN row_group g ON g.id = k.group_id WHERE k.signal_id = ? "
-                    "AND k.run_id BETWEEN ? AND ? GROUP BY k.run_id"
-                )
-            )
-            rows = self._connection.execute(query, (self._signal_ids[name], *self._bounds))
-            self._found[key] = {int(row[0]): row[1] for row in rows}
-        return self._found[key]
-
-
-def _compare(value: float, sign: str, bound: float) -> bool:
-    if sign in ("<", ">"):
-        return value < bound if sign == "<" else value > bound
-    return value <= bound if sign == "<=" else value >= bound
-
-
 # -- how runs ended --------------------------------------------------------------------------------
 
 _Outcomes = dict[str, dict[int, bool]]  # by name and run, where it is known
@@ -458,7 +355,7 @@ _Outcomes = dict[str, dict[int, bool]]  # by name and run, where it is known
 def _outcomes(
     connection: sqlite3.Connection,
     subject: Subject,
-    facts: _ChunkFacts,
+    facts: RunStatistics,
     run_ids: Sequence[int],
     goal: Condition | None,
     deadline: Deadline,
@@ -494,7 +391,7 @@ def _outcomes(
 def _goals(
     connection: sqlite3.Connection,
     subject: Subject,
-    facts: _ChunkFacts,
+    facts: RunStatistics,
     run_ids: Sequence[int],
     goal: Condition | None,
     deadline: Deadline,
@@ -588,14 +485,16 @@ def _had_event(
 # -- how the score developed -----------------------------------------------------------------------
 
 
-def _levels(scored: Sequence[ScoredRun]) -> list[Level]:
+def levels_of(scored: Sequence[ScoredRun]) -> list[Level]:
     """Return the levels of the score, oldest first."""
     if not scored:
         return []
     values = np.array([run.value for run in scored], np.float64)
     per_block = math.ceil(len(scored) / SETTINGS.blocks)
     starts = range(0, len(scored), per_block)
-    medians = np.array([np.median(values[start : start + per_block]) for start in starts])
+    medians: Array = np.array(
+        [float(np.median(values[start : start + per_block])) for start in starts], np.float64
+    )
     edges = [0, *level_changes(medians, SETTINGS.false_alarms), len(medians)]
     return [
         Level(part[0].run_id, part[-1].run_id, len(part), _median(part))

@@ -44,6 +44,7 @@ from webots_mcp.judging.comparison import (
 from webots_mcp.judging.detection.event_options import EventOptions, both_of
 from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
 from webots_mcp.judging.run_measures import WHOLE_RUNS, Measure
+from webots_mcp.judging.run_series import score_each
 from webots_mcp.questions.arguments import (
     AnyNames,
     ComparedRunIds,
@@ -58,8 +59,9 @@ from webots_mcp.questions.arguments import (
     Value,
 )
 from webots_mcp.questions.declaration import READS, SETS, question
-from webots_mcp.questions.scored_runs import find_series, series_facts, spelled_out
+from webots_mcp.questions.scored_runs import find_series, series_facts, spelled_out, unknown_of
 from webots_mcp.signals.conditions.expectation import Expectation, read_expectation
+from webots_mcp.signals.conditions.scoring import Scored
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
@@ -68,9 +70,9 @@ from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, p
 from webots_mcp.store.trial_sets import scored_runs
 
 RUN_COLUMNS: Final = (
-    "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
-    "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows", "notable",
-    "controller", "sha256", "git_commit", "world", "note",
+    "run_id", "robot", "label", "score", "parameters", "started", "began_by", "ended_by",
+    "duration_s", "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows",
+    "notable", "controller", "sha256", "git_commit", "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
@@ -156,6 +158,10 @@ def webots_list_runs(
         dict[str, Value] | None,
         Field(max_length=20, description='Only runs with these parameters, {"kp": 3.0}.'),
     ] = None,
+    score: Annotated[
+        str | None,
+        Field(max_length=500, description="Add a score, such as max(pose.x), or reward."),
+    ] = None,
     robot: RobotName = None,
 ) -> RunsAnswer:
     """List the runs, newest first: when, how long, which world and code, and how each ended.
@@ -171,7 +177,9 @@ def webots_list_runs(
         found = list_runs(
             connection, robot=robot, limit=most, before_id=cursor, parameters=parameters
         )
-        rows = fitting([_run_row(run) for run in found.runs])
+        ids = [run.run_id for run in found.runs]
+        scores = score_each(connection, ids, score, COMPARE_DEADLINE_S) if score else {}
+        rows = fitting([_run_row(run, scores.get(run.run_id)) for run in found.runs])
         older = len(rows) < len(found.runs)
         return RunsAnswer(
             **header,
@@ -335,12 +343,13 @@ def _values_of(parameters: Mapping[str, Any]) -> Any:
     return shorten(dict(parameters), budget_tokens, WHOLE).value or None
 
 
-def _run_row(run: RunInfo) -> list[Any]:
+def _run_row(run: RunInfo, scored: Scored | None = None) -> list[Any]:
     """Return a run as a row under `RUN_COLUMNS`."""
     return [
         run.run_id,
         short_name(run.robot),
         short_name(run.label),
+        None if scored is None else figure(scored.value),
         _values_of(run.parameters),
         started(run),
         run.start_reason,
@@ -413,12 +422,11 @@ def _scored(
     series = find_series(view, run_ids, score, goal)
     facts, (best, worst) = series_facts(series), series.ends
     if not best:
-        return facts | {"unknown": series.unknown or None}
+        return facts | {"unknown": unknown_of(series, {})}
     of = of._replace(limit=of.limit or _SIZES.of_series)
     beside = [v.model_dump() if isinstance(v, AnswerTable) else v for v in facts.values()]
     compared = _compared(view, of, groups={"worst": worst, "best": best}, beside=beside)
-    unknown = series.unknown | (compared["unknown"] or {})
-    return compared | facts | {"unknown": unknown or None}
+    return compared | facts | {"unknown": unknown_of(series, compared["unknown"] or {})}
 
 
 def _compared(

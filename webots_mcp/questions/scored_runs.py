@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from webots_mcp.answers.budget import figure, fitting, without_empty
@@ -63,13 +63,12 @@ def find_series(
 ) -> RunSeries:
     """Score the runs; errors as for `score_series`."""
     deadline_s = PERSON_DEADLINE_S if is_for_a_person() else SERIES_DEADLINE_S
-    asked = None if score is None or score.strip() == "reward" else score
     return score_series(
         view.connection,
         view.robot.id,
         view.robot.name,
         run_ids,
-        score=asked,
+        score=score,
         goal=goal,
         deadline_s=deadline_s,
     )
@@ -99,18 +98,28 @@ def trend_of(series: RunSeries) -> str | None:
         return None
     last, median = levels[-1], f"{best.median:.4g}"
     if series.is_rising:
-        return f"still rising within the last {last.count} runs, from run {last.first_run} on"
+        return f"still rising over the last {series.recent} runs (median {last.median:.4g})"
     if len(levels) == 1:
         return f"no change of level in {last.count} runs (median {median})"
     if best is last:
         return (
-            f"at its best level since run {last.first_run} (median {median}), no further "
-            f"improvement in the {last.count} runs from there on"
+            f"best level since run {last.first_run} (median {median}), no improvement in the "
+            f"{last.count} runs since"
         )
     return (
         f"best from run {best.first_run} to {best.last_run} (median {median}); from run "
         f"{last.first_run} on the median is {last.median:.4g}"
     )
+
+
+def unknown_of(series: RunSeries, compared: Mapping[str, str]) -> dict[str, str] | None:
+    """Return what is not known of all runs, and of the best and the worst of them."""
+    if is_for_a_person():
+        return {**series.unknown, **compared} or None
+    others = [name for name in compared if name.removesuffix(" per min") not in series.unknown]
+    named = {"of best or worst runs": listed(others)} if others else {}
+    cut = {name: cut_for_a_model(why, _REASON_CHARACTERS) for name, why in series.unknown.items()}
+    return {**cut, **named} or None
 
 
 def _curve_rows(series: RunSeries) -> list[list[Any]]:
@@ -153,6 +162,6 @@ def _unscored(series: RunSeries) -> dict[str, str] | None:
         if run.value is None:
             by_reason.setdefault(run.why or "unknown", []).append(run.run_id)
     return {
-        cut_for_a_model(why, _REASON_CHARACTERS): f"{len(runs)} runs: {listed(map(str, runs))}"
+        cut_for_a_model(why, _REASON_CHARACTERS): f"{len(runs)} runs: {listed([*map(str, runs)])}"
         for why, runs in list(by_reason.items())[:_SHOWN_REASONS]
     } or None

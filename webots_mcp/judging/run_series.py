@@ -11,7 +11,7 @@ import math
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np
@@ -58,6 +58,7 @@ class SeriesSettings:
             change then says that the level moved, not why.
         ends: How many of the best and of the worst runs are listed and compared.
         kinds: Events whose share of runs is reported.
+        searched: Runs in which they are searched, spread evenly over all.
         recent_share: Share of the runs at the end in which a rise is searched.
         score_share: Of the time for what is computed run by run, the share that scores may take.
     """
@@ -67,6 +68,7 @@ class SeriesSettings:
     false_alarms: float = 0.01
     ends: int = 10
     kinds: tuple[str, ...] = ("stuck", "fall")
+    searched: int = 24
     recent_share: float = 1 / 3
     score_share: float = 0.5
 
@@ -460,7 +462,7 @@ def _had_event(
     """Return whether runs had an event of a kind, as far as searched; else why not."""
     found: dict[int, bool] = {}
     why: str | None = None
-    for run_id in evenly(run_ids):
+    for run_id in islice(evenly(run_ids), SETTINGS.searched):
         if deadline.passed:
             break
         segment = whole_run(connection, run_id)
@@ -475,10 +477,10 @@ def _had_event(
             group=False,
             deadline_s=deadline.left_s,
         )
-        why = searched.verdicts.not_searched.get(kind)
-        if why is not None:
-            break  # what is missing in one run of a robot is missing in its others
-        found[run_id] = bool(searched.events)
+        missing = searched.verdicts.not_searched.get(kind)
+        if missing is None:
+            found[run_id] = bool(searched.events)
+        why = why or missing
     return found, why
 
 

@@ -7,7 +7,6 @@ Questions, the command line, page and report draw with these modules. They read 
 from __future__ import annotations
 
 import sqlite3
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, get_args
@@ -64,9 +63,8 @@ def plot(
         return plot_trials(connection, trial_set, signals, sheet=sheet)
     asked = scope or Scope()
     if kind == "runs":
-        chosen = tuple(run_ids)
         return plot_run_scores(
-            connection, _score(signals), scope=asked, run_ids=chosen, now_s=time.time(), sheet=sheet
+            connection, _score(signals), scope=asked, run_ids=run_ids, sheet=sheet
         )
     several = dict.fromkeys((asked.run_id, *run_ids) if asked.run_id is not None else run_ids)
     scopes = [replace(asked, run_id=run_id) for run_id in several] or [asked]

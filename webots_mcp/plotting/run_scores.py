@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import sqlite3
+import time
+from collections.abc import Sequence
 from typing import Any, Final
 
 from webots_mcp.analysis.arrays import Array, np
@@ -44,8 +46,7 @@ def plot_run_scores(
     score: str | None = None,
     *,
     scope: Scope,
-    run_ids: tuple[int, ...] = (),
-    now_s: float,
+    run_ids: Sequence[int] = (),
     sheet: Sheet | None = None,
 ) -> PlotImage:
     """Return the score of each run, its running median, the spread around it, and its levels.
@@ -55,7 +56,6 @@ def plot_run_scores(
         score: As for trials; None for the published reward of each run.
         scope: Its robot is the one whose runs are drawn, or the robot of its run.
         run_ids: Which runs; none for all.
-        now_s: The time, by which a robot is chosen where none is named.
         sheet: Size and format; None for a PNG of 900 x 500 pixels.
 
     Raises:
@@ -63,21 +63,9 @@ def plot_run_scores(
         WebotsMCPError: Its other kinds, as `score_series` raises them.
     """
     sheet = sheet or Sheet()
-    some_run = next(iter(run_ids), scope.run_id)
-    if scope.robot is None and some_run is not None:
-        robot_id = fetch_run(connection, some_run).robot_id
-        query = "SELECT name FROM robot WHERE id = ?"
-        name = str(connection.execute(query, (robot_id,)).fetchone()[0])
-    else:
-        robot = resolve_robot(connection, scope.robot, now_s)
-        robot_id, name = robot.id, robot.name
-    series = score_series(
-        connection, robot_id, name, run_ids or None, score=score, deadline_s=DEADLINE_S
-    )
-    scored = len(series.ranked)
-    if not scored:
-        raise NothingRecordedError(f"No run has the score {series.score!r}: {series.runs[0].why}.")
+    series, name = compose_run_scores(connection, score, scope, run_ids)
     canvas = paint_run_scores(series, name, sheet.width_px, sheet.height_px)
+    scored = len(series.ranked)
     left = len(series.runs) - scored
     notes = [f"{left} of {len(series.runs)} runs have no score"] if left else []
     best = series.ranked[0]
@@ -86,6 +74,29 @@ def plot_run_scores(
         f"run {best.run_id} ({best.value:.4g})"
     )
     return canvas.picture(sheet.image_format, caption, notes)
+
+
+def compose_run_scores(
+    connection: sqlite3.Connection,
+    score: str | None,
+    scope: Scope,
+    run_ids: Sequence[int] = (),
+) -> tuple[RunSeries, str]:
+    """Return what `plot_run_scores` paints: the series and the robot; errors as there."""
+    some_run = next(iter(run_ids), scope.run_id)
+    if scope.robot is None and some_run is not None:
+        robot_id = fetch_run(connection, some_run).robot_id
+        query = "SELECT name FROM robot WHERE id = ?"
+        name = str(connection.execute(query, (robot_id,)).fetchone()[0])
+    else:
+        robot = resolve_robot(connection, scope.robot, time.time())
+        robot_id, name = robot.id, robot.name
+    series = score_series(
+        connection, robot_id, name, run_ids or None, score=score, deadline_s=DEADLINE_S
+    )
+    if not series.ranked:
+        raise NothingRecordedError(f"No run has the score {series.score!r}: {series.runs[0].why}.")
+    return series, name
 
 
 def paint_run_scores(series: RunSeries, robot: str, width_px: int, height_px: int) -> Canvas:

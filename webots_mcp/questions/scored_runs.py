@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
+from webots_mcp.analysis.level_changes import FEWEST_VALUES
 from webots_mcp.answers.budget import figure, fitting, without_empty
 from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person
 from webots_mcp.errors import InvalidInputError
@@ -12,7 +13,7 @@ from webots_mcp.judging.run_series import MOST_RUNS, RunSeries, ScoredRun, score
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.recording import RobotView
 
-SERIES_DEADLINE_S: Final = 2.0  # for scores and events that are computed run by run
+SERIES_DEADLINE_S: Final = 5.0  # for scores and events that are computed run by run
 PERSON_DEADLINE_S: Final = 120.0
 CURVE_COLUMNS: Final = (
     "first_run",
@@ -97,6 +98,8 @@ def trend_of(series: RunSeries) -> str | None:
     if best is None:
         return None
     last, median = levels[-1], f"{best.median:.4g}"
+    if len(series.ranked) < 2 * FEWEST_VALUES:
+        return f"median {median}; {len(series.ranked)} runs are too few to find a change"
     if series.is_rising:
         return f"still rising over the last {series.recent} runs (median {last.median:.4g})"
     if len(levels) == 1:

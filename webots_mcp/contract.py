@@ -57,6 +57,7 @@ CUSTOM_DATA: Final = "customData"  # the kind of a robot that the observer recor
 OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
 WORLD_EVENT: Final = "world"  # the event with the robots and solids that an observer sees
 INSPECTION_EVENT: Final = "inspection"  # the event with the variables of a controller
+EPISODE_EVENT: Final = "episode"  # the event with the summed reward of a run that has ended
 WATCHED: Final = "watched"  # the key of a state under which watched variables are recorded
 MODE_EVENT: Final = "mode"  # the event with the simulation mode that an observer sees
 LOOK_AT: Final = "look_at"  # its action

@@ -27,6 +27,7 @@ from webots_mcp.cli import main
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.extras.plugin_registry import export_formats
+from webots_mcp.plotting.run_scores import compose_run_scores
 from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
@@ -86,6 +87,8 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "timeline": ("webots_get_timeline", {"limit": 20}),
     "runs": ("webots_list_runs", {}),
     "comparison": ("webots_compare_runs", {}),
+    "score of all runs": ("webots_compare_runs", {"score": "max(X)", "goal": "X > 1"}),
+    "runs with a score": ("webots_list_runs", {"score": "max(X)"}),
     "parameters": ("webots_get_parameters", {}),
     "trials": ("webots_get_trials", {}),
     "commands": ("webots_list_commands", {}),
@@ -244,6 +247,8 @@ def _plots(connection: sqlite3.Connection, recording: GoldenRecording) -> Iterat
     for name, ranges in (("", whole), (" of a part", part)):
         yield f"plot of signals{name}", _composed(compose_signals, connection, ranges, ["*"])
         yield f"plot of the trajectory{name}", _composed(compose_trajectory, connection, ranges)
+    score = f"max({recording.x})"
+    yield "plot of runs", _composed(compose_run_scores, connection, score, scope)
     yield "plot of trials", _composed(compose_trials, connection, 1, ())
 
 

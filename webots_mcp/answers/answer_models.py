@@ -554,6 +554,19 @@ class RerunAnswer(Answer):
 class ComparisonAnswer(NotedAnswer):
     """Runs side by side; the first group is the reference."""
 
+    score: str | None = said("The score of all runs; more is better.")
+    scored: dict[str, int] | None = said(
+        "Number of runs, how many have a score, and of how many each outcome is known."
+    )
+    trend: str | None = said("How the score developed over the runs.")
+    curve: AnswerTable | None = said(
+        "Score and outcomes of consecutive runs: score_low and score_high bound the middle 80 %."
+    )
+    levels: AnswerTable | None = said("Consecutive runs at the same level of the score.")
+    best_runs: AnswerTable | None = said("The runs with the highest scores.")
+    worst_runs: AnswerTable | None = said("The runs with the lowest scores.")
+    unscored: dict[str, str] | None = said("Why runs have no score, by reason the runs.")
+
     verdict: str | None = said("Where the two runs diverge, with first_difference.")
     different_before: dict[str, list[Any]] | None = said(
         "Properties in which the two runs differed from the beginning."

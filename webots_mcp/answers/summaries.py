@@ -557,6 +557,8 @@ def _(answer: RerunAnswer) -> str | None:
 def _(answer: ComparisonAnswer) -> str | None:
     if answer.verdict is not None:
         return _first_difference(answer)
+    if answer.score is not None:
+        return _development(answer)
     if len(list(_rows(answer.groups))) < 2:
         return "Figures of one group of runs; there is nothing to compare it with."
     rows = [*_rows(answer.measures), *_rows(answer.differences)]
@@ -569,6 +571,21 @@ def _(answer: ComparisonAnswer) -> str | None:
         parts = [f"Largest differences, not certain: {', '.join(apart)}", _too_few(answer, rows)]
     parts.append(f"{same} equal within what matters" if same else "")
     parts.append(f"{undecided} cannot be decided" if undecided and not apart else "")
+    return f"{'; '.join(part for part in parts if part)}."
+
+
+def _development(answer: ComparisonAnswer) -> str:
+    """Return how the score of many runs developed, and which run was best."""
+    scored, curve = answer.scored or {}, list(_rows(answer.curve))
+    runs, known = scored.get("runs", 0), scored.get("score", 0)
+    of_runs = _count(runs, "run") if known == runs else f"{known} of {_count(runs, 'run')}"
+    best = next(iter(_rows(answer.best_runs)), None)
+    parts = [f"Score of {of_runs}: {answer.trend}" if answer.trend else f"No score in {of_runs}"]
+    parts.append(f"best run {best['run_id']} ({best['score']})" if best else "")
+    reached = [row["goal_percent"] for row in curve if row.get("goal_percent") is not None]
+    if len(reached) > 1:
+        parts.append(f"goal reached in {reached[0]:.12g} % of the first, {reached[-1]:.12g} % of "
+                     "the last runs")  # fmt: skip
     return f"{'; '.join(part for part in parts if part)}."
 
 

@@ -16,6 +16,7 @@ from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.episode import Episode
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
@@ -39,6 +40,7 @@ class Publisher:
         total_s: The time that they took together, in seconds.
         longest_s: The time that the longest of them took.
         devices: Reads the devices for `auto_publish`.
+        episode: Sums up the reward of the run.
     """
 
     def __init__(
@@ -71,15 +73,20 @@ class Publisher:
         self._names = SignalNames()
         recorder.new_database_entries.append(self._names.begin_anew)
         self.devices = devices
+        self.episode = Episode(recorder)
         self._run = clock.run
         self._own_bytes = 0  # that a state of the devices takes in memory, about
         self.recorded = 0
         self.total_s = self.longest_s = 0.0
 
-    def publish(self, state: Mapping[Any, Any], force: bool, own_bytes: int = 0) -> None:
+    def publish(self, state: Mapping[Any, Any], force: bool) -> None:
         """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
         if self._clock.update():
             self._begin_run()
+        self.episode.add(state)
+        self._evaluate(state, force, 0)
+
+    def _evaluate(self, state: Mapping[Any, Any], force: bool, own_bytes: int) -> None:
         wanted, hit, full_rate, breakpoints = force, None, self._full_rate, self._breakpoints
         if self._variables.watches is not None:
             state = self._variables.watches.added_to(state, this_call())
@@ -114,12 +121,13 @@ class Publisher:
         state = None
         if self._clock.update():
             self._begin_run()
+        self.episode.add(extra)
         full_rate, throttle = self._full_rate, self._throttle
         due = full_rate.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
         if due or self._breakpoints.must_evaluate() or self._watch.asks_states:
             state = self._read(extra, include_time)
             # The devices' values are new objects in each call: no other code can change them.
-            self.publish(state, force, own_bytes=0 if extra else self._own_bytes)
+            self._evaluate(state, force, 0 if extra else self._own_bytes)
             return state
         if throttle.admits(force or self._heartbeat.loop is not None):
             state = self._read(extra, include_time)

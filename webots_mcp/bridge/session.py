@@ -241,6 +241,7 @@ class BridgeSession:
 
     def begin_run(self) -> None:
         """End the run at its newest known time and begin the next: simulation time went back."""
+        self.publisher.episode.end(self.clock.ended_sim_time_s)
         self.recorder.end_run("reset", self.clock.ended_sim_time_s)
         self.clock.meter.begin_run()
         self.recorder.run = self.clock.run
@@ -268,6 +269,7 @@ class BridgeSession:
             except Exception as error:  # noqa: BLE001, PERF203  (the session ends whatever fails)
                 self.errors.failed("close", error)
         reason = reason or self._end_reason
+        self.publisher.episode.end(self.clock.sim_time_s)
         self.recorder.close(reason, self.clock.sim_time_s)
 
     def release_loop(self) -> None:
@@ -293,6 +295,7 @@ class BridgeSession:
         self.control.report_end(extern=self.identity.extern)
         self.full_rate.write_all()
         self._watchdog.close()
+        self.publisher.episode.end(self.clock.sim_time_s)
         self.recorder.end(self._end_reason, self.clock.sim_time_s)
 
     def _on_tick(self) -> None:

@@ -619,6 +619,15 @@ def plot(
             help="Draw the scores of this trial set over one or two parameters, given as SIGNAL.",
         ),
     ] = None,
+    score: Annotated[
+        str | None,
+        Parameter(
+            "--score",
+            metavar="SCORE",
+            help="Draw this score over all runs, such as 'max(pose.x)'; reward: the sum of the "
+            "published rewards.",
+        ),
+    ] = None,
     width_px: Annotated[
         Count, Parameter("--width", metavar="N", help="Width in pixels. Default: 900.")
     ] = 900,
@@ -629,12 +638,17 @@ def plot(
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Draw signals over time, the robot's path, or the scores of trials.
+    """Draw signals over time, the robot's path, or the scores of runs or trials.
 
         webots-mcp plot 'pose*' --last 10 -o pose.png
 
     Without SIGNAL it draws the signals that changed most.
     """
+    if score is not None and (signals or trajectory or trial_set is not None):
+        raise InvalidInputError(
+            "--score draws a score over runs, and excludes SIGNAL, --trajectory and --trials. "
+            "Leave those out."
+        )
     ids = [int(each) for each in run_ids or () if _is_id(each)]
     behind_runs = [each for each in run_ids or () if not _is_id(each)]
 
@@ -643,11 +657,12 @@ def plot(
         from webots_mcp.plotting.canvas import image_format_of
 
         make_chunks_first(recorded.recording())
+        kind: plotting.PlotKind = "trajectory" if trajectory else "signals"
         with recorded.reader() as connection:
             picture = plotting.plot(
                 connection,
-                "trajectory" if trajectory else "signals",
-                [*signals, *behind_runs],
+                kind if score is None else "runs",
+                [*signals, *behind_runs] if score is None else [score],
                 scope=(span or TimeRangeOptions()).scope(),
                 run_ids=ids,
                 trial_set=trial_set,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Final, NamedTuple
@@ -325,6 +325,7 @@ def compare_runs(
     connection: sqlite3.Connection,
     run_ids: Sequence[int] | None = None,
     *,
+    groups: Mapping[str, Sequence[int]] | None = None,
     set_id: int | None = None,
     robot: str | None = None,
     names: Sequence[str] = ("*",),
@@ -345,6 +346,7 @@ def compare_runs(
     Args:
         connection: Any.
         run_ids: 1 to 10 different runs.
+        groups: Runs by the names of their groups, instead of `run_ids`.
         set_id: A trial set, where no runs are given.
         robot: Whose controller was edited, where neither is given.
         names: Signals, with `*`.
@@ -361,7 +363,9 @@ def compare_runs(
     """
     if not 0 < min_effect_sd < math.inf:
         raise InvalidInputError(f"min_effect_sd={min_effect_sd} must be a number above 0.")
-    groups, notes = _asked_groups(connection, run_ids, set_id, robot)
+    notes: list[str] = []
+    if groups is None:
+        groups, notes = _asked_groups(connection, run_ids, set_id, robot)
     options = options or EventOptions()
     deadline = Deadline(deadline_s)
     compared = _groups(connection, groups)
@@ -687,7 +691,9 @@ def _summarise(
     return None if frame.unread else found
 
 
-def _groups(connection: sqlite3.Connection, groups: dict[str, list[int]]) -> tuple[Group, ...]:
+def _groups(
+    connection: sqlite3.Connection, groups: Mapping[str, Sequence[int]]
+) -> tuple[Group, ...]:
     run_ids = [run_id for found in groups.values() for run_id in found]
     runs = {run.run_id: run for run in run_infos(connection, run_ids)}
     unlike = differing(list(parameters_of(connection, run_ids).values()))

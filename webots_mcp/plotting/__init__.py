@@ -1,4 +1,4 @@
-"""Pictures of a recording: signals over time, the path of a robot, and trials; PNG or SVG.
+"""Pictures of a recording: signals, the path of a robot, scores of runs and trials; PNG or SVG.
 
 Questions, the command line, page and report draw with these modules. They read through `store` and
 `judging`, and know nothing of answers or tools.
@@ -14,12 +14,13 @@ from typing import Literal, get_args
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.judging.trends import trends
 from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, PlotImage, Sheet
+from webots_mcp.plotting.run_scores import plot_run_scores
 from webots_mcp.plotting.signal_plot import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
 from webots_mcp.plotting.trials import plot_trials
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
-PlotKind = Literal["signals", "trajectory"]
+PlotKind = Literal["signals", "trajectory", "runs"]
 
 
 def plot(
@@ -35,13 +36,13 @@ def plot(
     height_px: int = HEIGHT_PX,
     image_format: ImageFormat = "png",
 ) -> PlotImage:
-    """Return a picture of signals over a range of time, of the robot's way, or of trials.
+    """Return a picture of signals over a range of time, of the robot's path, or of scores.
 
     Args:
         connection: Any.
-        kind: "signals" over time, or "trajectory" in the plane.
+        kind: "signals" over time, "trajectory" in the plane, or "runs": a score over all runs.
         signals: Names, with `*`; none for the three that changed most. Of a trajectory the two of
-            the position, or none to find them by name.
+            the position, or none to find them by name. Of runs one score, or none for the reward.
         scope: Robot and time range; None for the whole newest run.
         run_ids: More runs than that of the scope; of several, each from its start, in one picture.
         trial_set: The scores of that set instead, over one or two parameters, which `signals` may
@@ -61,6 +62,10 @@ def plot(
     if trial_set is not None:
         return plot_trials(connection, trial_set, signals, sheet=sheet)
     asked = scope or Scope()
+    if kind == "runs":
+        return plot_run_scores(
+            connection, _score(signals), scope=asked, run_ids=run_ids, sheet=sheet
+        )
     several = dict.fromkeys((asked.run_id, *run_ids) if asked.run_id is not None else run_ids)
     scopes = [replace(asked, run_id=run_id) for run_id in several] or [asked]
     ranges = [find_range(connection, each) for each in scopes]
@@ -77,6 +82,16 @@ def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[
     """Return the three numbers that changed most, which are drawn where none is named."""
     found = trends(connection, time_range, limit=3, shown=0).runs
     return [trend.name for run in found for trend in run.numbers] or ["*"]
+
+
+def _score(signals: Sequence[str]) -> str | None:
+    """Return the score that was asked for; None for the reward."""
+    if len(signals) > 1:
+        raise InvalidInputError(
+            f"kind='runs' draws one score, and {len(signals)} are given. Give one, as in "
+            "signals=['max(pose.x)'], or none for the published reward."
+        )
+    return signals[0] if signals else None
 
 
 def _position(signals: Sequence[str]) -> tuple[str, str] | None:

@@ -103,8 +103,12 @@ Limit = Annotated[int, Field(ge=1, le=500, description="Maximum number of rows i
 RunIds = Annotated[
     list[Id] | None, Field(max_length=10, description="Runs, from webots_list_runs.")
 ]
+_RunRange = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,17}-[1-9][0-9]{0,17}$")]
 ComparedRunIds = Annotated[
-    list[Id] | None, Field(max_length=300, description="Runs to compare, from webots_list_runs.")
+    list[Annotated[Id | _RunRange, WithJsonSchema({"type": ["integer", "string"]})]] | None,
+    Field(
+        max_length=300, description="Runs to compare, such as [3, 4]; a range such as ['20-90']."
+    ),
 ]
 Position = Annotated[
     list[str] | None,

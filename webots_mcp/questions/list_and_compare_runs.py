@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import Field
 
@@ -35,6 +35,7 @@ from webots_mcp.judging.checks.check import Finding
 from webots_mcp.judging.checks.check_run import CHECK_DEADLINE_S, check_run
 from webots_mcp.judging.comparison import (
     COMPARE_DEADLINE_S,
+    MOST_COMPARED,
     Comparison,
     Difference,
     Group,
@@ -43,6 +44,7 @@ from webots_mcp.judging.comparison import (
 from webots_mcp.judging.detection.event_options import EventOptions, both_of
 from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
 from webots_mcp.judging.run_measures import WHOLE_RUNS, Measure
+from webots_mcp.judging.run_series import score_each
 from webots_mcp.questions.arguments import (
     AnyNames,
     ComparedRunIds,
@@ -57,7 +59,9 @@ from webots_mcp.questions.arguments import (
     Value,
 )
 from webots_mcp.questions.declaration import READS, SETS, question
+from webots_mcp.questions.scored_runs import find_series, series_facts, spelled_out, unknown_of
 from webots_mcp.signals.conditions.expectation import Expectation, read_expectation
+from webots_mcp.signals.conditions.scoring import Scored
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
@@ -66,9 +70,9 @@ from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, p
 from webots_mcp.store.trial_sets import scored_runs
 
 RUN_COLUMNS: Final = (
-    "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
-    "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows", "notable",
-    "controller", "sha256", "git_commit", "world", "note",
+    "run_id", "robot", "label", "score", "parameters", "started", "began_by", "ended_by",
+    "duration_s", "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows",
+    "notable", "controller", "sha256", "git_commit", "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
@@ -106,6 +110,7 @@ class ComparisonSizes:
 
     Attributes:
         differences: Signals that differ, unless a limit is given.
+        of_series: The same next to a score over many runs.
         diverging: Signals in which two runs diverge, and properties in which they differ.
         only_in: Signals that only some groups have.
         verdict_characters: Characters of a verdict.
@@ -120,6 +125,7 @@ class ComparisonSizes:
     """
 
     differences: int = 15
+    of_series: int = 6
     diverging: int = 10
     only_in: int = 10
     verdict_characters: int = 600
@@ -152,6 +158,10 @@ def webots_list_runs(
         dict[str, Value] | None,
         Field(max_length=20, description='Only runs with these parameters, {"kp": 3.0}.'),
     ] = None,
+    score: Annotated[
+        str | None,
+        Field(max_length=500, description="Add a score, such as max(pose.x), or reward."),
+    ] = None,
     robot: RobotName = None,
 ) -> RunsAnswer:
     """List the runs, newest first: when, how long, which world and code, and how each ended.
@@ -167,7 +177,9 @@ def webots_list_runs(
         found = list_runs(
             connection, robot=robot, limit=most, before_id=cursor, parameters=parameters
         )
-        rows = fitting([_run_row(run) for run in found.runs])
+        ids = [run.run_id for run in found.runs]
+        scores = score_each(connection, ids, score, COMPARE_DEADLINE_S) if score else {}
+        rows = fitting([_run_row(run, scores.get(run.run_id)) for run in found.runs])
         older = len(rows) < len(found.runs)
         return RunsAnswer(
             **header,
@@ -208,36 +220,58 @@ def webots_compare_runs(
     first_difference: Annotated[
         bool, Field(description="Find the first row in which two runs differ.")
     ] = False,
+    score: Annotated[
+        str | None,
+        Field(
+            max_length=500,
+            description="Score all runs: max(pose.x) - count(stuck), or reward for the sum of "
+            "published rewards. Shows its curve, and what the best and worst runs do differently.",
+        ),
+    ] = None,
+    goal: Annotated[
+        str | None,
+        Field(max_length=500, description="With score: what a successful run reaches, arrived."),
+    ] = None,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
-    """Find out whether an edit or a parameter helped: compare runs by goal, speed and events.
+    """Find out whether an edit or a parameter helped; with score, how a training went.
 
     Without run_ids it compares the runs before and after the last edit of the controller; with
-    one run it gives its figures. `different` is true if the difference is larger than between
-    repeated runs (at least 4 of each), false if there is none that matters, and null if this
-    cannot be known yet: `undecided` says why. For curves over each other use webots_plot with
-    run_ids.
+    one run it gives its figures; with score it ranks all runs, thousands too. `different` is true
+    if the difference is larger than between repeated runs (at least 4 of each), false if there is
+    none that matters, and null if this cannot be known yet: `undecided` says why. For curves over
+    each other use webots_plot with run_ids.
     """
-    if run_ids and trial_set:
+    asked_ids = spelled_out(run_ids)
+    is_series = score is not None or goal is not None or len(asked_ids or ()) > MOST_COMPARED
+    if is_series and (trial_set or first_difference):
+        raise InvalidInputError(
+            "score and goal are for runs of a robot, and exclude trial_set and first_difference. "
+            "A trial set has a score of its own: webots_get_trials shows it."
+        )
+    if asked_ids and trial_set:
         raise InvalidInputError(
             "run_ids and trial_set exclude each other. Give run_ids to compare these runs, or "
             "trial_set to compare all of that set."
         )
-    if first_difference and (not run_ids or len(run_ids) != 2 or position or mode):
+    if first_difference and (not asked_ids or len(asked_ids) != 2 or position or mode):
         raise InvalidInputError(
-            f"first_difference=true needs exactly two runs, not {run_ids or 'none'}: "
+            f"first_difference=true needs exactly two runs, not {asked_ids or 'none'}: "
             "give run_ids with two ids from webots_list_runs. position and mode do not apply to it."
         )
     options = EventOptions(position=both_of(position), mode=mode)
-    first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
+    first = asked_ids[0] if asked_ids else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:
 
         def find() -> dict[str, Any]:
-            if not (first_difference and run_ids):
-                return _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd)
+            asked = _Asked(signals, limit, options, min_effect_sd)
+            if is_series:
+                return _scored(view, asked_ids, score, goal, asked)
+            if not (first_difference and asked_ids):
+                return _compared(view, asked, asked_ids, trial_set)
             limit_s = math.inf if is_for_a_person() else COMPARE_DEADLINE_S
             names, connection = signals or ("*",), view.connection
-            found = compare_rows(connection, run_ids, names=names, deadline_s=limit_s)
+            found = compare_rows(connection, asked_ids, names=names, deadline_s=limit_s)
             return parting_facts(found, limit)
 
         return answer_about(view, ComparisonAnswer, find)
@@ -309,12 +343,13 @@ def _values_of(parameters: Mapping[str, Any]) -> Any:
     return shorten(dict(parameters), budget_tokens, WHOLE).value or None
 
 
-def _run_row(run: RunInfo) -> list[Any]:
+def _run_row(run: RunInfo, scored: Scored | None = None) -> list[Any]:
     """Return a run as a row under `RUN_COLUMNS`."""
     return [
         run.run_id,
         short_name(run.robot),
         short_name(run.label),
+        None if scored is None else figure(scored.value),
         _values_of(run.parameters),
         started(run),
         run.start_reason,
@@ -371,29 +406,57 @@ def _cell(name: str, value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
+class _Asked(NamedTuple):
+    """What a comparison was asked for, but for the runs."""
+
+    names: Sequence[str] | None
+    limit: int | None
+    options: EventOptions
+    min_effect_sd: float
+
+
+def _scored(
+    view: RobotView, run_ids: Sequence[int] | None, score: str | None, goal: str | None, of: _Asked
+) -> dict[str, Any]:
+    """Return a score over all runs, and what the best and the worst of them did differently."""
+    series = find_series(view, run_ids, score, goal)
+    facts, (best, worst) = series_facts(series), series.ends
+    if not best:
+        return facts | {"unknown": unknown_of(series, {})}
+    of = of._replace(limit=of.limit or _SIZES.of_series)
+    parts = [v.model_dump() if isinstance(v, AnswerTable) else v for v in facts.values()]
+    compared = _compared(view, of, groups={"worst": worst, "best": best}, other_parts=parts)
+    return compared | facts | {"unknown": unknown_of(series, compared["unknown"] or {})}
+
+
 def _compared(
     view: RobotView,
-    run_ids: Sequence[int] | None,
-    set_id: int | None,
-    names: Sequence[str] | None,
-    limit: int | None,
-    options: EventOptions,
-    min_effect_sd: float,
+    of: _Asked,
+    run_ids: Sequence[int] | None = None,
+    set_id: int | None = None,
+    *,
+    groups: Mapping[str, Sequence[int]] | None = None,
+    other_parts: Sequence[Any] = (),
 ) -> dict[str, Any]:
-    asked: dict[str, Any] = {
-        "names": names or ("*",),
-        "options": options,
-        "min_effect_sd": min_effect_sd,
-    }
-    asked["limit"] = limit or _SIZES.differences
-    asked |= {"set_id": set_id or None, "robot": view.robot.name}
-    found = compare_runs(view.connection, run_ids or None, **asked)
+    """Return a comparison; `other_parts` are what else the answer holds."""
+    names, limit, options, min_effect_sd = of
+    found = compare_runs(
+        view.connection,
+        run_ids or None,
+        groups=groups,
+        set_id=set_id or None,
+        robot=view.robot.name,
+        names=names or ("*",),
+        limit=limit or _SIZES.differences,
+        options=options,
+        min_effect_sd=min_effect_sd,
+    )
     differing = [each for each in found.differences if _differs(each)]
     undecided = _undecided(found.measures, differing)
-    groups, only_in = _groups(found), list(found.only_in.items())
+    shown_groups, only_in = _groups(found), list(found.only_in.items())
     notes = notes_of([*_edit_note(found.groups), *found.notes])
     most = len(only_in) if is_for_a_person() else _SIZES.only_in
-    others: list[Any] = [groups and groups.rows, found.unknown, undecided, notes]
+    others = [*other_parts, shown_groups and shown_groups.rows, found.unknown, undecided, notes]
     of_measures = int(_SIZES.measures_share * row_budget_tokens(limit, others))
     measures = fitting(list(map(_measure_row, found.measures)), of_measures)
     others.append(measures)
@@ -401,7 +464,7 @@ def _compared(
     rows = fitting(rows, row_budget_tokens(limit, [*others, only_in[:most]]))
     tables = [without_empty(MEASURE_COLUMNS, measures), without_empty(DIFFERENCE_COLUMNS, rows)]
     return {
-        "groups": groups,
+        "groups": shown_groups,
         "legend": _legend(found, tables),
         "compared_s": seconds(found.compared_s),
         "measures": tables[0],

@@ -287,13 +287,18 @@ def webots_plot(
     recording: RecordingAccess,
     scope: Scope,
     kind: Annotated[
-        PlotKind, Field(description="signals: curves over time. trajectory: the path from above.")
+        PlotKind,
+        Field(
+            description="signals: curves over time. trajectory: the path from above. runs: a score "
+            "over all runs."
+        ),
     ] = "signals",
     signals: Annotated[
         list[str] | None,
         Field(
             max_length=50,
-            description="Signals to draw; '*' means any text. Default: those that changed most.",
+            description="Signals to draw; '*' means any text. Default: those that changed most. "
+            "For runs a score such as max(pose.x); default: the reward.",
         ),
     ] = None,
     run_ids: RunIds = None,

@@ -65,7 +65,8 @@ class Figure:
     def markup(self) -> str:
         """SVG and values; nothing that was recorded ends the element that holds them."""
         values = json.dumps(self.data, separators=(",", ":")).replace("<", "\\u003c")
-        return f'{self.svg}<script type="application/json">{values}</script>'
+        stage = f'<div class="stage">{self.svg}</div>'
+        return f'{stage}<script type="application/json">{values}</script>'
 
 
 def figure_part(name: str) -> str:

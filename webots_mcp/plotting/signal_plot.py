@@ -521,7 +521,7 @@ class _SignalPainter:
             if curve.last is not None
             for time_s, mean, *_ in [curve.points[-1]]
         ]
-        canvas.open(class_="marks")
+        canvas.open(class_="marks ends")
         for x, y, index in sorted(ends):
             curve = panel.curves[index]
             text = rounded_on(curve.last or 0.0, panel.scale)

@@ -57,7 +57,7 @@ class Tab:
 
     def point(self, share: float = 0.5, y: float = 60.0) -> None:
         """Move the pointer over the signals."""
-        box = self.page.locator("#signal-figure > svg").bounding_box()
+        box = self.page.locator("#signal-figure .stage > svg:first-child").bounding_box()
         assert box is not None
         self.page.mouse.move(box["x"] + share * box["width"], box["y"] + y)
 
@@ -290,7 +290,7 @@ def test_a_view_whose_rows_are_loaded_needs_no_request(
     tab.page.wait_for_function("() => drawnScope && isLoaded(figures.signals.figure.view.x)")
     tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
     asked = sum("/draw?" in url for url in tab.asked)
-    tab.page.locator("#signal-figure > svg").focus()
+    tab.page.locator("#signal-figure .stage > svg:first-child").focus()
     for key in ("+", "+", "-"):
         tab.page.keyboard.press(key)
     for _ in range(5):

@@ -750,7 +750,7 @@ def completion(
         source <(webots-mcp completion bash)
 
     --install sets it up for all later sessions. Repeat that after an update of webots-mcp. Robots,
-    runs, signals and kinds of events are completed in bash and fish.
+    runs, signals and kinds of events are completed in bash, zsh and fish.
     """
     from cyclopts.completion import detect_shell
     from cyclopts.completion.detect import ShellDetectionError

@@ -32,6 +32,7 @@ function lastUpTo(sorted, value) {
   return low - 1;
 }
 
+const BODY_PX = 6; // from the middle of a robot to its rim; a smaller one is shown by a mark
 const TICK_PX = 4; // of a line below a frame
 const LABEL_PX = 24; // of a label beside a frame
 const TICK = { stroke: "var(--faint)", "stroke-width": 0.8 };
@@ -241,7 +242,7 @@ class Figure {
     const more = AROUND * (high - low);
     const { width, top, height } = this.frames.at(-1);
     const [lines, labels] = this.ticks;
-    const times = ticks(low - more, high + more, ((1 + 2 * AROUND) * width) / 75);
+    const times = ticks(low - more, high + more, (1 + 2 * AROUND) * Math.max(width / 75, 4));
     const starts = this.frames.flatMap((frame) => times.map(([value]) => `M${this.px(frame, value)} ${frame.top + frame.height}v${TICK_PX}`));
     lines.setAttribute("d", starts.join(""));
     labels.replaceChildren();
@@ -363,11 +364,26 @@ class Figure {
 
   markPlaces(time) {
     const frame = this.frames[0];
+    const pen = { fill: "#E69F00", stroke: "var(--ink)", "stroke-width": 1.5 };
     for (const track of this.data.tracks) {
-      const index = Math.max(0, lastUpTo(track.t, time));
       if (!track.t.length) continue;
-      const [cx, cy] = [this.px(frame, track.x[index]), this.py(frame, track.y[index])];
-      made("circle", { cx, cy, r: 7, fill: "#E69F00", stroke: "var(--ink)", "stroke-width": 1.5 }, this.overlay);
+      const index = Math.max(0, lastUpTo(track.t, time));
+      const [x, y, heading] = [track.x[index], track.y[index], track.heading[index]];
+      const [cx, cy] = [this.px(frame, x), this.py(frame, y)];
+      if (cx < frame.left || cx > frame.left + frame.width || cy < frame.top || cy > frame.top + frame.height) continue;
+      if (heading === null) {
+        made("circle", { cx, cy, r: 7, ...pen }, this.overlay);
+        continue;
+      }
+      const [cos, sin] = [Math.cos(heading), Math.sin(heading)];
+      const outlines = track.body.map((outline) => outline.map(([ahead, left]) => (
+        [this.px(frame, x + cos * ahead - sin * left), this.py(frame, y + sin * ahead + cos * left)])));
+      const reach = Math.max(0, ...outlines.flat().map(([px, py]) => Math.hypot(px - cx, py - cy)));
+      if (reach >= BODY_PX) {
+        for (const outline of outlines) made("path", { class: "body", d: `M${outline.join("L")}Z`, ...pen, "fill-opacity": 0.6 }, this.overlay);
+      }
+      const turn = `translate(${cx} ${cy}) rotate(${(-180 / Math.PI) * heading})`;
+      made("path", { class: "heading", d: reach >= BODY_PX ? "M0 0h12" : "M11 0L-7 7L-3 0L-7-7Z", transform: turn, ...pen }, this.overlay);
     }
   }
 

@@ -55,7 +55,7 @@ _webots_mcp_values() {
 
 complete -F _webots_mcp_values webots-mcp
 """
-# A file that `compinit` loads is run at the first Tab; one that is sourced names the function.
+# A file that `compinit` loads is run at the first Tab, which it has to answer.
 _ZSH: Final = """
 _webots_mcp_values() {
   local cur="${words[CURRENT]}" prev="${words[CURRENT-1]}" kind=""
@@ -82,10 +82,9 @@ _webots_mcp_values() {
   _cyclopts_webots-mcp "$@"
 }
 
-if [[ "${funcstack[1]}" == _webots-mcp ]]; then
+(( $+functions[compdef] )) && compdef _webots_mcp_values webots-mcp
+if [[ "${funcstack[1]}" == _cyclopts_webots-mcp ]]; then
   _webots_mcp_values "$@"
-elif (( $+functions[compdef] )); then
-  compdef _webots_mcp_values webots-mcp
 fi
 """
 _FISH: Final = """

@@ -119,7 +119,9 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
         nonlocal next_s
         if time.monotonic() < next_s:
             return
-        text = f"{doing}: {progress_bar(done, of) if is_terminal else ''}{100 * done // max(of, 1)} %"
+        text = (
+            f"{doing}: {progress_bar(done, of) if is_terminal else ''}{100 * done // max(of, 1)} %"
+        )
         if is_terminal:
             next_s = time.monotonic() + 0.1
             rewrite(sys.stderr, text)

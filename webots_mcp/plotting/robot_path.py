@@ -54,7 +54,7 @@ class PathPoint(NamedTuple):
 
     @property
     def place(self) -> tuple[float, float]:
-        """x and y."""
+        """Return x and y."""
         return self.x, self.y
 
 

@@ -440,8 +440,8 @@ class _TrajectoryPainter:
             return
         self._canvas.open(data_part=f"track {index}", class_="body")
         for outline in track.body:
-            x, y = np.array(standing_at(last, outline)).T
-            d = line_through(frame.px(x), frame.py(y)) + "Z"
+            corners = np.array(standing_at(last, outline))
+            d = line_through(frame.px(corners[:, 0]), frame.py(corners[:, 1])) + "Z"
             self._canvas.add("path", d=d, fill=self._ink(index), fill_opacity=0.25,
                              stroke=self._ink(index), stroke_width=1.2)  # fmt: skip
         self._canvas.close()

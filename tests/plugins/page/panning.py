@@ -2,9 +2,9 @@
 
 `python -m tests.plugins.page.panning` records 1,000,000 rows, shows them in Chromium, drags the
 signals to and fro, and prints two measurements. The times between two frames, as
-`requestAnimationFrame` reports them, include the drawing of the browser, which is slow on a computer
-without a graphics card. The processor times are those of the page's own thread, which other programs
-do not lengthen.
+`requestAnimationFrame` reports them, include the drawing of the browser, which is slow without a
+graphics card. The processor times are those of the page's own thread, which other programs do not
+lengthen.
 `--keep FOLDER` keeps the recording, and uses it again.
 """
 

@@ -444,7 +444,8 @@ def test_a_pan_shifts_painted_layers_and_lays_nothing_out(
           for (let step = 1; step <= 20; step++) figure.pan(-step, 0);
           changed.push(...observer.takeRecords());
           observer.disconnect();
-          return [...new Set(changed.map(each => `${each.target.localName} ${each.attributeName}`))];
+          const names = changed.map(each => `${each.target.localName} ${each.attributeName}`);
+          return [...new Set(names)];
         }""",
         tab.page.evaluate_handle(figure),
     )
@@ -467,4 +468,5 @@ def test_the_map_shows_the_body_of_the_robot_and_where_it_heads(
     lengths = [max(x for x, _ in part) - min(x for x, _ in part) for part in track["body"]]
     assert 0.02 < max(lengths) < 0.5  # of the rover, in metres
     assert all(-4 < heading < 4 for heading in track["heading"])
-    expect(tab.page.locator("#way-figure .body path").first).to_be_attached()
+    body = tab.page.locator("#way-figure .body path").first
+    expect(body).to_be_attached(timeout=PATIENCE_MS)

@@ -74,6 +74,53 @@ def test_bash_completes_commands_options_choices_files_and_recorded_names(
     assert set(ended.stdout.split()) - {"--help", "--version"} == offered, ended.stderr
 
 
+# What zsh itself does: it calls the function with the words, and `compadd` takes what it offers.
+ZSH_TAB = """
+compdef() { function=$1 }
+compadd() { print -rl -- "${(@P)2}" }
+source $1; shift
+words=("$@"); CURRENT=$#
+$function
+"""
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        (["events", "--kind", ""], "oscillation"),
+        (["history", ""], "pose.x"),
+        (["plot", "--run", ""], "1"),
+        (["check", ""], "1"),
+        (["tail", "--robot", ""], "rover"),
+        (["logs", "--database", "other.db", "--robot", ""], "dog"),
+    ],
+)
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_zsh_and_fish_complete_recorded_names(
+    shell: str, tmp_path: Path, typed: list[str], offered: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = shutil.which(shell)
+    if program is None:
+        pytest.skip(f"no {shell}")
+    for file, robot in (("webots.db", "rover"), ("other.db", "dog")):
+        recording = Recorded(tmp_path / file)
+        recording.robot(robot).state(0.1, {"pose": {"x": 1.0, "y": 2.0}, "mode": "drive"})
+        recording.close()
+    assert main(["completion", shell]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    line = " ".join(["webots-mcp", *typed])
+    arguments = {
+        "zsh": ["-f", "-c", ZSH_TAB, "zsh", "./script", "webots-mcp", *typed],
+        "fish": ["--no-config", "-c", f"source script; complete -C '{line}'"],
+    }[shell]
+    ended = subprocess.run(
+        [program, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+             "WEBOTS_MCP_DATA_DIR": str(tmp_path)},
+    )  # fmt: skip
+    assert offered in ended.stdout.split(), (ended.stdout, ended.stderr)
+
+
 @pytest.mark.parametrize("shell", ["zsh", "fish", "powershell"])
 def test_each_shell_has_a_script_that_knows_every_command(
     shell: str, capsys: pytest.CaptureFixture[str]

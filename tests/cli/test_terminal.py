@@ -12,7 +12,8 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.cli import main
-from webots_mcp.cli.streams import rewrite, shown_progress, spelling_out
+from webots_mcp.cli.streams import progress_bar, rewrite, shown_progress, spelling_out
+from webots_mcp.cli.terminal import answer_lines
 
 # Sets the title of the terminal, clears it in one character (C1), and turns what follows round.
 HOSTILE = "a\x1b]0;owned\x07\x9b2J\u202egnp.exe\u2066\u200f"
@@ -128,3 +129,14 @@ def test_short_work_is_silent_where_no_terminal_is(capsys: pytest.CaptureFixture
         progress(1, 2)
         progress(2, 2)
     assert capsys.readouterr().err == ""
+
+
+def test_texts_within_parts_are_no_wider_than_the_terminal() -> None:
+    answer = {"verdicts": {"nearest": {"stuck": "smallest movement " * 12}, "found": "jump"}}
+    assert max(map(len, answer_lines(answer, width=60))) <= 60
+
+
+def test_a_bar_shows_how_much_is_done() -> None:
+    assert progress_bar(0, 40) == "[....................] "
+    assert progress_bar(10, 40) == "[#####...............] "
+    assert progress_bar(50, 40) == "[####################] "

@@ -72,7 +72,22 @@ def draw_drive(folder: Path) -> None:
     """A rover that drives a circle and runs commands, recorded by the bridge."""
     with patch.dict("os.environ", {INSPECT_VARIABLE: "0"}):  # lines of this file are no answers
         _drive_circle(folder)
+    _set_pace(folder / "webots.db")
     sum_up_file(folder)
+
+
+def _set_pace(database: Path) -> None:
+    """Give the rows twice the speed of real time, whatever the machine had: it ends as it did."""
+    with closing(connect(database, "writer")) as connection, connection:
+        (ended_s, last_s) = connection.execute(
+            "SELECT max(wall_time_s), max(sim_time_s) FROM state"
+        ).fetchone()
+        wall_s = f"{ended_s!r} - ({last_s!r} - sim_time_s) / 2"
+        for table in ("state", "kept_state", "event", "log"):
+            connection.execute(f"UPDATE {table} SET wall_time_s = {wall_s}")
+        began_s = ended_s - last_s / 2
+        connection.execute("UPDATE run SET started_wall_time_s = ?", (began_s,))
+        connection.execute("UPDATE session SET started_wall_time_s = ?", (began_s,))
 
 
 def _drive_circle(folder: Path) -> None:

@@ -23,7 +23,7 @@ EVERYDAY: Final = (
 )  # fmt: skip
 FORMER_NAMES: Final = {
     "requests": "audit", "keep": "capture", "label": "annotate", "retain": "retention",
-    "diff": "first-difference", "repeat": "repeatability",
+    "diff": "first-difference", "repeat": "repeatability", "page": "view",
 }  # fmt: skip
 
 

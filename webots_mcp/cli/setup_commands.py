@@ -524,7 +524,13 @@ def _print_project(found: dict[str, Any], notes: list[str]) -> None:
 
 def _next_steps(project: Path, controllers: list[dict[str, Any]]) -> list[str]:
     """Return the commands that follow the setup of a project, and the first question."""
-    fixes = [each["python"]["fix"] for each in controllers if "fix" in each.get("python", {})]
+    from webots_mcp.simulator.installations import installations
+
+    # The stand-in runs controllers with the Python of this command, which has the bridge.
+    when = "" if installations() else "  # before Webots runs it; the stand-in does not need this"
+    fixes = [
+        each["python"]["fix"] + when for each in controllers if "fix" in each.get("python", {})
+    ]
     steps = [
         f"webots-mcp init --patch {_shown(project / each['lines_in'])}"
         for each in controllers
@@ -751,7 +757,7 @@ def completion(
         source <(webots-mcp completion bash)
 
     --install sets it up for all later sessions. Repeat that after an update of webots-mcp. Robots,
-    runs, signals and kinds of events are completed in bash and fish.
+    runs, signals and kinds of events are completed in bash, zsh and fish.
     """
     from cyclopts.completion import detect_shell
     from cyclopts.completion.detect import ShellDetectionError
@@ -774,7 +780,11 @@ def completion(
         file.write_text(with_values(file.read_text("utf-8"), shell), "utf-8", newline="\n")
         if as_json:
             return print_json({"shell": shell, "file": str(file)})
-        return print(f"{file} written. Start a new {shell} to use it.")
+        print(f"{file} written. Start a new {shell} to use it.")
+        start = Path.home() / ".zshrc"
+        if shell == "zsh" and start.is_file() and "compinit" not in start.read_text("utf-8"):
+            print("zsh completes nothing yet: add 'autoload -Uz compinit && compinit' to ~/.zshrc.")
+        return None
     script = with_values(app.generate_completion(shell=shell), shell)
     if as_json:
         return print_json({"shell": shell, "script": script})

@@ -55,28 +55,78 @@ _webots_mcp_values() {
 
 complete -F _webots_mcp_values webots-mcp
 """
+# A file that `compinit` loads is run at the first Tab, which it has to answer.
+_ZSH: Final = """
+_webots_mcp_values() {
+  local cur="${words[CURRENT]}" prev="${words[CURRENT-1]}" kind=""
+  case "$prev" in
+@options@
+  esac
+  if [[ -z "$kind" && "$cur" != -* && "$prev" != -* && "$CURRENT" -gt 2 ]]; then
+    case "${words[2]}" in
+@positionals@
+    esac
+  fi
+  if [[ -n "$kind" ]]; then
+    local -a where names
+    local i
+    for ((i=3; i<CURRENT-1; i++)); do
+      case "${words[i]}" in
+        --data-dir|--database) where+=("${(Q)words[i]}" "${(Q)words[i+1]}");;
+      esac
+    done
+    names=("${(@f)$("${(Q)words[1]}" completion --values "$kind" "${where[@]}" 2>/dev/null)}")
+    names=(${names:#})
+    (( $#names )) && compadd -a names && return
+  fi
+  _cyclopts_webots-mcp "$@"
+}
+
+(( $+functions[compdef] )) && compdef _webots_mcp_values webots-mcp
+if [[ "${funcstack[1]}" == _cyclopts_webots-mcp ]]; then
+  _webots_mcp_values "$@"
+fi
+"""
+_FISH: Final = """
+function __webots_mcp_values
+  set -l given (commandline -opc)
+  set -l where
+  for i in (seq 2 (count $given))
+    if contains -- $given[$i] --data-dir --database; and test $i -lt (count $given)
+      set -a where $given[$i] $given[(math $i + 1)]
+    end
+  end
+  $given[1] completion --values $argv[1] $where 2>/dev/null
+end
+"""
 
 
 def with_values(script: str, shell: str) -> str:
-    """Return the script of a shell that also completes names of the recording (bash and fish)."""
-    if shell == "bash":
-        return script + _BASH.replace("@options@", _bash_cases(_OPTIONS, 4)).replace(
-            "@positionals@", _bash_cases(_POSITIONALS, 6)
+    """Return the script of a shell that also completes names of the recording."""
+    if shell in ("bash", "zsh"):
+        added = _BASH if shell == "bash" else _ZSH
+        return script + added.replace("@options@", _cases(_OPTIONS, 4)).replace(
+            "@positionals@", _cases(_POSITIONALS, 6)
         )
     if shell == "fish":
-        return script + "".join(map(_fish_line, _OPTIONS))
+        return script + _FISH + "".join(map(_fish_lines, _OPTIONS))
     return script
 
 
-def _bash_cases(words_by_kind: dict[str, tuple[str, ...]], indent: int) -> str:
+def _cases(words_by_kind: dict[str, tuple[str, ...]], indent: int) -> str:
     return "\n".join(
         f"{'':{indent}}{'|'.join(words)}) kind={kind};;" for kind, words in words_by_kind.items()
     )
 
 
-def _fish_line(kind: str) -> str:
+def _fish_lines(kind: str) -> str:
     options = " ".join(f"-l {option.removeprefix('--')}" for option in _OPTIONS[kind])
-    return f"complete -c webots-mcp {options} -x -a '(webots-mcp completion --values {kind})'\n"
+    values = f"-a '(__webots_mcp_values {kind})'"
+    commands = (
+        f"complete -c webots-mcp -n '__fish_webots-mcp_using_command {name}' {values}\n"
+        for name in _POSITIONALS.get(kind, ())
+    )
+    return f"complete -c webots-mcp {options} -x {values}\n" + "".join(commands)
 
 
 def values_of(kind: ValueKind, recording: RecordingAccess) -> list[str]:

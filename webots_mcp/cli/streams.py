@@ -21,6 +21,7 @@ from typing import Any, Final, TextIO, cast
 from webots_mcp.signals.naming import spelled_out
 
 _PLAIN_INTERVAL_S: Final = 3.0  # between two lines where a line cannot be rewritten
+_BAR_CELLS: Final = 20
 
 
 class _SpelledOut:
@@ -100,6 +101,12 @@ def rewrite(stream: TextIO, text: str = "") -> None:
         raw.flush()
 
 
+def progress_bar(done: int, of: int) -> str:
+    """Return a bar for a terminal, with a space behind it."""
+    full = min(_BAR_CELLS, _BAR_CELLS * done // max(of, 1))
+    return f"[{'#' * full}{'.' * (_BAR_CELLS - full)}] "
+
+
 @contextlib.contextmanager
 def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
     """Provide a function to call with the amount done and the total.
@@ -114,7 +121,9 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
         nonlocal next_s
         if time.monotonic() < next_s:
             return
-        text = f"{doing}: {100 * done // max(of, 1)} %"
+        text = (
+            f"{doing}: {progress_bar(done, of) if is_terminal else ''}{100 * done // max(of, 1)} %"
+        )
         if is_terminal:
             next_s = time.monotonic() + 0.1
             rewrite(sys.stderr, text)

@@ -439,6 +439,7 @@ class _Layout:
         self._paragraph = min(width, _LAYOUT.paragraph)
         self._most_rows = most_rows
         self._is_of_command = is_of_command
+        self._depth = 0  # how far the lines that are made now will be indented
 
     def members(self, members: Mapping[str, Any]) -> Iterator[str]:
         """Lay out members: short ones share a paragraph, each other one has lines of its own."""
@@ -477,7 +478,9 @@ class _Layout:
                 part = part | {
                     "rows": [["NULL" if v is None else v for v in row] for row in part["rows"]]
                 }
+            self._depth += 1
             yield from (_LAYOUT.indent + line for line in self._inside(part))
+            self._depth -= 1
 
     def _inside(self, part: Mapping[str, Any]) -> Iterator[str]:
         if {"columns", "rows"} <= part.keys():
@@ -500,14 +503,15 @@ class _Layout:
         yield from table_lines(
             table["columns"],
             rows[: self._most_rows],
-            self._width - len(_LAYOUT.indent),
+            self._width - len(_LAYOUT.indent) * max(1, self._depth),
             colour=self._colour,
         )
         if self._most_rows is not None and len(rows) > self._most_rows:
             yield f"... and {len(rows) - self._most_rows} more"
 
     def _wrapped(self, texts: Iterable[str]) -> list[str]:
-        return textwrap.wrap(", ".join(texts), self._paragraph, subsequent_indent=_LAYOUT.indent)
+        width = min(self._paragraph, self._width - len(_LAYOUT.indent) * self._depth)
+        return textwrap.wrap(", ".join(texts), width, subsequent_indent=_LAYOUT.indent)
 
 
 def _as_typed_texts(part: Mapping[str, Any]) -> dict[str, Any]:

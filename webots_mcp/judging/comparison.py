@@ -659,7 +659,7 @@ def _cut_notes(durations_s: dict[int, float], compared_s: float) -> list[str]:
     which = ", ".join(f"{run_id} ({durations_s[run_id]:.4g} s)" for run_id in longer)
     return [
         f"all figures are about the first {compared_s:.4g} s; for the rest of run {which} ask "
-        "webots_find_events(run_id)"
+        f"webots_find_events(run_id={longer[0]})"
     ]
 
 

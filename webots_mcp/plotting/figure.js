@@ -2,6 +2,7 @@
 "use strict";
 
 const SVG = "http://www.w3.org/2000/svg";
+const AROUND = 1; // widths of the frame that are painted on each side of it: a move within them paints nothing
 
 /** Round values between two others, at most so many, with their labels. */
 function ticks(low, high, most) {
@@ -31,6 +32,11 @@ function lastUpTo(sorted, value) {
   return low - 1;
 }
 
+const BODY_PX = 6; // from the middle of a robot to its rim; a smaller one is shown by a mark
+const TICK_PX = 4; // of a line below a frame
+const LABEL_PX = 24; // of a label beside a frame
+const TICK = { stroke: "var(--faint)", "stroke-width": 0.8 };
+const LABEL = { "font-size": 11, fill: "var(--ink)" };
 const told = (value) => (value === null ? "–" : String(Number(value.toPrecision(6))));
 
 function made(name, attributes, parent) {
@@ -39,11 +45,37 @@ function made(name, attributes, parent) {
   return parent.appendChild(element);
 }
 
+/** A part of a figure that the browser keeps as it was painted, and only shifts. */
+class Layer {
+  /** `clip` is where it is seen, `around` what is painted on each side of that, both in the units of the figure. */
+  constructor(stage, svg, clip, around) {
+    const { width, height } = svg.viewBox.baseVal;
+    this.size = [clip.width + 2 * around[0], clip.height + 2 * around[1]];
+    this.window = stage.appendChild(document.createElement("div"));
+    this.window.className = "layer";
+    Object.assign(this.window.style, {
+      left: `${(100 * clip.left) / width}%`, width: `${(100 * clip.width) / width}%`,
+      top: `${(100 * clip.top) / height}%`, height: `${(100 * clip.height) / height}%`,
+    });
+    const view = [clip.left - around[0], clip.top - around[1], ...this.size].join(" ");
+    this.svg = made("svg", { viewBox: view, preserveAspectRatio: "none", "font-family": svg.getAttribute("font-family") }, this.window);
+    Object.assign(this.svg.style, {
+      left: `${(-100 * around[0]) / clip.width}%`, width: `${(100 * this.size[0]) / clip.width}%`,
+      top: `${(-100 * around[1]) / clip.height}%`, height: `${(100 * this.size[1]) / clip.height}%`,
+    });
+  }
+
+  shift(dx, dy) {
+    this.svg.style.transform = `translate(${(100 * dx) / this.size[0]}%, ${(100 * dy) / this.size[1]}%)`;
+  }
+}
+
 /** One figure: the element that holds its SVG and, as JSON, its values. */
 class Figure {
   constructor(place) {
     this.place = place;
-    this.svg = place.querySelector("svg");
+    this.stage = place.querySelector(".stage");
+    this.svg = this.stage.querySelector("svg");
     this.data = JSON.parse(place.querySelector("script").textContent);
     this.frames = this.data.frames;
     this.isPlane = this.data.kind === "plane";
@@ -53,12 +85,15 @@ class Figure {
     this.changed = () => {}; // called when the view was changed
     this.pointed = () => {}; // called with the time under the pointer, or null
     this.moved = () => {}; // called with a name that was dragged, and the number of a panel
+    this.held = null; // what the pointer holds, and where
+    this.layers = null; // what moves with the view, once it was changed
     this.svg.tabIndex = 0;
     this.svg.style.touchAction = "pan-y";
-    this.overlay = made("g", { class: "overlay", "pointer-events": "none" }, this.svg);
-    this.told = place.appendChild(document.createElement("div"));
+    this.overlay = made("svg", { class: "overlay", viewBox: this.svg.getAttribute("viewBox") }, this.stage);
+    this.told = this.stage.appendChild(document.createElement("div"));
     this.told.className = "told";
     this.told.hidden = true;
+    this.tell(null, []);
     this.listen();
   }
 
@@ -74,7 +109,7 @@ class Figure {
   // Coordinates ----------------------------------------------------------------------------------
 
   spot(event) {
-    const box = this.svg.getBoundingClientRect();
+    const box = this.held?.box ?? this.svg.getBoundingClientRect(); // it stays where it is while it is dragged
     const scale = this.svg.viewBox.baseVal.width / box.width;
     return [(event.clientX - box.left) * scale, (event.clientY - box.top) * scale];
   }
@@ -109,23 +144,84 @@ class Figure {
 
   show(x, y = this.view.y) {
     this.view = { x, y };
-    const groups = [...this.svg.querySelectorAll(".zoom")];
-    groups.forEach((group, index) => {
-      const [a, e] = this.along(this.frames[index].x, x, this.frames[index], "left", "width");
-      const [d, f] = this.isPlane ? this.upright(this.frames[index], y) : [1, 0];
-      group.setAttribute("transform", `matrix(${a} 0 0 ${d} ${e} ${f})`);
-    });
-    const frame = this.frames.at(-1);
-    const [a, e] = this.along(frame.x, x, frame, "left", "width");
-    const [d, f] = this.isPlane ? this.upright(frame, y) : [1, 0];
-    for (const mark of this.svg.querySelectorAll(".marks .at")) {
-      const [left, top] = [a * mark.dataset.x + e, d * mark.dataset.y + f];
-      mark.setAttribute("transform", `translate(${left} ${top})`);
-      const inside = left >= frame.left - 1 && left <= frame.left + frame.width + 1;
-      mark.style.display = inside ? "" : "none";
+    this.layers ??= this.lift();
+    const [frame, painted] = [this.frames[0], this.painted];
+    const isAsWide = ([a, b], [c, d]) => Math.abs((b - a) / (d - c) - 1) < 1e-6;
+    const dx = painted && ((painted.x[0] - x[0]) / (x[1] - x[0])) * frame.width;
+    const dy = painted && this.isPlane ? ((y[0] - painted.y[0]) / (y[1] - y[0])) * frame.height : 0;
+    const isPainted = painted && isAsWide(painted.x, x) && isAsWide(painted.y, y)
+      && Math.abs(dx) <= this.around[0] && Math.abs(dy) <= this.around[1];
+    if (isPainted) this.shift(dx, dy);
+    else {
+      this.paint();
+      this.shift(0, 0);
+      this.tell(this.at);
     }
-    this.drawTicks();
-    this.tell(this.at);
+    if (this.isPlane) this.drawTicks();
+    this.point();
+  }
+
+  /** Put what moves with the view into layers: curves and marks, the values at their ends, the times below them. */
+  lift() {
+    const [first, last] = [this.frames[0], this.frames.at(-1)];
+    const { width, height } = this.svg.viewBox.baseVal;
+    const [right, bottom] = [first.left + first.width, last.top + last.height];
+    this.around = [AROUND * first.width, this.isPlane ? AROUND * first.height : 0];
+    const layer = (left, top, until, below) => new Layer(this.stage, this.svg, { left, top, width: until - left, height: below - top }, this.around);
+    const curves = layer(first.left, first.top, right, bottom + (this.isPlane ? 0 : TICK_PX));
+    const ends = layer(first.left, first.top, width, bottom);
+    const layers = [curves, ends];
+    this.zoomed = [...this.svg.querySelectorAll(".zoom")];
+    for (const [index, group] of this.zoomed.entries()) {
+      const { left, top, width: wide, height: high } = this.frames[index];
+      const box = [left - this.around[0], top - this.around[1], wide + 2 * this.around[0], high + 2 * this.around[1]];
+      const holder = group.parentElement;
+      holder.setAttribute("viewBox", box.join(" "));
+      ["x", "y", "width", "height"].forEach((name, at) => holder.setAttribute(name, box[at]));
+      curves.svg.append(holder);
+    }
+    for (const group of this.svg.querySelectorAll(".marks")) (group.matches(".ends") ? ends : curves).svg.append(group);
+    this.marks = [curves, ends].flatMap(({ svg }) => [...svg.querySelectorAll(".at")])
+      .map((element) => ({ element, x: Number(element.dataset.x), y: Number(element.dataset.y), isEnd: Boolean(element.closest(".ends")) }));
+    if (this.isPlane) this.svg.querySelector(".grid").style.display = "none"; // it is that of the whole
+    else {
+      const times = layer(first.left - LABEL_PX, bottom + TICK_PX, Math.min(right + LABEL_PX, width), Math.min(bottom + 22, height));
+      layers.push(times);
+      this.ticks = [made("path", { ...TICK }, curves.svg), made("g", {}, times.svg)];
+      for (const axis of this.svg.querySelectorAll(".x-axis .ticks")) axis.replaceChildren();
+    }
+    this.stage.append(this.overlay, this.told); // over the layers
+    return layers;
+  }
+
+  /** Paint the view and what is around it, to be shifted from now on. */
+  paint() {
+    const { x, y } = this.view;
+    this.painted = { x, y };
+    const placed = (frame) => [
+      ...this.along(frame.x, x, frame, "left", "width"), ...(this.isPlane ? this.upright(frame, y) : [1, 0]),
+    ];
+    for (const [index, group] of this.zoomed.entries()) {
+      const [a, e, d, f] = placed(this.frames[index]);
+      group.setAttribute("transform", `matrix(${a} 0 0 ${d} ${e} ${f})`);
+    }
+    const [a, e, d, f] = placed(this.frames.at(-1));
+    for (const mark of this.marks) {
+      [mark.left, mark.top] = [a * mark.x + e, d * mark.y + f];
+      mark.element.setAttribute("transform", `translate(${mark.left} ${mark.top})`);
+    }
+    if (this.ticks) this.paintTimes();
+  }
+
+  shift(dx, dy) {
+    for (const layer of this.layers) layer.shift(dx, dy);
+    const { left, width } = this.frames.at(-1);
+    for (const mark of this.marks) { // beside a curve that goes on its end would be none
+      const isBeyond = mark.isEnd && mark.left + dx > left + width + 1;
+      if (Boolean(mark.isBeyond) === isBeyond) continue;
+      mark.isBeyond = isBeyond;
+      mark.element.style.visibility = isBeyond ? "hidden" : "";
+    }
   }
 
   along(from, to, frame, start, size) {
@@ -140,32 +236,39 @@ class Figure {
     return [scale, shift - scale * frame.top];
   }
 
+  /** The times below the panels, also of what is around the view. */
+  paintTimes() {
+    const [low, high] = this.view.x;
+    const more = AROUND * (high - low);
+    const { width, top, height } = this.frames.at(-1);
+    const [lines, labels] = this.ticks;
+    const times = ticks(low - more, high + more, (1 + 2 * AROUND) * Math.max(width / 75, 4));
+    const starts = this.frames.flatMap((frame) => times.map(([value]) => `M${this.px(frame, value)} ${frame.top + frame.height}v${TICK_PX}`));
+    lines.setAttribute("d", starts.join(""));
+    labels.replaceChildren();
+    for (const [value, label] of times) {
+      const x = this.px(this.frames.at(-1), value);
+      made("text", { x, y: top + height + 16, "text-anchor": "middle", ...LABEL }, labels).textContent = label;
+    }
+  }
+
+  /** The places beside a map. */
   drawTicks() {
-    const pen = { stroke: "var(--faint)", "stroke-width": 0.8 };
-    const letters = { "font-size": 11, fill: "var(--ink)" };
-    const axes = [...this.svg.querySelectorAll(".x-axis .ticks")];
-    axes.forEach((axis, index) => {
-      axis.replaceChildren();
-      const frame = this.frames[index];
-      const bottom = frame.top + frame.height;
-      for (const [value, label] of ticks(...this.view.x, frame.width / 75)) {
-        const x = this.px(frame, value);
-        made("path", { d: `M${x} ${bottom}v4`, ...pen }, axis);
-        if (index < axes.length - 1) continue;
-        made("text", { x, y: bottom + 16, "text-anchor": "middle", ...letters }, axis)
-          .textContent = label;
-      }
-    });
-    if (!this.isPlane) return;
-    const [frame, axis] = [this.frames[0], this.svg.querySelector(".y-axis .ticks")];
-    axis.replaceChildren();
+    const frame = this.frames[0];
+    const bottom = frame.top + frame.height;
+    const [below, beside] = [this.svg.querySelector(".x-axis .ticks"), this.svg.querySelector(".y-axis .ticks")];
+    below.replaceChildren();
+    for (const [value, label] of ticks(...this.view.x, frame.width / 75)) {
+      const x = this.px(frame, value);
+      made("path", { d: `M${x} ${bottom}v4`, ...TICK }, below);
+      made("text", { x, y: bottom + 16, "text-anchor": "middle", ...LABEL }, below).textContent = label;
+    }
+    beside.replaceChildren();
     for (const [value, label] of ticks(...this.view.y, frame.height / 75)) {
       const y = this.py(frame, value);
-      made("path", { d: `M${frame.left} ${y}h-4`, ...pen }, axis);
-      made("text", { x: frame.left - 7, y: y + 4, "text-anchor": "end", ...letters }, axis)
-        .textContent = label;
+      made("path", { d: `M${frame.left} ${y}h-4`, ...TICK }, beside);
+      made("text", { x: frame.left - 7, y: y + 4, "text-anchor": "end", ...LABEL }, beside).textContent = label;
     }
-    this.svg.querySelector(".grid").style.display = "none"; // it is that of the whole
   }
 
   /** Zoom by a factor around a place in pixels, or the middle. */
@@ -193,7 +296,7 @@ class Figure {
 
   hide(name, isHidden) {
     this.hidden[isHidden ? "add" : "delete"](name);
-    for (const each of this.svg.querySelectorAll("[data-part], [data-hides]")) {
+    for (const each of this.stage.querySelectorAll("[data-part], [data-hides]")) {
       if (each.dataset.part === name) each.style.display = isHidden ? "none" : "";
       if (each.dataset.hides === name) each.style.opacity = isHidden ? 0.4 : "";
     }
@@ -203,25 +306,32 @@ class Figure {
 
   /** Mark a time, and tell what was there; null for none. */
   tell(time, lines = this.valuesAt(time), spot = null) {
-    this.at = time;
+    [this.at, this.spotTold, this.isTold] = [time, spot, lines.length > 0];
+    const text = lines.join("\n");
+    if (this.told.textContent !== text) this.told.textContent = text;
+    this.told.hidden = !this.isTold;
+    if (this.isTold) { // one layout, and none while the view moves
+      const { width } = this.svg.getBoundingClientRect();
+      Object.assign(this.told, { width, needs: this.told.offsetWidth, scale: width / this.svg.viewBox.baseVal.width });
+    }
+    this.point();
+  }
+
+  /** Put the cursor, and what is told, where the view shows them. */
+  point() {
+    const [time, frame] = [this.at, this.frames[0]];
     this.overlay.replaceChildren();
     if (time !== null) (this.isPlane ? this.markPlaces(time) : this.markTime(time));
-    this.told.hidden = lines.length === 0;
-    this.told.replaceChildren(
-      ...lines.map((line) => Object.assign(document.createElement("div"), { textContent: line })),
-    );
-    if (lines.length === 0) return;
-    const frame = this.frames[0];
-    const [x, y] = spot ?? [this.px(frame, time), frame.top];
-    const scale = this.svg.getBoundingClientRect().width / this.svg.viewBox.baseVal.width;
-    const width = this.told.offsetWidth;
-    const left = x * scale + 14 + width > this.place.clientWidth ? x * scale - width - 14 : x * scale + 14;
-    this.told.style.left = `${Math.max(0, left)}px`;
-    this.told.style.top = `${y * scale}px`;
+    if (!this.isTold) return;
+    const [x, y] = this.spotTold ?? [this.px(frame, time), frame.top];
+    this.told.hidden = !this.spotTold && (x < frame.left || x > frame.left + frame.width);
+    const { width, needs, scale } = this.told;
+    const left = x * scale + 14 + needs > width ? x * scale - needs - 14 : x * scale + 14;
+    this.told.style.transform = `translate(${Math.max(0, left)}px, ${y * scale}px)`;
   }
 
   valuesAt(time) {
-    if (time === null || this.isPlane || time < this.view.x[0] || time > this.view.x[1]) return [];
+    if (time === null || this.isPlane) return [];
     const lines = [`${time.toFixed(3)} s`];
     for (const curve of this.data.curves) {
       if (this.hidden.has(curve.part)) continue;
@@ -254,11 +364,26 @@ class Figure {
 
   markPlaces(time) {
     const frame = this.frames[0];
+    const pen = { fill: "#E69F00", stroke: "var(--ink)", "stroke-width": 1.5 };
     for (const track of this.data.tracks) {
-      const index = Math.max(0, lastUpTo(track.t, time));
       if (!track.t.length) continue;
-      const [cx, cy] = [this.px(frame, track.x[index]), this.py(frame, track.y[index])];
-      made("circle", { cx, cy, r: 7, fill: "#E69F00", stroke: "var(--ink)", "stroke-width": 1.5 }, this.overlay);
+      const index = Math.max(0, lastUpTo(track.t, time));
+      const [x, y, heading] = [track.x[index], track.y[index], track.heading[index]];
+      const [cx, cy] = [this.px(frame, x), this.py(frame, y)];
+      if (cx < frame.left || cx > frame.left + frame.width || cy < frame.top || cy > frame.top + frame.height) continue;
+      if (heading === null) {
+        made("circle", { cx, cy, r: 7, ...pen }, this.overlay);
+        continue;
+      }
+      const [cos, sin] = [Math.cos(heading), Math.sin(heading)];
+      const outlines = track.body.map((outline) => outline.map(([ahead, left]) => (
+        [this.px(frame, x + cos * ahead - sin * left), this.py(frame, y + sin * ahead + cos * left)])));
+      const reach = Math.max(0, ...outlines.flat().map(([px, py]) => Math.hypot(px - cx, py - cy)));
+      if (reach >= BODY_PX) {
+        for (const outline of outlines) made("path", { class: "body", d: `M${outline.join("L")}Z`, ...pen, "fill-opacity": 0.6 }, this.overlay);
+      }
+      const turn = `translate(${cx} ${cy}) rotate(${(-180 / Math.PI) * heading})`;
+      made("path", { class: "heading", d: reach >= BODY_PX ? "M0 0h12" : "M11 0L-7 7L-3 0L-7-7Z", transform: turn, ...pen }, this.overlay);
     }
   }
 
@@ -287,14 +412,13 @@ class Figure {
   }
 
   listen() {
-    let held = null;
-    this.svg.addEventListener("pointerdown", (event) => {
+    this.stage.addEventListener("pointerdown", (event) => {
       const entry = event.target.closest("[data-hides]");
-      held = { entry, spot: this.spot(event), far: false };
-      if (event.pointerType !== "touch" && this.frameAt(held.spot) >= 0) this.svg.setPointerCapture(event.pointerId);
+      this.held = { entry, spot: this.spot(event), box: this.svg.getBoundingClientRect(), far: false };
+      if (event.pointerType !== "touch" && this.frameAt(this.held.spot) >= 0) this.stage.setPointerCapture(event.pointerId);
     });
-    this.svg.addEventListener("pointermove", (event) => {
-      const spot = this.spot(event);
+    this.stage.addEventListener("pointermove", (event) => {
+      const [spot, held] = [this.spot(event), this.held];
       if (held) {
         const [dx, dy] = [spot[0] - held.spot[0], spot[1] - held.spot[1]];
         held.far ||= Math.hypot(dx, dy) > 4;
@@ -311,18 +435,18 @@ class Figure {
       this.tell(time, this.valuesAt(time), [spot[0], spot[1]]);
       this.pointed(time);
     });
-    this.svg.addEventListener("pointerup", (event) => {
-      const was = held;
-      held = null;
+    this.stage.addEventListener("pointerup", (event) => {
+      const was = this.held;
+      this.held = null;
       if (!was) return;
       if (was.entry && !was.far) this.hide(was.entry.dataset.hides, !this.hidden.has(was.entry.dataset.hides));
       else if (was.entry) this.moved(was.entry.dataset.hides.replace(/^curve /, ""), this.frameAt(this.spot(event)));
       else if (was.far) this.changed();
     });
-    this.svg.addEventListener("pointercancel", () => (held = null));
-    this.svg.addEventListener("pointerleave", () => this.leave());
-    this.svg.addEventListener("dblclick", () => this.reset());
-    this.svg.addEventListener("wheel", (event) => {
+    this.stage.addEventListener("pointercancel", () => (this.held = null));
+    this.stage.addEventListener("pointerleave", () => this.leave());
+    this.stage.addEventListener("dblclick", () => this.reset());
+    this.stage.addEventListener("wheel", (event) => {
       if (!event.ctrlKey) return;
       event.preventDefault();
       this.zoom(event.deltaY > 0 ? 1.25 : 0.8, this.spot(event));

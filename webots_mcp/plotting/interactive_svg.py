@@ -18,7 +18,7 @@ from webots_mcp.plotting.canvas import Room
 from webots_mcp.plotting.colours import ON_A_PAGE
 from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.intervals import Lane
-from webots_mcp.plotting.robot_path import thinned
+from webots_mcp.plotting.robot_path import thinned_with_headings
 from webots_mcp.plotting.signal_plot import SignalAxes, paint_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, paint_trajectory
 from webots_mcp.signals.naming import spelled_out
@@ -65,7 +65,8 @@ class Figure:
     def markup(self) -> str:
         """SVG and values; nothing that was recorded ends the element that holds them."""
         values = json.dumps(self.data, separators=(",", ":")).replace("<", "\\u003c")
-        return f'{self.svg}<script type="application/json">{values}</script>'
+        stage = f'<div class="stage">{self.svg}</div>'
+        return f'{stage}<script type="application/json">{values}</script>'
 
 
 def figure_part(name: str) -> str:
@@ -141,7 +142,7 @@ def _lane(lane: Lane) -> dict[str, Any]:
 
 
 def _track(track: PlottedPath) -> dict[str, Any]:
-    places = thinned(track.path.places) if track.path.places else []
-    columns = zip(*places, strict=True) if places else ((), (), ())
-    named = zip(("t", "x", "y"), map(_numbers, columns), strict=True)
-    return {"name": spelled_out(track.name), **dict(named)}
+    places = thinned_with_headings(track.path.places) if track.path.places else []
+    columns = zip(*places, strict=True) if places else ((), (), (), ())
+    named = zip(("t", "x", "y", "heading"), map(_numbers, columns), strict=True)
+    return {"name": spelled_out(track.name), **dict(named), "body": list(track.body)}

@@ -61,6 +61,7 @@ SHAPES: Final = {
     "triangle": "M0-1.1L1 .8H-1Z",
     "star": _star(1.2, 0.5),
     "arrow": "M1 0L-.9.9V-.9Z",
+    "nose": "M2.9 0L1.3 .85V-.85Z",
 }
 Sample: TypeAlias = "Callable[[Canvas, float, float], None]"
 

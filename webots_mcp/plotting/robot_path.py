@@ -31,22 +31,31 @@ class PathLimits:
         leap_factor: A step at more than this many times the speed that 95 % of the steps keep to is
             a leap.
         pixel_share: Share of the larger side below which two places fall on the same pixel.
+        agreement: Mean cosine between a heading and the direction of the path from which on the
+            heading is taken to be measured counterclockwise from the x axis.
     """
 
     places: int = 20_000
     leap_factor: float = 10.0
     pixel_share: float = 1 / 2000
+    agreement: float = 0.7
 
 
 _LIMITS: Final = PathLimits()
 
 
 class PathPoint(NamedTuple):
-    """Where the robot was at a simulation time."""
+    """Where the robot was at a simulation time, and where it headed; NaN if that is not known."""
 
     time_s: float
     x: float
     y: float
+    heading_rad: float = math.nan
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """Return x and y."""
+        return self.x, self.y
 
 
 @dataclass(frozen=True)
@@ -91,8 +100,12 @@ def read_path(
     x: RegisteredSignal,
     y: RegisteredSignal,
     deadline_s: float,
+    heading: RegisteredSignal | None = None,
 ) -> RobotPath:
-    """Return the places of one run: of every row, or of every nth one if there are many."""
+    """Return the places of one run: of every row, or of every nth one if there are many.
+
+    `heading` is an angle, if one is known. It is used if the robot moves along it.
+    """
     (segment,) = part.range.segments
     frame = read_frame(connection, segment, Deadline(deadline_s))
     xs, ys = frame.numbers(x.name), frame.numbers(y.name)
@@ -100,14 +113,45 @@ def read_path(
     every = max(1, math.ceil(len(rows) / _LIMITS.places))
     shown = np.union1d(rows[::every], rows[-1:])
     times = frame.times
-    places = [
+    headings_rad = np.full(len(times), math.nan)
+    if heading is not None and heading.turn:
+        headings_rad = frame.numbers(heading.name) * (math.tau / heading.turn)
+    places = _turned([
         PathPoint(*place)
-        for place in zip(times[shown].tolist(), xs[shown].tolist(), ys[shown].tolist(), strict=True)
-    ]
+        for place in zip(
+            *(each[shown].tolist() for each in (times, xs, ys, headings_rad)), strict=True
+        )
+    ])  # fmt: skip
     step_s = None
     if every > 1:
         step_s = float(f"{float(np.median(np.diff(times[shown]))):.3g}")
     return RobotPath(places, step_s, frozenset(_breaks(places)), is_whole=frame.cut_at_s is None)
+
+
+def _turned(places: Sequence[PathPoint]) -> list[PathPoint]:
+    """Return the places with headings that agree with the path.
+
+    A compass may count clockwise or from another direction, and a robot may drive backwards: then
+    the direction of the path is the heading.
+    """
+    kept = thinned(places)
+    steps = [(a, b) for a, b in pairwise(kept) if a.place != b.place]
+    directions = [math.atan2(b.y - a.y, b.x - a.x) for a, b in steps]
+    cosines = [
+        math.cos(a.heading_rad - direction)
+        for (a, _), direction in zip(steps, directions, strict=True)
+        if math.isfinite(a.heading_rad)
+    ]
+    if any(math.isfinite(each.heading_rad) for each in places) and (
+        not cosines or abs(sum(cosines)) >= _LIMITS.agreement * len(cosines)
+    ):
+        return list(places)
+    times = [a.time_s for a, _ in steps]
+    found = list[PathPoint]()
+    for each in places:
+        at = max(0, bisect_right(times, each.time_s) - 1)
+        found.append(each._replace(heading_rad=directions[at] if directions else math.nan))
+    return found
 
 
 def _breaks(places: Sequence[PathPoint]) -> Iterator[int]:
@@ -121,7 +165,7 @@ def _breaks(places: Sequence[PathPoint]) -> Iterator[int]:
 
 def _speed(before: PathPoint, after: PathPoint) -> float:
     passed_s = after.time_s - before.time_s
-    return math.dist(before[1:], after[1:]) / passed_s if passed_s > 0 else 0.0
+    return math.dist(before.place, after.place) / passed_s if passed_s > 0 else 0.0
 
 
 def extent(places: Sequence[PathPoint]) -> float:
@@ -135,9 +179,22 @@ def thinned(places: Sequence[PathPoint]) -> list[PathPoint]:
     least = _LIMITS.pixel_share * extent(places)
     kept = list(places[:1])
     for place in places:
-        if math.dist(place[1:], kept[-1][1:]) > least:
+        if math.dist(place.place, kept[-1].place) > least:
             kept.append(place)
     return [*kept, places[-1]] if kept[-1:] != list(places[-1:]) else kept
+
+
+def thinned_with_headings(places: Sequence[PathPoint], turned_rad: float = 0.1) -> list[PathPoint]:
+    """Return the thinned places, and those in between at which the robot has turned further."""
+    seen = set(thinned(places))
+    kept = list[PathPoint]()
+    for place in places:
+        is_turned = kept and abs(
+            math.remainder(place.heading_rad - kept[-1].heading_rad, math.tau)
+        ) > turned_rad  # fmt: skip
+        if place in seen or is_turned:
+            kept.append(place)
+    return kept
 
 
 class Heading(NamedTuple):
@@ -151,7 +208,7 @@ class Heading(NamedTuple):
 def headings(path: RobotPath, count: int) -> list[Heading]:
     """Return the direction at `count` places that are evenly spread over the length of the path."""
     steps = path.steps()
-    reached = list(accumulate(math.dist(before[1:], after[1:]) for before, after in steps))
+    reached = list(accumulate(math.dist(before.place, after.place) for before, after in steps))
     if not reached or reached[-1] == 0:
         return []
     found: list[Heading] = []

@@ -69,6 +69,7 @@ class SignalLayout:
         small_text_px: Size of the letters in rows of intervals and at the ends of curves.
         leader_px: Length of the line from the end of a curve to its value.
         tick_px: Minimum distance between labels of the time axis.
+        min_ticks: Labels of the time axis of a narrow figure, if their texts fit.
         level_px: Minimum distance between labels of the vertical axis.
         right_px: Margin on the right.
         time_labels_px: Height of the labels of the time axis.
@@ -80,6 +81,7 @@ class SignalLayout:
     small_text_px: float = 9.5
     leader_px: float = 9.0
     tick_px: float = 70.0
+    min_ticks: float = 4.0
     level_px: float = 20.0
     right_px: float = 16.0
     time_labels_px: float = 24.0
@@ -416,7 +418,8 @@ class _SignalPainter:
 
     def _time_marks(self, frame: AxesBox) -> list[tuple[float, str]]:
         low, high = self._plot.x_range
-        room = max(_LAYOUT.tick_px, 1.6 * max(width_of(text) for _, text in ticks(low, high, 8)))
+        tick_px = min(_LAYOUT.tick_px, frame.width / _LAYOUT.min_ticks)
+        room = max(tick_px, 1.6 * max(width_of(text) for _, text in ticks(low, high, 8)))
         return ticks(low, high, frame.width / room)
 
     # Panels ---------------------------------------------------------------------------------------
@@ -521,7 +524,7 @@ class _SignalPainter:
             if curve.last is not None
             for time_s, mean, *_ in [curve.points[-1]]
         ]
-        canvas.open(class_="marks")
+        canvas.open(class_="marks ends")
         for x, y, index in sorted(ends):
             curve = panel.curves[index]
             text = rounded_on(curve.last or 0.0, panel.scale)

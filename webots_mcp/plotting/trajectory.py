@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Found
-from webots_mcp.judging.detection.search import motion_in
+from webots_mcp.judging.detection.search import find_motion, motion_in
 from webots_mcp.plotting.axes import AxesBox, axis_range, rounded_on, ticks
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, short, width_of
 from webots_mcp.plotting.colours import INK, LINES, ON_PAPER, Theme, area_styles, scaled
@@ -138,6 +139,7 @@ def compose_trajectory(
     deadline = Deadline(deadline_s)
     known = known_signals(connection, ranges)
     x, y = position_of(connection, known, ranges[-1], position, deadline)
+    heading = find_motion(known, EventOptions(position=(x.name, y.name))).heading
     mode = mode_signal(known, bands)
     flags = _flags(known) if events else []
     names = [x.name, y.name, *([mode] if mode else []), *flags]
@@ -149,7 +151,7 @@ def compose_trajectory(
     for part in parts:
         modes = _lane(part, mode) if len(parts) == 1 else None
         marks = [_flagged(part, flag) for flag in flags]
-        path = read_path(connection, part, x, y, deadline.left_s)
+        path = read_path(connection, part, x, y, deadline.left_s, heading)
         if events:
             stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline.left_s, found)
             marks.insert(0, stuck)
@@ -287,12 +289,18 @@ class PlottedPath:
     Attributes:
         modes: What colours it; None for the time, or for the run where there are several.
         marks: Events, one lane per kind, which may be empty; at most five.
+        body: Outlines of the parts of the robot from above, in metres, in its own frame (x ahead,
+            y to the left); empty where its size is not known.
     """
 
     name: str
     path: RobotPath
     modes: Lane | None
     marks: Sequence[Lane]
+    body: Sequence[Outline] = ()
+
+
+Outline: TypeAlias = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -306,7 +314,7 @@ class Obstacle:
     name: str
     x: float
     y: float
-    outline: tuple[tuple[float, float], ...] = ()
+    outline: Outline = ()
 
 
 @dataclass(frozen=True)
@@ -359,6 +367,7 @@ class _TrajectoryPainter:
         drawn = [(i, each) for i, each in enumerate(plot.tracks) if each.path.places]
         for index, track in drawn:
             self._way(frame, track, index)
+            self._body(frame, track, index)
         canvas.close()
         canvas.close("svg")
         canvas.open(class_="marks")
@@ -424,6 +433,19 @@ class _TrajectoryPainter:
             self._by_time(frame, path)
         canvas.close()
 
+    def _body(self, frame: AxesBox, track: PlottedPath, index: int) -> None:
+        """Draw the robot at its true size where the path ends."""
+        last = track.path.places[-1]
+        if not track.path.is_whole or not math.isfinite(last.heading_rad):
+            return
+        self._canvas.open(data_part=f"track {index}", class_="body")
+        for outline in track.body:
+            corners = np.array(standing_at(last, outline))
+            d = line_through(frame.px(corners[:, 0]), frame.py(corners[:, 1])) + "Z"
+            self._canvas.add("path", d=d, fill=self._ink(index), fill_opacity=0.25,
+                             stroke=self._ink(index), stroke_width=1.2)  # fmt: skip
+        self._canvas.close()
+
     def _by_mode(self, frame: AxesBox, path: RobotPath, modes: Lane) -> None:
         stretches: dict[str, list[Sequence[PathPoint]]] = {value: [] for value in modes.values}
         spot = _LAYOUT.spot_share * extent(path.places)
@@ -464,7 +486,7 @@ class _TrajectoryPainter:
         self, frame: AxesBox, stretches: Any, colour: str, width: float, **style: Any
     ) -> None:
         """One line, broken between the segments."""
-        drawn = [np.array(thinned(each))[:, 1:] for each in stretches if len(each) > 1]
+        drawn = [np.array(thinned(each))[:, 1:3] for each in stretches if len(each) > 1]
         if drawn:
             d = "".join(line_through(frame.px(each[:, 0]), frame.py(each[:, 1])) for each in drawn)
             style = {"stroke_linecap": "round", "stroke_linejoin": "round"} | style
@@ -485,6 +507,9 @@ class _TrajectoryPainter:
         if path.is_whole:
             at = (float(frame.px(last.x)), float(frame.py(last.y)))
             paint_mark(canvas, "square", at, 6.5, fill=ink)
+            if math.isfinite(last.heading_rad):
+                degrees = -math.degrees(last.heading_rad)
+                paint_mark(canvas, "nose", at, 6.5, degrees=degrees, fill=ink, **edge)
         for mark, shape in zip(track.marks, _SHAPES, strict=False):
             size = 0.6 if len(mark.intervals) > _LAYOUT.many_marks else 1.0
             for interval in mark.intervals:
@@ -527,6 +552,12 @@ class _TrajectoryPainter:
                     text = f"{short(mark.name)} ({len(mark.intervals)}){whose}"
                     entries.append(LegendEntry(fitted(text, self._canvas.width_px - 80), sample))
         return entries
+
+
+def standing_at(place: PathPoint, outline: Outline) -> list[tuple[float, float]]:
+    """Return an outline of a robot in the world, for a robot that stands at a place."""
+    cos, sin = math.cos(place.heading_rad), math.sin(place.heading_rad)
+    return [(place.x + cos * u - sin * v, place.y + sin * u + cos * v) for u, v in outline]
 
 
 def _size(shape: str) -> float:

@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.plotting.colours import AREAS, LINES
+from webots_mcp.plotting.interactive_svg import figure_part
 from webots_mcp.plugins import page
 
-CSS = (Path(page.__file__).parent / "parts" / "page.css").read_text("utf-8")
+CSS = (Path(page.__file__).parent / "parts" / "page.css").read_text("utf-8") + figure_part(
+    "figure.css"
+)
 TEXT_CONTRAST = 4.5
 """Minimum for text, by success criterion 1.4.3."""
 GRAPHIC_CONTRAST = 3.0

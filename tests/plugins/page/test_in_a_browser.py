@@ -57,7 +57,7 @@ class Tab:
 
     def point(self, share: float = 0.5, y: float = 60.0) -> None:
         """Move the pointer over the signals."""
-        box = self.page.locator("#signal-figure > svg").bounding_box()
+        box = self.page.locator("#signal-figure .stage > svg:first-child").bounding_box()
         assert box is not None
         self.page.mouse.move(box["x"] + share * box["width"], box["y"] + y)
 
@@ -216,7 +216,7 @@ def test_the_values_of_all_are_told_at_the_pointer_and_in_a_replay(
         expect(shown).to_contain_text(name, timeout=PATIENCE_MS)
     tab.page.get_by_label("replay at").fill("20")
     expect(shown).to_contain_text("20.000 s", timeout=PATIENCE_MS)
-    expect(tab.page.locator("#way-figure .overlay circle")).to_have_count(1)
+    expect(tab.page.locator("#way-figure .overlay .heading")).to_have_count(1)
     assert "at=20" in tab.page.url
 
 
@@ -290,7 +290,7 @@ def test_a_view_whose_rows_are_loaded_needs_no_request(
     tab.page.wait_for_function("() => drawnScope && isLoaded(figures.signals.figure.view.x)")
     tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
     asked = sum("/draw?" in url for url in tab.asked)
-    tab.page.locator("#signal-figure > svg").focus()
+    tab.page.locator("#signal-figure .stage > svg:first-child").focus()
     for key in ("+", "+", "-"):
         tab.page.keyboard.press(key)
     for _ in range(5):
@@ -423,3 +423,50 @@ def test_it_survives_a_purge_a_database_that_goes_away_and_a_server_that_stops(
     said = server.stop()
     assert "Traceback" not in said, said
     tab.says("connection was lost")
+
+
+def test_a_pan_shifts_painted_layers_and_lays_nothing_out(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 1, 119)
+    figure = "document.getElementById('signal-figure').figure"
+    tab.page.evaluate(f"{figure}.held = {{}}")  # so that nothing is drawn anew meanwhile
+    tab.page.evaluate(f"{figure}.show([20, 40])")
+    changes = tab.page.evaluate(
+        """figure => {
+          const changed = [];
+          const observer = new MutationObserver(found => changed.push(...found));
+          observer.observe(figure.stage, {subtree: true, childList: true, attributes: true});
+          for (let step = 1; step <= 20; step++) figure.pan(-step, 0);
+          changed.push(...observer.takeRecords());
+          observer.disconnect();
+          const names = changed.map(each => `${each.target.localName} ${each.attributeName}`);
+          return [...new Set(names)];
+        }""",
+        tab.page.evaluate_handle(figure),
+    )
+    assert changes == ["svg style"]
+    low, high = tab.page.evaluate(f"{figure}.view.x")
+    assert 20 < low < 40
+    assert high - low == pytest.approx(20)
+    painted = tab.page.evaluate(f"{figure}.painted.x")
+    tab.page.evaluate(f"{figure}.pan(-3 * {figure}.frames[0].width, 0)")
+    assert tab.page.evaluate(f"{figure}.painted.x") != painted
+
+
+def test_the_map_shows_the_body_of_the_robot_and_where_it_heads(
+    opened: Callable[[Server], Tab], driven: Server
+) -> None:
+    tab = opened(driven)
+    figure = "document.getElementById('way-figure').figure"
+    tab.page.wait_for_function(f"() => {figure}?.data.tracks[0].t.length > 1")
+    track = tab.page.evaluate(f"{figure}.data.tracks[0]")
+    lengths = [max(x for x, _ in part) - min(x for x, _ in part) for part in track["body"]]
+    assert 0.02 < max(lengths) < 0.5  # of the rover, in metres
+    assert all(-4 < heading < 4 for heading in track["heading"])
+    body = tab.page.locator("#way-figure .body path").first
+    expect(body).to_be_attached(timeout=PATIENCE_MS)

@@ -33,7 +33,7 @@ from webots_mcp.plotting.interactive_svg import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.controller_variables import shown_variables
-from webots_mcp.plugins.report.obstacles import obstacles_of
+from webots_mcp.plugins.report.obstacles import obstacles_of, with_bodies
 from webots_mcp.signals.naming import flatten, spelled_out
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.inspections import inspections_of
@@ -439,6 +439,8 @@ def draw(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
             way, of_way = _composed(lambda: _all_paths(connection))
         else:
             way, of_way = _composed(lambda: compose_trajectory(connection, ranges))
+            if way:
+                way = replace(way, tracks=with_bodies(connection, way.tracks, ranges))
         standing: Sequence[Obstacle] = obstacles_of(connection, ranges) if way else ()
         drawn = _nothing(*dict.fromkeys((*notes, *of_way)))
         if signals:
@@ -501,7 +503,8 @@ def _all_paths(connection: sqlite3.Connection) -> tuple[TrajectoryAxes, tuple[st
             notes.append(f"{robot.name}: {error}")
             continue
         notes += [f"{robot.name}: {note}" for note in of_robot]
-        tracks += [replace(each, name=robot.name, modes=None) for each in found.tracks]
+        of_robot_tracks = with_bodies(connection, found.tracks, [whole])
+        tracks += [replace(each, name=robot.name, modes=None) for each in of_robot_tracks]
     if len(robots) > _LIMITS.robots:
         notes.append(f"the map shows {_LIMITS.robots} of {len(robots)} robots")
     if found is None:

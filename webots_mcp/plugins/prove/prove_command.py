@@ -6,13 +6,14 @@ import os
 import platform
 import sys
 import tempfile
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from cyclopts.validators import Number
 
 from webots_mcp.cli.options import Json, Parameter, whole_number
+from webots_mcp.cli.streams import progress_bar, shown_activity
 from webots_mcp.cli.terminal import print_json, printable
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
@@ -91,9 +92,12 @@ def _run_checks(only: list[str] | None, patience_s: int, *, as_json: bool) -> li
     with tempfile.TemporaryDirectory(prefix="webots-mcp-", ignore_cleanup_errors=True) as folder:
         bench = Bench(Path(folder) / "project", patience_s)
         try:
-            for name in only or [*CHECKS, *NOT_TRIED]:
+            names = only or [*CHECKS, *NOT_TRIED]
+            for done, name in enumerate(names):
                 answer: dict[str, Any] = {"outcome": "not tried", "seen": NOT_TRIED.get(name)}
-                answer = run_check(CHECKS[name], bench) if name in CHECKS else answer
+                if name in CHECKS:
+                    with _shown(name, done, len(names)):
+                        answer = run_check(CHECKS[name], bench)
                 parts = [f"{name}: {answer['outcome']}"]
                 parts += [
                     f"{key}: {answer[key]}"
@@ -105,6 +109,16 @@ def _run_checks(only: list[str] | None, patience_s: int, *, as_json: bool) -> li
         finally:
             bench.end()
     return found
+
+
+def _shown(name: str, done: int, of: int) -> AbstractContextManager[None]:
+    """Show on a terminal how many checks are done, and for how long this one has been running.
+
+    Elsewhere the line of each check is the progress.
+    """
+    if not sys.stderr.isatty():
+        return nullcontext()
+    return shown_activity(f"{progress_bar(done, of)}check {done + 1} of {of}, {name}")
 
 
 def _choose(path: Path) -> None:

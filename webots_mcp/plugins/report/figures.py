@@ -14,7 +14,7 @@ from webots_mcp.plotting.interactive_svg import Figure, signals_figure, way_figu
 from webots_mcp.plotting.signal_plot import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.report.chapter import Chapter, EventContext
-from webots_mcp.plugins.report.obstacles import obstacles_of
+from webots_mcp.plugins.report.obstacles import obstacles_of, with_bodies
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.registered_signals import RegisteredSignal
@@ -163,6 +163,7 @@ class _FigureSet:
 
     def _way(self, ranges: Sequence[TimeRange]) -> Figure:
         plot, notes = compose_trajectory(self._connection, ranges, found=self._found)
+        plot = replace(plot, tracks=with_bodies(self._connection, plot.tracks, ranges))
         return way_figure(plot, notes, obstacles_of(self._connection, ranges))
 
     def around(self, chapter: Chapter, moment: EventContext) -> None:

@@ -1,4 +1,4 @@
-"""What stands in the world of a run, for its map.
+"""What stands in the world of a run, and the bodies of its robots, for its map.
 
 It is read from the world file where that is possible, else from what an observer recorded.
 """
@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.plotting.trajectory import Obstacle
+from webots_mcp.plotting.trajectory import Obstacle, Outline, PlottedPath
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.robots import world_seen
 from webots_mcp.store.run_rows import RunRecord, fetch_run
@@ -40,7 +41,38 @@ def obstacles_of(
     return _of_file(run) or _seen(connection, run)
 
 
+def with_bodies(
+    connection: sqlite3.Connection, tracks: Sequence[PlottedPath], ranges: Sequence[TimeRange]
+) -> list[PlottedPath]:
+    """Return paths with the outlines of their robots, as far as the world files have them.
+
+    Args:
+        connection: Of the recording.
+        tracks: One path for each run of the ranges.
+        ranges: What was read.
+    """
+    segments = [(each.robot, segment.run_id) for each in ranges for segment in each.segments]
+    if len(segments) != len(tracks):  # A run without rows has no path.
+        segments = segments[-1:] * len(tracks)
+    return [
+        replace(track, body=_bodies_of_file(fetch_run(connection, run_id)).get(robot, ()))
+        for track, (robot, run_id) in zip(tracks, segments, strict=True)
+    ]
+
+
+def _bodies_of_file(run: RunRecord) -> dict[str, tuple[Outline, ...]]:
+    return {
+        body.name: tuple(_corners(shape, body) for shape in body.solid_shapes or body.shapes)
+        for body in _bodies_in(run)
+        if body.node.type_name == "Robot"
+    }
+
+
 def _of_file(run: RunRecord) -> tuple[Obstacle, ...]:
+    return tuple(each for body in _bodies_in(run) for each in _outlines(body))
+
+
+def _bodies_in(run: RunRecord) -> tuple[Body, ...]:
     file = Path(run.world or "")
     try:
         status = file.stat()
@@ -48,20 +80,19 @@ def _of_file(run: RunRecord) -> tuple[Obstacle, ...]:
         return ()
     if file.suffix != ".wbt" or not file.is_file() or status.st_size > _MAX_WORLD_BYTES:
         return ()
-    return _standing(file, status.st_mtime_ns)
+    return _loaded(file, status.st_mtime_ns)
 
 
 @lru_cache(maxsize=8)
-def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
+def _loaded(file: Path, _changed_ns: int) -> tuple[Body, ...]:
     from webots_mcp.standin.arena import Arena
     from webots_mcp.standin.standin_errors import WorldError
     from webots_mcp.standin.world import load_world
 
     try:
-        bodies = Arena(load_world(file)).bodies
+        return tuple(Arena(load_world(file)).bodies)
     except (WorldError, OSError):
         return ()  # The path is drawn without them.
-    return tuple(each for body in bodies for each in _outlines(body))
 
 
 def _outlines(body: Body) -> Iterator[Obstacle]:
@@ -71,19 +102,26 @@ def _outlines(body: Body) -> Iterator[Obstacle]:
         yield Obstacle(body.name, shape.x, shape.y, _corners(shape))
 
 
-def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
+def _corners(shape: Shape, of: Body | None = None) -> Outline:
+    """Return the corners of a shape in the world, or in the frame of a body."""
     from webots_mcp.standin.geometry import Disc
 
     if isinstance(shape, Disc):
         angles = [math.tau * side / _SIDES for side in range(_SIDES)]
         radius_m = shape.radius_m
-        return tuple(
+        corners = [
             (shape.x + radius_m * math.cos(angle), shape.y + radius_m * math.sin(angle))
             for angle in angles
-        )
-    halves = [(a * shape.half_x_m, b * shape.half_y_m) for a, b in _CORNERS]
-    cos, sin = shape.cos_yaw, shape.sin_yaw
-    return tuple((shape.x + cos * u - sin * v, shape.y + sin * u + cos * v) for u, v in halves)
+        ]
+    else:
+        halves = [(a * shape.half_x_m, b * shape.half_y_m) for a, b in _CORNERS]
+        cos, sin = shape.cos_yaw, shape.sin_yaw
+        corners = [(shape.x + cos * u - sin * v, shape.y + sin * u + cos * v) for u, v in halves]
+    if of is None:
+        return tuple(corners)
+    cos, sin = math.cos(of.yaw_rad), math.sin(of.yaw_rad)
+    moved = ((x - of.x, y - of.y) for x, y in corners)
+    return tuple((cos * x + sin * y, cos * y - sin * x) for x, y in moved)
 
 
 def _seen(connection: sqlite3.Connection, run: RunRecord) -> tuple[Obstacle, ...]:

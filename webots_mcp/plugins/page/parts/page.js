@@ -57,6 +57,11 @@ function element(name, properties = {}, ...children) {
   return made;
 }
 
+/** Hide or show; what is so already is not laid out again. */
+function hide(place, isHidden) {
+  if (place.hidden !== isHidden) place.hidden = isHidden;
+}
+
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
 // What there is ------------------------------------------------------------------------------------
@@ -74,7 +79,12 @@ async function look() {
   }
 }
 
+let said = ""; // what is said of the state: what did not change is not laid out again
+
 function say(pill, kind, text, why = "") {
+  const now = JSON.stringify([pill, kind, text, why]);
+  if (now === said) return;
+  said = now;
   by("status").replaceChildren(
     element("span", { className: `pill ${kind}`, textContent: pill }), ` ${text} `,
     element("span", { className: "why", textContent: why }),
@@ -87,9 +97,10 @@ function show(answer) {
   if (answer.unknown) change(Object.fromEntries(answer.unknown.map((name) => [name, null])));
   shown = answer.robot === undefined ? null : answer;
   if (!shown) return;
-  by("map").hidden = by("robots").hidden = answer.robots.length < 2;
-  by("run").parentElement.hidden = answer.runs.length === 0;
-  by("beside").parentElement.hidden = answer.runs.length < 2;
+  hide(by("map"), answer.robots.length < 2);
+  hide(by("robots"), answer.robots.length < 2);
+  hide(by("run").parentElement, answer.runs.length === 0);
+  hide(by("beside").parentElement, answer.runs.length < 2);
   offer("robot", answer.robots.map((name) => [name, name]), answer.robot);
   const runs = answer.runs.map(({ id, title }) => [String(id), title]);
   offer("run", [["", "newest run"], ...runs], wanted.run ?? "");
@@ -221,6 +232,7 @@ function arrange() {
 /** What begins a recording, where nothing is recorded yet. */
 function showStart(steps, why) {
   const isWaiting = steps.length > 0;
+  if (!isWaiting && !document.querySelector("main").hidden) return;
   by("start").hidden = !isWaiting;
   document.querySelector("header").hidden = isWaiting;
   document.querySelector("main").hidden = isWaiting;
@@ -253,7 +265,8 @@ function showStart(steps, why) {
 async function draw() {
   for (;;) {
     await pause(50);
-    if (!shown || shown.run === null || performance.now() < nextDrawing) continue;
+    const isHeld = Object.values(figures).some(({ figure }) => figure?.held); // it would be lost with what is drawn
+    if (!shown || shown.run === null || isHeld || performance.now() < nextDrawing) continue;
     const parameters = {
       robot: shown.robot, run: String(shown.run), window: wanted.window, beside: wanted.beside ?? "",
       signals: JSON.stringify(wanted.signals), panels: JSON.stringify(wanted.panels),

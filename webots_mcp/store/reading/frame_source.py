@@ -30,6 +30,7 @@ from webots_mcp.store.chunks import (
     chunks_by_signal,
     decoded_of,
     decoded_or_why,
+    fill_numbers,
     statistics_by_signal,
     statistics_in,
     statistics_of,
@@ -45,6 +46,7 @@ _OF_ITEMS: Final = (
 )
 _ITEMS: Final = _OF_ITEMS.format("state")
 _KEPT_ITEMS: Final = _OF_ITEMS.format("kept_state")
+_MANY_GROUPS: Final = 4  # that are read right into an array
 _FEW_COLUMNS: Final = 4  # of a short run are read one by one
 _MOST_GROUP_ROWS: Final = 2**20  # far more than any maker puts into a group
 _NAMES: Final[dict[Column, str]] = {
@@ -130,6 +132,37 @@ class FrameSource:
         """Return the parts that have rows in [start, stop)."""
         first = bisect_right(self.edges, start) - 1
         return slice(first, bisect_left(self.edges, stop) if start < stop else first)
+
+    def fill(self, column: Column, start: int, numbers: Array) -> tuple[list[int], Indexes]:
+        """Write the numbers of whole groups into an array, where each of their rows holds one.
+
+        Args:
+            column: Which values.
+            start: The first row.
+            numbers: An item for each row from there on.
+
+        Returns:
+            The parts that are written, and the others, which `values` reads.
+        """
+        parts = self.parts(start, start + len(numbers))
+        edges, ids = self.edges, self._ids_of_groups
+        signal_id = self._signal_id(column)
+        if signal_id is None or column in self.derived or self.is_item(column):
+            return [], np.arange(parts.start, parts.stop)
+        into: dict[int, Array] = {}
+        places: dict[int, int] = {}
+        for place in range(parts.start, min(parts.stop, len(ids))):
+            first, behind = edges[place] - start, edges[place + 1] - start
+            if first >= 0 and behind <= len(numbers):
+                into[ids[place]] = numbers[first:behind]
+                places[ids[place]] = place
+        if len(into) < _MANY_GROUPS:
+            return [], np.arange(parts.start, parts.stop)
+        filled = fill_numbers(self.connection, self.run_id, signal_id, into)
+        written = [places[group_id] for group_id in filled]
+        left = np.ones(parts.stop - parts.start, np.bool_)
+        left[np.array(written, np.intp) - parts.start] = False
+        return written, parts.start + np.flatnonzero(left)
 
     def values(
         self,

@@ -146,9 +146,10 @@ class FrameSource:
         """
         parts = self.parts(start, start + len(numbers))
         edges, ids = self.edges, self._ids_of_groups
+        others: Indexes = np.arange(int(parts.start), int(parts.stop))
         signal_id = self._signal_id(column)
         if signal_id is None or column in self.derived or self.is_item(column):
-            return [], np.arange(parts.start, parts.stop)
+            return [], others
         into: dict[int, Array] = {}
         places: dict[int, int] = {}
         for place in range(parts.start, min(parts.stop, len(ids))):
@@ -157,12 +158,10 @@ class FrameSource:
                 into[ids[place]] = numbers[first:behind]
                 places[ids[place]] = place
         if len(into) < _MANY_GROUPS:
-            return [], np.arange(parts.start, parts.stop)
+            return [], others
         filled = fill_numbers(self.connection, self.run_id, signal_id, into)
         written = [places[group_id] for group_id in filled]
-        left = np.ones(parts.stop - parts.start, np.bool_)
-        left[np.array(written, np.intp) - parts.start] = False
-        return written, parts.start + np.flatnonzero(left)
+        return written, others[~np.isin(others, np.array(written, np.intp))]
 
     def values(
         self,

@@ -568,7 +568,7 @@ def _sines(pieces: Array, weights: Array | None, period: float) -> tuple[float, 
     return period, np.hypot(fits.of_sine, fits.of_cosine), model
 
 
-class _Fits(NamedTuple):
+class _SineFits(NamedTuple):
     """Sines of some periods that are fitted to pieces.
 
     Attributes:
@@ -584,7 +584,7 @@ class _Fits(NamedTuple):
     cosine: Array
 
 
-def _fits(pieces: Array, weights: Array | None, periods: Array) -> _Fits:
+def _fits(pieces: Array, weights: Array | None, periods: Array) -> _SineFits:
     """Fit sines of some periods; without weights all values count alike."""
     rows = pieces.shape[1]
     places: Array = np.arange(rows, dtype=np.float64) - (rows - 1) / 2
@@ -603,7 +603,7 @@ def _fits(pieces: Array, weights: Array | None, periods: Array) -> _Fits:
         sy, cy = weighted @ sine, weighted @ cosine
         determinant: Array = np.maximum(ss * cc - sc * sc, _LEAST_SQUARES)
         of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
-    return _Fits(of_sine, of_cosine, of_sine * sy + of_cosine * cy, sine, cosine)
+    return _SineFits(of_sine, of_cosine, of_sine * sy + of_cosine * cy, sine, cosine)
 
 
 def _highest(values: Array, period: float) -> float:

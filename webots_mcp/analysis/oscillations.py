@@ -112,6 +112,7 @@ class _DecisionSettings(NamedTuple):
 
 
 DECIDE: Final = _DecisionSettings()
+_LEAST_SQUARES: Final = 1e-12  # of a sine in rows that do not show it
 
 
 @dataclass(frozen=True)
@@ -550,7 +551,7 @@ def _pieces(values: Array, period: float) -> Array:
 
 def _best_period(pieces: Array, weights: Array | None, period: float) -> float:
     """The period about the given one whose sines explain most."""
-    _, _, gains = _fits(pieces, weights, period * np.array(FIT.tried))
+    gains = _fits(pieces, weights, period * np.array(FIT.tried)).gains
     low, middle, high = gains.sum(axis=0).tolist()
     bend = 2 * middle - low - high  # of the parabola through them: its vertex is the best
     most = FIT.tried[2] - 1
@@ -561,35 +562,48 @@ def _best_period(pieces: Array, weights: Array | None, period: float) -> float:
 def _sines(pieces: Array, weights: Array | None, period: float) -> tuple[float, Array, Array]:
     """The best period about the given one, and the heights and values of its sines."""
     period = _best_period(pieces, weights, period)
-    sines, cosines, _ = _fits(pieces, weights, np.array([period]))
-    places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
-    angles: Array = places * (2 * np.pi / period)
-    model = sines * np.sin(angles) + cosines * np.cos(angles)
-    return period, np.hypot(sines, cosines), np.asarray(model, np.float64)
+    fits = _fits(pieces, weights, np.array([period]))
+    model = fits.of_sine * np.transpose(fits.sine)
+    model += fits.of_cosine * np.transpose(fits.cosine)
+    return period, np.hypot(fits.of_sine, fits.of_cosine), model
 
 
-def _fits(pieces: Array, weights: Array | None, periods: Array) -> tuple[Array, Array, Array]:
-    """Coefficients of sine and cosine and the squares they explain: pieces by periods.
+class _SineFits(NamedTuple):
+    """Sines of some periods that are fitted to pieces.
 
-    Without weights all values count alike.
+    Attributes:
+        of_sine: Coefficients, pieces by periods; `of_cosine` likewise.
+        gains: The squares that they explain.
+        sine: Rows by periods; `cosine` likewise.
     """
-    places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
-    angles: Array = 2 * np.pi * places[:, None] / periods
+
+    of_sine: Array
+    of_cosine: Array
+    gains: Array
+    sine: Array
+    cosine: Array
+
+
+def _fits(pieces: Array, weights: Array | None, periods: Array) -> _SineFits:
+    """Fit sines of some periods; without weights all values count alike."""
+    rows = pieces.shape[1]
+    places: Array = np.arange(rows, dtype=np.float64) - (rows - 1) / 2
+    frequencies: Array = 2 * np.pi / periods
+    angles: Array = places[:, None] * frequencies
     sine, cosine = np.sin(angles), np.cos(angles)
-    if weights is None:
-        weighted = pieces
-        ss, cc, sc = (
-            np.einsum("ij,ij->j", *pair)
-            for pair in ((sine, sine), (cosine, cosine), (sine, cosine))
-        )
+    if weights is None:  # about the middle, sine and cosine are orthogonal: Dirichlet's kernel
+        even = np.sin(rows * frequencies) / np.sin(frequencies)
+        sy, cy = pieces @ sine, pieces @ cosine
+        of_sine = sy / np.maximum((rows - even) / 2, _LEAST_SQUARES)
+        of_cosine = cy / np.maximum((rows + even) / 2, _LEAST_SQUARES)
     else:
         weighted = weights * pieces
         ss, cc = weights @ (sine * sine), weights @ (cosine * cosine)
         sc = weights @ (sine * cosine)
-    sy, cy = weighted @ sine, weighted @ cosine
-    determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
-    of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
-    return of_sine, of_cosine, of_sine * sy + of_cosine * cy
+        sy, cy = weighted @ sine, weighted @ cosine
+        determinant: Array = np.maximum(ss * cc - sc * sc, _LEAST_SQUARES)
+        of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
+    return _SineFits(of_sine, of_cosine, of_sine * sy + of_cosine * cy, sine, cosine)
 
 
 def _highest(values: Array, period: float) -> float:

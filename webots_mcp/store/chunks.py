@@ -15,7 +15,7 @@ import shutil
 import sqlite3
 import tempfile
 import zlib
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -626,21 +626,54 @@ def values_in(
         into: Arrays that receive the numbers of some groups; see `decode`.
     """
     into = into or {}
-    values_query = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
-    query, asked = (
-        values_query,
-        [run_id, signal_id, min(wanted, default=0), max(wanted, default=-1)],
-    )
-    if len(wanted) < _FEW * (asked[3] - asked[2]):
-        query, asked = (
-            f"{values_query} AND group_id IN (SELECT value FROM json_each(?))",
-            [*asked, json.dumps([*wanted])],
-        )
-    for group_id, *stored in connection.execute(query, asked):
+    for group_id, *stored in connection.execute(*_chunks_of(run_id, signal_id, wanted)):
         rows = wanted.get(group_id)
         if rows is None:
             continue
         yield group_id, decoded_or_why(EncodedChunk(*stored), rows, into.get(group_id))
+
+
+def fill_numbers(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, into: Mapping[int, Array]
+) -> list[int]:
+    """Decode chunks of a signal right into arrays, as long as each of their rows holds a number.
+
+    It ends at the first chunk that is another or cannot be read, since whole columns are mostly of
+    one sort: `values_in` reads the other groups.
+
+    Args:
+        connection: Any.
+        run_id: Of which run.
+        signal_id: Of which signal; or times or ids.
+        into: An array of as many rows as the group has, by its id.
+
+    Returns:
+        The groups whose numbers are in their array.
+    """
+    filled: list[int] = []
+    stored = connection.execute(*_chunks_of(run_id, signal_id, into))
+    for group_id, *encoded in stored:
+        target = into.get(group_id)
+        if target is None:
+            continue
+        chunk = EncodedChunk(*encoded)
+        if chunk.codes is not None or isinstance(
+            decoded_or_why(chunk, len(target), target), DamagedChunkError
+        ):
+            break
+        filled.append(group_id)
+    stored.close()
+    return filled
+
+
+def _chunks_of(run_id: int, signal_id: int, wanted: Collection[int]) -> tuple[str, list[Any]]:
+    """The query for the chunks of a signal in some groups, and perhaps in others between them."""
+    query = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
+    first, last = min(wanted, default=0), max(wanted, default=-1)
+    if len(wanted) >= _FEW * (last - first):
+        return query, [run_id, signal_id, first, last]
+    query += " AND group_id IN (SELECT value FROM json_each(?))"
+    return query, [run_id, signal_id, first, last, json.dumps([*wanted])]
 
 
 # Chunks of a recording that must not be written are made once, in a temporary file of this process.

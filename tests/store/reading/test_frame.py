@@ -118,6 +118,26 @@ def test_a_damaged_chunk_costs_its_signal_in_its_segment_and_it_is_said(
     assert frame.unread[0].why.startswith("the chunk of a is damaged")
 
 
+@pytest.mark.parametrize("odd", range(1, 7))
+def test_a_column_of_many_chunks_is_whole_wherever_one_holds_something_else_or_is_damaged(
+    short_groups: None, empty: sqlite3.Connection, odd: int
+) -> None:
+    held: list[Any] = [0.5 * step for step in range(64)]
+    held[8 * (odd - 1) + 3] = "off"
+    recorded(empty, [{"a": value} if step >= 8 else {} for step, value in enumerate(held)])
+    make_chunks(empty, 1000)
+    damaged = odd + 1
+    empty.execute(
+        "UPDATE chunk SET numbers = x'00' WHERE group_id = ? AND signal_id = ?",
+        (damaged, id_of_a(empty)),
+    )
+    held[:8] = held[8 * odd : 8 * damaged] = [None] * 8
+    for start, stop in ((0, 64), (3, 61)):
+        frame = framed(empty).rows(start, stop)
+        assert frame.values("a") == held[start:stop]
+        assert [part.start_s for part in frame.unread] == [round(0.8 * odd, 3)]
+
+
 def id_of_a(connection: sqlite3.Connection) -> int:
     return connection.execute("SELECT id FROM signal WHERE name = 'a'").fetchone()[0]
 

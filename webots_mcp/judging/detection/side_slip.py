@@ -127,10 +127,11 @@ def side_slips(search: Search, wheels: Sequence[RegisteredSignal], usual_m_s: fl
     if search.motion.heading is None:
         raise NotSearchableError("no heading is recorded")
     why = "its rows are too few"
+    columns = _wheel_columns(search, left, right)
     for lasts_s in CELLS_S:
         if lasts_s < 3 * search.noise.interval_s and lasts_s != CELLS_S[-1]:
             continue
-        cells = _cells_of(search, left, right, lasts_s)
+        cells = _cells_of(columns, lasts_s)
         try:
             return _slips_in(cells, usual_m_s)
         except NotSearchableError as error:
@@ -138,12 +139,10 @@ def side_slips(search: Search, wheels: Sequence[RegisteredSignal], usual_m_s: fl
     raise NotSearchableError(why)
 
 
-def _cells_of(
-    search: Search,
-    left: Sequence[RegisteredSignal],
-    right: Sequence[RegisteredSignal],
-    lasts_s: float,
-) -> _WheelCells:
+def _wheel_columns(
+    search: Search, left: Sequence[RegisteredSignal], right: Sequence[RegisteredSignal]
+) -> Array:
+    """Times, x, y, the course and the mean speeds of both sides, in rows that have all of them."""
     frame, position, heading = search.whole, search.motion.position, search.motion.heading
     assert position is not None and heading is not None
     rows, x, y = places_in(frame, position)
@@ -154,7 +153,17 @@ def _cells_of(
         for wheels in (left, right)
     )
     columns = np.array([frame.times[rows], x, y, course, *sides])
-    columns = columns[:, np.isfinite(columns).all(axis=0)]
+    known = np.isfinite(columns).all(axis=0)
+    return columns if known.all() else columns[:, known]
+
+
+def _cells_of(columns: Array, lasts_s: float) -> _WheelCells:
+    """Return means over cells of equal time.
+
+    Args:
+        columns: As `_wheel_columns` gives them.
+        lasts_s: How long a cell is.
+    """
     numbers = (columns[0] // lasts_s).astype(np.intp)
     firsts = np.flatnonzero(np.diff(numbers, prepend=-1))
     if len(firsts) < 2:
@@ -272,8 +281,11 @@ def _factor_of_turns(turned: Array, left: Array, right: Array, drives: Flags) ->
     if np.count_nonzero(wanted) < _LEAST_CELLS:
         raise NotSearchableError("its wheels turned it too seldom")
     factors = turned[wanted] / apart[wanted]
-    agree = np.abs(factors[:, None] - factors) <= _NEAR * np.abs(factors[:, None])
-    best = int(agree.sum(axis=1).argmax())
-    if agree[best].sum() < _AGREES * len(factors) or not factors[best]:
+    near = _NEAR * np.abs(factors)
+    ordered: Array = np.sort(factors)  # a table of all pairs would not fit into memory
+    agree = np.searchsorted(ordered, factors + near, "right")
+    agree -= np.searchsorted(ordered, factors - near)
+    best = int(agree.argmax())
+    if agree[best] < _AGREES * len(factors) or not factors[best]:
         raise NotSearchableError("it does not turn as its wheels do")
-    return median(factors[agree[best]])
+    return median(factors[np.abs(factors - factors[best]) <= near[best]])

@@ -360,7 +360,11 @@ class Frame:
         coded: list[tuple[slice, Indexes]] = []
         known: dict[object, int] = {}  # a flag equals a number, so the key contains the type
         labels: list[Value | Replaced] = []
-        for at, values in source.values(column, start, stop, into=numbers):
+        edges = source.edges
+        written, others = source.fill(column, start, numbers)
+        plain += [slice(edges[part] - start, edges[part + 1] - start) for part in written]
+        of_others = source.values(column, start, stop, others, numbers) if len(others) else ()
+        for at, values in of_others:
             inside = slice(at, at + len(values.numbers))
             if values.numbers.base is not numbers:
                 numbers[inside] = values.numbers

@@ -31,6 +31,7 @@ from webots_mcp.store.chunks import (
     chunks_by_signal,
     decoded_of,
     decoded_or_why,
+    fill_numbers,
     statistics_by_signal,
     statistics_in,
     statistics_of,
@@ -61,11 +62,13 @@ class SourceLimits:
 
     Attributes:
         cached_bytes: Size of the arrays that one frame caches.
+        many_groups: Groups from which on numbers are decoded right into one array.
         few_columns: Columns of a short run that are read one by one.
         group_rows: Rows of a group; far more than any process puts into one.
     """
 
     cached_bytes: int = 160_000_000
+    many_groups: int = 4
     few_columns: int = 4
     group_rows: int = 2**20
 
@@ -147,6 +150,36 @@ class FrameSource:
         """Return the parts that have rows in [start, stop)."""
         first = bisect_right(self.edges, start) - 1
         return slice(first, bisect_left(self.edges, stop) if start < stop else first)
+
+    def fill(self, column: Column, start: int, numbers: Array) -> tuple[list[int], Indexes]:
+        """Write the numbers of whole groups into an array, where each of their rows holds one.
+
+        Args:
+            column: Which values.
+            start: The first row.
+            numbers: An item for each row from there on.
+
+        Returns:
+            The parts that are written, and the others, which `values` reads.
+        """
+        parts = self.parts(start, start + len(numbers))
+        edges, ids = self.edges, self._ids_of_groups
+        others: Indexes = np.arange(int(parts.start), int(parts.stop))
+        signal_id = self._signal_id(column)
+        if signal_id is None or column in self.derived or self.is_item(column):
+            return [], others
+        into: dict[int, Array] = {}
+        places: dict[int, int] = {}
+        for place in range(parts.start, min(parts.stop, len(ids))):
+            first, behind = edges[place] - start, edges[place + 1] - start
+            if first >= 0 and behind <= len(numbers):
+                into[ids[place]] = numbers[first:behind]
+                places[ids[place]] = place
+        if len(into) < _SOURCE.many_groups:
+            return [], others
+        filled = fill_numbers(self.connection, self.run_id, signal_id, into)
+        written = [places[group_id] for group_id in filled]
+        return written, others[~np.isin(others, np.array(written, np.intp))]
 
     def values(
         self,

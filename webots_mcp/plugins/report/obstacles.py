@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from webots_mcp.plotting.trajectory import Obstacle
 from webots_mcp.store.reading.ranges import TimeRange
@@ -40,19 +41,42 @@ def obstacles_of(
     return _of_file(run) or _seen(connection, run)
 
 
+def robot_outline(
+    connection: sqlite3.Connection, robot: TimeRange
+) -> tuple[tuple[float, float], ...]:
+    """Return the outline of a robot as its world file has it, seen from above.
+
+    Its corners are ahead of the robot's origin and to the left of it, in metres. It is empty where
+    the file is not there, or has no shape of it that the stand-in knows.
+    """
+    run = fetch_run(connection, robot.segments[-1].run_id)
+    return _world_of(run).robots.get(robot.robot, ())
+
+
 def _of_file(run: RunRecord) -> tuple[Obstacle, ...]:
+    return _world_of(run).obstacles
+
+
+class _WorldOutlines(NamedTuple):
+    """What the file of a world has: its fixed bodies, and the outline of each robot by its name."""
+
+    obstacles: tuple[Obstacle, ...] = ()
+    robots: Mapping[str, tuple[tuple[float, float], ...]] = MappingProxyType({})
+
+
+def _world_of(run: RunRecord) -> _WorldOutlines:
     file = Path(run.world or "")
     try:
         status = file.stat()
     except (OSError, ValueError):
-        return ()
+        return _WorldOutlines()
     if file.suffix != ".wbt" or not file.is_file() or status.st_size > _MAX_WORLD_BYTES:
-        return ()
+        return _WorldOutlines()
     return _standing(file, status.st_mtime_ns)
 
 
 @lru_cache(maxsize=8)
-def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
+def _standing(file: Path, _changed_ns: int) -> _WorldOutlines:
     from webots_mcp.standin.arena import Arena
     from webots_mcp.standin.standin_errors import WorldError
     from webots_mcp.standin.world import load_world
@@ -60,8 +84,40 @@ def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
     try:
         bodies = Arena(load_world(file)).bodies
     except (WorldError, OSError):
-        return ()  # The path is drawn without them.
-    return tuple(each for body in bodies for each in _outlines(body))
+        return _WorldOutlines()  # The path is drawn without them.
+    return _WorldOutlines(
+        tuple(each for body in bodies for each in _outlines(body)),
+        {body.name: _hull(body) for body in bodies if body.node.type_name == "Robot"},
+    )
+
+
+def _hull(body: Body) -> tuple[tuple[float, float], ...]:
+    """Return the convex outline of all shapes of a robot, in its own frame."""
+    cos, sin = math.cos(body.yaw_rad), math.sin(body.yaw_rad)
+    points = sorted(
+        (cos * (x - body.x) + sin * (y - body.y), cos * (y - body.y) - sin * (x - body.x))
+        for shape in body.shapes
+        for x, y in _corners(shape)
+    )
+    if len(points) < 3:
+        return ()
+    halves = [_half_hull(points), _half_hull(points[::-1])]
+    return tuple(point for half in halves for point in half[:-1])
+
+
+def _half_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the hull below sorted points (A. M. Andrew, 1979)."""
+    hull: list[tuple[float, float]] = []
+    for point in points:
+        while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
+            hull.pop()
+        hull.append(point)
+    return hull
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    """Return whether three points turn left (positive), right (negative) or not at all."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def _outlines(body: Body) -> Iterator[Obstacle]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from webots_mcp.cli.options import (
     HERE,
@@ -148,5 +148,6 @@ def _write_sheet(file: Path, sheet: bytes) -> None:
         raise InvalidInputError(
             f"{file.name!r} is not the name of a picture. End it in .jpg or .png."
         )
-    with placed(file) as aside, Image.open(io.BytesIO(sheet)) as picture:
+    picture: Any = Image.open(io.BytesIO(sheet))
+    with placed(file) as aside:
         picture.convert("RGB").save(aside, form)

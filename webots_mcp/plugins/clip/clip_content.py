@@ -78,10 +78,8 @@ class RobotTrack:
 
     def pose_at(self, time_s: float) -> tuple[float, float, float | None]:
         """Return x, y and heading at a time, between two rows in proportion."""
-        x, y = (float(np.interp(time_s, self.times, values)) for values in (self.x, self.y))
-        if self.headings is None:
-            return x, y, None
-        return x, y, float(np.interp(time_s, self.times, self.headings))
+        x, y = (_at(time_s, self.times, values) for values in (self.x, self.y))
+        return x, y, None if self.headings is None else _at(time_s, self.times, self.headings)
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ class ClipContent:
     @property
     def view(self) -> str:
         """What is above the curves."""
-        return f"camera {self.camera}" if self.files else "map" if self.track else "curves"
+        return f"frames of {self.camera}" if self.files else "map" if self.track else "curves"
 
     def picture_at(self, time_s: float) -> tuple[StoredImage, Path]:
         """Return the newest frame up to a time, or the first one."""
@@ -146,7 +144,8 @@ def content_of(
         connection: Connection to the recording.
         data_dir: Folder of the pictures.
         moment: What it is about.
-        before_s: Simulated seconds before the moment; `after_s` after it.
+        before_s: Simulated seconds before the moment.
+        after_s: Simulated seconds after it.
         signals: Curves to draw, at most three; empty for those that changed most.
         camera: Name of the camera; empty for the one with most frames in the range.
         view: What is above the curves; None for the camera where it has frames, else the map.
@@ -223,13 +222,13 @@ def _camera(
         there = f"Cameras with frames there: {named}." if frames else "No camera has any there."
         raise InvalidInputError(
             f"Camera {wanted!r} has no frame from {span[0]:.3f} to {span[1]:.3f} s. {there} Name "
-            "one of these, give another time, or give view='map'."
+            "one of these, give another time, or ask for the map."
         )
     if not frames:
         raise InvalidInputError(
             f"No camera frame was recorded from {span[0]:.3f} to {span[1]:.3f} s. "
             "bridge.keep_camera(camera) in the controller keeps frames of the seconds around a "
-            "hit. Leave view out to see the map."
+            "hit. Ask for the map to see where the robot was."
         )
     chosen = wanted or min(frames, key=lambda name: (-frames[name], name))
     others = sorted(set(frames) - {chosen})
@@ -303,7 +302,7 @@ def _headings(
     present = np.flatnonzero(np.isfinite(values))
     if len(present) == 0:
         return moved
-    recorded = np.interp(times, frame.times[present], np.unwrap(values[present]))
+    recorded: Any = np.interp(times, frame.times[present], np.unwrap(values[present]))
     steps = np.hypot(np.diff(x), np.diff(y))
     moving = np.flatnonzero(steps > LIMITS.moving_share * steps.max(initial=0.0))
     if moved is not None and len(moving):
@@ -312,6 +311,11 @@ def _headings(
         if float(np.median(apart)) > math.sin(LIMITS.wrong_heading_rad):
             return moved
     return recorded
+
+
+def _at(time_s: float, times: Any, values: Any) -> float:
+    value: Any = np.interp(time_s, times, values)
+    return float(value)
 
 
 def _directions(x: Any, y: Any) -> Any:
@@ -328,7 +332,7 @@ def _directions(x: Any, y: Any) -> Any:
         return None
     at = np.flatnonzero(moving)
     angles = np.unwrap(np.arctan2(dy[at], dx[at]))
-    last = np.clip(np.searchsorted(at, np.arange(len(x)), "right") - 1, 0, None)
+    last = np.maximum(np.searchsorted(at, np.arange(len(x)), "right") - 1, 0)
     return angles[last]
 
 

@@ -131,10 +131,14 @@ def _durations_ms(times: Sequence[float], speed: float) -> list[int]:
 
 
 def _encoded(frames: Sequence[Image], durations_ms: Sequence[int], form: ClipFormat) -> bytes:
+    from PIL.Image import Dither
+
     file = io.BytesIO()
     options: dict[str, Any] = {"save_all": True, "duration": list(durations_ms), "loop": 0}
     if form == "gif":
-        frames = [each.quantize(_LIMITS.gif_colours, method=2, dither=0) for each in frames]
+        frames = [
+            each.quantize(_LIMITS.gif_colours, method=2, dither=Dither.NONE) for each in frames
+        ]
         frames[0].save(file, "GIF", append_images=frames[1:], **options)
     else:
         frames[0].save(

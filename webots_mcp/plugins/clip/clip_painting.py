@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from webots_mcp.analysis.arrays import np
 from webots_mcp.plotting.axes import AxesBox
 from webots_mcp.plotting.canvas import Canvas, PlotImage, fitted, width_of
-from webots_mcp.plotting.colours import INK, LINES, ON_PAPER, area_styles
+from webots_mcp.plotting.colours import INK, LINES, area_styles
 from webots_mcp.plotting.painting import paint_area
-from webots_mcp.plotting.signal_plot import SignalAxes, paint_signals
+from webots_mcp.plotting.signal_plot import paint_signals
 from webots_mcp.plotting.trajectory import paint_trajectory
 from webots_mcp.plugins.clip.clip_content import ClipContent, RobotTrack
 from webots_mcp.signals.naming import spelled_out
@@ -138,7 +138,7 @@ class ClipPainter:
         canvas.text(x, base, clock, size=size, font_weight="bold")
         x += 1.1 * width_of(clock, size) + 6
         apart_s = time_s - self._content.moment.at_s
-        apart = "moment" if abs(apart_s) < 0.0005 else f"{apart_s:+.2f} s".replace("-", "−")
+        apart = "moment" if abs(apart_s) < 0.0005 else f"{apart_s:+.2f} s".replace("-", "\u2212")
         colour = _ACCENT if apart == "moment" else canvas.theme.faint
         if x + width_of(apart, size - 2) < canvas.width_px:
             canvas.text(x, base, apart, size=size - 2, colour=colour)
@@ -358,7 +358,8 @@ class _Curves:
         for box, panel in zip(self._boxes, self._axes.panels, strict=False):
             for curve in panel.curves:
                 rows: Any = np.array(curve.points, np.float64)
-                value = float(np.interp(time_s, rows[:, 0], rows[:, 1]))
+                found: Any = np.interp(time_s, rows[:, 0], rows[:, 1])
+                value = float(found)
                 is_within = rows[0, 0] - 0.2 <= time_s <= rows[-1, 0] + 0.2
                 if math.isfinite(value) and is_within:
                     yield box, value

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.clip.clip_content import ClipContent, ClipView, content_of
@@ -15,6 +15,9 @@ from webots_mcp.plugins.clip.clip_encoding import ClipFormat, encode_clip
 from webots_mcp.plugins.clip.clip_painting import ClipPainter
 from webots_mcp.plugins.clip.moment import Moment
 from webots_mcp.store.reading.segment import in_one_snapshot
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,8 @@ def make_clip(
         connection: Connection to the recording.
         data_dir: Folder of the pictures.
         moment: What it is about.
-        before_s: Simulated seconds before the moment; `after_s` after it.
+        before_s: Simulated seconds before the moment.
+        after_s: Simulated seconds after it.
         signals: Curves to draw, at most three; empty for those that changed most.
         camera: Name of the camera; empty for the one with most frames in the range.
         view: "camera" or "map" above the curves; None for the camera where it has frames.
@@ -166,14 +170,13 @@ def sheet_times_of(content: ClipContent) -> list[float]:
     return [times[i] for i in chosen]
 
 
-def _as_file(content: ClipContent, sheet: object) -> tuple[bytes, str]:
+def _as_file(content: ClipContent, sheet: Image) -> tuple[bytes, str]:
     """Return a sheet as JPEG where it shows camera frames, else as PNG."""
-    from PIL.Image import Image
+    from PIL import Image as Pictures
 
-    assert isinstance(sheet, Image)
     file = io.BytesIO()
     if content.files:
         sheet.save(file, "JPEG", quality=LIMITS.jpeg_quality)
         return file.getvalue(), "jpeg"
-    sheet.quantize(128, dither=0).save(file, "PNG", optimize=True)
+    sheet.quantize(128, dither=Pictures.Dither.NONE).save(file, "PNG", optimize=True)
     return file.getvalue(), "png"

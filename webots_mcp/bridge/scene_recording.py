@@ -207,18 +207,16 @@ class SceneRecording:
             CommandRefusedError: They are missing or not complete.
         """
         file = self._data_dir / recording.path
-        if not file.is_file() or not file.stat().st_size:
-            raise CommandRefusedError(
-                f"Webots reported no failure, but wrote no {file}. Its console has the reason"
-            )
-        if recording.kind == "movie":
-            return [file]
-        files = [each for each in sorted(file.parent.glob(f"{file.stem}.*")) if each.is_file()]
         data = file.with_suffix(".json")
-        if not data.is_file() or not _is_whole(data):
+        if recording.kind == "animation" and data.is_file() and not _is_whole(data):
             raise CommandRefusedError(
                 f"the animation {file} has no content, because nothing moved while it was "
                 "recorded. Let the simulation run between start and stop"
+            )
+        files = [each for each in sorted(file.parent.glob(f"{file.stem}.*")) if each.is_file()]
+        if file not in files or not file.stat().st_size:
+            raise CommandRefusedError(
+                f"Webots reported no failure, but wrote no {file}. Its console has the reason"
             )
         return files
 

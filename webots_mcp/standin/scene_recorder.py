@@ -11,6 +11,7 @@ import json
 import os
 import struct
 import tempfile
+import weakref
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from pathlib import Path
@@ -119,6 +120,7 @@ class _Movie:
     def __init__(self, path: Path, size: tuple[int, int], quality: int) -> None:
         self._path, self._size, self._quality = path, size, quality
         self._pictures: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - until the movie ends
+        weakref.finalize(self, self._pictures.close)  # also where the world is loaded again
         self._due_ms = 0.0
         self.sizes: list[int] = []
 

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def _durations_ms(times: Sequence[float], speed: float) -> list[int]:
     Rounding does not add up. Browsers show a frame of less than 20 ms for longer.
     """
     ends = [1000 * (each - times[0]) / speed for each in times]
-    shown = [max(20, round(b) - round(a)) for a, b in zip(ends, ends[1:], strict=False)]
+    shown = [max(20, round(b) - round(a)) for a, b in pairwise(ends)]
     return [*shown, 1000]
 
 

@@ -8,13 +8,14 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import INSPECTION_EVENT, KEEP_AFTER_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.detection.stored_events import HITS
 from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.reading.ranges import recorded_bounds
 from webots_mcp.store.reading.segment import newest_kept, shown_time
 from webots_mcp.store.run_rows import RunRecord, camera_frame_bounds
 
 # Those that say that something went wrong, or that somebody waited for it.
-_INCIDENTS: Final = ("breakpoint", "violation", INSPECTION_EVENT)
+_INCIDENTS: Final = (*HITS, INSPECTION_EVENT)
 _COLUMNS: Final = "run_id, sim_time_s, kind, name, data"
 _LONGEST_NAME: Final = 60
 _NAMED_EVENTS: Final = 5

@@ -1,4 +1,4 @@
-"""Clips as assistants ask for them: a contact sheet in the answer, an animation beside the database."""
+"""Clips as assistants ask for them: a contact sheet, and an animation in the data folder."""
 
 from __future__ import annotations
 
@@ -36,8 +36,12 @@ def frames_of(file: str | Path) -> list[Image.Image]:
 
 
 def length_ms(file: str | Path) -> int:
+    length = 0
     with Image.open(file) as animation:
-        return sum(each.info["duration"] for each in ImageSequence.Iterator(animation))
+        for each in ImageSequence.Iterator(animation):
+            each.load()  # which reads the frame's duration
+            length += each.info["duration"]
+    return length
 
 
 async def test_a_hit_is_shown_by_its_event_with_the_frames_before_it(
@@ -83,7 +87,7 @@ async def test_without_a_moment_the_newest_hit_is_shown_else_the_end(
     async with connect() as client:
         at_end, _ = await shown(client)
         assert "around 10.000 s (the end of the recording)" in at_end["shows"]
-        assert at_end["notes"] == ["the recording ends at 10.000 s"]
+        assert at_end["notes"][0] == "the recording ends at 10.000 s"
         crash.hit()
         assert "breakpoint" in (await shown(client))[0]["shows"]
 
@@ -139,8 +143,12 @@ async def test_one_picture_is_enough_and_says_so(connect: Connect, crash: Crash)
     crash.drive().frame(HIT_S)
     async with connect() as client:
         told, _ = await shown(client, at_s=HIT_S)
+        assert told["shows"].startswith("map"), "a moving map shows more than one frame"
+        only = "camera eye has only one frame there, of 6.000 s"
+        assert told["notes"] == [only, "camera='eye' shows that frame"]
+        told, _ = await shown(client, at_s=HIT_S, camera="eye")
     assert told["sheet_sim_time_s"] == [HIT_S]
-    assert told["notes"] == ["eye has only one frame in the range"]
+    assert told["notes"] == [only]
 
 
 async def test_files_that_are_damaged_or_gone_are_left_out_and_counted(

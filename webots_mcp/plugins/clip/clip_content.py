@@ -27,7 +27,7 @@ from webots_mcp.plugins.report.obstacles import obstacles_of, robot_outline
 from webots_mcp.signals.naming import counted, listed
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.reading.segment import Deadline, just_after
+from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.run_rows import StoredImage, camera_frames_between, fetch_run, opened
 
 ClipView = Literal["camera", "map"]
@@ -170,12 +170,16 @@ def content_of(
         files, unusable = _usable([f for f in found if f.device == chosen], data_dir)
         notes += unusable
     track: RobotTrack | None = None
-    if not files:
+    is_still = len(files) == 1 and not camera and view is None  # a map shows more than one frame
+    if not files or is_still:
         track, why_not = _track(connection, whole, deadline_s=LIMITS.deadline_s)
         if view == "map" and track is None:
             raise InvalidInputError(f"No map can be drawn: {why_not}.")
         if track is None:
             notes.append(f"no map: {why_not}")
+        elif is_still:
+            files = ()
+            notes.append(f"camera={chosen!r} shows that frame")
     axes, mode = _curves(connection, whole, signals, moment.signals)
     if not files and track is None and axes is None:
         raise NothingRecordedError(
@@ -203,7 +207,7 @@ def _range(
     """Return the range of states; None if there are none, only pictures."""
     try:
         return find_range(
-            connection, Scope(run_id=run_id, start_s=start_s, end_s=just_after(end_s))
+            connection, Scope(run_id=run_id, start_s=start_s, end_s=end_s + 0.001)
         )
     except NothingRecordedError:
         return None
@@ -234,7 +238,8 @@ def _camera(
     others = sorted(set(frames) - {chosen})
     notes = [] if wanted or not others else [f"other cameras there: {listed(others)}"]
     if frames[chosen] == 1:
-        notes.append(f"{chosen} has only one frame in the range")
+        (only,) = (each for each in found if each.device == chosen)
+        notes.append(f"camera {chosen} has only one frame there, of {only.sim_time_s:.3f} s")
     return chosen, notes
 
 

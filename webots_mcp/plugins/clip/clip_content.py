@@ -206,9 +206,7 @@ def _range(
 ) -> TimeRange | None:
     """Return the range of states; None if there are none, only pictures."""
     try:
-        return find_range(
-            connection, Scope(run_id=run_id, start_s=start_s, end_s=end_s + 0.001)
-        )
+        return find_range(connection, Scope(run_id=run_id, start_s=start_s, end_s=end_s + 0.001))
     except NothingRecordedError:
         return None
 
@@ -241,6 +239,18 @@ def _camera(
         (only,) = (each for each in found if each.device == chosen)
         notes.append(f"camera {chosen} has only one frame there, of {only.sim_time_s:.3f} s")
     return chosen, notes
+
+
+def frames_of_a_camera(
+    connection: sqlite3.Connection, data_dir: Path, run_id: int, span: tuple[float, float]
+) -> tuple[str, Sequence[tuple[StoredImage, Path]]]:
+    """Return the camera with most frames from a time to another, and those that can be read."""
+    found = camera_frames_between(connection, run_id, *span, LIMITS.frames)
+    if not found:
+        return "", ()
+    chosen, _ = _camera(found, "", span)
+    usable, _ = _usable([each for each in found if each.device == chosen], data_dir)
+    return chosen, usable
 
 
 def _usable(

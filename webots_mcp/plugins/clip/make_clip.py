@@ -10,8 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.clip.clip_content import ClipContent, ClipView, content_of
-from webots_mcp.plugins.clip.clip_encoding import ClipFormat, encode_clip
+from webots_mcp.plugins.clip.clip_content import (
+    ClipContent,
+    ClipView,
+    content_of,
+    frames_of_a_camera,
+)
+from webots_mcp.plugins.clip.clip_encoding import ClipFormat, EncodedClip, encode_clip
 from webots_mcp.plugins.clip.clip_painting import ClipPainter
 from webots_mcp.plugins.clip.moment import Moment
 from webots_mcp.store.reading.segment import in_one_snapshot
@@ -33,6 +38,8 @@ class ClipLimits:
         width_px: Width of a frame, and `sheet_px` of the contact sheet.
         sheet_frames: Maximum number of frames on the sheet.
         jpeg_quality: Quality of a sheet with camera frames, from 1 to 100.
+        film_px: Width of a film of camera frames alone, which has `film_least` frames at least;
+            `film_processor_s` is what it may cost.
     """
 
     longest_s: float = 120.0
@@ -45,6 +52,9 @@ class ClipLimits:
     sheet_px: int = 1000
     sheet_frames: int = 16
     jpeg_quality: int = 88
+    film_px: int = 320
+    film_least: int = 3
+    film_processor_s: float = 0.5
 
 
 LIMITS: Final = ClipLimits()
@@ -133,6 +143,45 @@ def make_clip(
     notes = tuple(dict.fromkeys([*content.notes, *painter.notes]))
     return Clip(content, made.data, image_format, made.width, made.height, made.times, sheet,
                 sheet_format, sheet_times, notes)  # fmt: skip
+
+
+def camera_film(
+    connection: sqlite3.Connection,
+    data_dir: Path,
+    run_id: int,
+    span: tuple[float, float],
+    at_s: float,
+    max_bytes: int,
+) -> tuple[EncodedClip, str] | None:
+    """Return a small film of camera frames alone, with the clock, and the name of the camera.
+
+    Args:
+        connection: Connection to the recording.
+        data_dir: Folder of the pictures.
+        run_id: The run.
+        span: Simulation times from which to which it goes.
+        at_s: The moment that it is about.
+        max_bytes: Maximum size of the film.
+
+    Returns:
+        None if no camera has enough frames there, or the film would be too large.
+    """
+    camera, files = frames_of_a_camera(connection, data_dir, run_id, span)
+    if len(files) < LIMITS.film_least:
+        return None
+    start_s, end_s = (files[i][0].sim_time_s for i in (0, -1))
+    content = ClipContent(
+        Moment(run_id, at_s), "", start_s, end_s, camera, files, None, None, None, ()
+    )
+    made = encode_clip(
+        ClipPainter(content, LIMITS.film_px).frames,
+        [each.sim_time_s for each, _ in files],
+        speed=1.0,
+        image_format="webp",
+        max_bytes=max_bytes,
+        processor_s=LIMITS.film_processor_s,
+    )
+    return (made, camera) if len(made.data) <= max_bytes else None
 
 
 def frame_times(content: ClipContent, speed: float = 1.0) -> list[float]:

@@ -89,7 +89,10 @@ async def test_without_a_moment_the_newest_hit_is_shown_else_the_end(
         assert "around 10.000 s (the end of the recording)" in at_end["shows"]
         assert at_end["notes"][0] == "the recording ends at 10.000 s"
         crash.hit()
-        assert "breakpoint" in (await shown(client))[0]["shows"]
+        crash.robot.event(HIT_S, "inspection", "front_m < 0.1", {"frames": []})
+        told, _ = await shown(client)
+        assert "(breakpoint front_m < 0.1)" in told["shows"]
+        assert told["signals"][0] == "front_m"
 
 
 async def test_where_only_poses_are_recorded_the_robot_moves_over_the_map(

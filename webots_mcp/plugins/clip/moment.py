@@ -79,8 +79,8 @@ def newest_moment(connection: sqlite3.Connection, run: RunRecord) -> Moment:
     """Return the newest incident of a run; without any, its last recorded moment."""
     row = connection.execute(
         f"SELECT {_COLUMNS} FROM event WHERE run_id = ? AND kind IN (?, ?, ?) "
-        "ORDER BY sim_time_s DESC, id DESC LIMIT 1",
-        (run.id, *_INCIDENTS),
+        "ORDER BY sim_time_s DESC, kind = ?, id DESC LIMIT 1",
+        (run.id, *_INCIDENTS, INSPECTION_EVENT),  # which accompanies a hit
     ).fetchone()
     if row is not None:
         return _moment(*row)

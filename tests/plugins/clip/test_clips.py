@@ -31,13 +31,15 @@ async def shown(client: Client, **arguments: Any) -> tuple[dict[str, Any], Image
 
 
 def frames_of(file: str | Path) -> list[Image.Image]:
-    with Image.open(file) as animation:
+    animation: Any = Image.open(file)
+    with animation:
         return [each.convert("RGB") for each in ImageSequence.Iterator(animation)]
 
 
 def length_ms(file: str | Path) -> int:
     length = 0
-    with Image.open(file) as animation:
+    animation: Any = Image.open(file)
+    with animation:
         for each in ImageSequence.Iterator(animation):
             each.load()  # which reads the frame's duration
             length += each.info["duration"]
@@ -66,7 +68,8 @@ async def test_a_hit_is_shown_by_its_event_with_the_frames_before_it(
     assert len(frames) == told["frames"]
     assert frames[0].size == (told["width_px"], told["height_px"])
     assert length_ms(file) == pytest.approx(5000 + 1000, abs=60), "real time, and the last frame"
-    reds = [frame.getpixel((240, 150))[0] for frame in frames]  # type: ignore[index]
+    colours: list[Any] = [frame.getpixel((240, 150)) for frame in frames]
+    reds = [int(colour[0]) for colour in colours]
     assert reds == sorted(reds) and reds[-1] - reds[0] > 50, "the pictures follow each other"
 
 

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownSignalError
@@ -317,7 +317,7 @@ def _headings(
     present = np.flatnonzero(np.isfinite(values))
     if len(present) == 0:
         return moved
-    recorded: Any = np.interp(times, frame.times[present], np.unwrap(values[present]))
+    recorded: Any = cast("Any", np).interp(times, frame.times[present], np.unwrap(values[present]))
     steps = np.hypot(np.diff(x), np.diff(y))
     moving = np.flatnonzero(steps > LIMITS.moving_share * steps.max(initial=0.0))
     if moved is not None and len(moving):
@@ -329,8 +329,7 @@ def _headings(
 
 
 def _at(time_s: float, times: Any, values: Any) -> float:
-    value: Any = np.interp(time_s, times, values)
-    return float(value)
+    return float(cast("Any", np).interp(time_s, times, values))
 
 
 def _directions(x: Any, y: Any) -> Any:

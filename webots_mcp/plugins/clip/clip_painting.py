@@ -9,12 +9,14 @@ import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.plotting.axes import AxesBox
 from webots_mcp.plotting.canvas import Canvas, PlotImage, fitted, width_of
 from webots_mcp.plotting.colours import INK, LINES, area_styles
+from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.painting import paint_area
 from webots_mcp.plotting.signal_plot import paint_signals
 from webots_mcp.plotting.trajectory import paint_trajectory
@@ -36,6 +38,7 @@ class ClipLayout:
         map_share: Height of the map as a share of its width.
         panel_px: Height of a curve with its name; `axis_px` of what is below the curves.
         stale_s: Age from which on a picture says of which time it is.
+        at_end_s: Time beyond the ends of a curve up to which its last value is marked.
         least_outline_px: An outline that would be smaller is drawn as an arrow of `arrow_px`.
         gap_px: Gap between the tiles of a sheet.
         tile_header_px: Height of the line above a tile.
@@ -48,6 +51,7 @@ class ClipLayout:
     panel_px: int = 66
     axis_px: int = 62
     stale_s: float = 0.5
+    at_end_s: float = 0.2
     least_outline_px: float = 14.0
     arrow_px: float = 11.0
     gap_px: int = 8
@@ -320,7 +324,6 @@ class _Curves:
         axes = content.signals
         if axes is None:
             return
-        self._axes = axes
         panels = len(axes.panels)
         self.height = panels * _LAYOUT.panel_px + 20 * len(axes.rows) + _LAYOUT.axis_px
         canvas, self._boxes = paint_signals(axes, width, self.height, titled=False)
@@ -329,6 +332,11 @@ class _Curves:
             canvas.add("path", d=f"M{x:.1f} {box.top:.1f}V{box.bottom:.1f}", stroke=_ACCENT,
                        stroke_width=1.4, stroke_dasharray="3 3")  # fmt: skip
         self._painted, self.notes = _rasterised(canvas)
+        self._pieces = [
+            (box, _pieces_of(curve))
+            for box, panel in zip(self._boxes, axes.panels, strict=False)
+            for curve in panel.curves
+        ]
 
     def paint(
         self, image: Image, top: int, times: Sequence[float], *, numbered: bool = False
@@ -355,14 +363,22 @@ class _Curves:
                           font=_digits())  # fmt: skip
 
     def _values_at(self, time_s: float) -> Iterator[tuple[AxesBox, float]]:
-        for box, panel in zip(self._boxes, self._axes.panels, strict=False):
-            for curve in panel.curves:
-                rows: Any = np.array(curve.points, np.float64)
-                found: Any = np.interp(time_s, rows[:, 0], rows[:, 1])
-                value = float(found)
-                is_within = rows[0, 0] - 0.2 <= time_s <= rows[-1, 0] + 0.2
-                if math.isfinite(value) and is_within:
-                    yield box, value
+        """Return the value of each curve at a time, with its axes; none where it is broken."""
+        for box, pieces in self._pieces:
+            for piece in pieces:
+                if piece[0, 0] - _LAYOUT.at_end_s <= time_s <= piece[-1, 0] + _LAYOUT.at_end_s:
+                    value = float(cast("Any", np).interp(time_s, piece[:, 0], piece[:, 1]))
+                    if math.isfinite(value):
+                        yield box, value
+                    break
+
+
+def _pieces_of(curve: Curve) -> list[Any]:
+    """Return the points of a curve between its breaks, where a time is NaN."""
+    rows: Any = np.array(curve.points, np.float64)
+    breaks = np.flatnonzero(np.isnan(rows[:, 0])).tolist()
+    edges = [-1, *breaks, len(rows)]
+    return [rows[start + 1 : end] for start, end in pairwise(edges) if end > start + 1]
 
 
 def _digits() -> Any:

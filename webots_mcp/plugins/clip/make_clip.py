@@ -35,6 +35,7 @@ class ClipLimits:
         processor_share: Processor time of painting and encoding frames per simulated second;
             `least_processor_s` for any clip.
         frames: Maximum number of frames; `frames_per_s` of the animation.
+        smooth_s: Time that a frame is shown from which on a note says how to get a smoother one.
         width_px: Width of a frame, and `sheet_px` of the contact sheet.
         sheet_frames: Maximum number of frames on the sheet.
         jpeg_quality: Quality of a sheet with camera frames, from 1 to 100.
@@ -48,6 +49,7 @@ class ClipLimits:
     least_processor_s: float = 3.0
     frames: int = 100
     frames_per_s: float = 10.0
+    smooth_s: float = 0.5
     width_px: int = 480
     sheet_px: int = 1000
     sheet_frames: int = 16
@@ -140,9 +142,12 @@ def make_clip(
     )
     sheet_times = sheet_times_of(content)
     sheet, sheet_format = _as_file(content, painter.sheet(sheet_times, LIMITS.sheet_px))
-    notes = tuple(dict.fromkeys([*content.notes, *painter.notes]))
+    apart_s = content.length_s / max(1, len(made.times) - 1)
+    notes = [*content.notes, *painter.notes]
+    if apart_s / speed > LIMITS.smooth_s:
+        notes.append(f"one frame every {apart_s:.2g} s: less time or a higher speed is smoother")
     return Clip(content, made.data, image_format, made.width, made.height, made.times, sheet,
-                sheet_format, sheet_times, notes)  # fmt: skip
+                sheet_format, sheet_times, tuple(dict.fromkeys(notes)))  # fmt: skip
 
 
 def camera_film(

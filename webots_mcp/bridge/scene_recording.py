@@ -26,7 +26,7 @@ _LARGEST_PX: Final = 4096
 _TAIL_BYTES: Final = 16
 
 
-class _Recording(NamedTuple):
+class _UnderWay(NamedTuple):
     """A recording that is under way.
 
     Attributes:
@@ -49,7 +49,7 @@ class SceneRecording:
         self._clock = clock
         self._journal = journal
         self._data_dir = data_dir
-        self._current: _Recording | None = None
+        self._current: _UnderWay | None = None
 
     def by_name(self) -> dict[str, Action]:
         """Return the functions by the name of their action."""
@@ -119,7 +119,7 @@ class SceneRecording:
                 "Webots is recording or encoding a movie that this controller has not started. "
                 "Wait until it is written, or stop it where it was started"
             )
-        recording = _Recording(
+        recording = _UnderWay(
             kind, f"{SCENE_FOLDER}/{kind}-{command.id:06d}{_KINDS[kind]}", self._clock.sim_time_s
         )
         file = self._data_dir / recording.path
@@ -172,7 +172,7 @@ class SceneRecording:
             **({"also": others} if others else {}), **went_back,
         }  # fmt: skip
 
-    def _stop(self, recording: _Recording) -> None:
+    def _stop(self, recording: _UnderWay) -> None:
         robot = self._simulation.robot
         if recording.kind == "movie":
             robot.movieStopRecording()
@@ -182,7 +182,7 @@ class SceneRecording:
                 "console has the reason"
             )
 
-    def _until_saved(self, recording: _Recording) -> Generator[None]:
+    def _until_saved(self, recording: _UnderWay) -> Generator[None]:
         """Wait until Webots has encoded a movie.
 
         Raises:
@@ -200,7 +200,7 @@ class SceneRecording:
                 "failed (ffmpeg on Linux). Its console has the reason"
             )
 
-    def _files(self, recording: _Recording) -> list[Path]:
+    def _files(self, recording: _UnderWay) -> list[Path]:
         """Return the files of a recording.
 
         Raises:

@@ -288,7 +288,12 @@ def _track(
         return None, "no state was recorded there"
     try:
         axes, _ = compose_trajectory(connection, [whole], events=False, deadline_s=deadline_s)
-    except (InvalidInputError, NothingRecordedError, UnknownSignalError) as error:
+    except InvalidInputError:
+        return None, (
+            "no position was found among its signals (webots_describe_signals declares one, with "
+            "quantity='x' and quantity='y')"
+        )
+    except (NothingRecordedError, UnknownSignalError) as error:
         return None, str(error)
     places = axes.tracks[0].path.places
     times, x, y = (np.array([place[i] for place in places], np.float64) for i in range(3))

@@ -49,6 +49,7 @@ PLOTS: Final = {
 # Drawn by the steps of the tutorial, under these names in its folder.
 TUTORIAL_PLOTS: Final = {"tutorial-stuck.png": "stuck.png", "tutorial-paths.png": "paths.png"}
 ANIMATION: Final = "conversation.gif"
+CLIP: Final = "clip.png"
 # What a person asks of the tutorial's robot, and the calls that an assistant makes to find out.
 QUESTION: Final = "Why did the explorer stop?"
 TURNS: Final[tuple[demo.Turn, ...]] = (
@@ -108,6 +109,16 @@ def draw_plots(data_dir: Path, images: Path) -> None:
     for name, options in PLOTS.items():
         where = ("--data-dir", str(data_dir), "-o", str(images / name))
         _run("plot", *options.split(), *where)
+
+
+def draw_clip(data_dir: Path, images: Path) -> None:
+    """Draw the contact sheet of the clip of the breakpoint."""
+    sheet = data_dir / CLIP
+    where = ("--data-dir", str(data_dir), "-o", str(data_dir / "clip.webp"))
+    _run("clip", "--before", "4", "--after", "0", "--sheet", str(sheet), *where)
+    drawn: Any = Image.open(sheet)
+    images.mkdir(exist_ok=True)
+    drawn.quantize(64, dither=Image.Dither.NONE).save(images / CLIP, optimize=True)
 
 
 def photograph_report(browser: Any, data_dir: Path, images: Path) -> None:
@@ -301,6 +312,7 @@ def main() -> int:
         with simulation:
             drive(simulation, data_dir)
             draw_plots(data_dir, IMAGES)
+            draw_clip(data_dir, IMAGES)
             with started_browser() as browser:
                 photograph_report(browser, data_dir, IMAGES)
                 photograph_page(browser, data_dir, IMAGES)

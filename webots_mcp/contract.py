@@ -26,6 +26,7 @@ PROJECT_DATA_FOLDER: Final = "mcp_data"  # in a Webots project
 PROJECT_FILE: Final = "webots-mcp.toml"  # beside that folder: what is expected and allowed there
 CAMERA_FOLDER: Final = "camera"
 SCREENSHOT_FOLDER: Final = "screenshots"
+SCENE_FOLDER: Final = "scenes"  # movies and animations of the simulation
 KEPT_FRAME: Final = "kept"  # the kind of a picture that belongs to the kept stretch it lies in
 DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
 STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
@@ -123,6 +124,9 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "quit": BuiltInAction(("status",), ends_steps=True),
     "screenshot": BuiltInAction(("quality",)),
     "take_frame": BuiltInAction(("camera",), needs_supervisor=False),
+    "record_scene": BuiltInAction(
+        ("do", "kind", "width", "height", "quality", "speed", "caption"), ("do",)
+    ),
     "reset_state": BuiltInAction(None, needs_supervisor=False, runs_user_code=True),
     "set_parameters": BuiltInAction(("values", "when", "by"), ("values",), needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),

@@ -51,6 +51,14 @@ def test_the_plots_look_as_they_are_drawn_today(data_dir: Path, tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("simulation")
+def test_the_clip_looks_as_it_is_made_today(data_dir: Path, tmp_path: Path) -> None:
+    if resvg_py.__version__ != DRAWN["by"]["resvg"]:
+        pytest.skip("another version of resvg drew the pictures")
+    pictures.draw_clip(data_dir, tmp_path)
+    assert difference(tmp_path / pictures.CLIP, pictures.IMAGES / pictures.CLIP) < NEAR, ANEW
+
+
+@pytest.mark.usefixtures("simulation")
 def test_the_pages_look_as_a_browser_shows_them_today(data_dir: Path, tmp_path: Path) -> None:
     pytest.importorskip("playwright", reason="Playwright is not installed")
     if pictures.CHROMIUM is None:

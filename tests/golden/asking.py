@@ -45,6 +45,8 @@ ROWS_SHOWN: Final = 4
 POINTS_SHOWN: Final = 6  # of a curve, evenly from it
 NOT_MEASURED: Final = ("wall_time_s", "id", "run_id")  # columns of an export
 
+OF_THE_MACHINE: Final = ("frames", "width_px", "height_px", "size_bytes")  # of a clip: its pace
+
 PART_OF_STATE: Final = "part_of_state"  # in arguments: the first name of the signal X
 PICTURE_S: Final = "picture_s"  # in arguments: when the recording has a picture
 
@@ -95,6 +97,7 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "SELECT": ("webots_query_sql", {"sql": "SELECT count(*) AS n, max(sim_time_s) FROM state"}),
     "pictures": ("webots_get_camera", {"at_s": PICTURE_S}),
     "plot": ("webots_plot", {}),
+    "clip": ("webots_get_clip", {}),
     "check": ("webots_check_run", {}),
     "check of an expectation": ("webots_check_run", {"expect": ["X > -100"]}),
     "variables of the controller": ("webots_inspect_controller", {}),
@@ -127,6 +130,7 @@ ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
         "webots_run_trials",
         {"parameters": [{"speed": 0.3}], "score": "max(X)", "for_s": 1.0},
     ),
+    "film the scene": ("webots_record_scene", {"action": "start", "timeout_wall_s": 1}),
     "take a screenshot": ("webots_take_screenshot", {"timeout_wall_s": 1}),
     "pause": ("webots_simulation_control", {"command": "pause", "timeout_wall_s": 1}),
     "reset the world": ("webots_world_reset", {"timeout_wall_s": 1}),
@@ -205,6 +209,9 @@ async def ask_tools(
             result = await client.call_tool(tool, taken)
             texts = [block.text for block in result.content if block.type == "text"]
             found[name] = result.structured_content or [_read(text) for text in texts]
+    for caption in found.get("clip", ()):
+        for key in OF_THE_MACHINE if isinstance(caption, dict) else ():
+            cast("dict[str, Any]", caption).pop(key, None)
     return found
 
 

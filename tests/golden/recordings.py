@@ -85,6 +85,12 @@ def _set_pace(database: Path) -> None:
         wall_s = f"{ended_s!r} - ({last_s!r} - sim_time_s) / 2"
         for table in ("state", "kept_state", "event", "log"):
             connection.execute(f"UPDATE {table} SET wall_time_s = {wall_s}")
+        connection.execute(f"UPDATE image SET wall_time_s = {wall_s}")
+        sent_s = wall_s.replace("sim_time_s", "claimed_sim_time_s")
+        connection.execute(
+            f"UPDATE command SET created_wall_time_s = {sent_s}, claimed_wall_time_s = {sent_s}, "
+            f"finished_wall_time_s = {sent_s}"
+        )
         began_s = ended_s - last_s / 2
         connection.execute("UPDATE run SET started_wall_time_s = ?", (began_s,))
         connection.execute("UPDATE session SET started_wall_time_s = ?", (began_s,))

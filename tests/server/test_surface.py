@@ -37,7 +37,7 @@ ALL = DEFAULT | {
     "webots_load_world", "webots_quit", "webots_get_trials", "webots_list_breakpoints",
     "webots_inspect_controller", "webots_watch",
     "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
-    "webots_report", "webots_rerun_controller",
+    "webots_report", "webots_rerun_controller", "webots_get_clip", "webots_record_scene",
 }  # fmt: skip
 READING = {
     "webots_list_robots", "webots_diagnose_setup", "webots_get_world_info",
@@ -234,6 +234,7 @@ async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
         "webots_breakpoint",
         "webots_describe_signals",
         "webots_launch_world",
+        "webots_record_scene",
         "webots_remove_breakpoint",
         "webots_set_field",
         "webots_set_parameters",

@@ -28,6 +28,7 @@ from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_actions import SceneActions
+from webots_mcp.bridge.scene_recording import SceneRecording
 from webots_mcp.bridge.signal_meanings import SignalMeanings
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
@@ -93,6 +94,7 @@ class BridgeSession:
         self.publisher = self._build_publisher()
         self.unseen = UnseenSteps(simulation, journal, errors)
         self._scene = SceneActions(simulation, clock, journal, errors)
+        self._scene_recording = SceneRecording(simulation, clock, journal, data_dir)
         self.control = self._build_control()
         self._watchdog = Watchdog(
             simulation, clock, recorder, journal, self.variables, database, hang_after_s
@@ -121,7 +123,9 @@ class BridgeSession:
         simulation, clock, pause, queue = (
             self.simulation, self.clock, self.pause, ClaimedCommands(self.recorder)
         )  # fmt: skip
-        world = WorldActions(simulation, clock, pause, queue, self.reloads)
+        world = WorldActions(
+            simulation, clock, pause, queue, self.reloads, self._scene_recording.require_none
+        )
         running = RunningActions(
             simulation,
             clock,
@@ -138,6 +142,7 @@ class BridgeSession:
             world,
             PictureActions(simulation, clock, self.picture_files),
             self._scene,
+            self._scene_recording,
             InspectionActions(self.variables),
             ControllerActions(
                 clock, pause, self.reloads, self.parameters, self.breakpoints, self.full_rate
@@ -275,6 +280,10 @@ class BridgeSession:
     def release_loop(self) -> None:
         """Resume a paused simulation, and answer commands, which no later call would do."""
         self.pause.close()
+        try:
+            self._scene_recording.close()
+        except Exception as error:  # noqa: BLE001  (the session ends whatever fails)
+            self.errors.failed("close", error)
         self.control.report_end(extern=self.identity.extern)
 
     def abandon(self) -> None:

@@ -6,7 +6,7 @@ Each returns a generator, see `webots_mcp.bridge.control`.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Final
 
@@ -38,12 +38,14 @@ class WorldActions:
         pause: Pause,
         queue: ClaimedCommands,
         reloads: Reloads,
+        require_no_recording: Callable[[str], None],
     ) -> None:
         self._simulation = simulation
         self._clock = clock
         self._pause = pause
         self._queue = queue
         self._reloads = reloads
+        self._require_no_recording = require_no_recording
 
     def by_name(self) -> dict[str, Action]:
         """Return the functions by the name of their action."""
@@ -90,6 +92,10 @@ class WorldActions:
 
     def reload(self, command: ClaimedCommand) -> Progress:
         """Ask for the reload; this process ends, and the next session confirms the command."""
+        self._require_no_recording("a reload")
+        return self._reload(command)
+
+    def _reload(self, command: ClaimedCommand) -> Progress:
         self._queue.issue(command)
         self._reloads.requested_by = command
         self._pause.end(command.id)  # first: after worldReload() Webots answers nothing but quit
@@ -105,6 +111,7 @@ class WorldActions:
 
     def load_world(self, command: ClaimedCommand) -> Progress:
         """Ask for another world of the project; this process ends, as all controllers do."""
+        self._require_no_recording("another world")
         return self._load(command, self._world_of_project(command.params.get("world")))
 
     def _load(self, command: ClaimedCommand, world: Path) -> Progress:
@@ -136,6 +143,7 @@ class WorldActions:
 
     def quit(self, command: ClaimedCommand) -> Progress:
         """Ask Webots to end; this process ends with it."""
+        self._require_no_recording("the end of Webots")
         status = whole_number(command.params, "status", 0, 255, default=0)
         return self._quit(command, status)
 

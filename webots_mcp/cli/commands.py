@@ -75,6 +75,7 @@ _OF_THE_CORE: Final = {
     "field": CommandEntry(STEER, f"{_CLI}.steering_commands", "field"),
     "send": CommandEntry(STEER, f"{_Q}.send_command", "webots_send_command"),
     "wait": CommandEntry(STEER, f"{_Q}.send_command", "webots_wait_for_command"),
+    "record-scene": CommandEntry(STEER, f"{_Q}.record_scene", "webots_record_scene"),
     "capture": CommandEntry(STEER, f"{_CLI}.steering_commands", "capture"),
     "trials": CommandEntry(RUNS, f"{_CLI}.steering_commands", "trials"),
     "repeatability": CommandEntry(RUNS, f"{_CLI}.judging_commands", "repeatability"),

@@ -22,7 +22,7 @@ _OTHERS: Final = {  # by tool, for tools whose command has another name or funct
     "wait_for_command": "wait", "get_trials": "trials", "run_trials": "trials",
     "list_signals": "signals", "describe_signals": "signals --describe",
     "list_meanings": "signals --meanings", "get_field": "field", "diagnose_setup": "doctor",
-    "plot": "plot", "report": "report",
+    "plot": "plot", "report": "report", "get_clip": "clip",
     "simulation_control": "pause", "set_field": "field", "get_timeline": "events --one-by-one",
     "world_reset": "reset", "world_reload": "reload",
     "launch_world": "launch", "list_robots": "status", "get_world_info": "status --verbose",

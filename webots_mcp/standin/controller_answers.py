@@ -342,6 +342,26 @@ class SupervisorRequests:
         """Write a picture of the arena; relative paths start in the controller's folder."""
         self._simulator.export(self._robot.folder / path, quality)
 
+    def on_movie_start_recording(self, path: str, width: int, height: int, quality: int) -> None:
+        """Begin a movie of the arena from above."""
+        self._simulator.recorder.start_movie(self._robot.folder / path, (width, height), quality)
+
+    def on_movie_stop_recording(self) -> None:
+        """End the movie; its file is written a moment later."""
+        self._simulator.recorder.stop_movie()
+
+    def on_movie_status(self) -> int:
+        """Return what became of the movie."""
+        return int(self._simulator.recorder.movie_status())
+
+    def on_animation_start_recording(self, path: str) -> int:
+        """Begin an animation; return 1, or 0 if its file cannot be written."""
+        return int(self._simulator.recorder.start_animation(self._robot.folder / path))
+
+    def on_animation_stop_recording(self) -> int:
+        """End the animation and write its files; return 1 unless they cannot be written."""
+        return int(self._simulator.recorder.stop_animation())
+
     def on_set_label(
         self, number: int, text: str, x: float, y: float, size: float, rgb: int
     ) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body
+from webots_mcp.standin.scene_recorder import SceneRecorder
 from webots_mcp.standin.simulated_devices import (
     SimulatedDevice,
     SimulatedEmitter,
@@ -156,6 +157,7 @@ class Simulator:
         self.added: list[WorldNode] = []
         """Nodes that controllers have added; the next reset removes them."""
         self._pictures: list[PictureRequest] = []
+        self.recorder = SceneRecorder(world, self.arena, log)
         self._start = {
             node: ([*node.fields["translation"]], [*node.fields["rotation"]])
             for node in world.nodes
@@ -235,6 +237,7 @@ class Simulator:
         for robot in self.robots:
             self._measure(robot, basic)
         self._render()
+        self.recorder.note_step(self.time_ms, [*self.labels.values()])
         if self.wanted_after_step is not None:
             self.wanted, self.wanted_after_step = self.wanted_after_step, None
         return [robot for robot in self.robots if self._let_pass(robot, basic)]

@@ -1,4 +1,4 @@
-"""Pictures of the whole arena from above, for `exportImage`."""
+"""Pictures of the whole arena from above, for `exportImage` and movies."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from webots_mcp.standin.arena import Arena, Body
 from webots_mcp.standin.geometry import Color, Shape, UprightBox
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
 
 SIZE_PX: Final = (800, 600)
@@ -73,11 +74,20 @@ def save_picture(
         OSError: The file cannot be written.
         ImportError: Pillow is not installed.
     """
-    from PIL import Image, ImageDraw  # Imported late: most simulations never need a picture.
-
     kind = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}.get(picture.path.suffix.lower())
     if kind is None:
         raise ValueError(f"unknown extension {picture.path.suffix!r}, use .png or .jpg")
+    draw_view(arena, time_s, labels).save(picture.path, kind, quality=picture.quality)
+
+
+def draw_view(arena: Arena, time_s: float, labels: Iterable[Label]) -> Image:
+    """Return a picture of the arena from above.
+
+    Raises:
+        ImportError: Pillow is not installed.
+    """
+    from PIL import Image, ImageDraw  # Imported late: most simulations never need a picture.
+
     image = Image.new("RGB", SIZE_PX, _rgb(arena.colors.sky))
     pen = ImageDraw.Draw(image)
     chart = MapScale.of([shape for body in arena.bodies for shape in body.shapes])
@@ -87,7 +97,7 @@ def save_picture(
     pen.text((8, 4), f"{time_s:.3f} s", fill=(0, 0, 0), font_size=16)
     for label in labels:
         _draw_label(pen, label)
-    image.save(picture.path, kind, quality=picture.quality)
+    return image
 
 
 def _draw_floor(pen: ImageDraw, chart: MapScale, arena: Arena) -> None:

@@ -515,6 +515,30 @@ def camera_frames(
     return sorted((StoredImage(*row) for row in found), key=lambda each: each.sim_time_s)
 
 
+def camera_frames_between(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float, limit: int
+) -> list[StoredImage]:
+    """Frames of all cameras in [start_s, end_s] of a run, in order of time.
+
+    The first `limit` of them; those of full-rate segments too.
+    """
+    rows = connection.execute(
+        f"SELECT {_COLUMNS} FROM image WHERE run_id = ? AND {_OF_CAMERA} "
+        "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s, id LIMIT ?",
+        (run_id, start_s, end_s, limit),
+    )
+    return [StoredImage(*row) for row in rows]
+
+
+def camera_frame_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
+    """Simulation times of the first and the newest camera frame of a run; None without any."""
+    first_s, last_s = connection.execute(
+        f"SELECT min(sim_time_s), max(sim_time_s) FROM image WHERE run_id = ? AND {_OF_CAMERA}",
+        (run_id,),
+    ).fetchone()
+    return None if first_s is None else (first_s, last_s)
+
+
 def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | None:
     """Return the newest picture of a run of any kind."""
     row = connection.execute(

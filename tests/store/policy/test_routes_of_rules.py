@@ -38,6 +38,7 @@ PARAMS: dict[str, dict[str, Any]] = {
     "set_field": {"path": "WorldInfo.title", "value": "x"},
     "add_node": {"vrml": "Solid { }"},
     "remove_node": {"path": "WorldInfo"},
+    "record_scene": {"do": "start"},
 }
 
 
@@ -116,6 +117,11 @@ def routes_to(action: str, world: Path) -> list[Route]:
         ],
         "take_frame": [tool("webots_get_camera", fresh=True)],
         "screenshot": [tool("webots_take_screenshot")],
+        "record_scene": [
+            tool("webots_record_scene", action="start"),
+            tool("webots_record_scene", action="start", kind="animation"),
+            command("record-scene", "start"),
+        ],
         "get_scene": [tool("webots_get_scene"), command("scene")],
     }.get(action, [])
     if action in ("pause", "resume", "fast", "step", "reset", "reload"):

@@ -32,6 +32,7 @@ from webots_mcp.store.run_rows import count_kept_frames
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures
 MOST_NAMED: Final = 3  # values that are named where a signal has many changes
+HITS: Final = ("breakpoint", VIOLATION)  # what a condition that somebody set has noticed
 MOST_CHANGES: Final = 500  # of one signal that become events; more become one
 
 _IN_SEGMENT: Final = (
@@ -182,11 +183,13 @@ def noticed_events(search: Search) -> Iterator[Event]:
         details: dict[str, Any] = {"what": kind} | ({"data": said} if said else {})
         if kind == INSPECTION_EVENT:  # whose variables webots_inspect_controller shows
             details = {"what": kind, **reference_to(event_id, said)}
+        elif kind in HITS:  # of which webots_get_clip makes a clip
+            details["event_id"] = event_id
         yield Event("bridge_event", search.segment.run_id, time_s, time_s, wall_s, name, details)
 
 
-def _newest_inspection(events: Sequence[Event]) -> dict[str, Any]:
-    """The id of the newest one of several inspections, by which its variables are shown."""
+def _newest_id(events: Sequence[Event]) -> dict[str, Any]:
+    """The id of the newest of several events, by which its variables or a clip are shown."""
     event_id = events[-1].details.get("event_id")
     return {} if event_id is None else {"newest_event_id": event_id}
 
@@ -337,7 +340,7 @@ NOTICED: Final = EventKind(
     alike=Alike(
         lambda events, unit: f"times {events[0].details['what']}",
         sort=lambda e: e.details["what"],
-        adds=_newest_inspection,
+        adds=_newest_id,
     ),
 )
 KEPT: Final = EventKind(

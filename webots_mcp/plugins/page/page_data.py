@@ -32,6 +32,8 @@ from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.interactive_svg import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
+from webots_mcp.plugins.clip.make_clip import make_clip
+from webots_mcp.plugins.clip.moment import moment_at, newest_moment
 from webots_mcp.plugins.report.controller_variables import shown_variables
 from webots_mcp.plugins.report.obstacles import obstacles_of, with_bodies
 from webots_mcp.signals.naming import flatten, spelled_out
@@ -383,6 +385,29 @@ def picture(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
     except WebotsMCPError as error:
         return {"uri": None, "caption": f"{caption}: {spelled_out(str(error))}"}
     return {"uri": f"data:image/jpeg;base64,{data}", "caption": caption}
+
+
+def film(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
+    """Return a clip of the seconds around the cursor as a data URI, and its caption.
+
+    Without a cursor it is of the newest incident of the run.
+    """
+    with recording.reader() as connection:
+        run = _view(connection, request).require_run()
+        try:
+            moment = (
+                newest_moment(connection, run)
+                if request.at_s is None
+                else moment_at(connection, run, request.at_s)
+            )
+            clip = make_clip(connection, recording.data_dir, moment)
+        except (InvalidInputError, NothingRecordedError) as error:
+            return {"uri": None, "caption": spelled_out(str(error))}
+    content = clip.content
+    what = f", {content.moment.what}" if content.moment.what else ""
+    caption = f"{content.view}, {content.start_s:.3f} to {content.end_s:.3f} s{what}"
+    data = base64.b64encode(clip.data).decode("ascii")
+    return {"uri": f"data:image/webp;base64,{data}", "caption": spelled_out(caption)}
 
 
 def _inspected(connection: sqlite3.Connection, run_id: int) -> list[float]:

@@ -28,6 +28,7 @@ from webots_mcp.plugins.page.page_data import (
     controller_variables,
     describe_signals,
     draw,
+    film,
     page_request,
     picture,
     problem,
@@ -403,6 +404,10 @@ def _answer_picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]
     return picture(server.recording, page_request(asked))
 
 
+def _answer_film(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return film(server.recording, page_request(asked))
+
+
 def _answer_variables(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
     return controller_variables(server.recording, page_request(asked))
 
@@ -424,6 +429,7 @@ _QUESTIONS: Final = {
     "look": _answer_status,
     "draw": _answer_figures,
     "picture": _answer_picture,
+    "film": _answer_film,
     "signals": _answer_signals,
     "variables": _answer_variables,
 }

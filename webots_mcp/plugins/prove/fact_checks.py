@@ -26,7 +26,13 @@ from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, RobotRow, require
-from webots_mcp.questions import control_simulation, edit_scene, set_breakpoints, show_pictures
+from webots_mcp.questions import (
+    control_simulation,
+    edit_scene,
+    record_scene,
+    set_breakpoints,
+    show_pictures,
+)
 from webots_mcp.simulator import orders
 from webots_mcp.simulator.installations import find_webots
 from webots_mcp.simulator.instances import PORTS_TRIED
@@ -193,6 +199,30 @@ def running_breakpoint(bench: Bench) -> None:
 def running_screenshot(bench: Bench) -> str:
     """It writes its main view, also without a window; otherwise use the robots' cameras."""
     return _size_of(bench.ask(show_pictures.webots_take_screenshot))
+
+
+def running_movie(bench: Bench) -> str:
+    """A movie is ready once it is encoded, also headless; otherwise the answer says it failed."""
+    _record(bench, "start", kind="movie", width_px=320, height_px=240)
+    is_refused = bench.refuses(record_scene.webots_record_scene, action="start", kind="animation")
+    require(is_refused, "a second recording was begun at once")
+    bench.goes_on("a movie is recorded")
+    return _record(bench, "stop", timeout_wall_s=_LOAD_S)
+
+
+def running_animation(bench: Bench) -> str:
+    """An animation's page and data are written at its end; otherwise the answer says it failed."""
+    _record(bench, "start", kind="animation")
+    bench.goes_on("an animation is recorded")
+    return _record(bench, "stop")
+
+
+def _record(bench: Bench, action: str, **given: Any) -> str:
+    answer = bench.ask(record_scene.webots_record_scene, action=action, **given)
+    require(answer["outcome"] == "done", f"{action} is {answer['outcome']}")
+    result = answer["result"]
+    also = f", also {', '.join(result['also'])}" if "also" in result else ""
+    return f"{result.get('size_bytes', 0):,} bytes{also}"
 
 
 def running_camera(bench: Bench) -> str:

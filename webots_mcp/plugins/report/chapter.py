@@ -290,7 +290,7 @@ def chapter_of(
 def _changed(run_trends: RunTrends) -> list[str]:
     """Return the signals that changed, the most first, without clocks."""
     return [
-        each.name for each in run_trends.numbers if each.shape != "constant" and not _is_clock(each)
+        each.name for each in run_trends.numbers if each.shape != "constant" and not is_clock(each)
     ]
 
 
@@ -444,7 +444,7 @@ def _crash(info: RunInfo, ended_s: float) -> list[Event]:
     return [Event(CRASH, info.run_id, ended_s, ended_s, wall_s, details=details)]
 
 
-def _is_clock(trend: Trend) -> bool:
+def is_clock(trend: Trend) -> bool:
     """Return whether a signal is a time or counts steps, so that its curve shows nothing."""
     last_word = trend.name.rpartition(".")[2].rpartition("_")[2]
     is_time = trend.unit in _CLOCK_UNITS or last_word in _CLOCK_NAMES

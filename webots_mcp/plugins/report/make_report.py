@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import time
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -18,6 +19,7 @@ from webots_mcp.contract import VERSION
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plotting.interactive_svg import figure_part
+from webots_mcp.plugins.clip.make_clip import camera_film
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
 from webots_mcp.plugins.report.embedded_pictures import (
     EmbeddedPicture,
@@ -27,7 +29,7 @@ from webots_mcp.plugins.report.embedded_pictures import (
 )
 from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
 from webots_mcp.plugins.report.run_comparison import RunComparison, compare_two_runs
-from webots_mcp.plugins.report.words import clock, counted, size
+from webots_mcp.plugins.report.words import clock, counted, size, time_at
 from webots_mcp.questions.arguments import AnyNames, RobotName, RunIds
 from webots_mcp.questions.declaration import DESTROYS, question
 from webots_mcp.signals.naming import spelled_out
@@ -53,6 +55,8 @@ class _ReportLimits:
     """Time limit of all searches in values."""
     picture_within_s: float = 3.0
     """Time between a moment and the picture that is shown with it."""
+    share_of_a_film: float = 0.03
+    """Fraction of the size that the film of a moment may take."""
     frame_bytes: int = 60_000
     """Style, script, headings and facts, which always fit."""
     share_of_texts: float = 0.35
@@ -138,6 +142,8 @@ def make_report(
     done.step()
     page = ReportContent(_title(chapters), time.time(), max_mb, chapters, compared, figures)
     page.moment_pictures.update(_pictures_of_moments(chapters, data_dir))
+    film_bytes = int(_LIMITS.share_of_a_film * max_mb * 1e6)
+    page.moment_films.update(_films_of_moments(connection, chapters, data_dir, film_bytes))
     rest_bytes = max_mb * 1e6 - len(render(page))
     share_bytes = rest_bytes / len(chapters)
     for chapter in chapters:
@@ -159,6 +165,27 @@ def _pictures_of_moments(chapters: Sequence[Chapter], data_dir: Path) -> dict[st
             picture = picture_near(chapter.images, data_dir, at_s, within_s)
             if picture is not None:
                 found[moment_key(chapter, moment)] = picture
+    return found
+
+
+def _films_of_moments(
+    connection: sqlite3.Connection, chapters: Sequence[Chapter], data_dir: Path, max_bytes: int
+) -> dict[str, EmbeddedPicture]:
+    """Return the film of the camera frames around each moment, by the key of its figure."""
+    found: dict[str, EmbeddedPicture] = {}
+    for chapter in chapters:
+        for moment in chapter.moments:
+            at_s, within_s = moment.event.start_s, _LIMITS.picture_within_s
+            span = (at_s - within_s, at_s + within_s)
+            # What base64 makes of it is a third larger.
+            made = camera_film(
+                connection, data_dir, chapter.info.run_id, span, at_s, max_bytes * 3 // 4
+            )
+            if made is not None:
+                film, camera = made
+                caption = f"{time_at(film.times[0])} to {time_at(film.times[-1])} s, {camera}"
+                uri = f"data:image/webp;base64,{b64encode(film.data).decode()}"
+                found[moment_key(chapter, moment)] = EmbeddedPicture(uri, caption)
     return found
 
 
@@ -227,6 +254,7 @@ class ReportContent:
         comparison: The comparison of two runs; None for one run.
         pictures: Pictures by run.
         moment_pictures: The picture nearest to a moment, by the key of its figure.
+        moment_films: Camera frames around a moment that move, by the same key.
         left_out: Notes on what it lacks.
         size_bytes: Approximate size; None while unknown.
     """
@@ -239,6 +267,7 @@ class ReportContent:
     figures: Figures
     pictures: dict[int, EmbeddedPictures] = field(default_factory=dict[int, EmbeddedPictures])
     moment_pictures: dict[str, EmbeddedPicture] = field(default_factory=dict[str, EmbeddedPicture])
+    moment_films: dict[str, EmbeddedPicture] = field(default_factory=dict[str, EmbeddedPicture])
     left_out: Sequence[str] = ()
     size_bytes: int | None = None
 

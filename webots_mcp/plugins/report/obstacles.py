@@ -60,6 +60,21 @@ def with_bodies(
     ]
 
 
+def robot_outline(
+    connection: sqlite3.Connection, robot: TimeRange
+) -> tuple[tuple[float, float], ...]:
+    """Return the outline of a robot as its world file has it, seen from above.
+
+    Its corners are ahead of the robot's origin and to the left of it, in metres. It is empty where
+    the file is missing, or has no shape of the robot that the stand-in knows.
+    """
+    run = fetch_run(connection, robot.segments[-1].run_id)
+    body = next((each for each in _bodies_in(run) if each.name == robot.robot), None)
+    if body is None or body.node.type_name != "Robot":
+        return ()
+    return _hull([corner for shape in body.shapes for corner in _corners(shape, body)])
+
+
 def _bodies_of_file(run: RunRecord) -> dict[str, tuple[Outline, ...]]:
     return {
         body.name: tuple(_corners(shape, body) for shape in body.solid_shapes or body.shapes)
@@ -93,6 +108,30 @@ def _loaded(file: Path, _changed_ns: int) -> tuple[Body, ...]:
         return tuple(Arena(load_world(file)).bodies)
     except (WorldError, OSError):
         return ()  # The path is drawn without them.
+
+
+def _hull(corners: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """Return the convex outline of points."""
+    points = sorted(corners)
+    if len(points) < 3:
+        return ()
+    halves = [_half_hull(points), _half_hull(points[::-1])]
+    return tuple(point for half in halves for point in half[:-1])
+
+
+def _half_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the hull below sorted points (A. M. Andrew, 1979)."""
+    hull: list[tuple[float, float]] = []
+    for point in points:
+        while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
+            hull.pop()
+        hull.append(point)
+    return hull
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    """Return whether three points turn left (positive), right (negative) or not at all."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def _outlines(body: Body) -> Iterator[Obstacle]:

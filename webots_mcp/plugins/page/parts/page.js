@@ -222,6 +222,26 @@ async function showPicture(key) {
   arrange();
 }
 
+/** Show the seconds around the cursor as a film, in the place of the picture, until that changes. */
+async function showFilm() {
+  if (!shown || shown.run === null || by("film").disabled) return;
+  by("film").disabled = true;
+  const busy = setTimeout(() => (by("busy").hidden = false), 300);
+  try {
+    const answer = await ask("film", { robot: shown.robot, run: shown.run, at: wanted.at ?? "" });
+    const { uri, caption } = answer.caption === undefined ? { uri: null, caption: answer.text } : answer;
+    const image = uri ? [element("img", { src: uri, alt: "", className: "film" })] : [];
+    by("picture").replaceChildren(...image, element("figcaption", { textContent: caption }));
+    arrange();
+  } catch (error) {
+    by("said").textContent = error.message;
+  }
+  clearTimeout(busy);
+  by("busy").hidden = true;
+  by("film").disabled = false;
+}
+by("film").addEventListener("click", showFilm);
+
 /** Give no room to what the robot does not have. */
 function arrange() {
   const isEmpty = !by("picture").hasChildNodes() && !figures.way.hasChildNodes();

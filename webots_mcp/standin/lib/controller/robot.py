@@ -18,6 +18,8 @@ from .simulator_link import ControllerSession, NodeFacts, SimulatorLink, SocketL
 from .surface import Completed, integer, lacking, number, say, text
 
 _NULL_NODE: Final = (0, "", "", "", -1)
+_MOVIE_READY: Final = 0
+_MOVIE_SAVING: Final = 2
 _MAX_CUSTOM_DATA_BYTES: Final = 65_534
 """Webots' library sends the length in 16 bits, and takes the rest of a longer text for messages."""
 
@@ -312,6 +314,70 @@ class Supervisor(Robot):
             say(f"Error: wb_supervisor_export_image(): quality {quality} is not between 1 and 100.")
             return
         self._session.ask("export_image", filename, quality)
+
+    def movieStartRecording(
+        self,
+        filename: str,
+        width: int,
+        height: int,
+        codec: int,
+        quality: int,
+        acceleration: int,
+        caption: bool,
+    ) -> None:
+        """Let the simulator film the arena from above from the next step on, at 25 pictures a s.
+
+        Codec, acceleration and caption are checked, and change nothing.
+        """
+        name, numbers = text(filename), [integer(each) for each in (width, height, quality)]
+        integer(codec)
+        integer(acceleration)
+        wrong = ""
+        if not self.movieIsReady():
+            wrong = "movie recording has already been started."
+        elif not name:
+            wrong = "called with NULL or empty 'filename' argument."
+        elif numbers[0] <= 0 or numbers[1] <= 0:
+            wrong = "'width' and 'height' arguments must be postitive."
+        elif not 1 <= quality <= 100:
+            wrong = f"'quality' argument ({quality}) must be between 1 and 100."
+        elif acceleration < 1:
+            wrong = "'acceleration' argument must be greater than or equal to 1."
+        if wrong:
+            say(f"Error: wb_supervisor_movie_start_recording(): {wrong}")
+        else:
+            self._session.ask("movie_start_recording", name, *numbers)
+
+    def movieStopRecording(self) -> None:
+        """End the film; its file is written a moment later."""
+        self._session.ask("movie_stop_recording")
+
+    def movieIsReady(self) -> bool:
+        """Return whether no movie is being recorded or written."""
+        status = self._movie_status()
+        return status == _MOVIE_READY or status > _MOVIE_SAVING
+
+    def movieFailed(self) -> bool:
+        """Return whether the last movie could not be made."""
+        return self._movie_status() > _MOVIE_SAVING
+
+    def _movie_status(self) -> int:
+        return self._session.ask("movie_status", kept_as="movie_status", default=_MOVIE_READY)
+
+    def animationStartRecording(self, filename: str) -> int:
+        """Let the simulator record the poses of what moves, for an .html file; 0 if it cannot."""
+        name = text(filename)
+        if not name.endswith(".html"):
+            say(
+                "Error: the target file given to wb_supervisor_animation_start_recording() should "
+                "have the '.html' extension."
+            )
+            return 0
+        return self._session.ask("animation_start_recording", name, default=1)
+
+    def animationStopRecording(self) -> int:
+        """End the animation, and let the simulator write its files; 0 if it cannot."""
+        return self._session.ask("animation_stop_recording", default=1)
 
     def setLabel(
         self,

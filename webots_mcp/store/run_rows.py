@@ -518,12 +518,12 @@ def camera_frames(
 def camera_frames_between(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float, limit: int
 ) -> list[StoredImage]:
-    """Frames of all cameras in [start_s, end_s] of a run, in order of time.
+    """Return the frames of all cameras in [start_s, end_s] of a run, in order of time.
 
     The first `limit` of them; those of full-rate segments too.
     """
     rows = connection.execute(
-        f"SELECT {_COLUMNS} FROM image WHERE run_id = ? AND {_OF_CAMERA} "
+        f"SELECT {columns_of(StoredImage)} FROM image WHERE run_id = ? AND {_OF_CAMERA} "
         "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s, id LIMIT ?",
         (run_id, start_s, end_s, limit),
     )
@@ -531,7 +531,7 @@ def camera_frames_between(
 
 
 def camera_frame_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
-    """Simulation times of the first and the newest camera frame of a run; None without any."""
+    """Return the times of the first and the newest camera frame of a run; None without any."""
     first_s, last_s = connection.execute(
         f"SELECT min(sim_time_s), max(sim_time_s) FROM image WHERE run_id = ? AND {_OF_CAMERA}",
         (run_id,),

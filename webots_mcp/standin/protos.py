@@ -57,18 +57,62 @@ class Proto:
         return {name: each for name, each in self.fields.items() if not each.is_hidden}
 
 
-class Protos:
-    """The PROTO nodes that a world can use."""
+class ProtoFiles:
+    """The files of the PROTO nodes that a world names, found as Webots finds them."""
 
     def __init__(self, world: Path, urls: Mapping[str, str]) -> None:
         self._project = world.parent.parent / "protos"
         self._files: dict[str, Path] = {}
-        self._known: dict[str, Proto | None] = {}
         self.urls: dict[str, str] = {}
         """URLs of PROTOs by name, from EXTERNPROTO."""
+        self.note(urls, world.parent)
+
+    def note(self, urls: Mapping[str, str], folder: Path) -> None:
+        """Add the EXTERNPROTO lines of a file in this folder; the first of a name counts."""
+        for name, url in urls.items():
+            self.urls.setdefault(name, url)
+            of_webots = _OF_WEBOTS.fullmatch(url)
+            if of_webots and self.home:
+                self._files.setdefault(name, self.home / of_webots[1])
+            elif "://" not in url:
+                self._files.setdefault(name, folder / url)
+
+    def file_of(self, name: str) -> Path | None:
+        """Return the file of a PROTO, which may not exist; None if there is none on this disk."""
+        if name in self._files:
+            return self._files[name]
+        if "/" not in name and (self._project / f"{name}.proto").is_file():
+            return self._project / f"{name}.proto"
+        return self._installed.get(name)
+
+    @cached_property
+    def home(self) -> Path | None:
+        """Return the folder of the installed Webots that contains `projects`."""
+        home = Path(os.environ.get(HOME_VARIABLE) or "/nowhere")
+        return next(
+            (root for root in (home, home / "Contents") if (root / "projects").is_dir()), None
+        )
+
+    @cached_property
+    def _installed(self) -> dict[str, Path]:
+        """Return PROTO files of the installed Webots by name, for worlds without EXTERNPROTO."""
+        files = (self.home / "projects").rglob("*.proto") if self.home else ()
+        return {file.stem: file for file in files}
+
+
+class Protos:
+    """The PROTO nodes that a world can use."""
+
+    def __init__(self, world: Path, urls: Mapping[str, str]) -> None:
+        self._files = ProtoFiles(world, urls)
+        self._known: dict[str, Proto | None] = {}
         self.why_not: dict[str, str] = {}
         """Why the file of a PROTO cannot be used, by its name."""
-        self._note(urls, world.parent)
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """URLs of PROTOs by name, from EXTERNPROTO."""
+        return self._files.urls
 
     def find(self, name: str) -> Proto | None:
         """Return the definition of a PROTO; None if there is none that the stand-in can use."""
@@ -91,44 +135,15 @@ class Protos:
         except (OSError, ValueError, WorldError) as error:
             self.why_not[name] = f"{file.name}: {error}"
             return None
-        self._note(parser.urls, file.parent)
+        self._files.note(parser.urls, file.parent)
         proto = Proto(file, fields, body)
         if proto.base_type in NODE_TYPES or self.find(proto.base_type):
             return proto
         self.why_not[name] = f"{file.name}: it is made of a {proto.base_type} node"
         return None
 
-    def _note(self, urls: Mapping[str, str], folder: Path) -> None:
-        for name, url in urls.items():
-            self.urls.setdefault(name, url)
-            of_webots = _OF_WEBOTS.fullmatch(url)
-            if of_webots and self._home:
-                self._files.setdefault(name, self._home / of_webots[1])
-            elif "://" not in url:
-                self._files.setdefault(name, folder / url)
-
     def _file_of(self, name: str) -> Path | None:
-        if name in BUILT_IN:
-            return DATA / f"{name}.proto"
-        if name in self._files:
-            return self._files[name]
-        if "/" not in name and (self._project / f"{name}.proto").is_file():
-            return self._project / f"{name}.proto"
-        return self._installed.get(name)
-
-    @cached_property
-    def _home(self) -> Path | None:
-        """Return the folder of the installed Webots that contains `projects`."""
-        home = Path(os.environ.get(HOME_VARIABLE) or "/nowhere")
-        return next(
-            (root for root in (home, home / "Contents") if (root / "projects").is_dir()), None
-        )
-
-    @cached_property
-    def _installed(self) -> dict[str, Path]:
-        """Return PROTO files of the installed Webots by name, for worlds without EXTERNPROTO."""
-        files = (self._home / "projects").rglob("*.proto") if self._home else ()
-        return {file.stem: file for file in files}
+        return DATA / f"{name}.proto" if name in BUILT_IN else self._files.file_of(name)
 
     def build(self, node: WorldNode) -> None:
         """Build a PROTO node: give it its own fields and the fields of its base node.

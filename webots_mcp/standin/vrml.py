@@ -68,6 +68,10 @@ class WorldNode:
     """Name of the PROTO, if it was built from one. Its type is then that of its base node."""
     parameters: frozenset[str] = frozenset()
     """Fields that only the PROTO has. Nodes in them are part of the base node as well."""
+    field_lines: dict[str, int] = field(default_factory=lambda: {})
+    """Line of each field that the file names."""
+    file: Path | None = None
+    """The file that the node was read from, if the parser was given one."""
 
 
 def children_of(node: WorldNode) -> Iterator[WorldNode]:
@@ -110,6 +114,7 @@ class Parser:
         text: str | Sequence[Token],
         given: Mapping[str, Value] | None = None,
         line: int | None = None,
+        file: Path | None = None,
     ) -> None:
         """Begin at the first word.
 
@@ -117,10 +122,12 @@ class Parser:
             text: The text, or the words of a PROTO's body.
             given: Values of the fields of a PROTO, for `IS` in its body.
             line: Line of the PROTO node in the world, which all nodes of the body are given.
+            file: The file that the text is from, which all nodes are given.
         """
         self._tokens = [*tokens_of(text)] if isinstance(text, str) else text
         self._given = given
         self._line = line
+        self._file = file
         self._next = 0
         self._defined: dict[str, WorldNode] = {}
         self.urls: dict[str, str] = {}
@@ -232,7 +239,7 @@ class Parser:
     def _body(self, type_token: Token, def_name: str) -> WorldNode:
         is_inner = self._line is not None  # Nodes in a PROTO cannot be found from outside.
         line = type_token.line if self._line is None else self._line
-        node = WorldNode(type_token.text, "" if is_inner else def_name, line)
+        node = WorldNode(type_token.text, "" if is_inner else def_name, line, file=self._file)
         brace = self._take()
         if brace.text != "{":
             raise WorldError(
@@ -243,6 +250,7 @@ class Parser:
             if token.text == "hidden":  # State of a simulation that was saved.
                 self._value(self._take())
             else:
+                node.field_lines[token.text] = token.line
                 node.fields[token.text] = self._value(token)
         self._take()
         if def_name:

@@ -1,8 +1,8 @@
 """What is wrong with a world: faults that make a simulation shake, drift, explode or stand still.
 
 It reads the world file, the PROTO files that are here and the sources of the controllers, and
-starts nothing. Questions and commands import it. It may import the stand-in's parser, the project
-and what stands below.
+starts nothing. Questions and commands import it. It imports `worlds`, the project in
+`simulator`, and what stands below.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from webots_mcp.lint.physics_rules import PhysicsRules
 from webots_mcp.lint.scene import LIMITS, Deadline, OutOfTimeError, Scene
 from webots_mcp.lint.world_faults import IN_THE_SCENE, RULES, LintReport, WorldFault
 from webots_mcp.lint.world_rules import WorldRules
-from webots_mcp.standin.standin_errors import WorldError
+from webots_mcp.worlds.world_errors import WorldFileError
 
 __all__ = ["RULES", "LintReport", "lint_world"]
 
@@ -47,7 +47,7 @@ def lint_world(world: Path, wall_s: float = LIMITS.wall_s) -> LintReport:
         ControllerRules(scene, report, deadline).search()
         JointRules(scene, bodies, report).search()
         PhysicsRules(scene, bodies, report, deadline).search()
-    except WorldError as error:
+    except WorldFileError as error:
         line = error.line or 1
         report.judge("file")
         report.faults.append(

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from webots_mcp.lint.scene import JOINTS, NODE_TYPES, SOLIDS, Scene, SceneNode
-from webots_mcp.lint.shapes import Array, BoundingShape, pose_of, shape_of
-from webots_mcp.standin.geometry import CoordinateFrame
+from webots_mcp.lint.shapes import Array, BoundingShape, matrix_of, pose_of, shape_of
+from webots_mcp.worlds.frames import CoordinateFrame
 
 _UNSCALED: Final = [1.0, 1.0, 1.0]
 _PARTS: Final = ("children", "endPoint", "startPoint", "rotatingHead")
@@ -73,7 +73,8 @@ class SolidPart:
     def robot(self) -> SceneNode | None:
         """Return the outermost Robot that it belongs to."""
         line = [self, *self.ancestors()]
-        return next((each.node for each in reversed(line) if each.node.type_name == "Robot"), None)
+        kinds = ("Robot", "DifferentialWheels")
+        return next((each.node for each in reversed(line) if each.node.type_name in kinds), None)
 
     @cached_property
     def mass_kg(self) -> float | None:
@@ -120,12 +121,12 @@ def _uniform(shape: BoundingShape, mass: float) -> tuple[Array, Array]:
     volume = shape.volume_m3 or 1.0
     parts = [(each, mass * each.volume_m3 / volume) for each in shape.primitives]
     middle = sum((m * np.array(p.in_solid.translation) for p, m in parts), np.zeros(3)) / mass
-    total = np.zeros((3, 3))
+    total: Array = np.zeros((3, 3))
     for primitive, part in parts:
-        turn = np.array(primitive.in_solid.rotation).reshape(3, 3)
+        turn = matrix_of(primitive.in_solid)
         offset = np.array(primitive.in_solid.translation) - middle
-        total += turn @ primitive.inertia(part) @ turn.T
-        total += part * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+        turned: Array = turn @ primitive.inertia(part) @ np.transpose(turn)
+        total = total + turned + part * (offset @ offset * np.eye(3) - np.outer(offset, offset))
     return total, middle
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
 from webots_mcp.simulator.project import ProjectController, controllers_of
 
 _WITHOUT_PROCESS: Final = frozenset({"", "void", "<none>", "<generic>", "<extern>"})
-_OF_WEBOTS: Final = frozenset({"braitenberg", "ros", "ros2", "sumo_supervisor", "void"})
+_OF_WEBOTS: Final = frozenset({"braitenberg", "ros", "void"})
 """Controllers in Webots' folder projects/default/controllers."""
 _RULES_OF_SOURCE: Final = ("devices", "sampling period", "synchronization")
 _MOST_NAMED: Final = 6
@@ -70,7 +71,7 @@ class ControllerRules:
         return {each.name: each for each in controllers_of(self._scene.project)}
 
     def _unread_robot(self, node: SceneNode) -> None:
-        """Check the controller of a robot whose PROTO cannot be read, as far as that is possible."""
+        """Check the controller of a robot whose PROTO cannot be read, as far as possible."""
         name = node.text("controller") or str(node.fields.get("controller"))
         why = f"{node.written_type}: {node.unread}"
         if name not in _WITHOUT_PROCESS and name not in self._controllers:
@@ -96,6 +97,10 @@ class ControllerRules:
                     _RULES_OF_SOURCE, robot.path,
                     "its controller is <extern>: which program that is, the world does not say",
                 )  # fmt: skip
+            return None
+        if re.search(r"[{}$<>%]", name):
+            reason = f"{name!r} looks like a placeholder that a program replaces"
+            self._report.leave_out(["controller", *_RULES_OF_SOURCE], robot.path, reason)
             return None
         found = self._controllers.get(name) or self._next_to_proto(robot, name)
         if found is not None:
@@ -153,9 +158,7 @@ class ControllerRules:
     ) -> None:
         unread = next((node for node in _inside(robot) if node.unread), None)
         if unread is not None or self._scene.cut:
-            why = self._scene.cut or (
-                f"{unread.written_type}: {unread.unread}" if unread else ""
-            )
+            why = self._scene.cut or (f"{unread.written_type}: {unread.unread}" if unread else "")
             self._report.leave_out(["devices"], robot.path, why)
             return
         own = {node.text("name") for node in _devices_of(robot)}
@@ -223,9 +226,9 @@ class ControllerRules:
             best = max(1, round(steps)) * step_ms
             what = "robot.step" if use.call == "step" else "enable"
             effect = (
-                "Webots rounds the step and warns"
+                "Webots warns, and the loop runs at another rate than it asks for"
                 if use.call == "step"
-                else "the sensor is sampled at steps that do not fit its period"
+                else "Webots measures at steps only, so at another rate than asked for"
             )
             self._report.faults.append(
                 WorldFault(

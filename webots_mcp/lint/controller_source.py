@@ -5,11 +5,11 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 from webots_mcp.simulator.project import ProjectController
 
@@ -222,9 +222,9 @@ class _PythonFile(ast.NodeVisitor):
     def _loop(self, node: ast.For | ast.comprehension) -> None:
         if isinstance(node.target, ast.Name):
             values = self._values(node.iter)
-            lists = [each for each in values or () if isinstance(each, (tuple, range))]
+            lists = [cast("Sequence[object]", each) for each in values or () if _is_list(each)]
             is_known = values is not None and len(lists) == len(values)
-            flat = [item for each in lists for item in each][:_MOST_VALUES]
+            flat = [item for each in lists for item in each[:_MOST_VALUES]]
             known = self._names.get(node.target.id, ()) if node.target.id in self._names else ()
             self._names[node.target.id] = (
                 [*known, *flat] if is_known and known is not None else None
@@ -293,13 +293,13 @@ class _PythonFile(ast.NodeVisitor):
             return [range(*bounds)]
         return None
 
-    def _combined(self, parts: Sequence[_Values], join: object) -> _Values | None:
+    def _combined(self, parts: Sequence[_Values], join: Callable[..., object]) -> _Values | None:
         total = 1
         for each in parts:
             total *= len(each)
         if total > _MOST_VALUES:
             return None
-        found = [join(*items) for items in product(*parts)]  # pyright: ignore
+        found = [join(*items) for items in product(*parts)]
         return None if None in found else found
 
     # -- visiting --
@@ -352,6 +352,10 @@ class _PythonFile(ast.NodeVisitor):
             self._found.unread_period = f"line {node.lineno} of {self._file.name} computes a period"
 
 
+def _is_list(value: object) -> bool:
+    return isinstance(value, (tuple, range))
+
+
 def _last_name(node: ast.expr) -> str:
     if isinstance(node, ast.Attribute):
         return node.attr
@@ -362,16 +366,18 @@ def _added(a: object, b: object) -> object:
     if isinstance(a, str) and isinstance(b, str):
         return a + b
     if isinstance(a, tuple) and isinstance(b, tuple):
-        return (*a, *b)
-    both = isinstance(a, (int, float)) and isinstance(b, (int, float))
-    return a + b if both else None  # pyright: ignore
+        return (*cast("tuple[object, ...]", a), *cast("tuple[object, ...]", b))
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+        return a + b
+    return None
 
 
 def _multiplied(a: object, b: object) -> object:
     if (a is BASIC_STEP and isinstance(b, int)) or (b is BASIC_STEP and isinstance(a, int)):
         return BASIC_STEP
-    both = isinstance(a, (int, float)) and isinstance(b, (int, float))
-    return a * b if both else None  # pyright: ignore
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+        return a * b
+    return None
 
 
 def _formatted(text: object, value: object) -> object:

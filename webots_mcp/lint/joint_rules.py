@@ -157,6 +157,7 @@ class JointRules:
     def _without_limits(self, robot: SceneNode, motors: list[SceneNode]) -> None:
         sliding = [motor for motor in motors if motor.type_name == "LinearMotor"]
         turning = [motor for motor in motors if motor.type_name != "LinearMotor"]
+        severity: Severity
         for group, severity, what in (
             (sliding, "warning", "slides without an end"),
             (turning, "note", "turns without an end"),
@@ -207,9 +208,8 @@ _SPINS: Final = re.compile(
 
 
 def _has_joint(node: SceneNode) -> bool:
-    return any(
-        child.type_name.endswith("Joint") or _has_joint(child) for child in node.children("children")
-    )
+    inside = node.children("children")
+    return any(each.type_name.endswith("Joint") or _has_joint(each) for each in inside)
 
 
 def _names(part: SolidPart) -> Iterator[str]:

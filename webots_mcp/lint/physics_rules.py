@@ -116,9 +116,7 @@ class PhysicsRules:
         held = any(body.is_fixed or body.is_on_static for body in members)
         below = [each for top in parts for each in (top, *top.descendants())]
         can_touch = any(each.bounding is not None for each in below)
-        has_unread = part.is_in_unread or any(
-            node.unread for node in _within(part.node)
-        )
+        has_unread = part.is_in_unread or any(node.unread for node in _within(part.node))
         lifted = any(
             node.type_name in ("Propeller", "Connector", "VacuumCup", "VacuumGripper")
             for node in _within(part.node)
@@ -237,16 +235,18 @@ class PhysicsRules:
             return
         self._report.judge("mass ratio")
         light, heavy = sorted((a, b), key=lambda body: body.mass_kg or 0.0)
-        m, M = (light.mass_kg or 0.0), (heavy.mass_kg or 0.0)
-        if m <= 0.0 or M <= _TOLERANCES.mass_ratio * m or not isfinite(M):
+        small_kg, large_kg = (light.mass_kg or 0.0), (heavy.mass_kg or 0.0)
+        if small_kg <= 0.0 or not isfinite(large_kg):
+            return
+        if large_kg <= _TOLERANCES.mass_ratio * small_kg:
             return
         node = light.top.physics or light.top.node
         self._fault(
             "mass ratio", "warning", node, "mass" if node.type_name == "Physics" else "",
-            f"{light.top.node.label} ({m:.3g} kg) and {heavy.top.node.label} ({M:.3g} kg) are "
-            f"{how} at a ratio of 1:{M / m:,.0f}",
-            f"Bring the masses within 1:{_TOLERANCES.mass_ratio:,.0f}, for example {M / 1000.0:.3g}"
-            " kg for the light one, or merge the two: leave out its physics.",
+            f"{light.top.node.label} ({small_kg:.3g} kg) and {heavy.top.node.label} "
+            f"({large_kg:.3g} kg) are {how} at a ratio of 1:{large_kg / small_kg:,.0f}",
+            f"Set the light one to at least {large_kg / _TOLERANCES.mass_ratio:.3g} kg, or merge "
+            "the two: set its physics to NULL.",
         )  # fmt: skip
 
     def _springs(self) -> None:
@@ -271,15 +271,15 @@ class PhysicsRules:
                 continue
             unit = "N/m" if part.joint.type_name == "SliderJoint" else "N m/rad"
             moved = "kg" if part.joint.type_name == "SliderJoint" else "kg m²"
-            best_ms = max(1, int(2000.0 / rate))
+            best_ms = int(2000.0 / rate)
+            shorter = f"WorldInfo.basicTimeStep to at most {best_ms} ms, or " if best_ms else ""
             softer = 4.0 * load / step_s**2
             self._fault(
                 "time step", "warning", parameters, "springConstant",
                 f"A spring of {stiffness:.3g} {unit} on {load:.3g} {moved} oscillates at "
                 f"{rate:.3g} rad/s: basicTimeStep {1000.0 * step_s:g} ms is longer than 2/omega = "
                 f"{2000.0 / rate:.3g} ms, so it acts as a rigid link",
-                (f"Set WorldInfo.basicTimeStep to at most {best_ms} ms, or " if rate < 2000 else "Set ")
-                + f"springConstant to at most {softer:.2g} (4 m / step²).",
+                f"Set {shorter}springConstant to at most {softer:.2g} (4 m / step²).",
             )  # fmt: skip
 
     def _load(self, part: SolidPart, line: JointLine) -> float | None:

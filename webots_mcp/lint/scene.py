@@ -18,9 +18,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.standin.protos import ProtoFiles
-from webots_mcp.standin.standin_errors import WorldError
-from webots_mcp.standin.vrml import FieldDefinition, Parser, Token, WorldNode
+from webots_mcp.worlds.proto_files import ProtoFiles
+from webots_mcp.worlds.vrml import FieldDefinition, Parser, Token, WorldNode
+from webots_mcp.worlds.world_errors import WorldFileError
 
 NODES_FILE: Final = Path(__file__).with_name("nodes.txt")
 
@@ -87,12 +87,12 @@ def release_of(text: str) -> Release:
     """Return the release in the first line of a file.
 
     Raises:
-        WorldError: The file is not one of Webots.
+        WorldFileError: The file is not one of Webots.
     """
     first_line = text.partition("\n")[0].strip()
     found = _RELEASE.match(first_line)
     if found is None:
-        raise WorldError(
+        raise WorldFileError(
             f'the file has to begin with "#VRML_SIM R2023b utf8", not {first_line[:40]!r}', 1
         )
     return Release(int(found[1]), found[2] or "a") if found[1] else Release(0, "")
@@ -260,7 +260,7 @@ class Scene:
         """Read the world.
 
         Raises:
-            WorldError: It is missing, not text, too large, or has a fault of syntax; the text
+            WorldFileError: It is missing, not text, too large, or has a fault of syntax; the text
                 names the line.
             OutOfTimeError: There is no time left.
         """
@@ -341,14 +341,15 @@ class Scene:
     def _value(self, value: Any, node: SceneNode, name: str, depth: int) -> Any:
         if isinstance(value, WorldNode):
             return self._inner(value, node, name, None, depth)
-        if isinstance(value, list) and any(
-            isinstance(each, WorldNode) for each in cast("list[Any]", value)
-        ):
-            return [
-                self._inner(each, node, name, index, depth) if isinstance(each, WorldNode) else each
-                for index, each in enumerate(cast("list[Any]", value))
-            ]
-        return value
+        if not isinstance(value, list):
+            return value
+        items = cast("list[Any]", value)
+        if not any(isinstance(each, WorldNode) for each in items):
+            return items
+        return [
+            self._inner(each, node, name, index, depth) if isinstance(each, WorldNode) else each
+            for index, each in enumerate(items)
+        ]
 
     def _inner(
         self, value: WorldNode, node: SceneNode, name: str, index: int | None, depth: int
@@ -375,7 +376,7 @@ class Scene:
             given |= {key: value for key, value in node.fields.items() if key in source.fields}
             try:
                 (base,) = Parser(source.body, given, file=source.file).nodes()
-            except (WorldError, ValueError) as error:
+            except (WorldFileError, ValueError) as error:
                 return written, f"{source.file.name}: {error}", files
             files = (*files, source.file)
             node = base
@@ -399,7 +400,7 @@ class Scene:
                 return f"{file.name} is a template in a script language"
             parser = Parser(text, file=file)
             _, fields, body = parser.proto()
-        except (WorldError, ValueError) as error:
+        except (WorldFileError, ValueError) as error:
             return f"{file.name}: {error}"
         except RecursionError:
             return f"{file.name} nests its values too deep"
@@ -413,17 +414,17 @@ def _text_of(file: Path, what: str) -> str:
     """Return the text of a file of Webots; other files are not opened."""
     ending = ".wbt" if what == "world" else ".proto"
     if file.suffix != ending and file.parent != _cache():
-        raise WorldError(f"a {what} ends in {ending}")
+        raise WorldFileError(f"a {what} ends in {ending}")
     try:
         if not file.is_file():
-            raise WorldError("there is no such file")
+            raise WorldFileError("there is no such file")
         if file.stat().st_size > LIMITS.file_bytes:
-            raise WorldError(f"the file has more than {LIMITS.file_bytes // 1_000_000} MB")
+            raise WorldFileError(f"the file has more than {LIMITS.file_bytes // 1_000_000} MB")
         return file.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise WorldError("the file is not text in UTF-8") from error
+        raise WorldFileError("the file is not text in UTF-8") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise WorldError(f"the file cannot be read: {error}") from error
+        raise WorldFileError(f"the file cannot be read: {error}") from error
 
 
 def _cache() -> Path:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from webots_mcp.lint.scene import ENU_SINCE, SceneNode
-from webots_mcp.standin.geometry import CoordinateFrame, frame_of
+from webots_mcp.worlds.frames import CoordinateFrame, frame_of
 
 Array = NDArray[np.float64]
 Kind = Literal["Box", "Cylinder", "Capsule", "Sphere", "Plane"]
@@ -74,9 +74,10 @@ class Primitive:
         if self.kind == "Sphere":
             return np.eye(3) * 0.4 * mass_kg * x * x
         if self.kind == "Box":
-            return np.diag([y * y + z * z, x * x + z * z, x * x + y * y]) * mass_kg / 3.0
+            squares = np.array([y * y + z * z, x * x + z * z, x * x + y * y])
+            return np.eye(3) * squares * mass_kg / 3.0
         across = mass_kg * (3.0 * x * x + 4.0 * z * z) / 12.0
-        return np.diag([across, across, 0.5 * mass_kg * x * x])
+        return np.eye(3) * np.array([across, across, 0.5 * mass_kg * x * x])
 
     def support(self, directions: Array) -> Array:
         """Return how far it extends from its centre in each direction."""
@@ -161,6 +162,17 @@ def _geometries(
         yield node, frame
 
 
+def matrix_of(frame: CoordinateFrame) -> Array:
+    """Return the rotation of a frame as a matrix."""
+    r = frame.rotation
+    return np.array([[r[0], r[1], r[2]], [r[3], r[4], r[5]], [r[6], r[7], r[8]]])
+
+
+def columns_of(matrix: Array) -> list[Array]:
+    """Return the columns of a matrix."""
+    return [matrix[:, 0], matrix[:, 1], matrix[:, 2]]
+
+
 def pose_of(node: SceneNode) -> CoordinateFrame:
     """Return the pose of a node in its parent."""
     return frame_of(node.vector("translation", 3), node.vector("rotation", 4))
@@ -179,7 +191,7 @@ def _primitive(
     return Primitive(
         kind,
         np.array(world.translation),
-        np.array(world.rotation).reshape(3, 3),
+        matrix_of(world),
         np.array(half),
         in_solid,
     )
@@ -213,9 +225,9 @@ def overlap_m(a: Primitive, b: Primitive, enough_m: float = -inf) -> float:
     if a.kind == "Plane" or b.kind == "Plane":
         return _plane_overlap(a, b)
     apart = b.center - a.center
-    special = [*a.axes.T, *b.axes.T]
-    special += [np.cross(u, v) for u in a.axes.T for v in b.axes.T]
-    special.append(apart)
+    of_a, of_b = columns_of(a.axes), columns_of(b.axes)
+    special: list[Array] = [*of_a, *of_b, apart]
+    special += [np.cross(u, v) for u in of_a for v in of_b]
     special += [apart - axis * (axis @ apart) for axis in (a.axes[:, 2], b.axes[:, 2])]
     lengths = [float(np.linalg.norm(each)) for each in special]
     known = [each / size for each, size in zip(special, lengths, strict=True) if size > 1e-9]

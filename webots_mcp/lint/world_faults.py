@@ -43,7 +43,7 @@ RULES: Final = {
         LintRule(
             "undeclared PROTO",
             "From R2022b on, Webots uses only PROTO nodes that the file declares with EXTERNPROTO.",
-            f"{_REFERENCE}proto",
+            f"{_REFERENCE}proto-definition",
         ),
         LintRule(
             "time step",

@@ -127,9 +127,7 @@ class WorldRules:
             devices = [node for node in _inside(robot) if node.type_name in DEVICES]
             self._twice(devices, "device", robot)
 
-    def _twice(
-        self, nodes: Sequence[SceneNode], kind: str, robot: SceneNode | None = None
-    ) -> None:
+    def _twice(self, nodes: Sequence[SceneNode], kind: str, robot: SceneNode | None = None) -> None:
         self._report.judge("names", len(nodes))
         counts = Counter(node.text("name") for node in nodes)
         for name, count in counts.items():
@@ -163,8 +161,7 @@ class WorldRules:
         for node in self._scene.of_type("Camera", "RangeFinder"):
             width, height = node.number("width"), node.number("height")
             loads.append((width * height, node, f"{width:g} x {height:g} pixels"))
-        for node in self._scene.of_type("Lidar"):
-            loads.append(self._lidar(node))
+        loads += [self._lidar(node) for node in self._scene.of_type("Lidar")]
         self._report.judge("rendering load", len(loads) + 1)
         total = sum(load[0] for load in loads)
         factor = total / step_s / _RENDERING.pixels_per_wall_s

@@ -17,7 +17,7 @@ MODULES: Final = (
     "list_robots", "diagnose", "robot_state", "show_pictures", "get_logs", "monitor",
     "query_history", "describe_signals", "find_events", "list_and_compare_runs",
     "rerun_controller", "query_sql", "control_simulation", "run_trials", "set_breakpoints",
-    "send_command", "controller_parameters", "edit_scene", "inspect_controller",
+    "send_command", "controller_parameters", "edit_scene", "inspect_controller", "lint_world",
 )  # fmt: skip
 
 

@@ -8,20 +8,18 @@ Files that are templates in JavaScript are not read.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import cached_property
 from math import cos, pi, sin, tan
 from pathlib import Path
 from typing import Any, Final
 
+from webots_mcp.standin.node_types import DATA, NODE_TYPES
 from webots_mcp.standin.standin_errors import WorldError
-from webots_mcp.standin.vrml import (
-    DATA,
-    NODE_TYPES,
+from webots_mcp.worlds.proto_files import ProtoFiles
+from webots_mcp.worlds.vrml import (
     FieldDefinition,
     Parser,
     Token,
@@ -29,12 +27,9 @@ from webots_mcp.standin.vrml import (
     give_types,
     require_release,
 )
+from webots_mcp.worlds.world_errors import WorldFileError
 
-HOME_VARIABLE: Final = "WEBOTS_HOME"
 BUILT_IN: Final = sorted(file.stem for file in DATA.glob("*.proto"))
-_OF_WEBOTS: Final = re.compile(
-    r"(?:webots://|https://raw\.githubusercontent\.com/cyberbotics/webots/[^/]+/)(projects/.+)"
-)
 
 
 @dataclass(frozen=True)
@@ -55,49 +50,6 @@ class Proto:
     def visible(self) -> dict[str, FieldDefinition]:
         """Return the fields that a world can set and a supervisor can see."""
         return {name: each for name, each in self.fields.items() if not each.is_hidden}
-
-
-class ProtoFiles:
-    """The files of the PROTO nodes that a world names, found as Webots finds them."""
-
-    def __init__(self, world: Path, urls: Mapping[str, str]) -> None:
-        self._project = world.parent.parent / "protos"
-        self._files: dict[str, Path] = {}
-        self.urls: dict[str, str] = {}
-        """URLs of PROTOs by name, from EXTERNPROTO."""
-        self.note(urls, world.parent)
-
-    def note(self, urls: Mapping[str, str], folder: Path) -> None:
-        """Add the EXTERNPROTO lines of a file in this folder; the first of a name counts."""
-        for name, url in urls.items():
-            self.urls.setdefault(name, url)
-            of_webots = _OF_WEBOTS.fullmatch(url)
-            if of_webots and self.home:
-                self._files.setdefault(name, self.home / of_webots[1])
-            elif "://" not in url:
-                self._files.setdefault(name, folder / url)
-
-    def file_of(self, name: str) -> Path | None:
-        """Return the file of a PROTO, which may not exist; None if there is none on this disk."""
-        if name in self._files:
-            return self._files[name]
-        if "/" not in name and (self._project / f"{name}.proto").is_file():
-            return self._project / f"{name}.proto"
-        return self._installed.get(name)
-
-    @cached_property
-    def home(self) -> Path | None:
-        """Return the folder of the installed Webots that contains `projects`."""
-        home = Path(os.environ.get(HOME_VARIABLE) or "/nowhere")
-        return next(
-            (root for root in (home, home / "Contents") if (root / "projects").is_dir()), None
-        )
-
-    @cached_property
-    def _installed(self) -> dict[str, Path]:
-        """Return PROTO files of the installed Webots by name, for worlds without EXTERNPROTO."""
-        files = (self.home / "projects").rglob("*.proto") if self.home else ()
-        return {file.stem: file for file in files}
 
 
 class Protos:
@@ -132,7 +84,7 @@ class Protos:
                 raise WorldError("it is a template in JavaScript")
             parser = Parser(text)
             _, fields, body = parser.proto()
-        except (OSError, ValueError, WorldError) as error:
+        except (OSError, ValueError, WorldFileError) as error:
             self.why_not[name] = f"{file.name}: {error}"
             return None
         self._files.note(parser.urls, file.parent)
@@ -159,7 +111,7 @@ class Protos:
         given = deepcopy(own) | node.fields | (derive(node.fields) if derive else {})
         try:
             (base,) = Parser(proto.body, given, node.line).nodes()
-        except (WorldError, ValueError) as error:
+        except (WorldFileError, ValueError) as error:
             raise WorldError(f"{proto.file.name}: {error}", node.line) from None
         if base.type_name in NODE_TYPES:
             give_types(base, NODE_TYPES[base.type_name])

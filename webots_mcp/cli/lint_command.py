@@ -49,6 +49,11 @@ def lint(
             f"{str(world)!r} is no world file. Its name has to end in {WORLD_ENDING}, as in "
             "'webots-mcp lint worlds/arena.wbt'."
         )
+    if not world.is_file():
+        raise InvalidInputError(
+            f"There is no file {str(world)!r}. Give the path of a world file, as in "
+            "'webots-mcp lint worlds/arena.wbt'."
+        )
     report = lint_world(world)
     listed = SEVERITIES[: SEVERITIES.index(severity) + 1]
     faults = [fault for fault in report.faults if fault.severity in listed]
@@ -110,12 +115,15 @@ def _print_coverage(report: LintReport) -> None:
     print()
     if quiet:
         _print_folded("not found     ", ", ".join(quiet))
-    reasons: dict[str, dict[str, None]] = {}
+    rules_by_reason: dict[str, dict[str, None]] = {}
     for each in report.not_searched:
-        reasons.setdefault(each.reason, {})[each.rule] = None
-    for reason, rules in reasons.items():
+        rules_by_reason.setdefault(each.reason, {})[each.rule] = None
+    reasons_by_rules: dict[str, list[str]] = {}
+    for reason, rules in rules_by_reason.items():
         names = "all rules" if len(rules) >= len(RULES) - 1 else ", ".join(rules)
-        _print_folded("not searched  ", f"{names}: {reason}")
+        reasons_by_rules.setdefault(names, []).append(reason)
+    for names, reasons in reasons_by_rules.items():
+        _print_folded("not searched  ", f"{names}: {'; '.join(reasons)}")
 
 
 def _print_folded(head: str, text: str) -> None:

@@ -13,7 +13,7 @@ from webots_mcp.lint.bodies import Bodies
 from webots_mcp.lint.controller_rules import ControllerRules
 from webots_mcp.lint.joint_rules import JointRules
 from webots_mcp.lint.physics_rules import PhysicsRules
-from webots_mcp.lint.scene import LIMITS, Deadline, OutOfTimeError, Scene
+from webots_mcp.lint.scene import LIMITS, LintDeadline, OutOfTimeError, Scene
 from webots_mcp.lint.world_faults import IN_THE_SCENE, RULES, LintReport, WorldFault
 from webots_mcp.lint.world_rules import WorldRules
 from webots_mcp.worlds.world_errors import WorldFileError
@@ -32,7 +32,7 @@ def lint_world(world: Path, wall_s: float = LIMITS.wall_s) -> LintReport:
     """
     world = world.resolve()
     report = LintReport(world)
-    deadline = Deadline(wall_s)
+    deadline = LintDeadline(wall_s)
     others = [name for name in RULES if name != "file"]
     try:
         scene = Scene(world, deadline)

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from webots_mcp.lint.scene import JOINTS, NODE_TYPES, SOLIDS, Scene, SceneNode
+from webots_mcp.lint.scene import JOINTS, NODE_TYPES, SOLIDS, Scene, TreeNode
 from webots_mcp.lint.shapes import Array, BoundingShape, matrix_of, pose_of, shape_of
 from webots_mcp.worlds.frames import CoordinateFrame
 
@@ -30,21 +30,21 @@ class SolidPart:
         is_in_unread: Whether a PROTO node whose source cannot be read is around it.
     """
 
-    node: SceneNode
+    node: TreeNode
     frame: CoordinateFrame | None
     parent: SolidPart | None
-    joint: SceneNode | None
+    joint: TreeNode | None
     joint_frame: CoordinateFrame | None
     is_in_unread: bool
     children: list[SolidPart] = field(default_factory=list["SolidPart"])
 
     @property
-    def physics(self) -> SceneNode | None:
+    def physics(self) -> TreeNode | None:
         """Return its Physics node."""
         return self.node.child("physics")
 
     @property
-    def bounding(self) -> SceneNode | None:
+    def bounding(self) -> TreeNode | None:
         """Return its bounding object."""
         return self.node.child("boundingObject")
 
@@ -70,7 +70,7 @@ class SolidPart:
             yield from child.descendants()
 
     @property
-    def robot(self) -> SceneNode | None:
+    def robot(self) -> TreeNode | None:
         """Return the outermost Robot that it belongs to."""
         line = [self, *self.ancestors()]
         kinds = ("Robot", "DifferentialWheels")
@@ -177,10 +177,10 @@ class Bodies:
 
     def _walk(
         self,
-        node: SceneNode,
+        node: TreeNode,
         frame: CoordinateFrame | None,
         parent: SolidPart | None,
-        joint: SceneNode | None,
+        joint: TreeNode | None,
         joint_frame: CoordinateFrame | None,
         *,
         is_in_unread: bool,
@@ -259,7 +259,7 @@ class Bodies:
         return known
 
 
-def _fields_of(node: SceneNode) -> set[str]:
+def _fields_of(node: TreeNode) -> set[str]:
     return {*NODE_TYPES.get(node.type_name, {})}
 
 
@@ -273,7 +273,7 @@ class JointLine:
         self.is_known = frame is not None and (
             self.parameters is None or not self.parameters.unread
         )
-        source = self.parameters or SceneNode(
+        source = self.parameters or TreeNode(
             "HingeJointParameters" if joint.type_name == "HingeJoint" else "JointParameters",
             "", "", joint.file, joint.line, joint.release, joint, "jointParameters", None,
         )  # fmt: skip

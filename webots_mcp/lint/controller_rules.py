@@ -11,7 +11,7 @@ from typing import Final
 
 from webots_mcp.contract import CONTROLLER_FOLDER
 from webots_mcp.lint.controller_source import ControllerSource, read_source
-from webots_mcp.lint.scene import DEVICES, Deadline, Scene, SceneNode
+from webots_mcp.lint.scene import DEVICES, LintDeadline, Scene, TreeNode
 from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
 from webots_mcp.simulator.project import ProjectController, controllers_of
 
@@ -25,7 +25,7 @@ _MOST_NAMED: Final = 6
 class ControllerRules:
     """The rules about robots, for one scene."""
 
-    def __init__(self, scene: Scene, report: LintReport, deadline: Deadline) -> None:
+    def __init__(self, scene: Scene, report: LintReport, deadline: LintDeadline) -> None:
         self._scene = scene
         self._report = report
         self._deadline = deadline
@@ -37,7 +37,7 @@ class ControllerRules:
             if "controller" in node.fields:
                 self._unread_robot(node)
         robots = [*self._scene.of_type("Robot")]
-        running: dict[Path, list[SceneNode]] = {}
+        running: dict[Path, list[TreeNode]] = {}
         for robot in robots:
             self._deadline.check()
             controller = self._controller(robot)
@@ -52,7 +52,7 @@ class ControllerRules:
                 self._synchronization(robot, source)
 
     def _fault(
-        self, rule: str, severity: Severity, node: SceneNode, field: str, what: str, fix: str
+        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
     ) -> None:
         path = f"{node.path}.{field}" if field else node.path
         self._report.faults.append(
@@ -70,7 +70,7 @@ class ControllerRules:
     def _controllers(self) -> dict[str, ProjectController]:
         return {each.name: each for each in controllers_of(self._scene.project)}
 
-    def _unread_robot(self, node: SceneNode) -> None:
+    def _unread_robot(self, node: TreeNode) -> None:
         """Check the controller of a robot whose PROTO cannot be read, as far as possible."""
         name = node.text("controller") or str(node.fields.get("controller"))
         why = f"{node.written_type}: {node.unread}"
@@ -88,7 +88,7 @@ class ControllerRules:
             if node.fields.get("synchronization") is False:
                 self._synchronization(node, source)
 
-    def _controller(self, robot: SceneNode) -> ProjectController | None:
+    def _controller(self, robot: TreeNode) -> ProjectController | None:
         name = robot.text("controller")
         if name in _WITHOUT_PROCESS:
             self._report.judge("controller")
@@ -135,7 +135,7 @@ class ControllerRules:
     def _has_folder(self) -> bool:
         return (self._scene.project / CONTROLLER_FOLDER).is_dir()
 
-    def _next_to_proto(self, robot: SceneNode, name: str) -> ProjectController | None:
+    def _next_to_proto(self, robot: TreeNode, name: str) -> ProjectController | None:
         projects = dict.fromkeys(file.parent.parent for file in robot.proto_files)
         for project in projects:
             found = {each.name: each for each in controllers_of(project)}
@@ -154,7 +154,7 @@ class ControllerRules:
     # -- devices --
 
     def _devices(
-        self, robot: SceneNode, source: ControllerSource, those: Sequence[SceneNode]
+        self, robot: TreeNode, source: ControllerSource, those: Sequence[TreeNode]
     ) -> None:
         unread = next((node for node in _inside(robot) if node.unread), None)
         if unread is not None or self._scene.cut:
@@ -192,7 +192,7 @@ class ControllerRules:
             return
         self._unused(robot, source)
 
-    def _unused(self, robot: SceneNode, source: ControllerSource) -> None:
+    def _unused(self, robot: TreeNode, source: ControllerSource) -> None:
         used = {use.name for use in source.devices}
         self._report.judge("devices")
         idle = [
@@ -212,7 +212,7 @@ class ControllerRules:
 
     # -- periods and learning --
 
-    def _periods(self, source: ControllerSource, robots: Sequence[SceneNode]) -> None:
+    def _periods(self, source: ControllerSource, robots: Sequence[TreeNode]) -> None:
         step_ms = self._scene.info.number("basicTimeStep")
         if step_ms <= 0.0:
             return
@@ -240,7 +240,7 @@ class ControllerRules:
                 )
             )  # fmt: skip
 
-    def _synchronization(self, robot: SceneNode, source: ControllerSource) -> None:
+    def _synchronization(self, robot: TreeNode, source: ControllerSource) -> None:
         is_synchronous = robot.fields.get("synchronization") is not False
         if not is_synchronous and source.unread and not source.learns_with:
             self._report.leave_out(["synchronization"], robot.path, source.unread)
@@ -255,7 +255,7 @@ class ControllerRules:
         )  # fmt: skip
 
 
-def _inside(node: SceneNode) -> Iterator[SceneNode]:
+def _inside(node: TreeNode) -> Iterator[TreeNode]:
     """Yield the nodes in a robot, without those of robots in it."""
     for child in node.children():
         if child.type_name != "Robot":
@@ -263,5 +263,5 @@ def _inside(node: SceneNode) -> Iterator[SceneNode]:
             yield from _inside(child)
 
 
-def _devices_of(robot: SceneNode) -> Iterator[SceneNode]:
+def _devices_of(robot: TreeNode) -> Iterator[TreeNode]:
     return (node for node in _inside(robot) if node.type_name in DEVICES)

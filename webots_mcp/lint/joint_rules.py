@@ -12,7 +12,7 @@ import numpy as np
 
 from webots_mcp.lint.bodies import Bodies, JointLine, SolidPart
 from webots_mcp.lint.physics_rules import is_driven_wheel
-from webots_mcp.lint.scene import MOTORS, Scene, SceneNode
+from webots_mcp.lint.scene import MOTORS, Scene, TreeNode
 from webots_mcp.lint.shapes import Array
 from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
 
@@ -42,7 +42,7 @@ class JointRules:
 
     def search(self) -> None:
         """Apply all rules."""
-        endless: dict[SceneNode, list[SceneNode]] = {}
+        endless: dict[TreeNode, list[TreeNode]] = {}
         for part in self._bodies.parts:
             if part.joint is None:
                 continue
@@ -59,7 +59,7 @@ class JointRules:
             self._without_limits(robot, motors)
 
     def _fault(
-        self, rule: str, severity: Severity, node: SceneNode, field: str, what: str, fix: str
+        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
     ) -> None:
         path = f"{node.path}.{field}" if field else node.path
         self._report.faults.append(
@@ -107,7 +107,7 @@ class JointRules:
 
     # -- motors --
 
-    def _gain(self, motor: SceneNode) -> None:
+    def _gain(self, motor: TreeNode) -> None:
         """Report a P-controller that overshoots: it multiplies the error by 1 - P step."""
         self._report.judge("time step")
         gain = motor.vector("controlPID", 3)[0]
@@ -121,7 +121,7 @@ class JointRules:
             f"Set P of controlPID to at most {1.0 / step_s:.3g} (1 / step).",
         )  # fmt: skip
 
-    def _limits(self, part: SolidPart, parameters: SceneNode | None, motor: SceneNode) -> bool:
+    def _limits(self, part: SolidPart, parameters: TreeNode | None, motor: TreeNode) -> bool:
         """Check the limits of a motor; return whether it has none at all."""
         low, high = motor.number("minPosition"), motor.number("maxPosition")
         position = parameters.number("position") if parameters else 0.0
@@ -154,29 +154,28 @@ class JointRules:
             )  # fmt: skip
         return not has_soft and not has_hard
 
-    def _without_limits(self, robot: SceneNode, motors: list[SceneNode]) -> None:
+    def _without_limits(self, robot: TreeNode, motors: list[TreeNode]) -> None:
         sliding = [motor for motor in motors if motor.type_name == "LinearMotor"]
         turning = [motor for motor in motors if motor.type_name != "LinearMotor"]
-        severity: Severity
-        for group, severity, what in (
-            (sliding, "warning", "slides without an end"),
-            (turning, "note", "turns without an end"),
-        ):
-            if not group:
-                continue
-            names = ", ".join(motor.text("name") for motor in group[:4])
-            more = f" and {len(group) - 4} more" if len(group) > 4 else ""
-            many = f"{len(group)} motors of {robot.label} have" if len(group) > 1 else "A motor of "
-            many = many if len(group) > 1 else f"{many}{robot.label} has"
-            self._fault(
-                "motor limits", severity, group[0], "maxPosition",
-                f"{many} neither limits nor stops ({names}{more}): it {what}, and wrong targets "
-                "are not clipped",
-                "Set minPosition and maxPosition to the range of the real motor.",
-            )  # fmt: skip
+        self._without_end(robot, sliding, "warning", "slide")
+        self._without_end(robot, turning, "note", "turn")
+
+    def _without_end(
+        self, robot: TreeNode, motors: list[TreeNode], severity: Severity, verb: str
+    ) -> None:
+        if not motors:
+            return
+        names = ", ".join(motor.text("name") for motor in motors[:4])
+        more = f" and {len(motors) - 4} more" if len(motors) > 4 else ""
+        self._fault(
+            "motor limits", severity, motors[0], "maxPosition",
+            f"Motors of {robot.label} have neither limits nor stops ({names}{more}): they {verb} "
+            "without an end, and wrong targets are not clipped",
+            "Set minPosition and maxPosition to the range of the real motor.",
+        )  # fmt: skip
 
 
-def _axes(joint: SceneNode) -> Iterator[tuple[SceneNode | None, SceneNode]]:
+def _axes(joint: TreeNode) -> Iterator[tuple[TreeNode | None, TreeNode]]:
     """Yield the motors of a joint with the parameters of their axes."""
     for number in ("", "2", "3"):
         parameters = joint.child(f"jointParameters{number}")
@@ -185,7 +184,7 @@ def _axes(joint: SceneNode) -> Iterator[tuple[SceneNode | None, SceneNode]]:
                 yield parameters, device
 
 
-def _may_turn(part: SolidPart, motor: SceneNode) -> bool:
+def _may_turn(part: SolidPart, motor: TreeNode) -> bool:
     """Return whether a motor is meant to turn without an end: of a wheel, or of a part that may be.
 
     A part that carries no other joint and is round, or whose name is that of a wheel, may turn; so
@@ -207,7 +206,7 @@ _SPINS: Final = re.compile(
 )
 
 
-def _has_joint(node: SceneNode) -> bool:
+def _has_joint(node: TreeNode) -> bool:
     inside = node.children("children")
     return any(each.type_name.endswith("Joint") or _has_joint(each) for each in inside)
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from webots_mcp.lint.bodies import Bodies, JointLine, PhysicsBody, SolidPart, inertia_matrix
-from webots_mcp.lint.scene import Deadline, Scene, SceneNode
+from webots_mcp.lint.scene import LintDeadline, Scene, TreeNode
 from webots_mcp.lint.shapes import Primitive, overlap_m
 from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
 
@@ -43,7 +43,7 @@ class PhysicsRules:
     """The rules about bodies, for one scene."""
 
     def __init__(
-        self, scene: Scene, bodies: Bodies, report: LintReport, deadline: Deadline
+        self, scene: Scene, bodies: Bodies, report: LintReport, deadline: LintDeadline
     ) -> None:
         self._scene = scene
         self._bodies = bodies
@@ -68,7 +68,7 @@ class PhysicsRules:
         self._pairs()
 
     def _fault(
-        self, rule: str, severity: Severity, node: SceneNode, field: str, what: str, fix: str
+        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
     ) -> None:
         path = f"{node.path}.{field}" if field else node.path
         self._report.faults.append(
@@ -449,12 +449,12 @@ class PhysicsRules:
         )  # fmt: skip
 
 
-def _is_single(info: SceneNode) -> bool:
+def _is_single(info: TreeNode) -> bool:
     """Return whether gravity is one number; before R2020b it was a vector."""
     return len(info.fields.get("gravity", [0.0])) == 1
 
 
-def _within(node: SceneNode) -> Iterator[SceneNode]:
+def _within(node: TreeNode) -> Iterator[TreeNode]:
     yield node
     for child in node.children():
         yield from _within(child)
@@ -465,7 +465,7 @@ def is_driven_wheel(part: SolidPart) -> bool:
     joint = part.joint
     if joint is None or joint.type_name not in ("HingeJoint", "Hinge2Joint"):
         return False
-    motors: Sequence[SceneNode] = [
+    motors: Sequence[TreeNode] = [
         each for each in joint.children("device", "device2") if each.type_name == "RotationalMotor"
     ]
     if not motors or any(

@@ -103,7 +103,7 @@ class OutOfTimeError(Exception):
 
 
 @dataclass
-class Deadline:
+class LintDeadline:
     """The end of the time for one world."""
 
     wall_s: float = LIMITS.wall_s
@@ -131,7 +131,7 @@ class ProtoSource(NamedTuple):
 
 
 @dataclass(eq=False)
-class SceneNode:
+class TreeNode:
     """A node of the scene tree.
 
     Attributes:
@@ -156,7 +156,7 @@ class SceneNode:
     file: Path
     line: int
     release: Release
-    parent: SceneNode | None
+    parent: TreeNode | None
     field_name: str
     index: int | None
     unread: str = ""
@@ -204,22 +204,20 @@ class SceneNode:
         """Return a TRUE or FALSE, or its default."""
         return self._raw(name) is True
 
-    def child(self, name: str) -> SceneNode | None:
+    def child(self, name: str) -> TreeNode | None:
         """Return the node in a field; the first of several."""
         return next(self.children(name), None)
 
-    def children(self, *names: str) -> Iterator[SceneNode]:
+    def children(self, *names: str) -> Iterator[TreeNode]:
         """Yield the nodes in these fields, or in all."""
         for name in names or tuple(self.fields):
             value = self.fields.get(name)
-            if isinstance(value, SceneNode):
+            if isinstance(value, TreeNode):
                 yield value
             elif isinstance(value, list):
-                yield from (
-                    each for each in cast("list[Any]", value) if isinstance(each, SceneNode)
-                )
+                yield from (each for each in cast("list[Any]", value) if isinstance(each, TreeNode))
 
-    def around(self) -> Iterator[SceneNode]:
+    def around(self) -> Iterator[TreeNode]:
         """Yield the nodes around it, the nearest first."""
         node = self.parent
         while node is not None:
@@ -256,7 +254,7 @@ def _is_numbers(value: Any) -> bool:
 class Scene:
     """The scene tree of one world file."""
 
-    def __init__(self, world: Path, deadline: Deadline) -> None:
+    def __init__(self, world: Path, deadline: LintDeadline) -> None:
         """Read the world.
 
         Raises:
@@ -266,8 +264,8 @@ class Scene:
         """
         self.world = world
         self.project = world.parent.parent
-        self.roots: list[SceneNode] = []
-        self.nodes: list[SceneNode] = []
+        self.roots: list[TreeNode] = []
+        self.nodes: list[TreeNode] = []
         self.releases: dict[Path, Release] = {}
         self.declared: dict[Path, dict[str, str]] = {}
         """URLs of EXTERNPROTO by the file that declares them."""
@@ -294,10 +292,10 @@ class Scene:
         return self._files.home
 
     @cached_property
-    def info(self) -> SceneNode:
+    def info(self) -> TreeNode:
         """Return the WorldInfo node, or one with defaults."""
         found = next((node for node in self.roots if node.type_name == "WorldInfo"), None)
-        return found or SceneNode(
+        return found or TreeNode(
             "WorldInfo", "WorldInfo", "", self.world, 1, self.release, None, "", None
         )
 
@@ -306,28 +304,28 @@ class Scene:
         """Return the basic time step in seconds."""
         return self.info.number("basicTimeStep") / 1000.0
 
-    def of_type(self, *types: str) -> Iterator[SceneNode]:
+    def of_type(self, *types: str) -> Iterator[TreeNode]:
         """Yield the nodes of these types."""
         return (node for node in self.nodes if node.type_name in types)
 
     @property
-    def unread(self) -> list[SceneNode]:
+    def unread(self) -> list[TreeNode]:
         """Return the PROTO nodes whose source cannot be read."""
         return [node for node in self.nodes if node.unread]
 
-    def may_hold_solids(self, node: SceneNode) -> bool:
+    def may_hold_solids(self, node: TreeNode) -> bool:
         """Return whether a PROTO without source may hold solids: appearances and skies do not."""
         url = self._files.urls.get(node.written_type, "")
         return node.field_name not in _LOOKS and not _LOOKS_ONLY.search(url)
 
     def _built(
-        self, written: WorldNode, parent: SceneNode | None, name: str, index: int | None, depth: int
-    ) -> SceneNode:
+        self, written: WorldNode, parent: TreeNode | None, name: str, index: int | None, depth: int
+    ) -> TreeNode:
         if len(self.nodes) % 256 == 0:
             self._deadline.check()
         base, unread, files = self._base_of(written)
         file = base.file or self.world
-        node = SceneNode(
+        node = TreeNode(
             base.type_name, written.type_name, written.def_name, file, base.line,
             self.releases.get(file, self.release), parent, name, index, unread, files,
             written.file or self.world, written.line,
@@ -338,7 +336,7 @@ class Scene:
             node.fields[key] = self._value(value, node, key, depth + 1)
         return node
 
-    def _value(self, value: Any, node: SceneNode, name: str, depth: int) -> Any:
+    def _value(self, value: Any, node: TreeNode, name: str, depth: int) -> Any:
         if isinstance(value, WorldNode):
             return self._inner(value, node, name, None, depth)
         if not isinstance(value, list):
@@ -352,8 +350,8 @@ class Scene:
         ]
 
     def _inner(
-        self, value: WorldNode, node: SceneNode, name: str, index: int | None, depth: int
-    ) -> SceneNode | None:
+        self, value: WorldNode, node: TreeNode, name: str, index: int | None, depth: int
+    ) -> TreeNode | None:
         if depth > LIMITS.depth or len(self.nodes) >= LIMITS.nodes:
             self.cut = self.cut or (
                 f"nodes are more than {LIMITS.depth} deep, or PROTO nodes hold each other"
@@ -394,6 +392,7 @@ class Scene:
             url = self._files.urls.get(name)
             return "its source is not on this machine" if url else "no PROTO file of that name"
         try:
+            file = file.resolve()
             text = _text_of(file, "PROTO file")
             release = release_of(text)
             if _TEMPLATE.search(text):

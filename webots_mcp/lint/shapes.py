@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from webots_mcp.lint.scene import ENU_SINCE, SceneNode
+from webots_mcp.lint.scene import ENU_SINCE, TreeNode
 from webots_mcp.worlds.frames import CoordinateFrame, frame_of
 
 Array = NDArray[np.float64]
@@ -122,7 +122,7 @@ class BoundingShape:
         return sum(each.volume_m3 for each in self.primitives)
 
 
-def shape_of(bounding: SceneNode, solid_frame: CoordinateFrame) -> BoundingShape:
+def shape_of(bounding: TreeNode, solid_frame: CoordinateFrame) -> BoundingShape:
     """Return the bounding object of a Solid with this pose in the world."""
     found: list[Primitive] = []
     missing: list[str] = []
@@ -144,8 +144,8 @@ def shape_of(bounding: SceneNode, solid_frame: CoordinateFrame) -> BoundingShape
 
 
 def _geometries(
-    node: SceneNode, frame: CoordinateFrame
-) -> Iterator[tuple[SceneNode, CoordinateFrame]]:
+    node: TreeNode, frame: CoordinateFrame
+) -> Iterator[tuple[TreeNode, CoordinateFrame]]:
     """Yield primitives and meshes with their pose in the Solid; also what cannot be read."""
     if node.type_name == "Shape":
         geometry = node.child("geometry")
@@ -173,13 +173,13 @@ def columns_of(matrix: Array) -> list[Array]:
     return [matrix[:, 0], matrix[:, 1], matrix[:, 2]]
 
 
-def pose_of(node: SceneNode) -> CoordinateFrame:
+def pose_of(node: TreeNode) -> CoordinateFrame:
     """Return the pose of a node in its parent."""
     return frame_of(node.vector("translation", 3), node.vector("rotation", 4))
 
 
 def _primitive(
-    node: SceneNode, in_solid: CoordinateFrame, solid_frame: CoordinateFrame
+    node: TreeNode, in_solid: CoordinateFrame, solid_frame: CoordinateFrame
 ) -> Primitive | None:
     half = _half_size(node)
     if half is None:
@@ -197,7 +197,7 @@ def _primitive(
     )
 
 
-def _half_size(node: SceneNode) -> list[float] | None:
+def _half_size(node: TreeNode) -> list[float] | None:
     if node.type_name == "Plane":
         return [inf, inf, 0.0]
     if node.type_name == "Box":

@@ -15,7 +15,7 @@ from webots_mcp.lint.scene import (
     EXTERNPROTO_SINCE,
     NODE_TYPES,
     Scene,
-    SceneNode,
+    TreeNode,
 )
 from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
 
@@ -52,7 +52,7 @@ class WorldRules:
         self._rendering()
 
     def _fault(
-        self, rule: str, severity: Severity, node: SceneNode, field: str, what: str, fix: str
+        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
     ) -> None:
         path = f"{node.path}.{field}" if field else node.path
         self._report.faults.append(
@@ -102,7 +102,7 @@ class WorldRules:
         if not seen:
             self._report.judge("undeclared PROTO")
 
-    def _missing_declaration(self, node: SceneNode, name: str, file: Path, line: int) -> None:
+    def _missing_declaration(self, node: TreeNode, name: str, file: Path, line: int) -> None:
         own = self._scene.project / "protos" / f"{name}.proto"
         url = f"../protos/{name}.proto" if own.is_file() else f".../{name}.proto"
         self._report.faults.append(
@@ -127,7 +127,7 @@ class WorldRules:
             devices = [node for node in _inside(robot) if node.type_name in DEVICES]
             self._twice(devices, "device", robot)
 
-    def _twice(self, nodes: Sequence[SceneNode], kind: str, robot: SceneNode | None = None) -> None:
+    def _twice(self, nodes: Sequence[TreeNode], kind: str, robot: TreeNode | None = None) -> None:
         self._report.judge("names", len(nodes))
         counts = Counter(node.text("name") for node in nodes)
         for name, count in counts.items():
@@ -157,7 +157,7 @@ class WorldRules:
         step_s = self._scene.step_s
         if step_s <= 0.0:
             return
-        loads: list[tuple[float, SceneNode, str]] = []
+        loads: list[tuple[float, TreeNode, str]] = []
         for node in self._scene.of_type("Camera", "RangeFinder"):
             width, height = node.number("width"), node.number("height")
             loads.append((width * height, node, f"{width:g} x {height:g} pixels"))
@@ -178,7 +178,7 @@ class WorldRules:
             "Lower the resolution, or enable the sensor with a longer period.",
         )  # fmt: skip
 
-    def _lidar(self, node: SceneNode) -> tuple[float, SceneNode, str]:
+    def _lidar(self, node: TreeNode) -> tuple[float, TreeNode, str]:
         columns, layers = node.number("horizontalResolution"), node.number("numberOfLayers")
         wide, high = node.number("fieldOfView"), node.number("verticalFieldOfView")
         self._report.judge("lidar layers")
@@ -196,8 +196,8 @@ class WorldRules:
         return columns * max(layers, rows), node, f"{columns:g} x {max(layers, rows):.0f} points"
 
 
-def _inside(node: SceneNode) -> list[SceneNode]:
-    found: list[SceneNode] = []
+def _inside(node: TreeNode) -> list[TreeNode]:
+    found: list[TreeNode] = []
     for child in node.children():
         if child.type_name != "Robot":
             found += [child, *_inside(child)]

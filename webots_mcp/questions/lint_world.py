@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -149,8 +149,8 @@ def _file_of(recording: RecordingAccess, world: str | None) -> Path:
     file = Path(world)
     if file.suffix != WORLD_ENDING:
         raise InvalidInputError(
-            f"{cut_text(world, 200)!r} is no world file. Its name has to end in {WORLD_ENDING}, for "
-            "example world='worlds/arena.wbt'."
+            f"{cut_text(world, 200)!r} is no world file. Its name has to end in {WORLD_ENDING}, "
+            "for example world='worlds/arena.wbt'."
         )
     if not _is_file(file):
         raise InvalidInputError(
@@ -184,7 +184,7 @@ def _rules(faults: Sequence[WorldFault]) -> dict[str, str]:
     return {name: f"{RULES[name].why} {RULES[name].page}" for name in names}
 
 
-def _reasons(report: LintReport) -> Mapping[str, str]:
+def _reasons(report: LintReport) -> dict[str, str]:
     """Return for each rule why it did not judge everything: the first reason, and how many more."""
     by_rule: dict[str, dict[str, None]] = {}
     for each in report.not_searched:

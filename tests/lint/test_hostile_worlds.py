@@ -11,7 +11,7 @@ from tests.lint.worlds import faults_of, write_proto, write_world
 from webots_mcp.lint import lint_world
 
 HEAD = "#VRML_SIM R2023b utf8\n"
-WALL_S = 60.0  # a limit for a hang, not a measurement
+PROCESSOR_S = 40.0  # a limit for a hang, not a measurement
 
 BROKEN = {
     "empty": "",
@@ -66,9 +66,9 @@ PROTOS = {
 def test_a_proto_without_an_end_is_not_searched(tmp_path: Path, case: str) -> None:
     write_proto(tmp_path, "A", HEAD + 'EXTERNPROTO "A.proto"\n' + PROTOS[case])
     world = write_world(tmp_path, "A { }", declared='EXTERNPROTO "../protos/A.proto"')
-    began = time.monotonic()
+    began = time.thread_time()
     report = lint_world(world)
-    assert time.monotonic() - began < WALL_S
+    assert time.thread_time() - began < PROCESSOR_S
     assert report.faults == []
     assert report.verdicts()["overlap"] == "not searched"
 
@@ -84,9 +84,9 @@ def test_two_protos_that_hold_each_other_are_not_searched(tmp_path: Path) -> Non
 def test_a_use_of_a_use_does_not_grow_without_an_end(tmp_path: Path) -> None:
     lines = ["DEF G0 Group { }"]
     lines += [f"DEF G{i} Group {{ children [ USE G{i - 1} USE G{i - 1} ] }}" for i in range(1, 60)]
-    began = time.monotonic()
+    began = time.thread_time()
     report = lint_world(write_world(tmp_path, "\n".join(lines)))
-    assert time.monotonic() - began < WALL_S
+    assert time.thread_time() - began < PROCESSOR_S
     assert report.verdicts()["names"] == "not searched"
 
 
@@ -95,7 +95,7 @@ def test_time_that_is_over_is_said(tmp_path: Path) -> None:
         f'Solid {{ name "s{i}" boundingObject Box {{ }} physics Physics {{ }} }}'
         for i in range(600)
     )
-    report = lint_world(write_world(tmp_path, solids), wall_s=0.0)
+    report = lint_world(write_world(tmp_path, solids), processor_s=0.0)
     assert report.verdicts()["overlap"] == "not searched"
     assert any("not finished" in each.reason for each in report.not_searched)
 
@@ -105,9 +105,9 @@ def test_a_crowd_in_one_place_ends(tmp_path: Path) -> None:
         f'Solid {{ name "s{i}" boundingObject Box {{ }} physics Physics {{ }} }}'
         for i in range(400)
     )
-    began = time.monotonic()
+    began = time.thread_time()
     report = lint_world(write_world(tmp_path, solids))
-    assert time.monotonic() - began < WALL_S
+    assert time.thread_time() - began < PROCESSOR_S
     assert faults_of(report, "overlap") or report.verdicts()["overlap"] == "not searched"
 
 

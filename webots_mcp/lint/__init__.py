@@ -21,18 +21,18 @@ from webots_mcp.worlds.world_errors import WorldFileError
 __all__ = ["RULES", "LintReport", "lint_world"]
 
 
-def lint_world(world: Path, wall_s: float = LIMITS.wall_s) -> LintReport:
+def lint_world(world: Path, processor_s: float = LIMITS.processor_s) -> LintReport:
     """Search a world file for faults.
 
     A file that cannot be parsed is a fault itself, and then no other rule is searched.
 
     Args:
         world: A .wbt file.
-        wall_s: Time after which the rest is not searched.
+        processor_s: Processor time in seconds after which the rest is not searched.
     """
     world = world.resolve()
     report = LintReport(world)
-    deadline = LintDeadline(wall_s)
+    deadline = LintDeadline(processor_s)
     others = [name for name in RULES if name != "file"]
     try:
         scene = Scene(world, deadline)
@@ -58,7 +58,9 @@ def lint_world(world: Path, wall_s: float = LIMITS.wall_s) -> LintReport:
         )  # fmt: skip
         report.leave_out(others, world.name, "the file cannot be read")
     except OutOfTimeError:
-        report.leave_out(RULES, world.name, f"not finished after {wall_s:g} s")
+        report.leave_out(
+            RULES, world.name, f"not finished after {processor_s:g} s of processor time"
+        )
     except RecursionError:
         report.leave_out(RULES, world.name, "its nodes are too deep within each other")
     return report.finish()

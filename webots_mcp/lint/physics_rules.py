@@ -129,7 +129,7 @@ class PhysicsRules:
             )
             return
         self._fault(
-            "bounding object", "error", part.node, "boundingObject",
+            "bounding object", "warning", part.node, "boundingObject",
             f"{part.node.label} has physics and no bounding object anywhere: it falls through the "
             "floor",
             "Set boundingObject to a Box, Cylinder or Sphere of its size, or set physics to NULL.",

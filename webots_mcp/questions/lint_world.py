@@ -30,13 +30,13 @@ class LintAnswerSizes:
         faults_tokens: Budget of the table of faults.
         reasons_tokens: Budget of the reasons why something was not searched.
         text_characters: Characters of a path, and of one text.
-        in_world_info_wall_s: Time for the search within webots_get_world_info.
+        in_world_info_processor_s: Processor time in seconds for the search within webots_get_world_info.
     """
 
     faults_tokens: int = 1_000
     reasons_tokens: int = 350
     text_characters: int = 330
-    in_world_info_wall_s: float = 3.0
+    in_world_info_processor_s: float = 2.0
 
 
 _SIZES: Final = LintAnswerSizes()
@@ -96,7 +96,7 @@ def lint_in_short(world: str | None) -> dict[str, Any] | None:
     file = Path(world)
     if not file.is_absolute() or not _is_file(file):
         return {"not_searched": "the world file is not on this machine"}
-    report = _linted(file, _SIZES.in_world_info_wall_s)
+    report = _linted(file, _SIZES.in_world_info_processor_s)
     found: dict[str, Any] = {
         f"{name}s": report.count(name) for name in SEVERITIES if report.count(name)
     }
@@ -109,18 +109,18 @@ def lint_in_short(world: str | None) -> dict[str, Any] | None:
     return found or {"errors": 0}
 
 
-def _linted(file: Path, wall_s: float | None = None) -> LintReport:
+def _linted(file: Path, processor_s: float | None = None) -> LintReport:
     """Return the report of a world, again only if a file next to it has changed."""
     from webots_mcp.lint import lint_world  # numpy: only when it is needed
 
-    return lint_world(file) if wall_s is None else _lint_once(file, _stamp(file), wall_s)
+    return lint_world(file) if processor_s is None else _lint_once(file, _stamp(file), processor_s)
 
 
 @lru_cache(maxsize=8)
-def _lint_once(file: Path, stamp: object, wall_s: float) -> LintReport:
+def _lint_once(file: Path, stamp: object, processor_s: float) -> LintReport:
     from webots_mcp.lint import lint_world
 
-    return lint_world(file, wall_s)
+    return lint_world(file, processor_s)
 
 
 def _stamp(file: Path) -> tuple[float, ...]:

@@ -222,7 +222,9 @@ def _names(part: SolidPart) -> Iterator[str]:
 
 def _axis_in_joint(part: SolidPart, axis: Array) -> str:
     assert part.joint_frame is not None
-    return _shown(part.joint_frame.direction(axis.tolist()))
+    local = part.joint_frame.direction(axis.tolist())
+    sign = -1.0 if max(local, key=abs) < 0.0 else 1.0  # either way is the same axis
+    return _shown([sign * each for each in local])
 
 
 def _point_in_joint(part: SolidPart, point: Array) -> str:

@@ -30,7 +30,7 @@ class LintAnswerSizes:
         faults_tokens: Budget of the table of faults.
         reasons_tokens: Budget of the reasons why something was not searched.
         text_characters: Characters of a path, and of one text.
-        in_world_info_processor_s: Processor time in seconds for the search within webots_get_world_info.
+        in_world_info_processor_s: Processor time in seconds within webots_get_world_info.
     """
 
     faults_tokens: int = 1_000

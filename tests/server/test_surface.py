@@ -37,7 +37,7 @@ ALL = DEFAULT | {
     "webots_load_world", "webots_quit", "webots_get_trials", "webots_list_breakpoints",
     "webots_inspect_controller", "webots_watch",
     "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
-    "webots_report", "webots_rerun_controller",
+    "webots_report", "webots_rerun_controller", "webots_lint_world",
 }  # fmt: skip
 READING = {
     "webots_list_robots", "webots_diagnose_setup", "webots_get_world_info",

@@ -22,11 +22,11 @@ FLOORS = """
     server
     questions
     steering
-    answers      plotting     setup        testing
+    answers      plotting     setup        testing      lint
     judging      simulator    rerun
     store        bridge
     database     standin
-    signals
+    signals      worlds
     analysis     contract     errors       extras
 """
 LEVEL = {part: -number for number, floor in enumerate(FLOORS.split("\n")) for part in floor.split()}

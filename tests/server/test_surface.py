@@ -38,6 +38,7 @@ ALL = DEFAULT | {
     "webots_inspect_controller", "webots_watch",
     "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
     "webots_report", "webots_rerun_controller", "webots_get_clip", "webots_record_scene",
+    "webots_lint_world",
 }  # fmt: skip
 READING = {
     "webots_list_robots", "webots_diagnose_setup", "webots_get_world_info",

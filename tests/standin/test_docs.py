@@ -10,9 +10,9 @@ import controller
 from controller.surface import MEMBERS, Lacking, lacking
 
 from docs import reference
+from webots_mcp.standin.node_types import NODE_TYPES
 from webots_mcp.standin.protos import BUILT_IN
 from webots_mcp.standin.simulated_devices import DEVICES
-from webots_mcp.standin.vrml import NODE_TYPES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "standin.md").read_text(encoding="utf-8")
 HAD = {had.__name__ for had in controller.__all__}

@@ -145,6 +145,24 @@ class WorldAnswer(Answer):
         "How much is kept and who set that; size of the database."
     )
     data_dir: str | None = said("Folder of the recording.")
+    lint: dict[str, Any] | None = said(
+        "Faults of the world file: how many, and the worst one. webots_lint_world lists all."
+    )
+
+
+class LintAnswer(Answer):
+    """Faults of a world file."""
+
+    world: str | None = said("Path of the world file.")
+    counts: dict[str, int] | None = said("Number of errors, warnings and notes.")
+    faults: AnswerTable | None = said("One row for each fault, the worst first.")
+    rules: dict[str, str] | None = said(
+        "Why each rule that found something matters, and the page of Webots' documentation."
+    )
+    not_found: str | None = said("Rules that searched the whole world and found nothing.")
+    not_searched: dict[str, str] | None = said(
+        "Rules that could not judge everything, with the reason."
+    )
 
 
 class RobotsAnswer(Answer):

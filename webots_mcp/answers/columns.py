@@ -67,6 +67,14 @@ COLUMNS: Final[Mapping[str, Columns]] = {
         "kind": "Robot, Supervisor or observer.",
         "pause_state": "paused if its bridge has paused the simulation.",
     },
+    "LintAnswer.faults": {
+        "severity": "error: it cannot work as written; warning: it may misbehave; note: check it.",
+        "rule": "Name of the rule.",
+        "path": "Path of the node or field in the scene tree.",
+        "place": "File and line to edit.",
+        "what": "What is wrong, with the values.",
+        "fix": "What to set.",
+    },
     "FullStateAnswer.events": {
         "start_s": "Simulation time, in seconds.",
         "kind": "Kind of the event.",

@@ -26,6 +26,7 @@ from webots_mcp.answers.answer_models import (
     HistoryAnswer,
     InspectionAnswer,
     KindVerdicts,
+    LintAnswer,
     LogsAnswer,
     MonitorAnswer,
     ParametersAnswer,
@@ -108,6 +109,17 @@ def _(answer: WorldAnswer) -> str:
     world = answer.world.replace("\\", "/").rsplit("/", 1)[-1] if answer.world else "unknown world"
     runs = f", {answer.run_count} recorded" if answer.run_count else ""
     return f"{world}: {_subject(answer)} {_when(answer)}; run {answer.run_id}{runs}."
+
+
+@_summary.register
+def _(answer: LintAnswer) -> str:
+    counts = {name: count for name, count in (answer.counts or {}).items() if count}
+    name = (answer.world or "world").replace("\\", "/").rsplit("/", 1)[-1]
+    open_rules = len(answer.not_searched or ())
+    rest = f"; {_count(open_rules, 'rule')} could not judge everything" if open_rules else ""
+    if not counts:
+        return f"{name}: no fault found{rest}."
+    return f"{name}: {_listed([_count(n, each) for each, n in counts.items()])}{rest}."
 
 
 @_summary.register

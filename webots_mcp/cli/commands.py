@@ -43,6 +43,7 @@ _OF_THE_CORE: Final = {
     "init": CommandEntry(START, f"{_CLI}.setup_commands", "init"),
     "launch": CommandEntry(START, f"{_CLI}.server_commands", "launch"),
     "doctor": CommandEntry(START, f"{_CLI}.setup_commands", "doctor"),
+    "lint": CommandEntry(START, f"{_CLI}.lint_command", "lint"),
     "help": CommandEntry(START, f"{_CLI}.help_pages", "help_"),
     "status": CommandEntry(NOW, f"{_CLI}.status_command", "status"),
     "tail": CommandEntry(NOW, f"{_CLI}.recording_commands", "tail"),

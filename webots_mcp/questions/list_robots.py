@@ -32,6 +32,7 @@ from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.questions.arguments import RobotName, RunId
 from webots_mcp.questions.declaration import READS, question
+from webots_mcp.questions.lint_world import lint_in_short
 from webots_mcp.store.loop_evidence import rows_waiting
 from webots_mcp.store.recording import (
     GETTING_STARTED,
@@ -160,6 +161,7 @@ def webots_get_world_info(
             database=name_of(recording.database),
             retention=_retention(recording, view.connection),
             data_dir=str(recording.data_dir),
+            lint=lint_in_short(run.world),
         )
         space_tokens = row_budget_tokens(others=answer.model_dump(exclude_none=True))
         seen = _seen(world_seen(view.connection, run), space_tokens)

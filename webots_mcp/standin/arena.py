@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from math import cos, hypot, sin
 from typing import Final
 
-from webots_mcp.standin.geometry import Color, CoordinateFrame, Disc, Shape, UprightBox, frame_of
-from webots_mcp.standin.vrml import WorldNode, children_of, descendants_of
+from webots_mcp.standin.geometry import Color, Disc, Shape, UprightBox
 from webots_mcp.standin.world import World, own_frame
+from webots_mcp.worlds.frames import CoordinateFrame, frame_of
+from webots_mcp.worlds.vrml import WorldNode, children_of, descendants_of
 
 _DEFAULT_COLOR: Final[Color] = (0.5, 0.5, 0.5)
 _SLIDING_FRICTION: Final = 1.0

@@ -14,8 +14,8 @@ from controller.simulator_link import Message
 
 from webots_mcp.standin.controller_answers import answer, step_over
 from webots_mcp.standin.simulator import Mode, SimulatedRobot, Simulator
-from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.world import load_world
+from webots_mcp.worlds.world_errors import WorldFileError
 
 
 class ControllerEndpoint(ABC):
@@ -136,7 +136,7 @@ class BaseSimulation(ABC):
         self._end(self._endpoints)
         try:
             self.simulator = Simulator(load_world(path), self.mode, self.simulator.log)
-        except WorldError as error:
+        except WorldFileError as error:
             self.simulator.log(f"ERROR: {error}; the world stays as it was")
             self.simulator.reset()
         self._enter_world()

@@ -8,12 +8,14 @@ from typing import Any, Final, cast
 from controller.simulator_link import Message
 
 from webots_mcp.standin.arena import Body
+from webots_mcp.standin.node_types import NODE_TYPES
 from webots_mcp.standin.simulated_devices import FetchedSensor
 from webots_mcp.standin.simulator import Mode, SimulatedRobot, Simulator, TrackedKey
 from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.view_pictures import Label
-from webots_mcp.standin.vrml import NODE_TYPES, FieldDefinition, Parser, WorldNode, descendants_of
 from webots_mcp.standin.world import as_text
+from webots_mcp.worlds.vrml import FieldDefinition, Parser, WorldNode, descendants_of
+from webots_mcp.worlds.world_errors import WorldFileError
 
 CUSTOM_DATA_TAG: Final = 0
 """Tag of the robot itself among the tags of its devices."""
@@ -229,7 +231,7 @@ class SupervisorRequests:
                 )
             self._simulator.added.append(nodes[0])
             self._update_around(around)
-        except WorldError as error:
+        except WorldFileError as error:
             self._simulator.log(f"ERROR: importing a node: {error}")
         return -1 if many is None else len(many)
 

@@ -8,20 +8,18 @@ Files that are templates in JavaScript are not read.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import cached_property
 from math import cos, pi, sin, tan
 from pathlib import Path
 from typing import Any, Final
 
+from webots_mcp.standin.node_types import DATA, NODE_TYPES
 from webots_mcp.standin.standin_errors import WorldError
-from webots_mcp.standin.vrml import (
-    DATA,
-    NODE_TYPES,
+from webots_mcp.worlds.proto_files import ProtoFiles
+from webots_mcp.worlds.vrml import (
     FieldDefinition,
     Parser,
     Token,
@@ -29,12 +27,9 @@ from webots_mcp.standin.vrml import (
     give_types,
     require_release,
 )
+from webots_mcp.worlds.world_errors import WorldFileError
 
-HOME_VARIABLE: Final = "WEBOTS_HOME"
 BUILT_IN: Final = sorted(file.stem for file in DATA.glob("*.proto"))
-_OF_WEBOTS: Final = re.compile(
-    r"(?:webots://|https://raw\.githubusercontent\.com/cyberbotics/webots/[^/]+/)(projects/.+)"
-)
 
 
 @dataclass(frozen=True)
@@ -61,14 +56,15 @@ class Protos:
     """The PROTO nodes that a world can use."""
 
     def __init__(self, world: Path, urls: Mapping[str, str]) -> None:
-        self._project = world.parent.parent / "protos"
-        self._files: dict[str, Path] = {}
+        self._files = ProtoFiles(world, urls)
         self._known: dict[str, Proto | None] = {}
-        self.urls: dict[str, str] = {}
-        """URLs of PROTOs by name, from EXTERNPROTO."""
         self.why_not: dict[str, str] = {}
         """Why the file of a PROTO cannot be used, by its name."""
-        self._note(urls, world.parent)
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """URLs of PROTOs by name, from EXTERNPROTO."""
+        return self._files.urls
 
     def find(self, name: str) -> Proto | None:
         """Return the definition of a PROTO; None if there is none that the stand-in can use."""
@@ -88,47 +84,18 @@ class Protos:
                 raise WorldError("it is a template in JavaScript")
             parser = Parser(text)
             _, fields, body = parser.proto()
-        except (OSError, ValueError, WorldError) as error:
+        except (OSError, ValueError, WorldFileError) as error:
             self.why_not[name] = f"{file.name}: {error}"
             return None
-        self._note(parser.urls, file.parent)
+        self._files.note(parser.urls, file.parent)
         proto = Proto(file, fields, body)
         if proto.base_type in NODE_TYPES or self.find(proto.base_type):
             return proto
         self.why_not[name] = f"{file.name}: it is made of a {proto.base_type} node"
         return None
 
-    def _note(self, urls: Mapping[str, str], folder: Path) -> None:
-        for name, url in urls.items():
-            self.urls.setdefault(name, url)
-            of_webots = _OF_WEBOTS.fullmatch(url)
-            if of_webots and self._home:
-                self._files.setdefault(name, self._home / of_webots[1])
-            elif "://" not in url:
-                self._files.setdefault(name, folder / url)
-
     def _file_of(self, name: str) -> Path | None:
-        if name in BUILT_IN:
-            return DATA / f"{name}.proto"
-        if name in self._files:
-            return self._files[name]
-        if "/" not in name and (self._project / f"{name}.proto").is_file():
-            return self._project / f"{name}.proto"
-        return self._installed.get(name)
-
-    @cached_property
-    def _home(self) -> Path | None:
-        """Return the folder of the installed Webots that contains `projects`."""
-        home = Path(os.environ.get(HOME_VARIABLE) or "/nowhere")
-        return next(
-            (root for root in (home, home / "Contents") if (root / "projects").is_dir()), None
-        )
-
-    @cached_property
-    def _installed(self) -> dict[str, Path]:
-        """Return PROTO files of the installed Webots by name, for worlds without EXTERNPROTO."""
-        files = (self._home / "projects").rglob("*.proto") if self._home else ()
-        return {file.stem: file for file in files}
+        return DATA / f"{name}.proto" if name in BUILT_IN else self._files.file_of(name)
 
     def build(self, node: WorldNode) -> None:
         """Build a PROTO node: give it its own fields and the fields of its base node.
@@ -144,7 +111,7 @@ class Protos:
         given = deepcopy(own) | node.fields | (derive(node.fields) if derive else {})
         try:
             (base,) = Parser(proto.body, given, node.line).nodes()
-        except (WorldError, ValueError) as error:
+        except (WorldFileError, ValueError) as error:
             raise WorldError(f"{proto.file.name}: {error}", node.line) from None
         if base.type_name in NODE_TYPES:
             give_types(base, NODE_TYPES[base.type_name])

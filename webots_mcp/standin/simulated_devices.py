@@ -14,10 +14,11 @@ from typing import Any, Final
 
 from webots_mcp.standin.arena import Arena, Body, BodyPart, bounding_parts
 from webots_mcp.standin.camera_view import CameraView, render
-from webots_mcp.standin.geometry import CoordinateFrame, Shape, Vector, nearest_m, targets_from
+from webots_mcp.standin.geometry import Shape, nearest_m, targets_from
 from webots_mcp.standin.vehicle import Joint, Vehicle
-from webots_mcp.standin.vrml import WorldNode, children_of
 from webots_mcp.standin.world import World, own_frame
+from webots_mcp.worlds.frames import CoordinateFrame, Vector
+from webots_mcp.worlds.vrml import WorldNode, children_of
 
 _SUN_M: Final = 1000.0
 """Distance of a DirectionalLight: far enough for its rays to be parallel."""

@@ -23,8 +23,8 @@ from webots_mcp.standin.simulated_devices import (
 from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.vehicle import Vehicle, joints_in
 from webots_mcp.standin.view_pictures import Label, PictureRequest, save_picture
-from webots_mcp.standin.vrml import WorldNode
 from webots_mcp.standin.world import World
+from webots_mcp.worlds.vrml import WorldNode
 
 TrackedKey: TypeAlias = "tuple[int, int | str | None]"
 """A field: node id and name. A pose: node id and the id it is seen from, None for the world."""

@@ -8,17 +8,15 @@ StandInError
 
 from __future__ import annotations
 
+from webots_mcp.worlds.world_errors import WorldFileError
+
 
 class StandInError(Exception):
     """Base of all errors of the stand-in."""
 
 
-class WorldError(StandInError):
+class WorldError(WorldFileError, StandInError):
     """A world file that the stand-in cannot use."""
-
-    def __init__(self, message: str, line: int | None = None) -> None:
-        super().__init__(message if line is None else f"line {line}: {message}")
-        self.line = line
 
 
 class WouldBlockError(StandInError):

@@ -7,7 +7,7 @@ from math import cos, isinf, sin
 from typing import Any
 
 from webots_mcp.standin.arena import Arena, Body
-from webots_mcp.standin.vrml import WorldNode, descendants_of
+from webots_mcp.worlds.vrml import WorldNode, descendants_of
 
 
 @dataclass

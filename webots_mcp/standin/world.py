@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.standin.geometry import CoordinateFrame, frame_of
+from webots_mcp.standin.node_types import NODE_TYPES
 from webots_mcp.standin.protos import Protos
 from webots_mcp.standin.standin_errors import WorldError
-from webots_mcp.standin.vrml import (
-    NODE_TYPES,
+from webots_mcp.worlds.frames import CoordinateFrame, frame_of
+from webots_mcp.worlds.vrml import (
     Parser,
     WorldNode,
     children_of,
@@ -18,6 +18,7 @@ from webots_mcp.standin.vrml import (
     give_types,
     require_release,
 )
+from webots_mcp.worlds.world_errors import WorldFileError
 
 _NAME_OF_MISSING: Final = {
     **{"Altimeter": "altimeter", "Brake": "brake", "Connector": "connector", "Pen": "pen"},
@@ -168,7 +169,7 @@ class World:
             self._register(node, parent)
             if any(added.type_name == "Robot" for added in self.nodes[known:]):
                 raise WorldError("the stand-in adds no robots")
-        except WorldError:
+        except WorldFileError:
             self._forget(self.nodes[known:])
             del self.left_out[left_out:]
             raise
@@ -261,7 +262,7 @@ def load_world(path: str | Path) -> World:
         parser = Parser(text)
         top = parser.nodes()
         return World(path, top, Protos(path, parser.urls))
-    except WorldError as error:
+    except WorldFileError as error:
         raise WorldError(f"{path.name}: {error}") from None
     except RecursionError:
         raise WorldError(f"{path.name}: its PROTO nodes hold each other without an end") from None

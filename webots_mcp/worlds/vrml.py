@@ -1,11 +1,6 @@
 """The parser of the VRML dialect of .wbt and .proto files.
 
 It makes trees of nodes, whose fields `give_types` turns into Python values of their types.
-
-StandInError
-├── WorldError            the world file cannot be used; names the line
-├── WouldBlockError       the call would wait for ever: the simulation is paused
-└── ControllerEndedError  the API was used after `step` had returned -1
 """
 
 from __future__ import annotations
@@ -17,10 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
-from webots_mcp.standin.standin_errors import WorldError
-
-DATA: Final = Path(__file__).with_name("data")
-"""Folder of the node types and the built-in PROTO nodes."""
+from webots_mcp.worlds.world_errors import WorldFileError
 
 Value: TypeAlias = "bool | str | WorldNode | list[float] | list[Value] | None"
 """A field as written: numbers are always a list of floats, `[...]` is a list of any values."""
@@ -35,6 +27,8 @@ _FIELD_KEYWORDS: Final = (
 
 _TOKEN: Final = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]|[^\s\[\]{}",#]+)')
 _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
+_NAME: Final = re.compile(r"[^\s0-9\"'#+,.\-\[\]\\{}\x7f][^\s\"'#,.\[\]\\{}\x7f]*\Z")
+"""A name as VRML97 has it: letters of any language."""
 _WORDS: Final[dict[str, bool | None]] = {"TRUE": True, "FALSE": False, "NULL": None}
 
 
@@ -68,6 +62,10 @@ class WorldNode:
     """Name of the PROTO, if it was built from one. Its type is then that of its base node."""
     parameters: frozenset[str] = frozenset()
     """Fields that only the PROTO has. Nodes in them are part of the base node as well."""
+    field_lines: dict[str, int] = field(default_factory=lambda: {})
+    """Line of each field that the file names."""
+    file: Path | None = None
+    """The file that the node was read from, if the parser was given one."""
 
 
 def children_of(node: WorldNode) -> Iterator[WorldNode]:
@@ -95,7 +93,7 @@ def tokens_of(text: str) -> Iterator[Token]:
     while position < len(text):
         match = _TOKEN.match(text, position)
         if match is None:
-            raise WorldError(f"unexpected character {text[position]!r}", line)
+            raise WorldFileError(f"unexpected character {text[position]!r}", line)
         if word := match["token"]:
             yield Token(word, line)
         line += match[0].count("\n")
@@ -110,6 +108,7 @@ class Parser:
         text: str | Sequence[Token],
         given: Mapping[str, Value] | None = None,
         line: int | None = None,
+        file: Path | None = None,
     ) -> None:
         """Begin at the first word.
 
@@ -117,10 +116,12 @@ class Parser:
             text: The text, or the words of a PROTO's body.
             given: Values of the fields of a PROTO, for `IS` in its body.
             line: Line of the PROTO node in the world, which all nodes of the body are given.
+            file: The file that the text is from, which all nodes are given.
         """
         self._tokens = [*tokens_of(text)] if isinstance(text, str) else text
         self._given = given
         self._line = line
+        self._file = file
         self._next = 0
         self._defined: dict[str, WorldNode] = {}
         self.urls: dict[str, str] = {}
@@ -136,8 +137,8 @@ class Parser:
                 try:
                     nodes.append(self._node())
                 except RecursionError:
-                    why = "this node holds more, one in the other, than the stand-in can read"
-                    raise WorldError(why, line) from None
+                    why = "this node holds more, one in the other, than can be read"
+                    raise WorldFileError(why, line) from None
         return nodes
 
     def _takes_externproto(self) -> bool:
@@ -148,7 +149,7 @@ class Parser:
             return False
         token = self._take()
         if not self._peek().text.startswith('"'):
-            raise WorldError("EXTERNPROTO has no URL", token.line)
+            raise WorldFileError("EXTERNPROTO has no URL", token.line)
         url = self._take().text.strip('"')
         self.urls[url.rpartition("/")[2].removesuffix(".proto")] = url
         return True
@@ -188,7 +189,7 @@ class Parser:
         while self._takes_externproto():
             pass
         if self._take().text != "PROTO":
-            raise WorldError("there is no PROTO definition", self._last_line)
+            raise WorldFileError("there is no PROTO definition", self._last_line)
         name = self._name("the name of a PROTO").text
         self._take()
         fields = self.definitions("]")
@@ -198,7 +199,7 @@ class Parser:
 
     def _peek(self) -> Token:
         if self._next == len(self._tokens):
-            raise WorldError("the file ends in the middle of a node", self._last_line)
+            raise WorldFileError("the file ends in the middle of a node", self._last_line)
         return self._tokens[self._next]
 
     def _take(self) -> Token:
@@ -208,8 +209,8 @@ class Parser:
 
     def _name(self, what: str) -> Token:
         token = self._take()
-        if not re.match(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z", token.text):
-            raise WorldError(f"expected {what}, found {token.text!r}", token.line)
+        if not _NAME.match(token.text):
+            raise WorldFileError(f"expected {what}, found {token.text!r}", token.line)
         return token
 
     def _node(self) -> WorldNode:
@@ -217,7 +218,8 @@ class Parser:
         if token.text == "USE":
             return self._used()
         if token.text == "PROTO":
-            raise WorldError("a world holds no PROTO definitions, they have own files", token.line)
+            why = "a world holds no PROTO definitions, they have own files"
+            raise WorldFileError(why, token.line)
         if token.text != "DEF":
             return self._body(token, "")
         name = self._name("a DEF name").text
@@ -226,16 +228,16 @@ class Parser:
     def _used(self) -> WorldNode:
         token = self._name("a DEF name")
         if token.text not in self._defined:
-            raise WorldError(f"USE {token.text} comes before any DEF {token.text}", token.line)
+            raise WorldFileError(f"USE {token.text} comes before any DEF {token.text}", token.line)
         return self._defined[token.text]
 
     def _body(self, type_token: Token, def_name: str) -> WorldNode:
         is_inner = self._line is not None  # Nodes in a PROTO cannot be found from outside.
         line = type_token.line if self._line is None else self._line
-        node = WorldNode(type_token.text, "" if is_inner else def_name, line)
+        node = WorldNode(type_token.text, "" if is_inner else def_name, line, file=self._file)
         brace = self._take()
         if brace.text != "{":
-            raise WorldError(
+            raise WorldFileError(
                 f"expected {{ after {node.type_name}, found {brace.text!r}", brace.line
             )
         while self._peek().text != "}":
@@ -243,6 +245,7 @@ class Parser:
             if token.text == "hidden":  # State of a simulation that was saved.
                 self._value(self._take())
             else:
+                node.field_lines[token.text] = token.line
                 node.fields[token.text] = self._value(token)
         self._take()
         if def_name:
@@ -260,14 +263,14 @@ class Parser:
         if token.text in _WORDS or token.text.startswith('"'):
             return _word(self._take())
         if token.text in "]{}":
-            raise WorldError(f"field {owner.text} has no value", token.line)
+            raise WorldFileError(f"field {owner.text} has no value", token.line)
         return self._node()
 
     def _is_value(self) -> Value:
         self._take()
         name = self._name("a field of the PROTO")
         if self._given is None or name.text not in self._given:
-            raise WorldError(f"the PROTO has no field {name.text}", name.line)
+            raise WorldFileError(f"the PROTO has no field {name.text}", name.line)
         value = self._given[name.text]
         return [*value] if isinstance(value, list) else value  # pyright: ignore[reportReturnType]
 
@@ -292,7 +295,8 @@ class Parser:
     def _close(self, owner: Token) -> None:
         token = self._take()
         if token.text != "]":
-            raise WorldError(f"field {owner.text}: expected ], found {token.text!r}", token.line)
+            what = f"field {owner.text}: expected ], found {token.text!r}"
+            raise WorldFileError(what, token.line)
 
 
 def _word(token: Token) -> bool | str | None:
@@ -305,29 +309,25 @@ def require_release(text: str, what: str = "world") -> None:
     """Check the first line of a file.
 
     Raises:
-        WorldError: It is not a file of Webots, or of a release with different axes.
+        WorldFileError: It is not a file of Webots, or of a release with different axes.
     """
     first, first_line = "#VRML_SIM R2023b utf8", text.partition("\n")[0]
     release = re.match(r"#VRML_SIM (R20\d\d)[ab]?\S* utf8", first_line)
     if release is None:
-        raise WorldError(f'a {what} begins with "{first}", not {first_line[:40]!r}', 1)
+        raise WorldFileError(f'a {what} begins with "{first}", not {first_line[:40]!r}', 1)
     if release[1] < "R2022":
-        raise WorldError(
+        raise WorldFileError(
             f"{what}s of {release[1]} have other axes: "
             "open and save it with Webots R2022a or newer",
             1,
         )
 
 
-NODE_TYPES: Final = Parser((DATA / "nodes.txt").read_text(encoding="utf-8")).types()
-"""Definitions of fields by node type."""
-
-
 def give_types(node: WorldNode, definitions: Mapping[str, FieldDefinition]) -> None:
     """Give a node all fields of its type, with values of the right types.
 
     Raises:
-        WorldError: A value has the wrong type; the text names the field and the line.
+        WorldFileError: A value has the wrong type; the text names the field and the line.
     """
     written = node.fields
     node.fields = {}
@@ -346,7 +346,7 @@ def _typed(value: Value, name: str, definition: FieldDefinition, node: WorldNode
             return [_single(item, kind) for item in values]
         return _several_numbers(value, kind)
     except (TypeError, ValueError):
-        raise WorldError(
+        raise WorldFileError(
             f"{node.type_name}.{name} has to be {definition.type_name}, not {_shown(value)}",
             node.line,
         ) from None

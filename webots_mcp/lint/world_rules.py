@@ -1,0 +1,204 @@
+"""Rules about the file: PROTO nodes, names, and what its sensors cost."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.lint.bodies import Bodies, SolidPart
+from webots_mcp.lint.scene import (
+    DEVICES,
+    EXTERNPROTO_SINCE,
+    NODE_TYPES,
+    Scene,
+    TreeNode,
+)
+from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
+
+
+@dataclass(frozen=True)
+class RenderingEstimate:
+    """What an ordinary graphics card renders and copies; a rough estimate, not a measurement.
+
+    Attributes:
+        pixels_per_wall_s: Pixels or lidar points in a second of wall time.
+    """
+
+    pixels_per_wall_s: float = 100e6
+
+
+_RENDERING: Final = RenderingEstimate()
+_MOST_LINES: Final = 5
+
+
+class WorldRules:
+    """The rules about the file, for one scene."""
+
+    def __init__(self, scene: Scene, bodies: Bodies, report: LintReport) -> None:
+        self._scene = scene
+        self._bodies = bodies
+        self._report = report
+
+    def search(self) -> None:
+        """Apply all rules."""
+        self._report.judge("file")
+        self._time_step()
+        self._undeclared()
+        self._names()
+        self._rendering()
+
+    def _fault(
+        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
+    ) -> None:
+        path = f"{node.path}.{field}" if field else node.path
+        self._report.faults.append(
+            WorldFault(rule, severity, path, node.file, node.line_of(field), what, fix)
+        )
+
+    def _time_step(self) -> None:
+        info = self._scene.info
+        step_ms = info.number("basicTimeStep")
+        if step_ms < 1.0:
+            self._fault(
+                "time step", "error", info, "basicTimeStep",
+                f"basicTimeStep is {step_ms:g} ms; the shortest is 1 ms",
+                "Set it to 1 or more, for example 16.",
+            )  # fmt: skip
+
+    # -- PROTO nodes --
+
+    def _undeclared(self) -> None:
+        seen: set[tuple[Path, str]] = set()
+        for node in self._scene.nodes:
+            name = node.written_type
+            file = node.written_file or node.file
+            if name in NODE_TYPES or (file, name) in seen:
+                continue
+            seen.add((file, name))
+            release = self._scene.releases.get(file, self._scene.release)
+            if release < EXTERNPROTO_SINCE:
+                self._report.leave_out(
+                    ["undeclared PROTO"], file.name,
+                    f"it is a file of {release}, for which Webots finds PROTO nodes itself",
+                )  # fmt: skip
+                continue
+            self._report.judge("undeclared PROTO")
+            urls = self._scene.declared.get(file, {})
+            line = node.written_line
+            if name not in urls:
+                self._missing_declaration(node, name, file, line)
+            elif "://" not in urls[name] and not (file.parent / urls[name]).is_file():
+                self._report.faults.append(
+                    WorldFault(
+                        "undeclared PROTO", "error", node.path, file, line,
+                        f'EXTERNPROTO "{urls[name]}" names a file that is not there',
+                        f"Correct the path; it is relative to {file.parent.name}/.",
+                    )
+                )  # fmt: skip
+        if not seen:
+            self._report.judge("undeclared PROTO")
+
+    def _missing_declaration(self, node: TreeNode, name: str, file: Path, line: int) -> None:
+        own = self._scene.project / "protos" / f"{name}.proto"
+        url = f"../protos/{name}.proto" if own.is_file() else f".../{name}.proto"
+        self._report.faults.append(
+            WorldFault(
+                "undeclared PROTO", "error", node.path, file, line,
+                f"{file.name} uses {name}, which is no node of Webots, without EXTERNPROTO",
+                f'Add EXTERNPROTO "{url}" at the top of {file.name}'
+                + ("." if own.is_file() else ", with the address of the PROTO."),
+            )
+        )  # fmt: skip
+
+    # -- names --
+
+    def _names(self) -> None:
+        families: dict[SolidPart | None, list[SolidPart]] = {}
+        for part in self._bodies.parts:
+            families.setdefault(part.parent, []).append(part)
+        for siblings in families.values():
+            nodes = [part.node for part in siblings if not part.is_in_unread]
+            self._twice(nodes, "Solid")
+        for robot in self._scene.of_type("Robot"):
+            devices = [node for node in _inside(robot) if node.type_name in DEVICES]
+            self._twice(devices, "device", robot)
+
+    def _twice(self, nodes: Sequence[TreeNode], kind: str, robot: TreeNode | None = None) -> None:
+        self._report.judge("names", len(nodes))
+        counts = Counter(node.text("name") for node in nodes)
+        for name, count in counts.items():
+            if count < 2:
+                continue
+            those = [node for node in nodes if node.text("name") == name]
+            if kind == "Solid" and all(node.type_name in DEVICES for node in those):
+                continue  # reported as devices of the robot
+            lines = ", ".join(str(node.line_of("name")) for node in those[:_MOST_LINES])
+            more = " and more" if count > _MOST_LINES else ""
+            robots = [node for node in those if node.type_name == "Robot"]
+            severity: Severity = "warning" if kind == "device" or len(robots) > 1 else "note"
+            where = f"in {robot.label}" if robot else "next to each other"
+            effect = {
+                "device": "getDevice returns only one of them",
+                "Solid": "Webots warns, and only one can be found by name",
+            }[kind]
+            self._fault(
+                "names", severity, those[1], "name",
+                f"{count} {kind}s {where} have the name {name!r} (lines {lines}{more}): {effect}",
+                "Give each a name of its own.",
+            )  # fmt: skip
+
+    # -- what sensors cost --
+
+    def _rendering(self) -> None:
+        step_s = self._scene.step_s
+        if step_s <= 0.0:
+            return
+        loads: list[tuple[float, TreeNode, str]] = []
+        for node in self._scene.of_type("Camera", "RangeFinder"):
+            width, height = node.number("width"), node.number("height")
+            loads.append((width * height, node, f"{width:g} x {height:g} pixels"))
+        loads += [self._lidar(node) for node in self._scene.of_type("Lidar")]
+        self._report.judge("rendering load", len(loads) + 1)
+        total = sum(load[0] for load in loads)
+        factor = total / step_s / _RENDERING.pixels_per_wall_s
+        if factor <= 1.0 or not loads:
+            return
+        _, node, what = max(loads, key=lambda load: load[0])
+        field = "horizontalResolution" if node.type_name == "Lidar" else "width"
+        others = f", with {len(loads) - 1} others" if len(loads) > 1 else ""
+        self._fault(
+            "rendering load", "warning", node, field,
+            f"{node.label} renders {what}{others}: sampled at each step of {1000.0 * step_s:g} ms, "
+            f"about {total / step_s / 1e6:.0f} million pixels per simulated second, an estimated "
+            f"{factor:.1f} times what an ordinary graphics card does in real time",
+            "Lower the resolution, or enable the sensor with a longer period.",
+        )  # fmt: skip
+
+    def _lidar(self, node: TreeNode) -> tuple[float, TreeNode, str]:
+        columns, layers = node.number("horizontalResolution"), node.number("numberOfLayers")
+        wide, high = node.number("fieldOfView"), node.number("verticalFieldOfView")
+        self._report.judge("lidar layers")
+        if node.text("type") == "rotating":
+            wide = 2.0 * pi
+        rows = columns * high / wide if wide > 0.0 else 0.0
+        if layers > 1.0 and layers >= rows > 0.0:
+            self._fault(
+                "lidar layers", "warning", node, "numberOfLayers",
+                f"{node.label} has {layers:g} layers, but its image has only {rows:.3g} rows: "
+                "verticalFieldOfView * horizontalResolution / fieldOfView",
+                f"Set horizontalResolution to more than {layers * wide / high:.0f}, or "
+                f"numberOfLayers to less than {rows:.3g}.",
+            )  # fmt: skip
+        return columns * max(layers, rows), node, f"{columns:g} x {max(layers, rows):.0f} points"
+
+
+def _inside(node: TreeNode) -> list[TreeNode]:
+    found: list[TreeNode] = []
+    for child in node.children():
+        if child.type_name != "Robot":
+            found += [child, *_inside(child)]
+    return found

@@ -86,7 +86,7 @@ def _set_pace(database: Path) -> None:
         for table in ("state", "kept_state", "event", "log"):
             connection.execute(f"UPDATE {table} SET wall_time_s = {wall_s}")
         connection.execute(f"UPDATE image SET wall_time_s = {wall_s}")
-        sent_s = wall_s.replace("sim_time_s", "claimed_sim_time_s")
+        sent_s = f"{wall_s} - 0.001".replace("sim_time_s", "claimed_sim_time_s")  # then a picture
         connection.execute(
             f"UPDATE command SET created_wall_time_s = {sent_s}, claimed_wall_time_s = {sent_s}, "
             f"finished_wall_time_s = {sent_s}"

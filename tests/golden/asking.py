@@ -103,6 +103,7 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "variables of the controller": ("webots_inspect_controller", {}),
     "outcome of a command": ("webots_wait_for_command", {"command_id": 1, "timeout_wall_s": 1}),
     "diagnosis": ("webots_diagnose_setup", {}),
+    "faults of a world that is not there": ("webots_lint_world", {"world": "none/w.wbt"}),
     "scene": ("webots_get_scene", {}),
     "field of a node": ("webots_get_field", {"path": "ROBOT.translation"}),
 }

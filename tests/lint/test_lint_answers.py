@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 
+import anyio
 import pytest
+from mcp import Client
+from mcp.types import CallToolResult
 
 from tests.lint.worlds import write_world
 from webots_mcp.answers.shortening import compact_json, tokens_in
 from webots_mcp.answers.summaries import summary_of
 from webots_mcp.cli import main
+from webots_mcp.database.connection import connect
+from webots_mcp.database.schema import create_schema
 from webots_mcp.lint import RULES, lint_world
 from webots_mcp.questions.lint_world import lint_answer, lint_in_short
+from webots_mcp.server.mcp_server import create_server
 
 FAULTY = "Solid { physics Physics { mass 1 inertiaMatrix [ 1 1 -1 0 0 0 ] } }"
 NOTED = 'Solid { name "a" } Solid { name "a" }'
@@ -88,3 +95,25 @@ def test_a_world_that_is_elsewhere_is_not_searched(world: str) -> None:
 
 def test_a_run_without_a_world_says_nothing_of_it() -> None:
     assert lint_in_short(None) is None
+
+
+def test_an_assistant_may_ask_about_worlds_of_the_project_only(tmp_path: Path) -> None:
+    plant, visitor = tmp_path / "plant", tmp_path / "visitor"
+    for project in (plant, visitor):
+        (project / "controllers").mkdir(parents=True)
+        (project / "worlds").mkdir()
+        write_world(project, NOTED)
+    data = plant / "mcp_data"
+    with closing(connect(data / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+
+    async def ask(world: str) -> CallToolResult:
+        async with Client(create_server(data / "webots.db", data)) as client:
+            return await client.call_tool("webots_lint_world", {"world": world})
+
+    inside = anyio.run(ask, "worlds/w.wbt")
+    assert inside.structured_content is not None
+    assert inside.structured_content["counts"]["notes"] == 1
+    assert not anyio.run(ask, str(plant / "worlds" / "w.wbt")).is_error
+    for outside in (str(visitor / "worlds" / "w.wbt"), "../visitor/worlds/w.wbt"):
+        assert anyio.run(ask, outside).is_error

@@ -17,6 +17,8 @@ from webots_mcp.contract import WORLD_ENDING
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.lint.world_faults import RULES, SEVERITIES, LintReport, Severity, WorldFault
 from webots_mcp.questions.declaration import READS, question
+from webots_mcp.simulator.launch import require_world
+from webots_mcp.steering.launcher import project_of
 from webots_mcp.store.recording import RecordingAccess
 
 COLUMNS: Final = ("severity", "rule", "path", "place", "what", "fix")
@@ -146,6 +148,8 @@ def _file_of(recording: RecordingAccess, world: str | None) -> Path:
                 "The newest run does not name its world file. Give one, for example "
                 "world='worlds/arena.wbt'."
             )
+    elif not is_for_a_person():  # like a world to open, it has to be one of the project
+        return require_world(world, project_of(recording))[0]
     file = Path(world)
     if file.suffix != WORLD_ENDING:
         raise InvalidInputError(

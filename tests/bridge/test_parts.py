@@ -172,7 +172,7 @@ def test_control_claims_a_command_runs_its_handler_and_writes_the_answer(base: B
 def test_the_actions_that_run_the_simulation_need_no_session(base: Base) -> None:
     pause, throttle = base.pause(), Throttle(1)
     queue, reloads = ClaimedCommands(base.recorder), Reloads(base.errors.failed)
-    world = WorldActions(base.simulation, base.clock, pause, queue, reloads)
+    world = WorldActions(base.simulation, base.clock, pause, queue, reloads, lambda _: None)
     running = RunningActions(
         base.simulation,
         base.clock,

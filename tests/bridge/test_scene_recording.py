@@ -156,7 +156,8 @@ def test_a_movie_that_the_controller_itself_records_is_left_alone(
 def test_what_would_discard_the_recording_is_refused_until_it_is_stopped(
     scene: Scene, action: str
 ) -> None:
-    params = {"world": scene.robot.getWorldPath()} if action == "load_world" else {}
+    is_load = action == "load_world"
+    params: dict[str, Any] = {"world": scene.robot.getWorldPath()} if is_load else {}
     scene.ask(do="start", width=32, height=32)
     status, _, error = scene.ask(action, **params)
     assert status == "failed"
@@ -209,7 +210,10 @@ def test_what_cannot_be_meant_is_refused(scene: Scene, params: dict[str, Any], s
 
 
 def test_a_failure_of_webots_is_named(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene.robot, "animationStartRecording", lambda file: 0)
+    def refuse(file: str) -> int:
+        return 0
+
+    monkeypatch.setattr(scene.robot, "animationStartRecording", refuse)
     assert "could not begin the animation" in scene.ask(do="start", kind="animation")[2]
     scene.ask(do="start", width=32, height=32)
     scene.drive(5)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.encoding import plain
@@ -39,8 +38,7 @@ _CANNOT_PAUSE: Final = (
 )
 
 
-@dataclass(frozen=True)
-class BreakpointErrors:
+class BreakpointErrors(NamedTuple):
     """When and how errors of breakpoints are reported.
 
     Attributes:

@@ -32,7 +32,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from itertools import compress, islice
 from json.encoder import encode_basestring
 from operator import not_
@@ -64,8 +63,7 @@ TEXT_WITH_SURROGATES: Final = "unsupported: str"
 _Path: TypeAlias = "tuple[_Path | None, str | int]"
 
 
-@dataclass(frozen=True)
-class CleanedSizes:
+class CleanedSizes(NamedTuple):
     """Limits of what a state may hold, so that a row stays below 1,000,000 bytes.
 
     Attributes:

@@ -14,9 +14,8 @@ import sys
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
 from itertools import islice
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.bridge.camera_frames import MOST_FRAMES, CameraFrames
 from webots_mcp.bridge.error_report import cut, storable
@@ -30,8 +29,7 @@ from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import KEEP_AFTER_S, new_uuid
 
 
-@dataclass(frozen=True)
-class FullRateLimits:
+class FullRateLimits(NamedTuple):
     """Limits of full-rate segments.
 
     Attributes:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.bridge.cleaning import BYTES_AS_TEXT, TEXT_WITH_SURROGATES, TOO_LARGE
 from webots_mcp.bridge.encoding import Encoded, encode
@@ -20,8 +19,7 @@ _NOT_LOST: Final = ("nan", "inf", "-inf", BYTES_AS_TEXT, TEXT_WITH_SURROGATES)
 _LEVELS: Final = {"stdout": "info", "stderr": "warning"}
 
 
-@dataclass(frozen=True)
-class JournalLogLimits:
+class JournalLogLimits(NamedTuple):
     """Lengths of what a bridge without a database logs into its journal.
 
     Attributes:

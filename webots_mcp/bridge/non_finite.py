@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.bridge.cleaning import replace_non_finite
 from webots_mcp.bridge.plain_values import NotPlainError
@@ -21,8 +20,7 @@ from webots_mcp.bridge.plain_values import NotPlainError
 _KINDS: Final = frozenset(("nan", "inf", "-inf"))
 
 
-@dataclass(frozen=True)
-class KnownPathLimits:
+class KnownPathLimits(NamedTuple):
     """Limits of the paths that are remembered.
 
     Attributes:

@@ -21,12 +21,11 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import get_ident
 from types import FrameType
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.bridge.backlog import Backlog, Row
 from webots_mcp.bridge.error_report import ErrorReport
@@ -92,8 +91,7 @@ _of_parents: list[sqlite3.Connection | None] = []
 _HOLDER: Final = "holder"
 
 
-@dataclass(frozen=True)
-class RecorderPatience:
+class RecorderPatience(NamedTuple):
     """How long a call of the recorder may wait, in seconds.
 
     Attributes:

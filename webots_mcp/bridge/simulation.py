@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
@@ -27,8 +26,7 @@ _METER: Final = "_webots_mcp_meter"  # likewise
 _MARK: Final = "_webots_mcp_asks"  # of a method
 
 
-@dataclass(frozen=True)
-class StepTimes:
+class StepTimes(NamedTuple):
     """Times of waiting for a step, in seconds.
 
     Attributes:

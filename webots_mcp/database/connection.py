@@ -10,10 +10,9 @@ import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from webots_mcp.contract import (
     SCHEMA_VERSION,
@@ -50,8 +49,7 @@ Role = Literal["loop", "writer", "reader"]
 _inherited: set[tuple[int, int]] | None = set()
 
 
-@dataclass(frozen=True)
-class ReaderLimits:
+class ReaderLimits(NamedTuple):
     """Limits of a connection.
 
     Attributes:

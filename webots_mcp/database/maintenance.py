@@ -21,9 +21,8 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from webots_mcp.database.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files
 from webots_mcp.database.job_leases import JobLease, give_back, take
@@ -52,8 +51,7 @@ FREE_THE_LOG: Final = (
 Kind = Literal["server", "bridge", "prune", "question"]
 
 
-@dataclass(frozen=True)
-class LogLimits:
+class LogLimits(NamedTuple):
     """Sizes of the write-ahead log, and times for keeping it short.
 
     Attributes:

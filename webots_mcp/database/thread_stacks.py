@@ -16,7 +16,6 @@ import re
 import signal
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
@@ -41,8 +40,7 @@ _DEBUGGER: Final = r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)"
 _STRANGE: Final = (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError)
 
 
-@dataclass(frozen=True)
-class StackLimits:
+class StackLimits(NamedTuple):
     """Limits of what is read from a file of stacks.
 
     Attributes:

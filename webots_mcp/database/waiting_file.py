@@ -25,7 +25,6 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from io import FileIO
 from pathlib import Path
@@ -221,8 +220,7 @@ _OF_THE_FILE: Final = (
 _PART: Final = r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
 
 
-@dataclass(frozen=True)
-class WaitingFileLimits:
+class WaitingFileLimits(NamedTuple):
     """Limits of a file of waiting rows.
 
     Attributes:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Final, Literal, NamedTuple, get_args
@@ -154,8 +153,7 @@ _OF_SPEEDS: Final = frozenset((
 ))  # fmt: skip
 
 
-@dataclass(frozen=True)
-class RememberedMeanings:
+class RememberedMeanings(NamedTuple):
     """Sizes of caches.
 
     Attributes:
@@ -170,8 +168,7 @@ class RememberedMeanings:
 _CACHE: Final = RememberedMeanings()
 
 
-@dataclass(frozen=True)
-class BehaviourRules:
+class BehaviourRules(NamedTuple):
     """What the values of an unknown signal must show before a meaning follows.
 
     Attributes:

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 Value: TypeAlias = "int | float | str | None"  # a bool is an int
 
@@ -98,8 +97,7 @@ _OBEYED: Final = re.compile(
 )
 
 
-@dataclass(frozen=True)
-class NameLimits:
+class NameLimits(NamedTuple):
     """Limits of how much of a name is read.
 
     Attributes:

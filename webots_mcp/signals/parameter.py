@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.errors import InvalidInputError
@@ -28,8 +27,7 @@ _MEANT: Final = {
 }
 
 
-@dataclass(frozen=True)
-class DeclarationLimits:
+class DeclarationLimits(NamedTuple):
     """Limits of a declaration of a parameter.
 
     Attributes:

@@ -15,7 +15,6 @@ import re
 import sqlite3
 import time
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, cast
@@ -80,8 +79,7 @@ _LONGEST_TEXT: Final = 1000  # characters; a longer text is not a mode either
 _UNSEEN: Final = object()
 
 
-@dataclass(frozen=True)
-class AngleRanges:
+class AngleRanges(NamedTuple):
     """Values that show whether a signal is an angle in radians.
 
     Attributes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import OrderedDict
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
@@ -54,7 +55,10 @@ def test_values_of_extra_count_once_in_each_call(
     assert episodes(recording) == [(1, {"reward": 7.0, "count": 7, "success": True})]
 
 
-@pytest.mark.parametrize("reward", [np.float32(0.5), np.int64(2), Fraction(1, 2), True])
+@pytest.mark.parametrize(
+    "reward",
+    [np.float32(0.5), np.int64(2), np.array(1.0), Fraction(1, 2), Decimal("1.5"), True],
+)
 def test_every_kind_of_real_number_is_a_reward(
     robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording, reward: Any
 ) -> None:
@@ -65,7 +69,7 @@ def test_every_kind_of_real_number_is_a_reward(
 
 
 @pytest.mark.parametrize(
-    "reward", [None, "3", [1.0], float("nan"), float("inf"), 10**400, Decimal(1), {"sum": 2}]
+    "reward", [None, "3", [1.0], np.ones(1), float("nan"), float("inf"), 10**400, {"sum": 2}]
 )
 def test_what_is_no_finite_number_leaves_the_state_as_it_is(
     robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording, reward: Any
@@ -84,3 +88,32 @@ def test_a_controller_without_rewards_has_no_episodes(
     sparse.publish({"x": 1.0})
     sparse.close()
     assert episodes(recording) == []
+
+
+def test_the_last_step_of_a_run_may_lack_its_reward_and_tell_how_it_ended(
+    robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording
+) -> None:
+    for reward in (1.0, float("nan"), 2.0, None):
+        robot.step(STEP_MS)
+        sparse.publish(OrderedDict(reward=reward, success=np.bool_(reward is None)))
+    robot.step(STEP_MS)
+    sparse.publish({"truncated": 1.0})
+    sparse.close()
+    told = {"reward": 3.0, "count": 2, "missing": 3, "success": True, "truncated": True}
+    assert episodes(recording) == [(1, told)]
+
+
+def test_a_hostile_number_costs_nothing_but_its_reward(
+    robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording
+) -> None:
+    class Hostile(float):
+        def __float__(self) -> float:
+            raise RuntimeError
+
+        def __sub__(self, other: object) -> float:
+            raise RuntimeError
+
+    robot.step(STEP_MS)
+    sparse.publish({"reward": Hostile(2.0), "x": 1.5}, force=True)
+    sparse.close()
+    assert recording.rows("SELECT json_extract(data, '$.x') FROM state") == [1.5]

@@ -107,8 +107,8 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "scene": ("webots_get_scene", {}),
     "field of a node": ("webots_get_field", {"path": "ROBOT.translation"}),
 }
-NEEDS_A_SIMULATION: Final = ("scene", "field of a node")
-"""Questions that read, but a running simulation and no recording."""
+NEEDS_A_SIMULATION: Final = ("scene", "field of a node", "faults of a world that is not there")
+"""Questions that read a running simulation or a world file, and no recording."""
 
 # What changes something is asked last. A recording alone takes labels and gives reports; what needs
 # a running simulation says that there is none.

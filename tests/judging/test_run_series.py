@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import socket
 import sqlite3
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownSignalError
+from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.judging import run_series
 from webots_mcp.judging.run_score import score_run
 from webots_mcp.judging.run_series import RunSeries, evenly, score_series
@@ -32,7 +33,8 @@ def train(connection: sqlite3.Connection, scores: Sequence[float], rows: int = 4
             recorder.run(1, 1, "reset")
         for row in range(rows):
             done = row / (rows - 1)
-            recorder.publish(row * 0.1, {"x": score * done, "arrived": done == 1 and score > 5})
+            state = {"x": score * done, "arrived": done == 1 and score > 5, "name": "a"}
+            recorder.publish(row * 0.1, state)
         recorder.end_run("reset")
     while not make_chunks(connection, 2000).done:
         pass
@@ -120,7 +122,7 @@ def test_a_training_that_collapses_is_no_plateau(empty: sqlite3.Connection) -> N
     best = found.best_level
     assert best is not None
     assert (best.first_run, best.last_run) == (pytest.approx(61, abs=3), pytest.approx(140, abs=3))
-    assert found.levels[-1].median < best.median
+    assert found.levels[-1].mean < best.mean
 
 
 def test_a_score_that_still_rises_is_said_to(empty: sqlite3.Connection) -> None:
@@ -164,7 +166,7 @@ def test_the_reward_of_episodes_is_the_default(empty: sqlite3.Connection) -> Non
     found = series_of(empty, None)
 
     assert [run.value for run in found.runs] == [10.0, 20.0, None, 40.0]
-    assert "no episode event" in str(found.runs[2].why)
+    assert "no summed reward" in str(found.runs[2].why)
     assert sum(point.shares["time over"][0] for point in found.curve) == 1
 
 
@@ -177,14 +179,54 @@ def test_events_that_cannot_be_searched_are_said_to_be_unknown(empty: sqlite3.Co
     assert "stuck" not in found.known
 
 
+def test_sparse_scores_have_levels_and_the_better_one_is_the_best(
+    empty: sqlite3.Connection,
+) -> None:
+    chance = random.Random(13)
+    train(empty, [float(chance.random() < (0.05 if n < 300 else 0.4)) for n in range(600)])
+
+    found = series_of(empty)
+
+    assert len(found.levels) == 2
+    assert found.levels[1].first_run == pytest.approx(301, abs=25)
+    assert found.best_level is found.levels[1]
+
+
+def test_equal_scores_have_no_best_and_worst(empty: sqlite3.Connection) -> None:
+    train(empty, [2.0] * 12)
+
+    assert series_of(empty).ends == ([], [])
+
+
+def test_a_run_whose_process_was_killed_counts_as_crashed(empty: sqlite3.Connection) -> None:
+    recorder = train(empty, [1.0, 2.0, 3.0])
+    recorder.run(1, 1, "reset")
+    recorder.publish(0.0, {"x": 1.0})  # and then nothing more: its process does not exist
+    empty.execute("UPDATE session SET host = ?, pid = ?", (socket.gethostname(), 2**22 - 1))
+
+    crashed = series_of(empty).curve[-1].shares["crashed"]
+
+    assert crashed == (1, 1)
+
+
+def test_a_range_takes_the_runs_of_the_robot_and_names_are_required(
+    empty: sqlite3.Connection,
+) -> None:
+    train(empty, [1.0, 2.0, 3.0, 4.0])
+
+    assert len(series_of(empty, run_ids=list(range(2, 99))).runs) == 3
+    with pytest.raises(InvalidInputError, match="Its runs are 1 to 4"):
+        series_of(empty, run_ids=[1, 2, 9], required=[1, 2, 9])
+
+
 def test_what_cannot_be_a_series_is_refused_in_words(empty: sqlite3.Connection) -> None:
     train(empty, [1.0, 2.0, 3.0])
-    with pytest.raises(NothingRecordedError, match="publish a number named 'reward'"):
+    with pytest.raises(InvalidInputError, match="publish a number named 'reward'"):
         series_of(empty, None)
     with pytest.raises(InvalidInputError, match="3 to 20,000 runs"):
         series_of(empty, run_ids=[1, 2])
-    with pytest.raises(InvalidInputError, match="Run 9 is no run"):
-        series_of(empty, run_ids=[1, 2, 9])
+    with pytest.raises(InvalidInputError, match="goal='name' is a text"):
+        series_of(empty, goal="name")
     with pytest.raises(UnknownSignalError, match="no signal 'arived'"):
         series_of(empty, goal="arived")
     with pytest.raises(UnknownSignalError, match="no signal 'y'"):

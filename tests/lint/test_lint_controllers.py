@@ -132,3 +132,8 @@ def test_robots_with_one_program_may_have_different_devices(tmp_path: Path) -> N
     )
     report = lint_world(write_world(tmp_path, ROBOT % "" + second))
     assert [fault for fault in faults_of(report, "devices") if fault.severity == "error"] == []
+
+
+def test_a_source_that_cannot_be_parsed_is_not_searched(tmp_path: Path) -> None:
+    verdicts = linted(tmp_path, asked("robot.step(33")).verdicts()
+    assert (verdicts["devices"], verdicts["sampling period"]) == ("not searched", "not searched")

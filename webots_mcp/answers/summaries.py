@@ -113,7 +113,9 @@ def _(answer: WorldAnswer) -> str:
 
 @_summary.register
 def _(answer: LintAnswer) -> str:
-    counts = {name: count for name, count in (answer.counts or {}).items() if count}
+    counts = {
+        name.removesuffix("s"): count for name, count in (answer.counts or {}).items() if count
+    }
     name = (answer.world or "world").replace("\\", "/").rsplit("/", 1)[-1]
     open_rules = len(answer.not_searched or ())
     rest = f"; {_count(open_rules, 'rule')} could not judge everything" if open_rules else ""
@@ -592,12 +594,24 @@ def _development(answer: ComparisonAnswer) -> str:
     runs, known = scored.get("runs", 0), scored.get("score", 0)
     of_runs = _count(runs, "run") if known == runs else f"{known} of {_count(runs, 'run')}"
     best = next(iter(_rows(answer.best_runs)), None)
-    parts = [f"Score of {of_runs}: {answer.trend}" if answer.trend else f"No score in {of_runs}"]
-    parts.append(f"best run {best['run_id']} ({best['score']})" if best else "")
-    reached = [row["goal_percent"] for row in curve if row.get("goal_percent") is not None]
+    if not known:
+        reason = next(iter(answer.unscored or ()), "no reason is known")
+        return f"None of {_count(runs, 'run')} has a score: {reason}."
+    parts = [f"Score of {of_runs}: {answer.trend}"]
+    parts.append(
+        f"best {'scored ' * (known < runs)}run {best['run_id']} ({best['score']})" if best else ""
+    )
+    counts = [row.get("scored") or 0 for row in curve]
+    reached = [
+        row["goal_percent"]
+        for row, count in zip(curve, counts, strict=True)
+        if row.get("goal_percent") is not None and 2 * count >= max(counts)
+    ]
     if len(reached) > 1:
-        parts.append(f"goal reached in {reached[0]:.12g} % of the first, {reached[-1]:.12g} % of "
-                     "the last runs")  # fmt: skip
+        parts.append(
+            f"goal reached in {reached[0]:.12g} % of the first, {reached[-1]:.12g} % of the "
+            "last runs"
+        )
     return f"{'; '.join(part for part in parts if part)}."
 
 

@@ -64,7 +64,7 @@ class SceneRecording:
         if self._current is not None:
             raise CommandRefusedError(
                 f"{what} would discard the {self._current.kind} that is being recorded since "
-                f"{self._current.from_s:.3f} s. Stop it first: record_scene with do='stop'"
+                f"{self._current.from_s:.3f} s. Stop it first: webots_record_scene(action='stop')"
             )
 
     def close(self) -> None:
@@ -110,8 +110,8 @@ class SceneRecording:
         if self._current is not None:
             raise CommandRefusedError(
                 f"{_a(self._current.kind)} is being recorded since {self._current.from_s:.3f} s, "
-                f"and one recording is possible at a time. Stop it first: record_scene with "
-                "do='stop'"
+                f"and one recording is possible at a time. Stop it first: "
+                "webots_record_scene(action='stop')"
             )
         robot = self._simulation.robot
         if not robot.movieIsReady():
@@ -149,7 +149,7 @@ class SceneRecording:
         if recording is None:
             raise CommandRefusedError(
                 "nothing is being recorded: this controller has started no recording, or it was "
-                "restarted since. Start one: record_scene with do='start'"
+                "restarted since. Start one: webots_record_scene(action='start')"
             )
         if kind != recording.kind:
             raise InvalidInputError(

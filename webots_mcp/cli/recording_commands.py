@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -649,8 +650,11 @@ def plot(
             "--score draws a score over runs, and excludes SIGNAL, --trajectory and --trials. "
             "Leave those out."
         )
-    ids = [int(each) for each in run_ids or () if _is_id(each)]
-    behind_runs = [each for each in run_ids or () if not _is_id(each)]
+    is_range = score is not None
+    from webots_mcp.questions.scored_runs import spelled_out
+
+    ids, _ = spelled_out([each for each in run_ids or () if _is_id(each, ranges=is_range)])
+    behind_runs = [each for each in run_ids or () if not _is_id(each, ranges=is_range)]
 
     def draw() -> None:
         from webots_mcp import plotting
@@ -664,7 +668,7 @@ def plot(
                 kind if score is None else "runs",
                 [*signals, *behind_runs] if score is None else [score],
                 scope=(span or TimeRangeOptions()).scope(),
-                run_ids=ids,
+                run_ids=ids or (),
                 trial_set=trial_set,
                 width_px=width_px,
                 height_px=height_px,
@@ -675,9 +679,9 @@ def plot(
     past_wrong_values(draw)
 
 
-def _is_id(text: str) -> bool:
-    """Return whether a text is the id of a run; otherwise it is a signal."""
-    return text.isascii() and text.isdecimal()
+def _is_id(text: str, *, ranges: bool = False) -> bool:
+    """Return whether a text is the id of a run, or a range of ids; otherwise it is a signal."""
+    return re.fullmatch(r"[0-9]+(-[0-9]+)?" if ranges else r"[0-9]+", text, re.ASCII) is not None
 
 
 def write_picture(file: Path, picture: PlotImage, *, as_json: bool = False) -> None:

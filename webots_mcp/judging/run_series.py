@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
 from typing import Final, NamedTuple
@@ -20,7 +20,6 @@ from webots_mcp.contract import EPISODE_EVENT
 from webots_mcp.errors import (
     ConditionFailedError,
     InvalidInputError,
-    NothingRecordedError,
     UnknownSignalError,
     WebotsMCPError,
 )
@@ -32,15 +31,18 @@ from webots_mcp.judging.run_score import require_kinds, score_run
 from webots_mcp.judging.run_statistics import RunStatistics
 from webots_mcp.signals.conditions.compiler import Condition, parse_condition
 from webots_mcp.signals.conditions.scoring import Score, Scored, parse_score
-from webots_mcp.signals.naming import nearest_first
+from webots_mcp.signals.conditions.syntax import is_signal
+from webots_mcp.signals.naming import listed, nearest_first
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Subject
 from webots_mcp.store.registered_signals import RegisteredSignal
+from webots_mcp.store.runs import run_info
 
 MOST_RUNS: Final = 20_000
 FEWEST_RUNS: Final = 3
+_NEWEST: Final = 20  # runs of which it is asked whether their process is gone
 REWARD_NAME: Final = "reward"  # by which one asks for the reward that was published
 _UNSCORED: Final = Scored(None, "not scored before the deadline")
 
@@ -51,7 +53,7 @@ class SeriesSettings:
 
     Attributes:
         points: Rows of the curve at most.
-        blocks: Changes are searched in medians of consecutive runs, at most this many: the search
+        blocks: Changes are searched in means of consecutive runs, at most this many: the search
             takes time and memory by the square of their number.
         false_alarms: How often at most a series without a change is divided, if its runs are
             independent of each other. Runs of a learner that keeps its state are not quite: a
@@ -95,7 +97,7 @@ class Level:
     first_run: int
     last_run: int
     count: int
-    median: float
+    mean: float
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class Point:
 
     Attributes:
         count: Runs, of which `scored` have a score.
-        median: Of the scores; a tenth of them is at most `low`, a tenth at least `high`.
+        mean: Of the scores; a tenth of them is at most `low`, a tenth at least `high`.
         shares: Of an outcome, the runs that had it and the runs of which that is known.
     """
 
@@ -112,6 +114,7 @@ class Point:
     last_run: int
     count: int
     scored: int
+    mean: float | None
     median: float | None
     low: float | None
     high: float | None
@@ -151,15 +154,21 @@ class RunSeries:
 
     @property
     def best_level(self) -> Level | None:
-        """The level with the highest median; of equal ones the first."""
-        return max(self.levels, key=lambda level: level.median, default=None)
+        """The level with the highest mean; of equal ones the first."""
+        return max(self.levels, key=lambda level: level.mean, default=None)
 
     @property
     def ends(self) -> tuple[list[int], list[int]]:
-        """The best and the worst runs, as many of each, at most a third of all."""
-        ranked = [run.run_id for run in self.ranked]
+        """The best and the worst runs, as many of each, at most a third of all.
+
+        None if equal scores would be divided into best and worst.
+        """
+        ranked = self.ranked
         count = min(SETTINGS.ends, len(ranked) // 3)
-        return sorted(ranked[:count]), sorted(ranked[len(ranked) - count :])
+        best, worst = ranked[:count], ranked[len(ranked) - count :]
+        if not count or best[-1].value == worst[0].value:
+            return [], []
+        return sorted(run.run_id for run in best), sorted(run.run_id for run in worst)
 
 
 def score_series(
@@ -168,6 +177,7 @@ def score_series(
     robot: str,
     run_ids: Sequence[int] | None = None,
     *,
+    required: Collection[int] = (),
     score: str | None = None,
     goal: str | None = None,
     deadline_s: float,
@@ -178,7 +188,8 @@ def score_series(
         connection: Any.
         robot_id: Whose runs.
         robot: Its name.
-        run_ids: Which of them; None for all that recorded a state.
+        run_ids: Which of them; None for all that recorded a state. Ids of other runs do not count.
+        required: Ids that have to be runs of the robot with a state.
         score: As for trials: `max(pose.x) - count(stuck)`; more is better. None or "reward" for
             the sum of the rewards that each run published.
         goal: A condition that holds at some time of a run which reached its goal. None for the
@@ -186,19 +197,19 @@ def score_series(
         deadline_s: Wall time for what is computed run by run.
 
     Raises:
-        InvalidInputError: Too few or too many runs, or a kind of event that does not exist.
+        InvalidInputError: Too few or too many runs, a kind of event that does not exist, a goal
+            that is neither true nor false, or no reward and no other score.
         InvalidConditionError: The text is no score, or the goal no condition.
         UnknownSignalError: The robot has no such signal.
-        NothingRecordedError: No run has a reward, and no score was given.
     """
-    ids = _runs_of(connection, robot_id, run_ids)
+    ids = _runs_of(connection, robot_id, run_ids, required)
     deadline = Deadline(deadline_s)
     subject = Subject(robot_id, robot, ids[-1])
     known = catalogue(connection, subject)
     condition = None if goal is None else _condition(goal, known)
     facts = RunStatistics(connection, robot_id, ids, known)
     if score is None or score.strip() == REWARD_NAME:
-        scored = _rewards(connection, ids)
+        scored = _rewards(connection, ids, REWARD_NAME in known)
         text = REWARD_NAME
     else:
         parsed = parse_score(score)
@@ -234,11 +245,19 @@ def _condition(text: str, known: Mapping[str, RegisteredSignal]) -> Condition:
             raise UnknownSignalError(
                 f"goal={text!r}: no signal {name!r} is recorded. Nearest signals: {offer}"
             )
+    if is_signal(condition.tree) and known[condition.signals[0]].kind == "text":
+        raise InvalidInputError(
+            f"goal={text!r} is a text, and a goal is true or false. Compare it, for example "
+            f"goal=\"{text} == 'done'\"."
+        )
     return condition
 
 
 def _runs_of(
-    connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int] | None
+    connection: sqlite3.Connection,
+    robot_id: int,
+    run_ids: Sequence[int] | None,
+    required: Collection[int],
 ) -> list[int]:
     """Return the runs that recorded something, oldest first."""
     found = [
@@ -249,20 +268,22 @@ def _runs_of(
             (robot_id,),
         )
     ]
+    own = set(found)
+    missing = [run_id for run_id in required if run_id not in own]
+    if missing:
+        named = listed([str(each) for each in missing])
+        raise InvalidInputError(
+            f"Run {named}: no run of this robot with a recorded state. Its runs are "
+            f"{found[0]} to {found[-1]}; leave out the others, or give robot."
+            if found
+            else f"Run {named}: this robot has no run with a recorded state. Give robot."
+        )
     if run_ids is not None:
-        wanted = set(run_ids)
-        missing = sorted(wanted.difference(found))
-        if missing:
-            raise InvalidInputError(
-                f"Run {missing[0]} is no run of this robot with a recorded state"
-                f"{f' ({len(missing) - 1} more)' if len(missing) > 1 else ''}. webots_list_runs "
-                "shows the runs; give robot to choose another robot."
-            )
-        found = sorted(wanted)
+        found = sorted(own.intersection(run_ids))
     if not FEWEST_RUNS <= len(found) <= MOST_RUNS:
         raise InvalidInputError(
-            f"A series needs {FEWEST_RUNS} to {MOST_RUNS:,} runs, and there are {len(found):,}. "
-            "Compare single runs without score, or give run_ids to choose runs."
+            f"A series needs {FEWEST_RUNS} to {MOST_RUNS:,} runs of one robot, and there are "
+            f"{len(found):,}. Compare single runs without score, or choose other run_ids."
         )
     return found
 
@@ -279,7 +300,7 @@ def score_each(
         InvalidConditionError: The text is no score.
     """
     if score.strip() == REWARD_NAME:
-        return _rewards(connection, sorted(run_ids)) if run_ids else {}
+        return _rewards(connection, sorted(run_ids), is_published=True) if run_ids else {}
     parse_score(score)
     deadline, scored = Deadline(deadline_s), dict[int, Scored]()
     for run_id in run_ids:
@@ -299,9 +320,11 @@ def _score_of(
     return Scored(found.value, found.why)
 
 
-def _rewards(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[int, Scored]:
+def _rewards(
+    connection: sqlite3.Connection, run_ids: Sequence[int], is_published: bool
+) -> dict[int, Scored]:
     """Return the rewards that bridges summed up, by run."""
-    found = {  # a controller that goes on after its last step leaves a second event
+    of_all = {  # a controller that goes on after its last step leaves a second event
         int(run_id): Scored(reward)
         for run_id, reward in connection.execute(
             "SELECT run_id, total(json_extract(data, '$.reward')) FROM event WHERE kind = ? "
@@ -310,13 +333,19 @@ def _rewards(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[int
             (EPISODE_EVENT, run_ids[0], run_ids[-1]),
         )
     }
-    if not found:
-        raise NothingRecordedError(
-            "No run has a reward, so there is nothing to rank by. Give score, for example "
+    if not any(run_id in of_all for run_id in run_ids):
+        raise InvalidInputError(
+            "No run has a summed reward: bridges before this version did not sum it up, and "
+            "neither do controllers without the bridge. Give another score, such as "
+            "score='mean(reward)'."
+            if is_published
+            else "No run has published a reward. Give another score, for example "
             "score='max(pose.x)', or publish a number named 'reward' in each step."
         )
-    missing = Scored(None, "no episode event: its controller was killed, or the run goes on")
-    return {run_id: found.get(run_id, missing) for run_id in run_ids}
+    missing = Scored(
+        None, "no summed reward: the run goes on, its controller was killed, or it published none"
+    )
+    return {run_id: of_all.get(run_id, missing) for run_id in run_ids}
 
 
 def _scored(
@@ -376,7 +405,11 @@ def _outcomes(
         (subject.robot_id, run_ids[0], run_ids[-1]),
     )
     wanted = set(run_ids)
-    found["crashed"] = {int(run_id): bool(value) for run_id, value in ends if run_id in wanted}
+    crashed = {int(run_id): bool(value) for run_id, value in ends if run_id in wanted}
+    for run_id in run_ids[-_NEWEST:]:  # whose process may be gone without a word
+        if run_id not in crashed and (ended := run_info(connection, run_id).end_reason):
+            crashed[run_id] = ended == "crashed"
+    found["crashed"] = crashed
     timed_out = _flags_of_episodes(connection, run_ids, "truncated")
     if timed_out:
         found["time over"] = timed_out
@@ -488,25 +521,26 @@ def _had_event(
 
 
 def levels_of(scored: Sequence[ScoredRun]) -> list[Level]:
-    """Return the levels of the score, oldest first."""
+    """Return the levels of the score, oldest first.
+
+    Blocks are compared by their means: of scores that are mostly 0, such as sparse rewards, the
+    medians say nothing. The test is one of ranks, so that single outliers divide nothing.
+    """
     if not scored:
         return []
-    values = np.array([run.value for run in scored], np.float64)
     per_block = math.ceil(len(scored) / SETTINGS.blocks)
     starts = range(0, len(scored), per_block)
-    medians: Array = np.array(
-        [float(np.median(values[start : start + per_block])) for start in starts], np.float64
-    )
-    edges = [0, *level_changes(medians, SETTINGS.false_alarms), len(medians)]
+    means: Array = np.array([_mean(scored[at : at + per_block]) for at in starts], np.float64)
+    edges = [0, *level_changes(means, SETTINGS.false_alarms), len(means)]
     return [
-        Level(part[0].run_id, part[-1].run_id, len(part), _median(part))
+        Level(part[0].run_id, part[-1].run_id, len(part), _mean(part))
         for first, last in pairwise(edges)
         for part in (scored[first * per_block : last * per_block],)
     ]
 
 
-def _median(runs: Sequence[ScoredRun]) -> float:
-    return float(np.median([run.value for run in runs if run.value is not None]))
+def _mean(runs: Sequence[ScoredRun]) -> float:
+    return float(np.mean([run.value for run in runs if run.value is not None]))
 
 
 def _is_rising(scored: Sequence[ScoredRun]) -> bool:
@@ -517,7 +551,7 @@ def _is_rising(scored: Sequence[ScoredRun]) -> bool:
     """
     per_block = math.ceil(max(1, len(scored)) / SETTINGS.blocks)
     values = np.array(
-        [_median(scored[at : at + per_block]) for at in range(0, len(scored), per_block)]
+        [_mean(scored[at : at + per_block]) for at in range(0, len(scored), per_block)]
     )
     count = len(values)
     if count < 8:  # of fewer the sum is not about normal
@@ -542,7 +576,8 @@ def _curve(runs: Sequence[ScoredRun], outcomes: _Outcomes) -> Iterator[Point]:
             for known in ([by_run[run.run_id] for run in part if run.run_id in by_run],)
         }
         ends = part[0].run_id, part[-1].run_id
-        yield Point(*ends, len(part), len(values), median, low, high, shares)
+        mean = float(np.mean(values)) if values else None
+        yield Point(*ends, len(part), len(values), mean, median, low, high, shares)
 
 
 def _round_up(count: int) -> int:

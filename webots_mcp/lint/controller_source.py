@@ -148,6 +148,7 @@ class _PythonReader:
                 _PythonFile(file, tree, self._found).visit_all()
             except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
                 self._found.unread = f"{file.name} cannot be parsed: {type(error).__name__}"
+                self._found.unread_period = self._found.unread
 
     def _imports(self, tree: ast.Module) -> Iterator[Path]:
         """Yield the files of the project that a module imports, and note other packages."""

@@ -83,9 +83,8 @@ def compose_run_scores(
     run_ids: Sequence[int] = (),
 ) -> tuple[RunSeries, str]:
     """Return what `plot_run_scores` paints: the series and the robot; errors as there."""
-    some_run = next(iter(run_ids), scope.run_id)
-    if scope.robot is None and some_run is not None:
-        robot_id = fetch_run(connection, some_run).robot_id
+    if scope.robot is None and scope.run_id is not None:
+        robot_id = fetch_run(connection, scope.run_id).robot_id
         query = "SELECT name FROM robot WHERE id = ?"
         name = str(connection.execute(query, (robot_id,)).fetchone()[0])
     else:
@@ -125,7 +124,7 @@ def paint_run_scores(series: RunSeries, robot: str, width_px: int, height_px: in
     _paint_running(canvas, frame, ids, values)
     for level in series.levels if len(series.levels) > 1 else ():
         across = np.array([frame.px(level.first_run), frame.px(level.last_run)])
-        at = np.full(2, float(frame.py(level.median)))
+        at = np.full(2, float(frame.py(level.mean)))
         canvas.add("path", d=line_through(across, at), fill="none", stroke=_LEVEL,
                    stroke_width=1.8, stroke_dasharray="5 4")  # fmt: skip
     best = series.ranked[0]

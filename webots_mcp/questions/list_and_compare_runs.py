@@ -111,6 +111,8 @@ class ComparisonSizes:
     Attributes:
         differences: Signals that differ, unless a limit is given.
         of_series: The same next to a score over many runs.
+        ids: Runs that are named in a list.
+        note_characters: Characters of a note, and of a reason why a figure is unknown.
         diverging: Signals in which two runs diverge, and properties in which they differ.
         only_in: Signals that only some groups have.
         verdict_characters: Characters of a verdict.
@@ -126,6 +128,8 @@ class ComparisonSizes:
 
     differences: int = 15
     of_series: int = 6
+    ids: int = 20
+    note_characters: int = 300
     diverging: int = 10
     only_in: int = 10
     verdict_characters: int = 600
@@ -186,7 +190,7 @@ def webots_list_runs(
             runs=condensed(RUN_COLUMNS, rows),
             total=found.total,
             cursor=found.runs[len(rows) - 1].run_id if older else found.cursor,
-            hint=None if rows else _no_runs(parameters),
+            hint=_unscored_hint(scores) if rows else _no_runs(parameters),
         )
 
 
@@ -242,7 +246,7 @@ def webots_compare_runs(
     none that matters, and null if this cannot be known yet: `undecided` says why. For curves over
     each other use webots_plot with run_ids.
     """
-    asked_ids = spelled_out(run_ids)
+    asked_ids, named = spelled_out(run_ids)
     is_series = score is not None or goal is not None or len(asked_ids or ()) > MOST_COMPARED
     if is_series and (trial_set or first_difference):
         raise InvalidInputError(
@@ -260,13 +264,14 @@ def webots_compare_runs(
             "give run_ids with two ids from webots_list_runs. position and mode do not apply to it."
         )
     options = EventOptions(position=both_of(position), mode=mode)
-    first = asked_ids[0] if asked_ids else _first_run(recording, trial_set) if trial_set else None
+    chosen = named if is_series else asked_ids  # the runs of a range may be of any robot
+    first = chosen[0] if chosen else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:
 
         def find() -> dict[str, Any]:
             asked = _Asked(signals, limit, options, min_effect_sd)
             if is_series:
-                return _scored(view, asked_ids, score, goal, asked)
+                return _scored(view, asked_ids, named, score, goal, asked)
             if not (first_difference and asked_ids):
                 return _compared(view, asked, asked_ids, trial_set)
             limit_s = math.inf if is_for_a_person() else COMPARE_DEADLINE_S
@@ -329,6 +334,16 @@ def webots_annotate_run(
 def _change(text: str) -> str | None:
     """None leaves it as it is, an empty text takes it away."""
     return "" if text == "-" else text or None
+
+
+def _unscored_hint(scores: Mapping[int, Scored]) -> str | None:
+    """Return why runs have no score: the reason of the newest."""
+    reasons = [each.why for each in scores.values() if each.value is None]
+    if not reasons:
+        return None
+    return cut_for_a_model(
+        f"no score of {len(reasons)} of these runs: {reasons[0]}", _SIZES.verdict_characters
+    )
 
 
 def _no_runs(parameters: dict[str, Any] | None) -> str:
@@ -416,10 +431,15 @@ class _Asked(NamedTuple):
 
 
 def _scored(
-    view: RobotView, run_ids: Sequence[int] | None, score: str | None, goal: str | None, of: _Asked
+    view: RobotView,
+    run_ids: Sequence[int] | None,
+    named: Sequence[int],
+    score: str | None,
+    goal: str | None,
+    of: _Asked,
 ) -> dict[str, Any]:
     """Return a score over all runs, and what the best and the worst of them did differently."""
-    series = find_series(view, run_ids, score, goal)
+    series = find_series(view, run_ids, named, score, goal)
     facts, (best, worst) = series_facts(series), series.ends
     if not best:
         return facts | {"unknown": unknown_of(series, {})}
@@ -454,9 +474,10 @@ def _compared(
     differing = [each for each in found.differences if _differs(each)]
     undecided = _undecided(found.measures, differing)
     shown_groups, only_in = _groups(found), list(found.only_in.items())
-    notes = notes_of([*_edit_note(found.groups), *found.notes])
+    notes = notes_of([_cut(each) for each in (*_edit_note(found.groups), *found.notes)])
+    not_known = {_cut(name): _cut(why) for name, why in found.unknown.items()}
     most = len(only_in) if is_for_a_person() else _SIZES.only_in
-    others = [*other_parts, shown_groups and shown_groups.rows, found.unknown, undecided, notes]
+    others = [*other_parts, shown_groups and shown_groups.rows, not_known, undecided, notes]
     of_measures = int(_SIZES.measures_share * row_budget_tokens(limit, others))
     measures = fitting(list(map(_measure_row, found.measures)), of_measures)
     others.append(measures)
@@ -468,7 +489,7 @@ def _compared(
         "legend": _legend(found, tables),
         "compared_s": seconds(found.compared_s),
         "measures": tables[0],
-        "unknown": found.unknown or None,
+        "unknown": not_known or None,
         "undecided": undecided,
         "differences": tables[1],
         "total": found.total,
@@ -476,6 +497,10 @@ def _compared(
         "notes": notes,
         "hint": _hint(found, len(measures), len(rows), len(differing), len(only_in) - most),
     }
+
+
+def _cut(text: str) -> str:
+    return cut_for_a_model(text, _SIZES.note_characters)
 
 
 def _legend(found: Comparison, tables: Sequence[AnswerTable | None]) -> str | None:
@@ -536,9 +561,16 @@ def _measure_row(measure: Measure) -> list[Any]:
         _intervals(measure.interval),
         _verdicts_against_first(measure.runs_wanted),
         None if measure.compared == "means" else measure.compared,
-        measure.runs,
+        measure.runs and [_ids(each) for each in measure.runs],
         measure.holds_for if measure.holds_for == WHOLE_RUNS else None,
     ]
+
+
+def _ids(run_ids: Sequence[int]) -> list[int | str]:
+    """Return run ids; of many, for a model, the first and how many more there are."""
+    if is_for_a_person() or len(run_ids) <= _SIZES.ids:
+        return list(run_ids)
+    return [*run_ids[: _SIZES.ids], f"and {len(run_ids) - _SIZES.ids} more"]
 
 
 def _medians(spreads: Sequence[Spread | None]) -> list[float | None]:
@@ -567,7 +599,7 @@ def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
     return [
         group.name,
         short_name(group.runs[0].robot) if told_robot else None,
-        [run.run_id for run in group.runs],
+        _ids([run.run_id for run in group.runs]),
         labels[: _SIZES.only_in] or None,
         _values_of({n: v[0] if len(v) == 1 else v for n, v in group.parameters.items()}),
         ", ".join(hashes) or None,

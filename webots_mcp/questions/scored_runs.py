@@ -19,11 +19,12 @@ CURVE_COLUMNS: Final = (
     "first_run",
     "last_run",
     "scored",
+    "score_mean",
     "score_median",
     "score_low",
     "score_high",
 )
-LEVEL_COLUMNS: Final = ("first_run", "last_run", "run_count", "score_median")
+LEVEL_COLUMNS: Final = ("first_run", "last_run", "run_count", "score_mean")
 _RUN_COLUMNS: Final = ("run_id", "score")
 _SHOWN_RUNS: Final = 5
 _SHOWN_REASONS: Final = 3
@@ -33,34 +34,36 @@ _OUTCOMES: Final = {"goal": "goal_percent", "crashed": "crashed_percent", "stuck
                     "fall": "fell_percent", "time over": "time_over_percent"}  # fmt: skip
 
 
-def spelled_out(run_ids: Sequence[int | str] | None) -> list[int] | None:
-    """Return run ids with ranges such as "20-90" spelled out, each once, in their order.
+def spelled_out(run_ids: Sequence[int | str] | None) -> tuple[list[int] | None, list[int]]:
+    """Return run ids with ranges such as "20-90" spelled out, and those that are named singly.
 
     Raises:
         InvalidInputError: A range ends before it begins, or there are too many runs.
     """
     if run_ids is None:
-        return None
+        return None, []
     found: list[int] = []
     for each in run_ids:
-        if isinstance(each, int):
-            found.append(each)
-            continue
-        first, last = map(int, each.split("-"))
-        if last < first:
+        first, _, last = str(each).partition("-")
+        start, end = int(first), int(last or first)
+        if end < start:
             raise InvalidInputError(
-                f"The range {each!r} ends before it begins. Write '{last}-{first}'."
+                f"The range {each!r} ends before it begins. Write '{end}-{start}'."
             )
-        if last - first + len(found) >= MOST_RUNS:
+        if end - start + len(found) >= MOST_RUNS:
             raise InvalidInputError(
                 f"{each!r} names more than {MOST_RUNS:,} runs. Choose a shorter range."
             )
-        found += range(first, last + 1)
-    return found
+        found += range(start, end + 1)
+    return found, [each for each in run_ids if isinstance(each, int)]
 
 
 def find_series(
-    view: RobotView, run_ids: Sequence[int] | None, score: str | None, goal: str | None
+    view: RobotView,
+    run_ids: Sequence[int] | None,
+    named: Sequence[int],
+    score: str | None,
+    goal: str | None,
 ) -> RunSeries:
     """Score the runs; errors as for `score_series`."""
     deadline_s = PERSON_DEADLINE_S if is_for_a_person() else SERIES_DEADLINE_S
@@ -69,6 +72,7 @@ def find_series(
         view.robot.id,
         view.robot.name,
         run_ids,
+        required=named,
         score=score,
         goal=goal,
         deadline_s=deadline_s,
@@ -83,7 +87,7 @@ def series_facts(series: RunSeries) -> dict[str, Any]:
     return {
         "score": series.score,
         "scored": {"runs": len(series.runs), "score": len(ranked), **series.known},
-        "trend": trend_of(series),
+        "trend": _in_sample(series) + (trend_of(series) or "") or None,
         "curve": without_empty((*CURVE_COLUMNS, *_OUTCOMES.values()), _curve_rows(series)),
         "levels": _levels(series),
         "best_runs": _runs(ranked[:shown]),
@@ -92,26 +96,31 @@ def series_facts(series: RunSeries) -> dict[str, Any]:
     }
 
 
+def _in_sample(series: RunSeries) -> str:
+    """Return that only some runs were scored, if so."""
+    return "of a sample spread over all runs: " if series.sampled else ""
+
+
 def trend_of(series: RunSeries) -> str | None:
     """Return how the score developed, in a sentence."""
     levels, best = series.levels, series.best_level
     if best is None:
         return None
-    last, median = levels[-1], f"{best.median:.4g}"
+    last, mean = levels[-1], f"{best.mean:.4g}"
     if len(series.ranked) < 2 * FEWEST_VALUES:
-        return f"median {median}; {len(series.ranked)} runs are too few to find a change"
+        return f"mean {mean}; {len(series.ranked)} runs are too few to find a change"
     if series.is_rising:
-        return f"still rising over the last {series.recent} runs (median {last.median:.4g})"
+        return f"still rising over the last {series.recent} scored runs (mean {last.mean:.4g})"
     if len(levels) == 1:
-        return f"no change of level in {last.count} runs (median {median})"
+        return f"no change of level in {last.count} scored runs (mean {mean})"
     if best is last:
         return (
-            f"best level since run {last.first_run} (median {median}), no improvement in the "
-            f"{last.count} runs since"
+            f"best level since run {last.first_run} (mean {mean}), no improvement in the "
+            f"{last.count} scored runs since"
         )
     return (
-        f"best from run {best.first_run} to {best.last_run} (median {median}); from run "
-        f"{last.first_run} on the median is {last.median:.4g}"
+        f"best from run {best.first_run} to {best.last_run} (mean {mean}); from run "
+        f"{last.first_run} on the mean is {last.mean:.4g}"
     )
 
 
@@ -131,7 +140,7 @@ def _curve_rows(series: RunSeries) -> list[list[Any]]:
             point.first_run,
             point.last_run,
             point.scored,
-            *map(figure, (point.median, point.low, point.high)),
+            *map(figure, (point.mean, point.median, point.low, point.high)),
             *(_percent(*point.shares.get(name, (0, 0))) for name in _OUTCOMES),
         ]
         for point in series.curve
@@ -148,7 +157,7 @@ def _levels(series: RunSeries) -> Any:
         return None
     most = None if is_for_a_person() else _MOST_LEVELS
     rows = [
-        [level.first_run, level.last_run, level.count, figure(level.median)]
+        [level.first_run, level.last_run, level.count, figure(level.mean)]
         for level in series.levels[-most if most else None :]
     ]
     return without_empty(LEVEL_COLUMNS, rows)

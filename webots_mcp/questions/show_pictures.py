@@ -21,14 +21,15 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPE
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
 from webots_mcp.questions.arguments import (
+    ComparedRunIds,
     Id,
     RobotName,
     RunId,
-    RunIds,
     Seconds,
     TimeoutS,
 )
 from webots_mcp.questions.declaration import CHANGES, READS, Caller, question
+from webots_mcp.questions.scored_runs import spelled_out
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.reading.segment import full_rate_segments, just_after
@@ -53,6 +54,7 @@ class PictureLimits:
         file_bytes: Size of a file that is sent as it is: more than such a picture has pixels, so a
             larger one holds something else.
         jpeg_quality: Quality of JPEG, from 1 to 100.
+        plotted_runs: Runs that are drawn over each other.
         gap_px: Gap between pictures of a sheet, in pixels.
     """
 
@@ -63,6 +65,7 @@ class PictureLimits:
     side_px: int = 1000
     file_bytes: int = 4_000_000
     jpeg_quality: int = 85
+    plotted_runs: int = 10
     gap_px: int = 4
 
 
@@ -301,7 +304,7 @@ def webots_plot(
             "For runs a score such as max(pose.x); default: the reward.",
         ),
     ] = None,
-    run_ids: RunIds = None,
+    run_ids: ComparedRunIds = None,
     trial_set: Annotated[
         Id | None,
         Field(description="Draw the scores of this set of trials over one or two parameters."),
@@ -324,11 +327,17 @@ def webots_plot(
             picture = draw(connection, trial_set=trial_set)
         facts = {"shows": picture.caption, "notes": notes_of(picture.notes) or []}
         return [_caption(facts), ShownPicture(data=picture.data, format="png")]
-    first = scope.run_id or next(iter(run_ids or ()), None)
+    ids, named = spelled_out(run_ids)
+    if kind != "runs" and len(ids or ()) > _LIMITS.plotted_runs:
+        raise InvalidInputError(
+            f"{len(ids or ())} runs cannot be drawn over each other. Give at most "
+            f"{_LIMITS.plotted_runs}, or draw a score over all of them with kind='runs'."
+        )
+    first = scope.run_id or next(iter((named if kind == "runs" else ids) or ()), None)
     with recording.view(scope.robot, first) as view:
         view.require_run()
         meant = scope if first else replace(scope, robot=view.robot.name)
-        picture = draw(view.connection, scope=meant, run_ids=run_ids or ())
+        picture = draw(view.connection, scope=meant, run_ids=ids or ())
         facts = (
             view.header()
             | view.position_by()

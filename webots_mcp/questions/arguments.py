@@ -5,6 +5,7 @@ Each is an annotated type: pydantic reads its bounds, and clients show its descr
 
 from __future__ import annotations
 
+import re
 from typing import (
     Annotated,
     Final,
@@ -103,9 +104,25 @@ Limit = Annotated[int, Field(ge=1, le=500, description="Maximum number of rows i
 RunIds = Annotated[
     list[Id] | None, Field(max_length=10, description="Runs, from webots_list_runs.")
 ]
-_RunRange = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,17}-[1-9][0-9]{0,17}$")]
+
+
+def _as_run_or_range(value: str | int) -> str | int:
+    text = str(value)
+    if re.fullmatch(r"[1-9][0-9]{0,17}-[1-9][0-9]{0,17}", text):
+        return text
+    if not re.fullmatch(r"[1-9][0-9]{0,17}", text):
+        raise ValueError("be the number of a run, or a range such as '20-90'")
+    return int(text)
+
+
+# The text comes first: the command line has texts only.
+_RunOrRange = Annotated[
+    str | int,
+    AfterValidator(_as_run_or_range),
+    WithJsonSchema({"type": ["integer", "string"]}),
+]
 ComparedRunIds = Annotated[
-    list[Annotated[Id | _RunRange, WithJsonSchema({"type": ["integer", "string"]})]] | None,
+    list[_RunOrRange] | None,
     Field(
         max_length=300, description="Runs to compare, such as [3, 4]; a range such as ['20-90']."
     ),

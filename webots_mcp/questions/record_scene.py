@@ -32,13 +32,15 @@ async def webots_record_scene(
     recording: RecordingAccess,
     action: Annotated[
         Literal["start", "stop"],
-        Field(description="start: film from now on. stop: end the film and write its file."),
+        Field(
+            description="Use start to film from now on, and stop to end the film and write its file."
+        ),
     ],
     caller: Caller,
     kind: Annotated[
         RecordingKind | None,
         Field(
-            description="movie: an MP4 of the main view. animation: an HTML page in which the "
+            description="A movie is an MP4 of the main view, an animation an HTML page in which the "
             "scene can be turned. Default: movie."
         ),
     ] = None,

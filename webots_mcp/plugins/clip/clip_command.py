@@ -65,7 +65,12 @@ def clip(
         Parameter("--map", negative=(), help="Show the map, even if a camera has frames."),
     ] = False,
     speed: Annotated[
-        float, Parameter("--speed", metavar="X", help="0.5 is half of real time. Default: 1.")
+        float,
+        Parameter(
+            "--speed",
+            metavar="X",
+            help="Speed of the animation: 0.5 is half of real time. Default: 1.",
+        ),
     ] = 1.0,
     output: Annotated[
         Path,

@@ -33,15 +33,15 @@ async def webots_record_scene(
     action: Annotated[
         Literal["start", "stop"],
         Field(
-            description="Use start to film from now on, and stop to end the film and write its file."
+            description="Use start to film from now on, stop to end the film and write its file."
         ),
     ],
     caller: Caller,
     kind: Annotated[
         RecordingKind | None,
         Field(
-            description="A movie is an MP4 of the main view, an animation an HTML page in which the "
-            "scene can be turned. Default: movie."
+            description="A movie is an MP4 of the main view, an animation an HTML page in which "
+            "the scene can be turned. Default: movie."
         ),
     ] = None,
     width_px: Annotated[

@@ -119,13 +119,11 @@ def _as_run_or_range(value: str | int) -> str | int:
 _RunOrRange = Annotated[
     str | int,
     AfterValidator(_as_run_or_range),
-    WithJsonSchema({"type": ["integer", "string"]}),
+    WithJsonSchema({}),
 ]
 ComparedRunIds = Annotated[
     list[_RunOrRange] | None,
-    Field(
-        max_length=300, description="Runs to compare, such as [3, 4]; a range such as ['20-90']."
-    ),
+    Field(max_length=300, description="Runs, such as [3, 4] or ['20-90']."),
 ]
 Position = Annotated[
     list[str] | None,

@@ -164,7 +164,7 @@ def webots_list_runs(
     ] = None,
     score: Annotated[
         str | None,
-        Field(max_length=500, description="Add a score, such as max(pose.x), or reward."),
+        Field(max_length=500, description="Score to add: max(pose.x)."),
     ] = None,
     robot: RobotName = None,
 ) -> RunsAnswer:
@@ -228,23 +228,25 @@ def webots_compare_runs(
         str | None,
         Field(
             max_length=500,
-            description="Score all runs: max(pose.x) - count(stuck), or reward for the sum of "
-            "published rewards. Shows its curve, and what the best and worst runs do differently.",
+            description="Score all runs: max(pose.x), or reward.",
         ),
     ] = None,
     goal: Annotated[
         str | None,
-        Field(max_length=500, description="With score: what a successful run reaches, arrived."),
+        Field(
+            max_length=500,
+            description="Condition of success: arrived.",
+        ),
     ] = None,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Find out whether an edit or a parameter helped; with score, how a training went.
 
     Without run_ids it compares the runs before and after the last edit of the controller; with
-    one run it gives its figures; with score it ranks all runs, thousands too. `different` is true
-    if the difference is larger than between repeated runs (at least 4 of each), false if there is
-    none that matters, and null if this cannot be known yet: `undecided` says why. For curves over
-    each other use webots_plot with run_ids.
+    one run it gives its figures; with score it ranks all. `different` is true if the
+    difference is larger than between repeated runs (at least 4 of each), false if there is none
+    that matters, and null if this cannot be known yet: `undecided` says why. For curves use
+    webots_plot.
     """
     asked_ids, named = spelled_out(run_ids)
     is_series = score is not None or goal is not None or len(asked_ids or ()) > MOST_COMPARED

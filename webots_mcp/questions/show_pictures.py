@@ -291,23 +291,20 @@ def webots_plot(
     scope: Scope,
     kind: Annotated[
         PlotKind,
-        Field(
-            description="signals: curves over time. trajectory: the path from above. runs: a score "
-            "over all runs."
-        ),
+        Field(description="signals: curves. trajectory: path from above. runs: a score."),
     ] = "signals",
     signals: Annotated[
         list[str] | None,
         Field(
             max_length=50,
             description="Signals to draw; '*' means any text. Default: those that changed most. "
-            "For runs a score such as max(pose.x); default: the reward.",
+            "For runs a score.",
         ),
     ] = None,
     run_ids: ComparedRunIds = None,
     trial_set: Annotated[
         Id | None,
-        Field(description="Draw the scores of this set of trials over one or two parameters."),
+        Field(description="Draw the scores of this set of trials."),
     ] = None,
     width_px: Annotated[
         int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Width of the picture in pixels.")

@@ -137,7 +137,7 @@ def test_one_recording_is_possible_at_a_time(scene: Scene) -> None:
         status, _, error = scene.ask(do="start", kind=kind)
         assert status == "failed"
         assert "one recording is possible at a time" in error
-        assert "do='stop'" in error
+        assert "action='stop'" in error
     assert "is being recorded, not an animation" in scene.ask(do="stop", kind="animation")[2]
     scene.drive(5)
     assert scene.ask(do="stop")[0] == "done"

@@ -35,6 +35,7 @@ from webots_mcp.store.reading.ranges import (
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 DEFAULT_LIMIT: Final = 50
+_ROWS_TOKENS: Final = 1_050  # a long summary and all verdicts leave this within 1,500
 
 
 def _as_kind(name: str) -> str:
@@ -141,7 +142,8 @@ def _found(
 ) -> dict[str, Any]:
     found = search_events(view.connection, asked, options, group=group, after=cursor or None)
     verdicts, notes = verdicts_of(found.verdicts), notes_of(_notes(found.notes, options))
-    budget_tokens = row_budget_tokens(limit, [verdicts.model_dump(exclude_none=True), notes])
+    others = [verdicts.model_dump(exclude_none=True), notes]
+    budget_tokens = row_budget_tokens(limit, others, _ROWS_TOKENS)
     reported, events = fitting_events(
         found, limit or DEFAULT_LIMIT, budget_tokens, view, time_of_day=time_of_day
     )

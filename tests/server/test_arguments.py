@@ -57,7 +57,7 @@ HUGE = 2**63
             {"run_id": HUGE},
             f"run_id must be an id from an earlier answer, not {HUGE}",
         ),
-        ("plot", {"run_ids": [1, HUGE]}, "run_ids.1 must be an id from an earlier answer"),
+        ("plot", {"run_ids": [1, HUGE]}, "run_ids.1 must be the number of a run, or a range"),
         (
             "get_logs",
             {"level": "loud"},

@@ -222,7 +222,7 @@ class SceneRecording:
 
 
 def _is_whole(data: Path) -> bool:
-    """Return whether the JSON of an animation has its end, which it lacks if nothing moved."""
+    """Return whether the JSON of an animation is complete; it is not if nothing moved."""
     with data.open("rb") as file:
         file.seek(max(0, data.stat().st_size - _TAIL_BYTES))
         return file.read().rstrip().endswith(b"}")

@@ -16,7 +16,7 @@ from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.judging import run_series
 from webots_mcp.judging.run_score import score_run
-from webots_mcp.judging.run_series import RunSeries, evenly, score_series
+from webots_mcp.judging.run_series import ScoreSeries, evenly, score_series
 from webots_mcp.store.chunk_making import make_chunks
 
 SCORES = (
@@ -43,7 +43,7 @@ def train(connection: sqlite3.Connection, scores: Sequence[float], rows: int = 4
 
 def series_of(
     connection: sqlite3.Connection, score: str | None = "max(x)", **asked: Any
-) -> RunSeries:
+) -> ScoreSeries:
     asked.setdefault("deadline_s", 60.0)
     return score_series(connection, 1, "rover", score=score, **asked)
 

@@ -101,7 +101,7 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """Consecutive runs on the curve of a score.
 
     Attributes:
@@ -122,7 +122,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class RunSeries:
+class ScoreSeries:
     """How a score developed over runs, oldest first.
 
     Attributes:
@@ -139,7 +139,7 @@ class RunSeries:
     score: str
     runs: tuple[ScoredRun, ...]
     sampled: bool
-    curve: tuple[Point, ...]
+    curve: tuple[CurvePoint, ...]
     levels: tuple[Level, ...]
     is_rising: bool
     recent: int
@@ -181,7 +181,7 @@ def score_series(
     score: str | None = None,
     goal: str | None = None,
     deadline_s: float,
-) -> RunSeries:
+) -> ScoreSeries:
     """Score runs of a robot and find how the score developed.
 
     Args:
@@ -223,7 +223,7 @@ def score_series(
     levels = levels_of(scored_runs)
     in_last_level = levels[-1].count if levels else 0
     recent = max(in_last_level, math.ceil(len(scored_runs) * SETTINGS.recent_share))
-    return RunSeries(
+    return ScoreSeries(
         text,
         runs,
         any(scored.get(run_id, _UNSCORED) is _UNSCORED for run_id in ids),
@@ -561,7 +561,7 @@ def _is_rising(scored: Sequence[ScoredRun]) -> bool:
     return 0.5 * math.erfc((signs - 1) / deviation / math.sqrt(2)) < SETTINGS.false_alarms
 
 
-def _curve(runs: Sequence[ScoredRun], outcomes: _Outcomes) -> Iterator[Point]:
+def _curve(runs: Sequence[ScoredRun], outcomes: _Outcomes) -> Iterator[CurvePoint]:
     """Yield the points of the curve: equally many runs each, but for the last."""
     per_point = _round_up(math.ceil(len(runs) / SETTINGS.points))
     for start in range(0, len(runs), per_point):
@@ -577,7 +577,7 @@ def _curve(runs: Sequence[ScoredRun], outcomes: _Outcomes) -> Iterator[Point]:
         }
         ends = part[0].run_id, part[-1].run_id
         mean = float(np.mean(values)) if values else None
-        yield Point(*ends, len(part), len(values), mean, median, low, high, shares)
+        yield CurvePoint(*ends, len(part), len(values), mean, median, low, high, shares)
 
 
 def _round_up(count: int) -> int:

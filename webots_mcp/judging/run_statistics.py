@@ -52,7 +52,7 @@ class SignalFacts:
         self.last = last
 
 
-class _Rows(NamedTuple):
+class _RunRows(NamedTuple):
     """Rows of a run: in chunks, and after them."""
 
     chunked: int
@@ -89,7 +89,7 @@ class RunStatistics:
             )
         }
         self._found: dict[str, dict[int, SignalFacts]] = {}
-        self._rows: dict[int, _Rows] = {}
+        self._rows: dict[int, _RunRows] = {}
         self.durations_s: dict[int, float] = {}
         self._find_runs(set(run_ids))
 
@@ -148,7 +148,7 @@ class RunStatistics:
             last = after.get(run_id, 0)
             is_whole = chunked >= 0 and chunked + last == rows
             if run_id in wanted and is_whole and last < MIN_ROWS_AT_END:
-                self._rows[run_id] = _Rows(chunked, last)
+                self._rows[run_id] = _RunRows(chunked, last)
                 self.durations_s[run_id] = end_s - (0.0 if reason == "reset" else start_s)
 
     def _signal_in(self, aggregate: Aggregate) -> str | None:

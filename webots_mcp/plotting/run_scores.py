@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import Array, np
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.judging.run_series import RunSeries, score_series
+from webots_mcp.judging.run_series import ScoreSeries, score_series
 from webots_mcp.plotting.axes import AxesBox, axis_range, ticks
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, width_of
 from webots_mcp.plotting.colours import FAINT, LINES
@@ -81,7 +81,7 @@ def compose_run_scores(
     score: str | None,
     scope: Scope,
     run_ids: Sequence[int] = (),
-) -> tuple[RunSeries, str]:
+) -> tuple[ScoreSeries, str]:
     """Return what `plot_run_scores` paints: the series and the robot; errors as there."""
     if scope.robot is None and scope.run_id is not None:
         robot_id = fetch_run(connection, scope.run_id).robot_id
@@ -98,7 +98,7 @@ def compose_run_scores(
     return series, name
 
 
-def paint_run_scores(series: RunSeries, robot: str, width_px: int, height_px: int) -> Canvas:
+def paint_run_scores(series: ScoreSeries, robot: str, width_px: int, height_px: int) -> Canvas:
     """Paint it."""
     canvas = Canvas(width_px, height_px)
     runs = [run for run in series.runs if run.value is not None]

@@ -9,7 +9,7 @@ from webots_mcp.analysis.level_changes import FEWEST_VALUES
 from webots_mcp.answers.budget import figure, fitting, without_empty
 from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.run_series import MOST_RUNS, RunSeries, ScoredRun, score_series
+from webots_mcp.judging.run_series import MOST_RUNS, ScoredRun, ScoreSeries, score_series
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.recording import RobotView
 
@@ -64,7 +64,7 @@ def find_series(
     named: Sequence[int],
     score: str | None,
     goal: str | None,
-) -> RunSeries:
+) -> ScoreSeries:
     """Score the runs; errors as for `score_series`."""
     deadline_s = PERSON_DEADLINE_S if is_for_a_person() else SERIES_DEADLINE_S
     return score_series(
@@ -79,7 +79,7 @@ def find_series(
     )
 
 
-def series_facts(series: RunSeries) -> dict[str, Any]:
+def series_facts(series: ScoreSeries) -> dict[str, Any]:
     """Return the members of the answer that are about the score."""
     ranked = series.ranked
     most = len(ranked) if is_for_a_person() else _SHOWN_RUNS
@@ -96,12 +96,12 @@ def series_facts(series: RunSeries) -> dict[str, Any]:
     }
 
 
-def _in_sample(series: RunSeries) -> str:
+def _in_sample(series: ScoreSeries) -> str:
     """Return that only some runs were scored, if so."""
     return "of a sample spread over all runs: " if series.sampled else ""
 
 
-def trend_of(series: RunSeries) -> str | None:
+def trend_of(series: ScoreSeries) -> str | None:
     """Return how the score developed, in a sentence."""
     levels, best = series.levels, series.best_level
     if best is None:
@@ -124,7 +124,7 @@ def trend_of(series: RunSeries) -> str | None:
     )
 
 
-def unknown_of(series: RunSeries, compared: Mapping[str, str]) -> dict[str, str] | None:
+def unknown_of(series: ScoreSeries, compared: Mapping[str, str]) -> dict[str, str] | None:
     """Return what is not known of all runs, and of the best and the worst of them."""
     if is_for_a_person():
         return {**series.unknown, **compared} or None
@@ -134,7 +134,7 @@ def unknown_of(series: RunSeries, compared: Mapping[str, str]) -> dict[str, str]
     return {**cut, **named} or None
 
 
-def _curve_rows(series: RunSeries) -> list[list[Any]]:
+def _curve_rows(series: ScoreSeries) -> list[list[Any]]:
     return [
         [
             point.first_run,
@@ -151,7 +151,7 @@ def _percent(having: int, known: int) -> float | None:
     return round(100 * having / known, 1) if known else None
 
 
-def _levels(series: RunSeries) -> Any:
+def _levels(series: ScoreSeries) -> Any:
     """Return the levels, of many the last ones: what happened last is asked for most."""
     if len(series.levels) < 2:
         return None
@@ -167,7 +167,7 @@ def _runs(runs: Iterable[ScoredRun]) -> Any:
     return without_empty(_RUN_COLUMNS, fitting([[run.run_id, figure(run.value)] for run in runs]))
 
 
-def _unscored(series: RunSeries) -> dict[str, str] | None:
+def _unscored(series: ScoreSeries) -> dict[str, str] | None:
     """Return which runs have no score, by the reason."""
     by_reason: dict[str, list[int]] = {}
     for run in series.runs:

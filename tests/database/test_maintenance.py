@@ -182,3 +182,31 @@ def test_where_another_took_the_lease_no_checkpoint_is_made(recorded: Recorded) 
     assert maintainer._copy_log(maintainer._connection, "RESTART") == 0  # pyright: ignore[reportPrivateUsage, reportArgumentType]
     assert Path(f"{recorded.database}-wal").stat().st_size > 1_000_000
     maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]
+
+
+def test_a_loop_that_writes_without_a_pause_is_not_told_as_a_reader(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("webots_mcp.database.maintenance.LONG_LOG_BYTES", 1_000_000)
+    monkeypatch.setattr("webots_mcp.database.maintenance.HELD_LOG_BYTES", 500_000)
+    file, stopped = recorded.database, threading.Event()
+    assert isinstance(file, Path)
+    recorded.robot()
+
+    def write() -> None:
+        with closing(sqlite3.connect(file, isolation_level=None, timeout=60)) as writer:
+            writer.execute("PRAGMA wal_autocheckpoint=0")
+            while not stopped.is_set():
+                writer.execute("UPDATE robot SET name = name")
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    maintainer = Maintainer(file, "server")
+    try:
+        for _ in range(40):
+            assert maintainer.tick()
+    finally:
+        stopped.set()
+        thread.join()
+    assert "holds a read transaction" not in capsys.readouterr().err
+    maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]

@@ -28,7 +28,7 @@ from webots_mcp.database.connection import CHECKPOINT_TIMEOUT_MS, connect, ident
 from webots_mcp.database.job_leases import JobLease, give_back, take
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.schema import require_current
-from webots_mcp.database.transactions import is_busy, never_wait, text_of
+from webots_mcp.database.transactions import is_busy, text_of
 from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn
 
@@ -64,6 +64,8 @@ class LogLimits(NamedTuple):
         shortest_held_bytes: Size up to which a log may grow that nobody holds.
         held_retry_s: Time between two attempts while nothing is written; each attempt makes the log
             longer.
+        restart_wait_ms: Wait for the write lock, which a loop that writes without a pause rarely
+            leaves free, and then for readers; as long, a row waits.
     """
 
     hurried_interval_s: float = 0.25
@@ -72,6 +74,7 @@ class LogLimits(NamedTuple):
     share_of_free_space: float = 0.1
     shortest_held_bytes: int = 40_000_000
     held_retry_s: float = 10.0
+    restart_wait_ms: int = 3
 
 
 LOG_LIMITS: Final = LogLimits()
@@ -107,6 +110,7 @@ class Maintainer(threading.Thread):
         self._interval_s = LOG_LIMITS.hurried_interval_s
         self._data_version = -1
         self._log_bytes = 0  # after the last checkpoint
+        self._copied_bytes = 0  # of the log, by the last checkpoint
         self._is_held = False  # a reader keeps the log from beginning anew
         self._retry_s = 0.0
         self._has_warned_of_reader = False
@@ -203,6 +207,7 @@ class Maintainer(threading.Thread):
         rests, self._data_version = version == self._data_version, version
         if rests and self._is_held and time.monotonic() < self._retry_s:
             return
+        copied_before_bytes = self._copied_bytes
         log_bytes = self._copy_log(connection, "PASSIVE")
         if log_bytes - self._log_bytes > LOG_LIMITS.fast_growth_bytes:
             self._interval_s = LOG_LIMITS.hurried_interval_s
@@ -213,7 +218,8 @@ class Maintainer(threading.Thread):
             # The first commit into a new log waits until the disk has the log's header. Made here
             # it costs no control loop its time: 5 ms at p99.9.
             self._take_lease(connection)
-            self._note_held(is_held=log_bytes > 0)
+            # A reader lets nothing be copied beyond the rows that it sees; a writer does.
+            self._note_held(is_held=log_bytes > 0 and self._copied_bytes == copied_before_bytes)
         self._log_bytes = log_bytes
 
     def _note_held(self, *, is_held: bool) -> None:
@@ -233,14 +239,17 @@ class Maintainer(threading.Thread):
         """
         if not self._take_lease(connection):
             return 0
-        never_wait(connection)  # for readers, with the write lock in hand
+        connection.execute(f"PRAGMA busy_timeout={LOG_LIMITS.restart_wait_ms}")
         try:
-            ((is_kept, pages, _),) = connection.execute(f"PRAGMA wal_checkpoint({how})").fetchall()
+            (checkpoint,) = connection.execute(f"PRAGMA wal_checkpoint({how})").fetchall()
         finally:
             connection.execute(f"PRAGMA busy_timeout={CHECKPOINT_TIMEOUT_MS}")
+        is_kept, pages, copied_pages = map(int, checkpoint)
+        page_bytes = int(connection.execute("PRAGMA page_size").fetchone()[0])
+        self._copied_bytes = copied_pages * page_bytes
         if how != "PASSIVE" and not is_kept:
             return 0
-        return max(int(pages), 1) * int(connection.execute("PRAGMA page_size").fetchone()[0])
+        return max(pages, 1) * page_bytes
 
     def _give_back(self) -> None:
         if self._connection is None:
@@ -273,8 +282,8 @@ def held_log(database: Database) -> str | None:
     if log_bytes <= min(HELD_LOG_BYTES, share_bytes):
         return None
     return (
-        f"{log.name} is {log_bytes / 1e6:.0f} MB long, with {free_bytes / 1e9:.1f} GB free: a "
-        "program holds a read transaction, so that the log grows until the disk is full"
+        f"{log.name} is {log_bytes / 1e6:.0f} MB long, with {free_bytes / 1e9:.1f} GB free: it "
+        "grows until the disk is full while a program holds a read transaction"
     )
 
 

@@ -71,8 +71,8 @@ PAGES_OF: Final = {INSIDE: "inspect.md", EDITED: "rerun.md"}
 TURNED: Final = "changed(mode)"  # It begins to turn after some 5 s.
 EDIT: Final = ('"near", 0.35', '"near", 0.5')
 ROVER: Final = Path("controllers/rover/rover.py")
-FIGURES_ARE_THERE: Final = """() => document.querySelector(".figure > svg")
-    && [...document.querySelectorAll(".figure > svg")].every(each => each.parentNode.figure)"""
+FIGURES_ARE_THERE: Final = """() => document.querySelector(".figure > .stage > svg")
+    && [...document.querySelectorAll(".figure > .stage")].every(each => each.parentNode.figure)"""
 CONVERSATION: Final = re.compile(r"(?<=<!-- conversation -->\n```text\n).*?(?=^```$)", re.M | re.S)
 
 

@@ -23,26 +23,6 @@ from webots_mcp.worlds.vrml import FieldDefinition, Parser, Token, WorldNode, to
 from webots_mcp.worlds.world_errors import WorldFileError
 
 NODES_FILE: Final = Path(__file__).with_name("nodes.txt")
-
-
-@dataclass(frozen=True)
-class ReadingLimits:
-    """How much of a world is read; beyond it the rest is not searched.
-
-    Attributes:
-        file_bytes: Size of a world or PROTO file.
-        nodes: Nodes of the scene tree, with those of PROTO nodes.
-        depth: Nodes and PROTO nodes within each other.
-        processor_s: Processor time for reading and judging together, in seconds.
-    """
-
-    file_bytes: int = 16_000_000
-    nodes: int = 60_000
-    depth: int = 250
-    processor_s: float = 20.0
-
-
-LIMITS: Final = ReadingLimits()
 _RELEASE: Final = re.compile(r"#VRML_SIM (?:R(20\d\d)([ab])?|V(\d+))\S* utf8")
 _TEMPLATE: Final = re.compile(r"%[<{]")
 _LOOKS: Final = frozenset({"appearance", "material", "texture", "textureTransform"})
@@ -70,6 +50,26 @@ NODE_TYPES: Final[Mapping[str, Mapping[str, FieldDefinition]]] = {
     name: {**(_TYPES["Solid"] if name in SOLIDS else {}), **fields}
     for name, fields in _TYPES.items()
 }
+
+
+@dataclass(frozen=True)
+class ReadingLimits:
+    """How much of a world is read; beyond it the rest is not searched.
+
+    Attributes:
+        file_bytes: Size of a world or PROTO file.
+        nodes: Nodes of the scene tree, with those of PROTO nodes.
+        depth: Nodes and PROTO nodes within each other.
+        processor_s: Processor time for reading and judging together, in seconds.
+    """
+
+    file_bytes: int = 16_000_000
+    nodes: int = 60_000
+    depth: int = 250
+    processor_s: float = 20.0
+
+
+LIMITS: Final = ReadingLimits()
 
 
 class Release(NamedTuple):

@@ -28,6 +28,12 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 
+_PAPER: Final = (255, 255, 255)
+_SURROUND: Final = (32, 32, 32)  # beside a picture of another shape
+_CURSOR: Final = (51, 51, 51)
+_ACCENT: Final = LINES[1]  # the moment, and the robot
+
+
 @dataclass(frozen=True)
 class ClipLayout:
     """The layout of a clip and of its contact sheet, in pixels.
@@ -59,10 +65,6 @@ class ClipLayout:
 
 
 _LAYOUT: Final = ClipLayout()
-_PAPER: Final = (255, 255, 255)
-_SURROUND: Final = (32, 32, 32)  # beside a picture of another shape
-_CURSOR: Final = (51, 51, 51)
-_ACCENT: Final = LINES[1]  # the moment, and the robot
 
 
 class ClipPainter:

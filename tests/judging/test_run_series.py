@@ -13,11 +13,18 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.errors import (
+    InvalidConditionError,
+    InvalidInputError,
+    InvalidRangeError,
+    UnknownSignalError,
+)
 from webots_mcp.judging import run_series
 from webots_mcp.judging.run_score import score_run
-from webots_mcp.judging.run_series import ScoreSeries, evenly, score_series
+from webots_mcp.judging.run_series import ScoreSeries, evenly, score_each, score_series
+from webots_mcp.plotting.run_scores import compose_run_scores
 from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.reading.ranges import Scope
 
 SCORES = (
     "max(x)", "min(x)", "first(x)", "last(x)", "mean(x)", "max(arrived)", "duration",
@@ -231,3 +238,22 @@ def test_what_cannot_be_a_series_is_refused_in_words(empty: sqlite3.Connection) 
         series_of(empty, goal="arived")
     with pytest.raises(UnknownSignalError, match="no signal 'y'"):
         series_of(empty, "max(y)")
+
+
+def test_a_plot_of_a_score_refuses_a_range_of_time(empty: sqlite3.Connection) -> None:
+    train(empty, [1.0, 2.0, 3.0])
+    with pytest.raises(InvalidRangeError, match=r"shows whole runs.*run_ids"):
+        compose_run_scores(empty, "max(x)", Scope(last_s=5.0))
+    series, name = compose_run_scores(empty, "max(x)", Scope())
+    assert (name, [run.value for run in series.runs]) == ("rover", [1.0, 2.0, 3.0])
+
+
+def test_who_asks_for_the_sum_of_rewards_is_offered_the_one_that_is_recorded(
+    empty: sqlite3.Connection,
+) -> None:
+    train(empty, [1.0, 2.0, 3.0])
+    offer = r"no sum.*ask for score='reward'"
+    with pytest.raises(InvalidConditionError, match=offer):
+        series_of(empty, "sum( reward )")
+    with pytest.raises(InvalidConditionError, match=offer):
+        score_each(empty, [1], "sum(reward)", 60.0)

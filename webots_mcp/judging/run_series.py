@@ -8,6 +8,7 @@ that spreads evenly over the series, so that what was reached in time is a fair 
 from __future__ import annotations
 
 import math
+import re
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from webots_mcp.analysis.level_changes import level_changes
 from webots_mcp.contract import EPISODE_EVENT
 from webots_mcp.errors import (
     ConditionFailedError,
+    InvalidConditionError,
     InvalidInputError,
     UnknownSignalError,
     WebotsMCPError,
@@ -212,7 +214,7 @@ def score_series(
         scored = _rewards(connection, ids, REWARD_NAME in known)
         text = REWARD_NAME
     else:
-        parsed = parse_score(score)
+        parsed = _parse(score)
         parsed.require_known(known)
         require_kinds(connection, parsed, ids[-1])
         scored = _scored(connection, parsed, facts, ids, deadline.part(SETTINGS.score_share))
@@ -234,6 +236,18 @@ def score_series(
         {name: len(found) for name, found in outcomes.items()},
         unknown,
     )
+
+
+def _parse(text: str) -> Score:
+    """Return a score of runs; its error offers what sums up rewards where a sum was asked for."""
+    try:
+        return parse_score(text)
+    except InvalidConditionError as error:
+        if re.search(rf"\bsum\({REWARD_NAME}\)", text.replace(" ", "")):
+            raise InvalidConditionError(
+                f"{error}. The bridge sums up the rewards of a run: ask for score='{REWARD_NAME}'."
+            ) from None
+        raise
 
 
 def _condition(text: str, known: Mapping[str, RegisteredSignal]) -> Condition:
@@ -301,7 +315,7 @@ def score_each(
     """
     if score.strip() == REWARD_NAME:
         return _rewards(connection, sorted(run_ids), is_published=True) if run_ids else {}
-    parse_score(score)
+    _parse(score)
     deadline, scored = Deadline(deadline_s), dict[int, Scored]()
     for run_id in run_ids:
         scored[run_id] = _score_of(connection, run_id, score, deadline)

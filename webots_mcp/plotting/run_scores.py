@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from webots_mcp.analysis.arrays import Array, np
-from webots_mcp.errors import NothingRecordedError
+from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.judging.run_series import ScoreSeries, score_series
 from webots_mcp.plotting.axes import AxesBox, axis_range, ticks
 from webots_mcp.plotting.canvas import Canvas, PlotImage, Sheet, fitted, width_of
@@ -59,6 +59,7 @@ def plot_run_scores(
         sheet: Size and format; None for a PNG of 900 x 500 pixels.
 
     Raises:
+        InvalidRangeError: The scope has times.
         NothingRecordedError: No run has a score.
         WebotsMCPError: Its other kinds, as `score_series` raises them.
     """
@@ -83,6 +84,11 @@ def compose_run_scores(
     run_ids: Sequence[int] = (),
 ) -> tuple[ScoreSeries, str]:
     """Return what `plot_run_scores` paints: the series and the robot; errors as there."""
+    if scope.last_s is not None or scope.in_simulation_time or scope.in_wall_time:
+        raise InvalidRangeError(
+            "A plot of a score shows whole runs, not a range of time. Leave out the times, and "
+            "name runs with run_ids where only some of them are asked for."
+        )
     if scope.robot is None and scope.run_id is not None:
         robot_id = fetch_run(connection, scope.run_id).robot_id
         query = "SELECT name FROM robot WHERE id = ?"

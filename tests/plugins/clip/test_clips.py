@@ -315,8 +315,22 @@ async def test_the_newest_fifty_clips_are_kept(
     async with connect() as client:
         for at_s in (4, 5, 6):
             await shown(client, at_s=at_s, before_s=0.2, after_s=0.2)
-    left = {each.name for each in (crash.folder / "clips").iterdir()}
-    assert left == {"mine.webp", "run-1-at-5.000s.webp", "run-1-at-6.000s.webp"}
+    left = sorted(each.name.rpartition("-")[0] for each in (crash.folder / "clips").iterdir())
+    assert left == ["", "run-1-at-5.000s", "run-1-at-6.000s"]
+    assert own.is_file()
+
+
+async def test_clips_of_one_moment_do_not_replace_each_other(
+    connect: Connect, crash: Crash
+) -> None:
+    crash.drive()
+    async with connect() as client:
+        files = [
+            Path((await shown(client, at_s=5, before_s=before_s, after_s=0.2))[0]["file"])
+            for before_s in (0.2, 1, 0.2)
+        ]
+    assert files[0] == files[2] != files[1]
+    assert all(file.is_file() for file in files)
 
 
 async def test_a_heading_on_other_axes_is_replaced_by_the_direction_of_motion(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -164,13 +165,16 @@ def _save(recording: RecordingAccess, clip: Clip) -> dict[str, Any]:
 
 
 def file_name(clip: Clip) -> str:
-    """Return the name of a clip's file, such as run-3-at-12.480s.webp."""
-    moment = clip.content.moment
-    return f"run-{moment.run_id}-at-{moment.at_s:.3f}s.{clip.format}"
+    """Return the name of a clip's file, such as run-3-at-12.480s-9c1f5a.webp.
+
+    Clips of one moment with other cameras, curves or lengths get other names.
+    """
+    moment, digest = clip.content.moment, hashlib.sha256(clip.data).hexdigest()[:6]
+    return f"run-{moment.run_id}-at-{moment.at_s:.3f}s-{digest}.{clip.format}"
 
 
 def _forget_oldest(folder: Path) -> None:
     """Delete the oldest clips beyond the newest fifty; other files stay."""
-    clips = [each for form in ("webp", "gif") for each in folder.glob(f"run-*-at-*s.{form}")]
+    clips = [each for form in ("webp", "gif") for each in folder.glob(f"run-*-at-*s*.{form}")]
     for file in sorted(clips, key=lambda each: each.stat().st_mtime_ns)[:-MOST_CLIPS]:
         file.unlink(missing_ok=True)

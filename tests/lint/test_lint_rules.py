@@ -57,6 +57,27 @@ FREE = 'Solid { translation 0 0 %s name "box" %s }'
 
 # rule, faulty, healthy, a word of the message
 CASES = {
+    "a number in quotes": (
+        "file",
+        'DirectionalLight {} WorldInfo { basicTimeStep "16" }',
+        "DirectionalLight {} WorldInfo { basicTimeStep 16 }",
+        'takes a number, not "16"',
+    ),
+    "a text without quotes": (
+        "file", "Solid { name 5 }", 'Solid { name "5" }', "takes a text in quotes, not 5",
+    ),
+    "a node where numbers belong": (
+        "file", "Solid { translation Box {} }", "Solid { translation 0 0 1 }", "not a Box node",
+    ),
+    "an axis without a direction": (
+        "file",
+        robot(hinge(child=ARM, axis="0 0 0", device=MOTOR % "maxPosition 1 minPosition -1")),
+        robot(hinge(child=ARM, axis="0 1 0", device=MOTOR % "maxPosition 1 minPosition -1")),
+        "no direction",
+    ),
+    "neither mass nor density": (
+        "inertia", FREE % (1, BOX % "-1"), FREE % (1, BOX % "1"), "none of them is positive",
+    ),
     "mass ratio at a joint": (
         "mass ratio", robot(hinge(child=ARM, device=MOTOR % "maxPosition 1"), mass="200"),
         robot(hinge(child=ARM, device=MOTOR % "maxPosition 1"), mass="90"), "1:2,000",

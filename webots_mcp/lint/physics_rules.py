@@ -184,6 +184,16 @@ class PhysicsRules:
         if physics is None or physics.unread:
             return
         self._report.judge("inertia")
+        mass, density = physics.number("mass"), physics.number("density")
+        if mass <= 0.0 and density <= 0.0:
+            self._fault(
+                "inertia", "error", physics, "mass",
+                f"mass is {mass:g} and density is {density:g}: none of them is positive, so that "
+                "the mass is not given",
+                "Set mass to the mass in kg and density to -1, or density to that of the material, "
+                "for example 1000.",
+            )  # fmt: skip
+            return
         values = physics.numbers("inertiaMatrix")
         if not values:
             return

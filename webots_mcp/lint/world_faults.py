@@ -37,7 +37,7 @@ RULES: Final = {
     for rule in (
         LintRule(
             "file",
-            "Webots loads nothing, or only a part, of a file that it cannot parse.",
+            "Webots loads nothing, or only a part, of what it cannot parse or use.",
             f"{_REFERENCE}proto",
         ),
         LintRule(

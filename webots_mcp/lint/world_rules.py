@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, cast
 
 from webots_mcp.lint.bodies import Bodies, SolidPart
 from webots_mcp.lint.scene import (
@@ -18,6 +18,7 @@ from webots_mcp.lint.scene import (
     TreeNode,
 )
 from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
+from webots_mcp.worlds.vrml import FieldDefinition
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,12 @@ class RenderingEstimate:
 
 _RENDERING: Final = RenderingEstimate()
 _MOST_LINES: Final = 5
+_NO_FIELDS: Final[Mapping[str, FieldDefinition]] = {}
+_TAKES: Final = {
+    "Bool": "TRUE or FALSE", "String": "a text in quotes", "Node": "a node or NULL",
+    **dict.fromkeys(("Float", "Int32"), "a number"),
+    **dict.fromkeys(("Vec2f", "Vec3f", "Rotation", "Color"), "numbers"),
+}  # fmt: skip
 
 
 class WorldRules:
@@ -46,6 +53,7 @@ class WorldRules:
     def search(self) -> None:
         """Apply all rules."""
         self._report.judge("file")
+        self._values()
         self._time_step()
         self._undeclared()
         self._names()
@@ -58,6 +66,25 @@ class WorldRules:
         self._report.faults.append(
             WorldFault(rule, severity, path, node.file, node.line_of(field), what, fix)
         )
+
+    def _values(self) -> None:
+        """Report values of another kind than their field takes, such as a number in quotes."""
+        for node in self._scene.nodes:
+            types = NODE_TYPES.get("" if node.unread else node.type_name, _NO_FIELDS)
+            for name in node.fields.keys() & types.keys():
+                takes, value = _TAKES[types[name].type_name[2:]], node.fields[name]
+                if not _is_of_kind(value, types[name].type_name):
+                    self._fault(
+                        "file", "error", node, name,
+                        f"{node.type_name}.{name} takes {takes}, not {_as_written(value)}",
+                        f"Write {takes} there.",
+                    )  # fmt: skip
+            if "axis" in types and not any(node.vector("axis", 3)):
+                self._fault(
+                    "file", "error", node, "axis",
+                    f"{node.type_name}.axis is 0 0 0, which is no direction",
+                    "Set axis to a direction, for example 0 1 0.",
+                )  # fmt: skip
 
     def _time_step(self) -> None:
         info = self._scene.info
@@ -202,3 +229,23 @@ def _inside(node: TreeNode) -> list[TreeNode]:
         if child.type_name != "Robot":
             found += [child, *_inside(child)]
     return found
+
+
+def _is_of_kind(value: Any, type_name: str) -> bool:
+    """Whether a value of the file fits a type, but for how many numbers it has."""
+    kind = type_name[2:]
+    expected = {"String": str, "Bool": bool, "Node": (TreeNode, type(None))}.get(kind, float)
+    values = cast("list[Any]", value) if isinstance(value, list) else [value]
+    return all(isinstance(each, expected) for each in values)
+
+
+def _as_written(value: Any) -> str:
+    if isinstance(value, list):
+        value = cast("list[Any]", value)[0]
+    if isinstance(value, TreeNode):
+        return f"a {value.written_type} node"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, str):
+        return f'"{value}"'
+    return {True: "TRUE", False: "FALSE"}.get(value, "NULL")

@@ -15,6 +15,7 @@ from webots_mcp.answers.budget import fitting, table
 from webots_mcp.answers.shortening import cut_text, is_for_a_person, tokens_of
 from webots_mcp.contract import WORLD_ENDING
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.lint import lint_world
 from webots_mcp.lint.world_faults import RULES, SEVERITIES, LintReport, Severity, WorldFault
 from webots_mcp.questions.declaration import READS, question
 from webots_mcp.simulator.launch import require_world
@@ -113,15 +114,11 @@ def lint_in_short(world: str | None) -> dict[str, Any] | None:
 
 def _linted(file: Path, processor_s: float | None = None) -> LintReport:
     """Return the report of a world, again only if a file next to it has changed."""
-    from webots_mcp.lint import lint_world  # numpy: only when it is needed
-
     return lint_world(file) if processor_s is None else _lint_once(file, _stamp(file), processor_s)
 
 
 @lru_cache(maxsize=8)
 def _lint_once(file: Path, stamp: object, processor_s: float) -> LintReport:
-    from webots_mcp.lint import lint_world
-
     return lint_world(file, processor_s)
 
 

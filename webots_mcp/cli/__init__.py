@@ -1,8 +1,9 @@
 """The console commands.
 
 The commands are a table in `commands`; what one needs is imported inside it, so that each answers
-at once, and `--version` before anything else is imported. Errors of webots-mcp end it with one line on stderr and exit code 2, refusals of the system
-(a full disk) and missing packages with 1, Ctrl-C and SIGTERM with 130 and 143.
+at once, and `--version` before anything else is imported. Errors of webots-mcp end it with one line
+on stderr and exit code 2, refusals of the system (a full disk) and missing packages with 1, Ctrl-C
+and SIGTERM with 130 and 143.
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ from webots_mcp.answers.shortening import cut_text
 from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
 from webots_mcp.questions.controller_parameters import settable
@@ -352,6 +351,8 @@ def _header(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, 
 
 def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, Any]:
     trials, plan = trials_of(connection, found.id), json.loads(found.plan)
+    from webots_mcp.judging.divergence import repeats_noted
+
     best = best_of(plan)
     over = sum(each.is_over for each in trials)
     planned = count_planned(plan, trials)

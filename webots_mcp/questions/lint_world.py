@@ -18,8 +18,6 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.lint import lint_world
 from webots_mcp.lint.world_faults import RULES, SEVERITIES, LintReport, Severity, WorldFault
 from webots_mcp.questions.declaration import READS, question
-from webots_mcp.simulator.launch import require_world
-from webots_mcp.steering.launcher import project_of
 from webots_mcp.store.recording import RecordingAccess
 
 COLUMNS: Final = ("severity", "rule", "path", "place", "what", "fix")
@@ -146,6 +144,9 @@ def _file_of(recording: RecordingAccess, world: str | None) -> Path:
                 "world='worlds/arena.wbt'."
             )
     elif not is_for_a_person():  # like a world to open, it has to be one of the project
+        from webots_mcp.simulator.launch import require_world
+        from webots_mcp.steering.launcher import project_of
+
         return require_world(world, project_of(recording))[0]
     file = Path(world)
     if file.suffix != WORLD_ENDING:

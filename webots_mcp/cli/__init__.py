@@ -290,10 +290,19 @@ def app_for(argv: Sequence[str], *, shows_all: bool = False) -> App:
     )
     names = [called] if called in COMMANDS else list(EVERYDAY) if is_short else list(COMMANDS)
     groups = {name: Group(name, sort_key=place) for place, name in enumerate(GROUPS)}
+    is_list = is_short and len(argv) < 2  # nothing but sentences is shown of any command
     for name in names:
         command = COMMANDS[name]
-        app.command(_function_of(command), name=name, group=groups[command.group])
+        group = groups[command.group]
+        if is_list:
+            app.command(_only_listed, name=name, group=group, help=EVERYDAY[name])
+        else:
+            app.command(_function_of(command), name=name, group=group)
     return app
+
+
+def _only_listed() -> None:
+    """Stand for a command in the list of commands."""
 
 
 def _function_of(command: CommandEntry) -> Callable[..., Any]:

@@ -43,9 +43,6 @@ class ClipLimits:
     film_processor_s: float = 0.5
 
 
-CLIP_LIMITS: Final = ClipLimits()
-
-
 @dataclass(frozen=True)
 class ContentLimits:
     """Limits of what a clip shows.
@@ -68,4 +65,5 @@ class ContentLimits:
     deadline_s: float = 2.0
 
 
+CLIP_LIMITS: Final = ClipLimits()
 CONTENT_LIMITS: Final = ContentLimits()

@@ -78,7 +78,7 @@ def _without_mode(recorded: Where) -> frozenset[str]:
 
     Reading a signal imports numpy, for which they need not wait.
     """
-    with recorded.reader() as connection:
+    with recorded.recording().reader() as connection:
         return frozenset(
             name
             for (name,) in connection.execute(

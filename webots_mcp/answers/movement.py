@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from webots_mcp.answers.budget import (
     figure,
@@ -11,12 +11,14 @@ from webots_mcp.answers.budget import (
 )
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import doubt_of_length, doubt_of_unit, motion_in
-from webots_mcp.judging.run_measures import Way, way_in
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.recording import RobotView
+
+if TYPE_CHECKING:
+    from webots_mcp.judging.run_measures import Way
 
 
 def movement(
@@ -29,6 +31,8 @@ def movement(
     Several runs are reported one by one: the jump to the start at a reset was not travelled. Where
     reading took longer than the deadline, the answer has the time since which rows are missing.
     """
+    from webots_mcp.judging.run_measures import way_in
+
     known = known_signals(view.connection, found)
     deadline = Deadline(deadline_s)
     ways: dict[int, dict[str, Any]] = {}

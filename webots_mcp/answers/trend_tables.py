@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.answers.answer_models import (
     RunTrendTables,
 )
 from webots_mcp.answers.budget import figure, fitting, seconds, short_name, shown, some, table
 from webots_mcp.answers.shortening import compact_json, cut_for_a_model, is_for_a_person, tokens_of
-from webots_mcp.judging.trends import RunTrends, StateTrend, Trend
+
+if TYPE_CHECKING:
+    from webots_mcp.judging.trends import RunTrends, StateTrend, Trend
 
 TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
 STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")

@@ -1,4 +1,8 @@
-"""The public interface of the bridge: what a controller calls."""
+"""The public interface of the bridge: what a controller calls.
+
+Most controllers import it before they know whether they will record. What a session needs is
+imported when a bridge is made, before the robot moves; no step of the loop waits for an import.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from webots_mcp.bridge.attachment import Attachment
-from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handler
-from webots_mcp.bridge.encoding import text_of
-from webots_mcp.bridge.error_report import ErrorReport, describe
-from webots_mcp.bridge.parameters import Parameter, V
-from webots_mcp.bridge.picture_files import MOST_FRAMES
-from webots_mcp.bridge.session import BridgeSession
-from webots_mcp.bridge.simulation import Simulation
-from webots_mcp.bridge.taping import find_tape
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
     ENDED_BY,
@@ -26,6 +21,7 @@ from webots_mcp.contract import (
     KEEP_LAST_S,
     KEEP_LAST_VARIABLE,
     LOG_LEVELS,
+    MAX_CAMERA_PICTURES,
     STRICT_VARIABLE,
     THROTTLE_VARIABLE,
     BreakpointAction,
@@ -33,13 +29,14 @@ from webots_mcp.contract import (
 )
 from webots_mcp.database.location import Database, MemoryDatabase, resolve_database
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.signals.meaning import declare_meaning
-from webots_mcp.signals.parameter import declare
 
 if TYPE_CHECKING:
     import logging
 
+    from webots_mcp.bridge.attachment import Attachment
     from webots_mcp.bridge.capture import Capture
+    from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handler
+    from webots_mcp.bridge.parameters import Parameter, V
 
 _FALSE: Final = ("", "0", "false", "no", "off")
 _MOST_SECONDS: Final = 3600.0
@@ -111,6 +108,11 @@ class MCPBridge:
         database: str | os.PathLike[str] | MemoryDatabase | None = None,
         tape: bool | Literal["images"] | None = None,
     ) -> None:
+        from webots_mcp.bridge.error_report import ErrorReport
+        from webots_mcp.bridge.session import BridgeSession
+        from webots_mcp.bridge.simulation import Simulation
+        from webots_mcp.bridge.taping import find_tape
+
         keep_last_s = _seconds("keep_last_s", KEEP_LAST_VARIABLE, keep_last_s)
         hang_after_s = _seconds("hang_after_s", HANG_VARIABLE, hang_after_s)
         throttle = Throttle(int(os.environ.get(THROTTLE_VARIABLE) or throttle_interval))
@@ -283,6 +285,8 @@ class MCPBridge:
         Args:
             reason: Why they are kept; it is stored with the segment.
         """
+        from webots_mcp.bridge.encoding import text_of
+
         try:
             self._session.full_rate.keep(text_of(reason))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
@@ -341,6 +345,8 @@ class MCPBridge:
         return LogHandler(self._log, level)
 
     def _log(self, message: object, level: object, logger: str | None) -> None:
+        from webots_mcp.bridge.encoding import text_of
+
         try:
             known = find_log_level(level)
             if known is None:
@@ -354,7 +360,7 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
-    def save_camera_frame(self, camera: Any, max_frames: int = MOST_FRAMES) -> str | None:
+    def save_camera_frame(self, camera: Any, max_frames: int = MAX_CAMERA_PICTURES) -> str | None:
         """Save the camera's current image as PNG, with a row in the database.
 
         Args:
@@ -428,6 +434,8 @@ class MCPBridge:
             ValueError: One is out of bounds, they contradict each other, or there are 500
                 parameters already.
         """
+        from webots_mcp.signals.parameter import declare
+
         declaration = declare(
             name, default, low=low, high=high, choices=choices, doc=doc, unit=unit
         )
@@ -471,6 +479,8 @@ class MCPBridge:
             ValueError: A value is not allowed (the text lists those that are), nothing is said, or
                 there are 2,000 declarations already.
         """
+        from webots_mcp.signals.meaning import declare_meaning
+
         said = {
             "quantity": quantity, "role": role, "unit": unit, "target_of": target_of,
             "same_as": same_as, "side": side, "low": low, "high": high,
@@ -637,6 +647,8 @@ class MCPBridge:
         """
         if self._closed:
             return
+        from webots_mcp.bridge.error_report import describe
+
         why = f"{ENDED_BY} {describe(error)}"
         self._session.control.why_ended = why
         self.keep(why)

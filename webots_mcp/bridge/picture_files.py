@@ -10,11 +10,10 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock, CurrentRun
-from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME
+from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME, MAX_CAMERA_PICTURES
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import CommandRefusedError
 
-MOST_FRAMES: Final = 50  # of a camera that are stored; older ones are deleted
 _PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
 
 
@@ -53,7 +52,12 @@ class PictureFiles:
         return str(frame["path"])
 
     def add_frame(
-        self, device: str, bgra: bytes, width: int, height: int, max_frames: int = MOST_FRAMES
+        self,
+        device: str,
+        bgra: bytes,
+        width: int,
+        height: int,
+        max_frames: int = MAX_CAMERA_PICTURES,
     ) -> dict[str, object]:
         """Write a picture of a device; return the result of its command.
 

@@ -1,30 +1,25 @@
 """The console commands.
 
 The commands are a table in `commands`; what one needs is imported inside it, so that each answers
-at once. Errors of webots-mcp end it with one line on stderr and exit code 2, refusals of the system
-(a full disk) and missing packages with 1, Ctrl-C and SIGTERM with 130 and 143.
+at once, and `--version` before anything else is imported. Errors of webots-mcp end it with one line
+on stderr and exit code 2, refusals of the system (a full disk) and missing packages with 1, Ctrl-C
+and SIGTERM with 130 and 143.
 """
 
 from __future__ import annotations
 
 import contextlib
-import inspect
-import json
 import os
-import re
 import sys
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.cli.interrupts import ended_by, ending_by_signals
-from webots_mcp.cli.streams import spelling_out
-from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
 from webots_mcp.errors import InvalidInputError, NotAllowedError, WebotsMCPError
-from webots_mcp.signals.naming import is_destructive, spelled_out
 
 if TYPE_CHECKING:
+    import re
+
     from cyclopts import App, Argument, CycloptsError
 
     from webots_mcp.cli.commands import CommandEntry
@@ -56,12 +51,17 @@ def names() -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code."""
-    given = _take_global_options(list(sys.argv[1:] if argv is None else argv))
+    given = list(sys.argv[1:] if argv is None else argv)
     try:
+        if given == ["--version"]:
+            return _print_version()
+        given = _take_global_options(given)
         return _run(given, is_process=argv is None)
     except NotAllowedError as error:  # quotes a line of a file exactly as it is written there
         return _fail(EXIT_BAD_INPUT, str(error), given)
     except WebotsMCPError as error:
+        from webots_mcp.cli.wording import as_typed
+
         answer = getattr(error, "answer", {})
         return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given, answer)
     except UnicodeEncodeError as error:  # arguments that are not valid text
@@ -71,6 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         return _fail(EXIT_SYSTEM, _explain_missing(error), given)
     except KeyboardInterrupt as interrupt:
+        from webots_mcp.cli.interrupts import ended_by
+
         return _end(*ended_by(interrupt))
     except BrokenPipeError:  # the reader of a pipe has closed it
         _discard_output()
@@ -78,6 +80,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(EXIT_SYSTEM, str(error), given)
     except Exception as error:  # noqa: BLE001  (raised again unless it is about a value)
         return _fail(EXIT_SYSTEM, _explain_value(error), given)
+    return 0
+
+
+def _print_version() -> int:
+    from webots_mcp.contract import VERSION
+
+    print(VERSION, flush=True)
     return 0
 
 
@@ -106,6 +115,9 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
     from cyclopts import CycloptsError, UnusedCliTokensError
 
     from webots_mcp.cli.commands import COMMANDS
+    from webots_mcp.cli.interrupts import ending_by_signals
+    from webots_mcp.cli.streams import spelling_out
+    from webots_mcp.cli.wording import Typed, speak_of
 
     app = app_for(argv)
     if argv and argv[0] in COMMANDS:
@@ -138,6 +150,8 @@ def _run(argv: Sequence[str], *, is_process: bool) -> int:
 
 def _named(error: CycloptsError) -> str:
     """Describe an error with the argument that caused it: cyclopts omits some names."""
+    import re
+
     text = re.sub(r' Did you mean "?([^\s"?]+)"?\?', _harmless_offer, str(error))
     argument = error.argument
     if argument is None or any(name in text for name in argument.names):
@@ -147,12 +161,18 @@ def _named(error: CycloptsError) -> str:
 
 def _harmless_offer(offer: re.Match[str]) -> str:
     """Return cyclopts' correction of an unknown name, unless it would destroy data."""
+    from webots_mcp.signals.naming import is_destructive
+
     return "" if is_destructive(offer[1]) else offer[0]
 
 
 def _fail(code: int, text: str, given: Sequence[str], answer: Mapping[str, Any] = _NOTHING) -> int:
     """End with an error, which programs read as JSON together with the outcome of a command."""
     if "--json" in given:
+        import json
+
+        from webots_mcp.signals.naming import spelled_out
+
         with contextlib.suppress(OSError):
             print(spelled_out(json.dumps({**answer, "error": text}, ensure_ascii=False)))
     return _end(code, text)
@@ -163,6 +183,8 @@ def _end(code: int, text: str) -> int:
 
     What could not be printed before is not retried at the exit.
     """
+    from webots_mcp.signals.naming import spelled_out
+
     with contextlib.suppress(OSError):
         print(f"webots-mcp: {spelled_out(text)}", file=sys.stderr, flush=True)
         _print_details()
@@ -175,7 +197,10 @@ def _end(code: int, text: str) -> int:
 
 def _print_details() -> None:
     """With `--verbose`, print which recording was read and where the error was raised."""
+    import traceback
+
     from webots_mcp.cli.terminal import is_verbose, recording_read
+    from webots_mcp.signals.naming import spelled_out
 
     error = sys.exc_info()[1]
     if not is_verbose() or error is None or isinstance(error, KeyboardInterrupt):
@@ -219,6 +244,8 @@ def _explain_value(error: Exception) -> str:
     Raises:
         Exception: Raised again if it is not about a value of a row.
     """
+    import traceback
+
     from webots_mcp.store.recording import is_over_a_value
 
     if not is_over_a_value(error):
@@ -263,14 +290,25 @@ def app_for(argv: Sequence[str], *, shows_all: bool = False) -> App:
     )
     names = [called] if called in COMMANDS else list(EVERYDAY) if is_short else list(COMMANDS)
     groups = {name: Group(name, sort_key=place) for place, name in enumerate(GROUPS)}
+    is_list = is_short and len(argv) < 2  # nothing but sentences is shown of any command
     for name in names:
         command = COMMANDS[name]
-        app.command(_function_of(command), name=name, group=groups[command.group])
+        group = groups[command.group]
+        if is_list:
+            app.command(_only_listed, name=name, group=group, help=EVERYDAY[name])
+        else:
+            app.command(_function_of(command), name=name, group=group)
     return app
+
+
+def _only_listed() -> None:
+    """Stand for a command in the list of commands."""
 
 
 def _function_of(command: CommandEntry) -> Callable[..., Any]:
     """Return the function of a command, with the parameters that are its options."""
+    import inspect
+
     found = command.declared()
     if inspect.isfunction(found):
         return found
@@ -288,6 +326,8 @@ class CommandHelp(NamedTuple):
 
 def described() -> dict[str, CommandHelp]:
     """Return every command by its name."""
+    import inspect
+
     from webots_mcp.cli.commands import COMMANDS
 
     app = app_for([], shows_all=True)
@@ -306,6 +346,8 @@ def described() -> dict[str, CommandHelp]:
 
 def called_value(argument: Argument) -> str:
     """Return the word for its value."""
+    from webots_mcp.cli.wording import value_name
+
     metavar = getattr(argument.parameter, "metavar", None)  # missing in cyclopts 4
     return metavar if isinstance(metavar, str) else value_name(argument.names[-1])
 

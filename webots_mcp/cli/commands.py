@@ -16,11 +16,26 @@ START, NOW, PAST, STEER, RUNS, DATA, SERVER = (
 GROUPS: Final = (START, NOW, PAST, STEER, RUNS, DATA, SERVER)
 _Q: Final = "webots_mcp.questions"
 _CLI: Final = "webots_mcp.cli"
-# The commands of everyday use, in their order; `--help --all` shows the rest.
-EVERYDAY: Final = (
-    "demo", "init", "launch", "doctor", "status", "view", "logs", "check", "events", "plot",
-    "compare", "report",
-)  # fmt: skip
+# The commands of everyday use, in their order; `--help --all` shows the rest. Their sentences stand
+# here too, so that `--help` need not import what carries them out.
+EVERYDAY: Final = {
+    "demo": "Drive a simulated robot and ask it questions, in under 30 s and without Webots.",
+    "init": "Set up a Webots project: register the MCP server and list what each controller needs.",
+    "launch": (
+        "Start Webots on a world, record its console, and report the first controller that records."
+    ),
+    "doctor": "Check every step from controller to client, and show how to fix what is wrong.",
+    "status": "Show what each robot is doing, since when, and any warnings.",
+    "view": "Show a recording live in the browser: signals, the path, pictures and the log.",
+    "logs": "Read what the controller printed and logged: the newest lines, oldest first.",
+    "check": "Check a run: motion against commands, sensors, pace, log, end, lost rows and goal.",
+    "events": (
+        "Find what went wrong, since when and how often: stuck, falls, sensor faults and more."
+    ),
+    "plot": "Draw signals over time, the robot's path, or the scores of runs or trials.",
+    "compare": "Find out whether an edit or a parameter helped; with --score, how a training went.",
+    "report": "Write a report about a run, or a comparison of two runs, as one HTML file.",
+}
 FORMER_NAMES: Final = {
     "requests": "audit", "keep": "capture", "label": "annotate", "retain": "retention",
     "diff": "first-difference", "repeat": "repeatability", "page": "view",

@@ -44,7 +44,11 @@ def status(
         return show(webots_list_robots, reply, recorded, as_json=json)
     robots = _rows_of(answer["robots"])
     print_answer({"summary": answer["summary"]})
-    shown = [row | _mode_of(row, recorded) for row in robots[:_MOST_MODES]]
+    modeless = _without_mode(recorded)
+    shown = [
+        row if row["robot"] in modeless else row | _mode_of(row, recorded)
+        for row in robots[:_MOST_MODES]
+    ]
     shown += robots[_MOST_MODES:]
     print()
     print_table(_COLUMNS, [[row.get(name) for name in _COLUMNS] for row in shown])
@@ -67,6 +71,21 @@ def status(
 
 def _rows_of(table: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     return [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+
+
+def _without_mode(recorded: Where) -> frozenset[str]:
+    """Return the robots whose signals are known, with none called `mode` among them.
+
+    Reading a signal imports numpy, for which they need not wait.
+    """
+    with recorded.recording().reader() as connection:
+        return frozenset(
+            name
+            for (name,) in connection.execute(
+                "SELECT robot.name FROM robot JOIN signal ON signal.robot_id = robot.id "
+                "GROUP BY robot.id HAVING sum(signal.name = 'mode') = 0"
+            )
+        )
 
 
 def _mode_of(robot: Mapping[str, Any], recorded: Where) -> dict[str, Any]:

@@ -9,29 +9,34 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from webots_mcp.lint.bodies import Bodies
-from webots_mcp.lint.controller_rules import ControllerRules
-from webots_mcp.lint.joint_rules import JointRules
-from webots_mcp.lint.physics_rules import PhysicsRules
-from webots_mcp.lint.scene import LIMITS, LintDeadline, OutOfTimeError, Scene
 from webots_mcp.lint.world_faults import IN_THE_SCENE, RULES, LintReport, WorldFault
-from webots_mcp.lint.world_rules import WorldRules
-from webots_mcp.worlds.world_errors import WorldFileError
 
 __all__ = ["RULES", "LintReport", "lint_world"]
 
 
-def lint_world(world: Path, processor_s: float = LIMITS.processor_s) -> LintReport:
+def lint_world(world: Path, processor_s: float | None = None) -> LintReport:
     """Search a world file for faults.
 
     A file that cannot be parsed is a fault itself, and then no other rule is searched.
 
     Args:
         world: A .wbt file.
-        processor_s: Processor time in seconds after which the rest is not searched.
+        processor_s: Processor time in seconds after which the rest is not searched. Default: as
+            `ReadingLimits` says.
     """
+    # The rules and numpy, which a server that only lists its tools does without.
+    from webots_mcp.lint.bodies import Bodies
+    from webots_mcp.lint.controller_rules import ControllerRules
+    from webots_mcp.lint.joint_rules import JointRules
+    from webots_mcp.lint.physics_rules import PhysicsRules
+    from webots_mcp.lint.scene import LIMITS, LintDeadline, OutOfTimeError, Scene
+    from webots_mcp.lint.world_rules import WorldRules
+    from webots_mcp.worlds.world_errors import WorldFileError
+
     world = world.resolve()
     report = LintReport(world)
+    if processor_s is None:
+        processor_s = LIMITS.processor_s
     deadline = LintDeadline(processor_s)
     others = [name for name in RULES if name != "file"]
     try:

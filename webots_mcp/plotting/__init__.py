@@ -1,7 +1,8 @@
 """Pictures of a recording: signals, the path of a robot, scores of runs and trials; PNG or SVG.
 
 Questions, the command line, page and report draw with these modules. They read through `store` and
-`judging`, and know nothing of answers or tools.
+`judging`, and know nothing of answers or tools. A kind of picture is imported when one is drawn: a
+server that only lists its tools does without.
 """
 
 from __future__ import annotations
@@ -12,12 +13,7 @@ from dataclasses import replace
 from typing import Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.trends import trends
 from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, PlotImage, Sheet
-from webots_mcp.plotting.run_scores import plot_run_scores
-from webots_mcp.plotting.signal_plot import plot_signals
-from webots_mcp.plotting.trajectory import plot_trajectory
-from webots_mcp.plotting.trials import plot_trials
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
 PlotKind = Literal["signals", "trajectory", "runs"]
@@ -60,9 +56,13 @@ def plot(
     """
     sheet = Sheet(width_px, height_px, image_format)
     if trial_set is not None:
+        from webots_mcp.plotting.trials import plot_trials
+
         return plot_trials(connection, trial_set, signals, sheet=sheet)
     asked = scope or Scope()
     if kind == "runs":
+        from webots_mcp.plotting.run_scores import plot_run_scores
+
         return plot_run_scores(
             connection, _score(signals), scope=asked, run_ids=run_ids, sheet=sheet
         )
@@ -70,16 +70,22 @@ def plot(
     scopes = [replace(asked, run_id=run_id) for run_id in several] or [asked]
     ranges = [find_range(connection, each) for each in scopes]
     if kind == "signals":
+        from webots_mcp.plotting.signal_plot import plot_signals
+
         names = signals or changed_most(connection, ranges[-1])
         return plot_signals(connection, ranges, names, bands=bands, sheet=sheet)
     if kind != "trajectory":
         raise InvalidInputError(f"Unknown kind={kind!r}. Kinds: {', '.join(get_args(PlotKind))}.")
+    from webots_mcp.plotting.trajectory import plot_trajectory
+
     position = _position(signals)
     return plot_trajectory(connection, ranges, position, bands=bands, sheet=sheet)
 
 
 def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:
     """Return the three numbers that changed most, which are drawn where none is named."""
+    from webots_mcp.judging.trends import trends
+
     found = trends(connection, time_range, limit=3, shown=0).runs
     return [trend.name for run in found for trend in run.numbers] or ["*"]
 

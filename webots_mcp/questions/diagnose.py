@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.answers.answer_models import (
     DiagnosisAnswer,
@@ -17,8 +17,10 @@ from webots_mcp.answers.shortening import (
     tokens_in,
 )
 from webots_mcp.questions.declaration import READS, question
-from webots_mcp.setup.doctor import Checked, diagnose, subject_of, worst
 from webots_mcp.store.recording import RecordingAccess
+
+if TYPE_CHECKING:
+    from webots_mcp.setup.doctor import Checked
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ def webots_diagnose_setup(recording: RecordingAccess) -> DiagnosisAnswer:
     one. It judges the installation, not the robot: for the robot's behaviour use
     webots_check_run.
     """
+    from webots_mcp.setup.doctor import diagnose, subject_of, worst
+
     checked = diagnose(subject_of(recording, "how this server was started"))
     return DiagnosisAnswer(
         verdict=worst([each.finding for each in checked]).verdict,

@@ -15,10 +15,9 @@ from webots_mcp.answers.budget import fitting, table
 from webots_mcp.answers.shortening import cut_text, is_for_a_person, tokens_of
 from webots_mcp.contract import WORLD_ENDING
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.lint import lint_world
 from webots_mcp.lint.world_faults import RULES, SEVERITIES, LintReport, Severity, WorldFault
 from webots_mcp.questions.declaration import READS, question
-from webots_mcp.simulator.launch import require_world
-from webots_mcp.steering.launcher import project_of
 from webots_mcp.store.recording import RecordingAccess
 
 COLUMNS: Final = ("severity", "rule", "path", "place", "what", "fix")
@@ -113,15 +112,11 @@ def lint_in_short(world: str | None) -> dict[str, Any] | None:
 
 def _linted(file: Path, processor_s: float | None = None) -> LintReport:
     """Return the report of a world, again only if a file next to it has changed."""
-    from webots_mcp.lint import lint_world  # numpy: only when it is needed
-
     return lint_world(file) if processor_s is None else _lint_once(file, _stamp(file), processor_s)
 
 
 @lru_cache(maxsize=8)
 def _lint_once(file: Path, stamp: object, processor_s: float) -> LintReport:
-    from webots_mcp.lint import lint_world
-
     return lint_world(file, processor_s)
 
 
@@ -149,6 +144,9 @@ def _file_of(recording: RecordingAccess, world: str | None) -> Path:
                 "world='worlds/arena.wbt'."
             )
     elif not is_for_a_person():  # like a world to open, it has to be one of the project
+        from webots_mcp.simulator.launch import require_world
+        from webots_mcp.steering.launcher import project_of
+
         return require_world(world, project_of(recording))[0]
     file = Path(world)
     if file.suffix != WORLD_ENDING:

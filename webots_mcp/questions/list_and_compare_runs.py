@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Annotated, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 from pydantic import Field
 
-from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
+from webots_mcp.analysis.summary import MIN_EFFECT_SD
 from webots_mcp.answers.answer_models import AnswerTable, CheckAnswer, ComparisonAnswer, RunsAnswer
 from webots_mcp.answers.budget import (
     DETAIL_BUDGET_TOKENS,
@@ -31,20 +31,7 @@ from webots_mcp.answers.budget import (
 )
 from webots_mcp.answers.shortening import WHOLE, cut_for_a_model, is_for_a_person, shorten
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.checks.check import Finding
-from webots_mcp.judging.checks.check_run import CHECK_DEADLINE_S, check_run
-from webots_mcp.judging.comparison import (
-    COMPARE_DEADLINE_S,
-    MOST_COMPARED,
-    Comparison,
-    Difference,
-    Group,
-    compare_runs,
-)
 from webots_mcp.judging.detection.event_options import EventOptions, both_of
-from webots_mcp.judging.divergence import PartedSignal, Parting, compare_rows
-from webots_mcp.judging.run_measures import WHOLE_RUNS, Measure
-from webots_mcp.judging.run_series import score_each
 from webots_mcp.questions.arguments import (
     AnyNames,
     ComparedRunIds,
@@ -68,6 +55,13 @@ from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.relative_times import utc
 from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
 from webots_mcp.store.trial_sets import scored_runs
+
+if TYPE_CHECKING:
+    from webots_mcp.analysis.summary import Spread
+    from webots_mcp.judging.checks.check import Finding
+    from webots_mcp.judging.comparison import Comparison, Difference, Group
+    from webots_mcp.judging.divergence import Parting
+    from webots_mcp.judging.run_measures import Measure
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "score", "parameters", "started", "began_by", "ended_by",
@@ -175,6 +169,9 @@ def webots_list_runs(
     are wall-clock milliseconds per step in the controller's code and in step(). `notable` counts
     warnings, errors, dropped rows and failed commands.
     """
+    from webots_mcp.judging.comparison import COMPARE_DEADLINE_S
+    from webots_mcp.judging.run_series import score_each
+
     with recording.reader() as connection:
         header = view_robot(connection, robot).header() if robot else header_of_only(connection)
         most = min(limit, MOST_RUNS)
@@ -248,6 +245,9 @@ def webots_compare_runs(
     that matters, and null if this cannot be known yet: `undecided` says why. For curves use
     webots_plot.
     """
+    from webots_mcp.judging.comparison import COMPARE_DEADLINE_S, MOST_COMPARED
+    from webots_mcp.judging.divergence import compare_rows
+
     asked_ids, named = spelled_out(run_ids)
     is_series = score is not None or goal is not None or len(asked_ids or ()) > MOST_COMPARED
     if is_series and (trial_set or first_difference):
@@ -398,6 +398,8 @@ def _file(path: str | None) -> str | None:
 
 def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     """Return where two runs part, as an answer has it."""
+    from webots_mcp.judging.divergence import PartedSignal
+
     notes, most = notes_of(found.notes), None if is_for_a_person() else _SIZES.diverging
     known = {short_name(n): shown([*pair]) for n, pair in list(found.unlike.items())[:most]}
     names, parted = PartedSignal._fields[1:-1], found.parted[: limit or _SIZES.diverging]
@@ -461,6 +463,8 @@ def _compared(
     other_parts: Sequence[Any] = (),
 ) -> dict[str, Any]:
     """Return a comparison; `other_parts` are what else the answer holds."""
+    from webots_mcp.judging.comparison import compare_runs
+
     names, limit, options, min_effect_sd = of
     found = compare_runs(
         view.connection,
@@ -555,6 +559,8 @@ def _differs(difference: Difference) -> bool:
 
 
 def _measure_row(measure: Measure) -> list[Any]:
+    from webots_mcp.judging.run_measures import WHOLE_RUNS
+
     return [
         short_name(measure.name),
         _medians(measure.spread),
@@ -703,6 +709,8 @@ def _checked(
     view: RobotView, expected: Sequence[Expectation], project: Sequence[Expected] | None
 ) -> dict[str, Any]:
     """Return what became of the checks, the worst first; of those that passed the names."""
+    from webots_mcp.judging.checks.check_run import CHECK_DEADLINE_S, check_run
+
     deadline_s = 120.0 if is_for_a_person() else CHECK_DEADLINE_S
     run_id = view.require_run().id
     checked = check_run(

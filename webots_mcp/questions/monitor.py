@@ -7,7 +7,7 @@ import sqlite3
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import anyio
 from anyio import to_thread
@@ -29,13 +29,15 @@ from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_kinds import asked_kinds
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import search_events
-from webots_mcp.judging.trends import RunTrends, trends
 from webots_mcp.judging.verdicts import Verdicts
 from webots_mcp.questions.arguments import MAX_WAIT_S, RobotName
 from webots_mcp.questions.declaration import READS, Caller, question
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import RecordingAccess, RobotView
+
+if TYPE_CHECKING:
+    from webots_mcp.judging.trends import RunTrends
 
 USUAL_DURATION_S: Final = 10.0
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
@@ -151,6 +153,8 @@ def _report(view: RobotView, wall_start_s: float, window_s: float) -> MonitorAns
 
 @in_one_snapshot
 def _found(connection: sqlite3.Connection, view: RobotView, wall_start_s: float) -> dict[str, Any]:
+    from webots_mcp.judging.trends import trends
+
     window = window_from(view, wall_start_s)
     recorded, shown = bool(window.rows.segments), _SIZES.signals
     # The events are searched in a row more, so that trends find the values that these read.

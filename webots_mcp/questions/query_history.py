@@ -37,7 +37,6 @@ from webots_mcp.answers.budget import (
 from webots_mcp.answers.shortening import tokens_of
 from webots_mcp.answers.trend_tables import MOST_SIGNALS, trend_tables
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.trends import trends
 from webots_mcp.questions.arguments import (
     AnyNames,
     Cursor,
@@ -441,6 +440,8 @@ def webots_get_trends(
 def _trends(
     view: RobotView, asked: TimeRange, names: Sequence[str], limit: int | None
 ) -> dict[str, Any]:
+    from webots_mcp.judging.trends import trends
+
     most = limit or _SIZES.trends
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS, shown=most)
     budget_tokens = row_budget_tokens(limit) // max(len(found.runs), 1)

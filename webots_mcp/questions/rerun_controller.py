@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
@@ -13,19 +13,12 @@ from webots_mcp.database.location import find_project
 from webots_mcp.errors import NotAllowedError
 from webots_mcp.questions.arguments import MAX_WAIT_S, RunId, Seconds
 from webots_mcp.questions.declaration import DESTROYS, Caller, question
-from webots_mcp.rerun.running import (
-    LIMIT_S,
-    TapedRun,
-    current_file,
-    find_taped_run,
-    newest_run,
-    require_own,
-    require_own_tape,
-    rerun,
-)
 from webots_mcp.store.policy import RERUN, is_named, policies_of
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import permit
+
+if TYPE_CHECKING:
+    from webots_mcp.rerun.running import TapedRun
 
 _REPLAYS: Final = (
     4  # of the old and the new version, and once more of each in the round that differs
@@ -68,6 +61,8 @@ def webots_rerun_controller(
     one whose rows hold each step and all that the code reads. The script runs with all its side
     effects. To compare two recorded runs use webots_compare_runs.
     """
+    from webots_mcp.rerun.running import LIMIT_S, require_own_tape, rerun
+
     require_rerun(recording, caller, file)
     taped = taped_run(recording, run_id)
     require_own_tape(taped, trusted=trust and caller.client == "cli")
@@ -125,6 +120,8 @@ def taped_run(recording: RecordingAccess, run_id: int | None) -> TapedRun:
     Raises:
         NothingRecordedError: It has no tape, and its rows do not suffice.
     """
+    from webots_mcp.rerun.running import find_taped_run, newest_run
+
     place = (recording.database, recording.data_dir)
     return find_taped_run(*place, newest_run(*place) if run_id is None else run_id)
 
@@ -135,6 +132,8 @@ def file_of(taped: TapedRun, file: str | None, recording: RecordingAccess) -> Pa
     Raises:
         InvalidInputError: It is missing, is not Python, or lies outside of the project.
     """
+    from webots_mcp.rerun.running import current_file, require_own
+
     if file is None:
         return current_file(taped)
     head: dict[str, Any] = taped.tape.head

@@ -29,8 +29,6 @@ from webots_mcp.answers.shortening import cut_text
 from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.judging.divergence import repeats_noted
-from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
 from webots_mcp.questions.controller_parameters import settable
 from webots_mcp.questions.declaration import DESTROYS, READS, Caller, question
@@ -244,6 +242,8 @@ def _begin(
 
 
 def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: RobotView) -> None:
+    from webots_mcp.judging.run_score import require_kinds
+
     score = parse_score(plan.score)
     require_kinds(connection, score, view.require_run().id)
     if known := known_names(view):
@@ -352,6 +352,9 @@ def _header(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, 
 
 def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, Any]:
     trials, plan = trials_of(connection, found.id), json.loads(found.plan)
+    from webots_mcp.judging.divergence import repeats_noted
+    from webots_mcp.judging.run_score import unseen
+
     best = best_of(plan)
     over = sum(each.is_over for each in trials)
     planned = count_planned(plan, trials)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.analysis.level_changes import FEWEST_VALUES
 from webots_mcp.answers.budget import figure, fitting, without_empty
 from webots_mcp.answers.shortening import cut_for_a_model, is_for_a_person
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.judging.run_series import MOST_RUNS, ScoredRun, ScoreSeries, score_series
 from webots_mcp.signals.naming import listed
 from webots_mcp.store.recording import RobotView
+
+if TYPE_CHECKING:
+    from webots_mcp.judging.run_series import ScoredRun, ScoreSeries
 
 SERIES_DEADLINE_S: Final = 5.0  # for scores and events that are computed run by run
 PERSON_DEADLINE_S: Final = 120.0
@@ -42,6 +44,8 @@ def spelled_out(run_ids: Sequence[int | str] | None) -> tuple[list[int] | None, 
     """
     if run_ids is None:
         return None, []
+    from webots_mcp.judging.run_series import MOST_RUNS
+
     found: list[int] = []
     for each in run_ids:
         first, _, last = str(each).partition("-")
@@ -66,6 +70,8 @@ def find_series(
     goal: str | None,
 ) -> ScoreSeries:
     """Score the runs; errors as for `score_series`."""
+    from webots_mcp.judging.run_series import score_series
+
     deadline_s = PERSON_DEADLINE_S if is_for_a_person() else SERIES_DEADLINE_S
     return score_series(
         view.connection,

@@ -35,6 +35,7 @@ from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import Requester
 
 _TOOL_NAME: Final = re.compile(r"\bwebots_[a-z_]+\b")
+_CONTEXT: Final = Context[Any]  # evaluated once: it takes as long as declaring an argument
 _log = logging.getLogger(__name__)
 
 
@@ -123,10 +124,10 @@ def _answering(question: Question) -> Callable[..., Any]:
                 "or by another tool, and report what the server wrote to stderr"
             ) from error
 
-    context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=Context[Any])
+    context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=_CONTEXT)
     own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in question.parameters]
     vars(wrapper)["__signature__"] = question.signature.replace(parameters=[*own, context])
-    wrapper.__annotations__ = {"ctx": Context[Any]}
+    wrapper.__annotations__ = {"ctx": _CONTEXT}
     return wrapper
 
 

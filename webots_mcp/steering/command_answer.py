@@ -21,7 +21,6 @@ from webots_mcp.database.queue import QueuedCommand
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.events import search_events
-from webots_mcp.judging.trends import trends
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.signals.conditions.functions import SAME_TIME_S
 from webots_mcp.signals.naming import flatten
@@ -253,6 +252,8 @@ def _rows_before_end(view: RobotView, command: QueuedCommand, run_id: int, end_s
 
 
 def _trends_and_events(view: RobotView, command: QueuedCommand, asked: TimeRange) -> dict[str, Any]:
+    from webots_mcp.judging.trends import trends
+
     (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS, shown=_SIZES.trends_signals).runs
     found = search_events(view.connection, asked)
     of_others = found.only([event for event in found.events if not _is_own(event, command)])

@@ -23,7 +23,6 @@ from webots_mcp.errors import (
     ConditionFailedError,
     NoDatabaseError,
 )
-from webots_mcp.judging.run_score import score_run
 from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, any_port
 from webots_mcp.steering.trial_plan import TrialPlan, WorldPlan
 from webots_mcp.steering.trial_watch import End, TrialWatch
@@ -250,6 +249,8 @@ def _scored(
     if end.by == "prune":
         why = f"{plan.prune!r} held at {end.sim_time_s:.3f} s"
         return TrialResult(watch.run_id, None, why, *ended, pruned=True)
+    from webots_mcp.judging.run_score import score_run
+
     scored = score_run(connection, watch.run_id, plan.score, end_s=end.sim_time_s)
     return TrialResult(watch.run_id, scored.value, scored.why, *ended)
 

@@ -19,7 +19,6 @@ from typing import Any, Final
 
 from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
-from webots_mcp.judging.run_score import score_run
 from webots_mcp.steering.dispatch import BLOCK_NOTICED_S, withdraw_if_blocked
 from webots_mcp.steering.run_command import ACTION
 from webots_mcp.steering.target_robot import find_target
@@ -308,6 +307,8 @@ class TrialWorker(threading.Thread):
             why = f"{self._plan.prune!r} held at {end_s:.3f} s"
             return TrialResult(run_id, None, why, *ended, pruned=True)
         try:
+            from webots_mcp.judging.run_score import score_run
+
             scored = score_run(connection, run_id, self._plan.score, end_s=end_s)
         except InvalidInputError as error:
             if not any(each.score is not None for each in trials_of(connection, self.set_id)):

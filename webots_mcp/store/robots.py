@@ -5,7 +5,6 @@ Their rows, the one a name means, and what an observer saw.
 
 from __future__ import annotations
 
-import difflib
 import json
 import sqlite3
 from dataclasses import dataclass
@@ -151,7 +150,9 @@ def _named(robots: list[RobotRecord], name: str) -> RobotRecord:
     for robot in robots:
         if robot.name in (name, recorded_name(name)):
             return robot
-    near = difflib.get_close_matches(name, [robot.name for robot in robots], n=3, cutoff=0.5)
+    from difflib import get_close_matches
+
+    near = get_close_matches(name, [robot.name for robot in robots], n=3, cutoff=0.5)
     offer = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
     raise UnknownRobotError(
         f"No robot named {name!r} was recorded. {offer}Recorded robots: {_listed(robots)}."

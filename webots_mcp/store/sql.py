@@ -10,7 +10,6 @@ role "reader" cannot write anyway.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import json
 import math
 import os
@@ -316,7 +315,9 @@ def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) 
     named = [table for table in tables if table in words] or list(tables)
     columns = dict.fromkeys(column for table in named for column in tables[table])
     said = f"No column {name!r}."
-    if len(named) <= _MOST_NAMED or difflib.get_close_matches(wanted, columns, 1, 0.5):
+    from difflib import get_close_matches
+
+    if len(named) <= _MOST_NAMED or get_close_matches(wanted, columns, 1, 0.5):
         offer = listed(_by_likeness(wanted, columns), _LIMITS.offered_columns)
         whose = ", ".join(named[:_MOST_NAMED])
         said += f" Columns of {whose}, the nearest first: {offer}."
@@ -327,7 +328,9 @@ def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) 
 
 
 def _by_likeness(wanted: str, names: Iterable[str]) -> list[str]:
-    return [*dict.fromkeys([*difflib.get_close_matches(wanted, names, 4, 0.4), *names])]
+    from difflib import get_close_matches
+
+    return [*dict.fromkeys([*get_close_matches(wanted, names, 4, 0.4), *names])]
 
 
 # -- a separate process, which the deadline ends whatever the engine is doing ----------------------

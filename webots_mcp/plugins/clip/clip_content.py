@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, cast
 
 from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownSignalError
@@ -21,6 +21,7 @@ from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.plotted_runs import known_signals, mode_signal
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, TrajectoryAxes, compose_trajectory
+from webots_mcp.plugins.clip.clip_limits import CONTENT_LIMITS, ClipView
 from webots_mcp.plugins.clip.moment import Moment, span_of
 from webots_mcp.plugins.report.chapter import is_clock
 from webots_mcp.plugins.report.obstacles import obstacles_of, robot_outline
@@ -29,33 +30,6 @@ from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.run_rows import StoredImage, camera_frames_between, fetch_run, opened
-
-ClipView = Literal["camera", "map"]
-
-
-@dataclass(frozen=True)
-class ContentLimits:
-    """Limits of what a clip shows.
-
-    Attributes:
-        signals: Curves below the picture.
-        frames: Camera frames that are looked at, of all cameras.
-        points: Points of a curve.
-        wrong_heading_rad: Median difference from the direction of motion from which on a recorded
-            heading is not on the map's axes, and the direction of motion is shown instead.
-        moving_share: A step counts as motion if it is longer than this share of the longest step.
-        deadline_s: Time limit of reading curves, and of reading the path.
-    """
-
-    signals: int = 3
-    frames: int = 2_000
-    points: int = 200
-    wrong_heading_rad: float = 0.5
-    moving_share: float = 0.1
-    deadline_s: float = 2.0
-
-
-LIMITS: Final = ContentLimits()
 
 
 @dataclass(frozen=True)
@@ -161,7 +135,7 @@ def content_of(
     end_s = min(last_s, moment.at_s + after_s)
     notes = _shortened(moment, before_s, after_s, start_s, end_s)
     whole = _range(connection, run.id, start_s, end_s)
-    found = camera_frames_between(connection, run.id, start_s, end_s, LIMITS.frames)
+    found = camera_frames_between(connection, run.id, start_s, end_s, CONTENT_LIMITS.frames)
     files: Sequence[tuple[StoredImage, Path]] = ()
     chosen = ""
     if view != "map" and (found or camera or view == "camera"):
@@ -172,7 +146,7 @@ def content_of(
     track: RobotTrack | None = None
     is_still = len(files) == 1 and not camera and view is None  # a map shows more than one frame
     if not files or is_still:
-        track, why_not = _track(connection, whole, deadline_s=LIMITS.deadline_s)
+        track, why_not = _track(connection, whole, deadline_s=CONTENT_LIMITS.deadline_s)
         if view == "map" and track is None:
             raise InvalidInputError(f"No map can be drawn: {why_not}.")
         if track is None:
@@ -245,7 +219,7 @@ def frames_of_a_camera(
     connection: sqlite3.Connection, data_dir: Path, run_id: int, span: tuple[float, float]
 ) -> tuple[str, Sequence[tuple[StoredImage, Path]]]:
     """Return the camera with most frames from a time to another, and those that can be read."""
-    found = camera_frames_between(connection, run_id, *span, LIMITS.frames)
+    found = camera_frames_between(connection, run_id, *span, CONTENT_LIMITS.frames)
     if not found:
         return "", ()
     chosen, _ = _camera(found, "", span)
@@ -324,11 +298,11 @@ def _headings(
         return moved
     recorded: Any = cast("Any", np).interp(times, frame.times[present], np.unwrap(values[present]))
     steps = np.hypot(np.diff(x), np.diff(y))
-    moving = np.flatnonzero(steps > LIMITS.moving_share * steps.max(initial=0.0))
+    moving = np.flatnonzero(steps > CONTENT_LIMITS.moving_share * steps.max(initial=0.0))
     if moved is not None and len(moving):
         towards = np.arctan2(np.diff(y), np.diff(x))[moving]
         apart = np.abs(np.sin(recorded[moving] - towards))
-        if float(np.median(apart)) > math.sin(LIMITS.wrong_heading_rad):
+        if float(np.median(apart)) > math.sin(CONTENT_LIMITS.wrong_heading_rad):
             return moved
     return recorded
 
@@ -346,7 +320,7 @@ def _directions(x: Any, y: Any) -> Any:
         return None
     dx, dy = np.diff(x), np.diff(y)
     steps = np.hypot(dx, dy)
-    moving = steps > LIMITS.moving_share * steps.max()
+    moving = steps > CONTENT_LIMITS.moving_share * steps.max()
     if not moving.any():
         return None
     at = np.flatnonzero(moving)
@@ -376,18 +350,18 @@ def _curves(
     mode = mode_signal(known, None)
     told = [name for name in of_event if name in known and known[name].is_number]
     usual = () if names else (*told, *_changed_most(connection, whole))
-    chosen = list(names) or list(dict.fromkeys(usual))[: LIMITS.signals]
-    if len(chosen) > LIMITS.signals:
+    chosen = list(names) or list(dict.fromkeys(usual))[: CONTENT_LIMITS.signals]
+    if len(chosen) > CONTENT_LIMITS.signals:
         raise InvalidInputError(
-            f"{len(chosen)} signals are named, and a clip has at most {LIMITS.signals} curves. "
-            "Name fewer; webots_plot draws more."
+            f"{len(chosen)} signals are named, and a clip has at most {CONTENT_LIMITS.signals} "
+            "curves. Name fewer; webots_plot draws more."
         )
-    room = Room(points=LIMITS.points, panels=LIMITS.signals, lanes=1, rows=1)
+    room = Room(points=CONTENT_LIMITS.points, panels=CONTENT_LIMITS.signals, lanes=1, rows=1)
     try:
         axes, _ = compose_signals(
             connection, [whole], [*chosen, *([] if chosen or mode is None else [mode])],
             events=False, room=room, grouped=[[name] for name in chosen],
-            deadline_s=LIMITS.deadline_s,
+            deadline_s=CONTENT_LIMITS.deadline_s,
         )  # fmt: skip
     except NothingRecordedError:
         return None, None
@@ -399,11 +373,11 @@ def _curves(
 
 def _changed_most(connection: sqlite3.Connection, whole: TimeRange) -> list[str]:
     """Return the numbers that changed most in a range, without clocks."""
-    found = trends(connection, whole, limit=4 * LIMITS.signals, shown=0).runs
+    found = trends(connection, whole, limit=4 * CONTENT_LIMITS.signals, shown=0).runs
     changed = [
         trend.name
         for run in found
         for trend in run.numbers
         if trend.shape != "constant" and not is_clock(trend)
     ]
-    return changed[: LIMITS.signals]
+    return changed[: CONTENT_LIMITS.signals]

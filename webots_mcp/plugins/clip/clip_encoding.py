@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
+
+from webots_mcp.plugins.clip.clip_limits import ClipFormat
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
-ClipFormat = Literal["webp", "gif"]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field
 
@@ -13,14 +13,14 @@ from webots_mcp.answers.budget import notes_of, seconds
 from webots_mcp.answers.shortening import compact_json
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.clip.clip_content import LIMITS as CONTENT_LIMITS
-from webots_mcp.plugins.clip.clip_content import ClipView
-from webots_mcp.plugins.clip.clip_encoding import ClipFormat
-from webots_mcp.plugins.clip.make_clip import LIMITS, Clip, make_clip
-from webots_mcp.plugins.clip.moment import Moment, moment_at, moment_of_event, newest_moment
+from webots_mcp.plugins.clip.clip_limits import CLIP_LIMITS, CONTENT_LIMITS, ClipFormat, ClipView
 from webots_mcp.questions.arguments import Id, RobotName, RunId, Seconds
 from webots_mcp.questions.declaration import READS, question
 from webots_mcp.store.recording import RecordingAccess, RobotView
+
+if TYPE_CHECKING:
+    from webots_mcp.plugins.clip.make_clip import Clip
+    from webots_mcp.plugins.clip.moment import Moment
 
 FOLDER: Final = "clips"  # in the data folder
 MOST_CLIPS: Final = 50  # files that are kept there; older ones are deleted
@@ -42,11 +42,11 @@ def webots_get_clip(
     ] = None,
     before_s: Annotated[
         float,
-        Field(ge=0, le=LIMITS.longest_s, description="Simulated seconds to show before it."),
+        Field(ge=0, le=CLIP_LIMITS.longest_s, description="Simulated seconds to show before it."),
     ] = 3.0,
     after_s: Annotated[
         float,
-        Field(ge=0, le=LIMITS.longest_s, description="Simulated seconds to show after it."),
+        Field(ge=0, le=CLIP_LIMITS.longest_s, description="Simulated seconds to show after it."),
     ] = 2.0,
     signals: Annotated[
         list[str] | None,
@@ -84,6 +84,8 @@ def webots_get_clip(
     picture use webots_get_camera; for curves of a whole run use webots_plot. A film of the whole
     simulation view is made by webots_record_scene while it runs.
     """
+    from webots_mcp.plugins.clip.make_clip import make_clip
+
     asked = _event(recording, event_id, at_s)
     if asked is not None and run_id not in (None, asked.run_id):
         raise InvalidInputError(
@@ -137,11 +139,15 @@ def _event(recording: RecordingAccess, event_id: int | None, at_s: float | None)
         raise InvalidInputError(
             "event_id and at_s name two moments, and a clip shows one. Leave one of them out."
         )
+    from webots_mcp.plugins.clip.moment import moment_of_event
+
     with recording.reader() as connection:
         return moment_of_event(connection, event_id)
 
 
 def _moment(shown: RobotView, at_s: float | None) -> Moment:
+    from webots_mcp.plugins.clip.moment import moment_at, newest_moment
+
     run = shown.require_run()
     if at_s is None:
         return newest_moment(shown.connection, run)

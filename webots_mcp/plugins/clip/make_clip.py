@@ -7,59 +7,19 @@ import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.clip.clip_content import (
-    ClipContent,
-    ClipView,
-    content_of,
-    frames_of_a_camera,
-)
-from webots_mcp.plugins.clip.clip_encoding import ClipFormat, EncodedClip, encode_clip
+from webots_mcp.plugins.clip.clip_content import ClipContent, content_of, frames_of_a_camera
+from webots_mcp.plugins.clip.clip_encoding import EncodedClip, encode_clip
+from webots_mcp.plugins.clip.clip_limits import CLIP_LIMITS as LIMITS
+from webots_mcp.plugins.clip.clip_limits import ClipFormat, ClipView
 from webots_mcp.plugins.clip.clip_painting import ClipPainter
 from webots_mcp.plugins.clip.moment import Moment
 from webots_mcp.store.reading.segment import in_one_snapshot
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
-
-@dataclass(frozen=True)
-class ClipLimits:
-    """How large a clip is, and what it may cost.
-
-    Attributes:
-        longest_s: Simulated seconds before a moment, and after it.
-        max_bytes: Maximum size of the file.
-        processor_share: Processor time of painting and encoding frames per simulated second;
-            `least_processor_s` for any clip.
-        frames: Maximum number of frames; `frames_per_s` of the animation.
-        smooth_s: Time that a frame is shown from which on a note says how to get a smoother one.
-        width_px: Width of a frame, and `sheet_px` of the contact sheet.
-        sheet_frames: Maximum number of frames on the sheet.
-        jpeg_quality: Quality of a sheet with camera frames, from 1 to 100.
-        film_px: Width of a film of camera frames alone, which has `film_least` frames at least;
-            `film_processor_s` is what it may cost.
-    """
-
-    longest_s: float = 120.0
-    max_bytes: int = 3_000_000
-    processor_share: float = 0.75
-    least_processor_s: float = 3.0
-    frames: int = 100
-    frames_per_s: float = 10.0
-    smooth_s: float = 0.5
-    width_px: int = 480
-    sheet_px: int = 1000
-    sheet_frames: int = 16
-    jpeg_quality: int = 88
-    film_px: int = 320
-    film_least: int = 3
-    film_processor_s: float = 0.5
-
-
-LIMITS: Final = ClipLimits()
 
 
 @dataclass(frozen=True)

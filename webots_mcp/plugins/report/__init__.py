@@ -7,5 +7,5 @@ from webots_mcp.extras.plugin_registry import Plugin, PluginCommand
 
 PLUGIN = Plugin(
     commands=(PluginCommand("report", "Ask", f"{__name__}.report_command:report"),),
-    questions=(f"{__name__}.make_report",),
+    questions=(f"{__name__}.write_report",),
 )

@@ -15,6 +15,7 @@ from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport, describe
 from webots_mcp.bridge.parameters import Parameter, V
 from webots_mcp.bridge.picture_files import MOST_FRAMES
+from webots_mcp.bridge.restored import RestoredState
 from webots_mcp.bridge.session import BridgeSession
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.taping import find_tape
@@ -26,6 +27,7 @@ from webots_mcp.contract import (
     KEEP_LAST_S,
     KEEP_LAST_VARIABLE,
     LOG_LEVELS,
+    RESTORED_EVENT,
     STRICT_VARIABLE,
     THROTTLE_VARIABLE,
     BreakpointAction,
@@ -120,6 +122,7 @@ class MCPBridge:
         self.database, self.data_dir = resolve_database(database, data_dir)
         self._closed = False
         self._close_after_answer = False
+        self._restored_read = False
         strict = os.environ.get(STRICT_VARIABLE, "").lower() not in _FALSE
         self._errors = ErrorReport(strict=strict)
         taped = find_tape(tape, self.database)  # before the steps of the robot's class are replaced
@@ -560,6 +563,27 @@ class MCPBridge:
     def run_id(self) -> int | None:
         """Id of the current run; None while nothing has been written yet."""
         return self._session.clock.run.id
+
+    @property
+    def restored(self) -> RestoredState | None:
+        """What a controller in a branch continues with; None in any other run.
+
+            if bridge.restored is not None:
+                mode = bridge.restored.state["mode"]
+                integral = bridge.restored.state["integral"]
+
+        A branch is a copy of the world at a moment of another run ('webots-mcp help branches').
+        Webots brings back positions and velocities; the controller starts anew, and takes its own
+        variables from here. Reading it the first time is recorded as an event.
+        """
+        origin = self._session.origin
+        if origin is None or origin.restored is None:
+            return None
+        if not self._restored_read:
+            self._restored_read = True
+            moment = {"run_id": origin.restored.run_id, "sim_time_s": origin.restored.sim_time_s}
+            self._session.journal.event(RESTORED_EVENT, moment)
+        return origin.restored
 
     def stats(self) -> BridgeStats:
         """Return how much was recorded so far and how much was not, and how long it took."""

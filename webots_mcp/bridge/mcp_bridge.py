@@ -579,11 +579,15 @@ class MCPBridge:
         origin = self._session.origin
         if origin is None or origin.restored is None:
             return None
+        moment = origin.restored
         if not self._restored_read:
             self._restored_read = True
-            moment = {"run_id": origin.restored.run_id, "sim_time_s": origin.restored.sim_time_s}
-            self._session.journal.event(RESTORED_EVENT, moment)
-        return origin.restored
+            try:
+                where: dict[str, object] = {"run_id": moment.run_id, "at_s": moment.sim_time_s}
+                self._session.journal.event(RESTORED_EVENT, where)
+            except Exception as error:  # noqa: BLE001  (the robot comes first)
+                self._errors.failed("restored", error)
+        return moment
 
     def stats(self) -> BridgeStats:
         """Return how much was recorded so far and how much was not, and how long it took."""

@@ -24,8 +24,8 @@ from webots_mcp.bridge.picture_actions import PictureActions
 from webots_mcp.bridge.picture_files import PictureFiles
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.restored import find_origin
 from webots_mcp.bridge.registration import Registration, identify
+from webots_mcp.bridge.restored import find_origin
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_actions import SceneActions

@@ -60,6 +60,7 @@ class WorldSaving:
             "world": str(world),
             "sim_time_s": self._clock.sim_time_s,
             "calls": self._throttle.calls_in_run,
+            "running_mode": self._pause.running_mode,
         }
         yield
 

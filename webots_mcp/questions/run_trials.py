@@ -29,6 +29,7 @@ from webots_mcp.answers.shortening import cut_text
 from webots_mcp.answers.summaries import TRIAL_FIGURES
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.judging.branch_parting import parting_notes
 from webots_mcp.judging.divergence import repeats_noted
 from webots_mcp.judging.run_score import require_kinds, unseen
 from webots_mcp.questions.arguments import RobotName, TimeoutS, TrialSetId
@@ -54,6 +55,7 @@ from webots_mcp.store.trial_sets import (
     fetch_trial_set,
     find_trial_set,
     is_at_work,
+    is_branching,
     progress_of,
     ranking_of,
     stop_trial_set,
@@ -230,27 +232,32 @@ def _begin(
     require_possible(recording, robot, asked["until"], asked["for_s"], reset=True)
     if asked["prune"] is not None:
         require_possible(recording, robot, asked["prune"], None, reset=True)
-    checked = _as_declared(settable(recording, robot), sets)
+    checked = as_declared(settable(recording, robot), sets)
     for name, value in {(name, each) for values in checked for name, each in values.items()}:
         permit(recording, ACTION, {**OF_EACH_TRIAL, "parameters": {name: value}})
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)
         plan = TrialPlan(parameters=checked, robot=view.robot.name, **asked)
-        _require_scorable(connection, plan, view)
+        require_scorable(connection, plan, view)
     with recording.writer() as connection:
         set_id = create_trial_set(connection, plan.text, plan.trials, view.robot.id)
     workers.begin(set_id)
     return set_id
 
 
-def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: RobotView) -> None:
+def require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: RobotView) -> None:
+    """Refuse a score that no run of the robot can have.
+
+    Raises:
+        InvalidInputError: It reads a signal or counts events that there are not.
+    """
     score = parse_score(plan.score)
     require_kinds(connection, score, view.require_run().id)
     if known := known_names(view):
         score.require_known(known)
 
 
-def _as_declared(
+def as_declared(
     declared: Mapping[str, Declared], sets: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """Return the values in the types of the declared parameters."""
@@ -286,9 +293,12 @@ def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, can
 
 def _goes_on(found: TrialSetRecord) -> str:
     """Return how to continue a set that no robot's simulation runs."""
+    plan = json.loads(found.plan)
+    if is_branching(plan):
+        return "branched off a moment that is over: begin new branches with webots_branch_run"
     return (
         "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
-        if "world" in json.loads(found.plan)
+        if "world" in plan
         else "came from another recording, and its robot did not: begin a new set"
     )
 
@@ -358,7 +368,9 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
     state, hint = _state(found, planned - over, at_work=is_at_work(connection, found))
     ranking = ranking_of(trials, best)
     rows = fitting(_rows(ranking, trials), _SIZES.table_tokens)
-    repeats = [] if state == "under way" else repeats_noted(connection, found.id)
+    repeats = list[str]()
+    if state != "under way":
+        repeats = parting_notes(connection, found.id) or repeats_noted(connection, found.id)
     left_out = len(ranking.sets) - len(rows)
     rank_lower = "that rank lower are not shown: webots_query_sql has all in table trial"
     return {

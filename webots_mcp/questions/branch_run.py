@@ -22,7 +22,6 @@ from webots_mcp.questions.run_trials import (
     require_scorable,
     set_facts,
 )
-from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.steering.branches import SAVE, BranchWorker, SavedMoment, branches_of, save_moment
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.trial_plan import BranchPlan, TrialPlan, combinations
@@ -31,7 +30,6 @@ from webots_mcp.steering.trial_run import stand_in as stand_in_command
 from webots_mcp.store.policy import LAUNCH
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import permit
-from webots_mcp.store.run_parameters import Declared
 from webots_mcp.store.trial_sets import create_trial_set, progress_of, stop_trial_set
 
 _POLL_S = 0.05
@@ -91,12 +89,11 @@ async def webots_branch_run(
     sets = combinations(parameters) if isinstance(parameters, dict) else parameters
     asked: dict[str, Any] = {"score": score, "best": best, "for_s": for_s, "until": until}
     asked |= {"prune": prune, "repeats": repeats, "timeout_s": branch_timeout_wall_s}
-    declared, checked = await to_thread.run_sync(_checked, recording, robot, sets, asked)
-    command = stand_in_command if stand_in else webots
-    simulators = LocalSimulators(command, jobs)
+    simulators = LocalSimulators(stand_in_command if stand_in else webots, jobs)
+    robot, checked = await to_thread.run_sync(_checked, recording, robot, sets, asked, simulators)
     saved = await save_moment(recording, robot, caller.report)
     try:
-        worker = await to_thread.run_sync(LAMBDA)
+        worker = await to_thread.run_sync(_worker, recording, saved, checked, asked, simulators)
     except BaseException:
         saved.remove()
         raise
@@ -111,40 +108,41 @@ async def webots_branch_run(
 
 
 def _checked(
-    recording: RecordingAccess, robot: str | None, sets: list[dict[str, Any]], asked: dict[str, Any]
-) -> tuple[dict[str, Declared], list[dict[str, Any]]]:
-    """Return the declared parameters and the sets in their types, before anything is paused.
+    recording: RecordingAccess,
+    robot: str | None,
+    sets: list[dict[str, Any]],
+    asked: dict[str, Any],
+    simulators: LocalSimulators,
+) -> tuple[str, list[dict[str, Any]]]:
+    """Return the robot, and the sets in the types of its parameters, before anything is paused.
 
     Raises:
         InvalidInputError: A parameter, the score or a condition is not possible.
-        CommandRefusedError: No live Supervisor could save the world.
+        CommandRefusedError: No live Supervisor could save the world, or there is no simulator.
         NotAllowedError: A rule of the project forbids to start a simulator.
     """
-    declared = settable(recording, robot)
-    checked = as_declared(declared, sets)
-    plan = TrialPlan(parameters=checked, **asked)
     with recording.reader() as connection:
         view = find_target(connection, robot, SAVE)
-        world = view.require_run().world
-        require_scorable(connection, plan, view)
-    for text in (asked["until"], asked["prune"]):
-        if text is not None:
-            parse_condition(text)
+        name, world = view.robot.name, view.require_run().world
+    checked = as_declared(settable(recording, name), sets)
+    plan = TrialPlan(parameters=checked, **asked)
+    with recording.reader() as connection:
+        require_scorable(connection, plan, find_target(connection, name, SAVE))
     for values in checked:
         permit(recording, LAUNCH, {"world": world, "parameters": values})
-    return declared, checked
+    simulators.command(world or "")
+    return name, checked
 
 
 def _worker(
     recording: RecordingAccess,
     saved: SavedMoment,
-    branches: list[dict[str, Any]],
+    sets: list[dict[str, Any]],
     asked: dict[str, Any],
     simulators: LocalSimulators,
 ) -> BranchWorker:
-    simulators.command(str(saved.world))  # there has to be a simulator
     plan = BranchPlan(
-        parameters=branches,
+        parameters=branches_of(saved, sets),
         robot=saved.robot,
         world=str(saved.world),
         moment=saved.moment,

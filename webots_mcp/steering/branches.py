@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import shutil
 import threading
 from collections.abc import Awaitable, Callable, Mapping
 from contextvars import copy_context
@@ -167,19 +168,22 @@ def _moment(recording: RecordingAccess, robot: str, saved: Mapping[str, Any]) ->
     text = json.dumps({"world": saved["world"], "robots": states}, ensure_ascii=False)
     file.write_text(text, "utf-8")
     parameters = {name: each["parameters"] for name, each in states.items()}
-    moment = Moment(run_uuid, saved["sim_time_s"], parameters)
+    moment = Moment(run_uuid, saved["sim_time_s"], saved["world"], parameters)
     return SavedMoment(moment, own, run.id, Path(saved["file"]), file)
 
 
 def _state_of(view: RobotView) -> dict[str, Any] | None:
     if view.run is None or view.state is None:
         return None
-    values = {each["name"]: each["value"] for each in described(view.connection, view.run)}
+    values = {
+        each["name"]: each["default"] if each["value"] is None else each["value"]
+        for each in described(view.connection, view.run)
+    }
     return {
         "run_id": view.run.id,
         "sim_time_s": view.state.sim_time_s,
         "state": json.loads(view.state.data),
-        "parameters": {name: value for name, value in values.items() if value is not None},
+        "parameters": values,
         "calls": 0,
     }
 
@@ -208,12 +212,14 @@ class BranchWorker(threading.Thread):
         self._recording = recording
         self._saved = saved
         self._stopping = threading.Event()
-        self._set_run = SetRun(recording, plan, simulators, self._stopping)
+        self._run_ends = threading.Event()  # set whenever the trials of the set have been run
+        self._plan, self._simulators = plan, simulators
         self.set_id = set_id
 
     def stop(self) -> None:
         """End the running branches."""
         self._stopping.set()
+        self._run_ends.set()
         self.join(_END_S)
 
     def run(self) -> None:
@@ -222,12 +228,13 @@ class BranchWorker(threading.Thread):
             self._context.run(self._work)
         finally:
             self._saved.remove()
+            self._remove_folders()
 
     def _work(self) -> None:
         try:
-            run_trials(self._set_run, self.set_id, _ignore)
+            self._run_waiting()
             if self._needs_another():
-                run_trials(self._set_run, self.set_id, _ignore)
+                self._run_waiting()
         except (StoppedError, LeaseLostError):
             self._note_stop("it was stopped, and its moment is over")
         except (WebotsMCPError, OSError) as error:
@@ -235,6 +242,13 @@ class BranchWorker(threading.Thread):
         except Exception as error:  # noqa: BLE001  (a thread must not end without a report)
             _log.exception("the branches of set %d failed", self.set_id)
             self._note_stop(f"an error of webots-mcp ({error})")
+
+    def _run_waiting(self) -> None:
+        self._run_ends = threading.Event()
+        if self._stopping.is_set():
+            raise StoppedError
+        set_run = SetRun(self._recording, self._plan, self._simulators, self._run_ends)
+        run_trials(set_run, self.set_id, _ignore)
 
     def _needs_another(self) -> bool:
         """Add a second unchanged branch, if there is nothing else to compare the first with."""
@@ -246,28 +260,31 @@ class BranchWorker(threading.Thread):
             add_trial(connection, self.set_id, trials_of(connection, self.set_id)[0].values)
             return True
 
+    def _remove_folders(self) -> None:
+        """Remove what branches that did not end have recorded: they cannot be run again."""
+        with self._recording.reader() as connection:
+            for trial in trials_of(connection, self.set_id):
+                folder = self._recording.data_dir / FOLDER / trial.uuid
+                shutil.rmtree(folder, ignore_errors=True)
+
     def _note_stop(self, reason: str) -> None:
         with self._recording.writer() as connection:
             if fetch_trial_set(connection, self.set_id).stop_reason is None:
                 stop_trial_set(connection, self.set_id, reason)
 
 
-def branches_of(
-    saved: SavedMoment, declared: Mapping[str, Any], sets: list[dict[str, Any]]
-) -> list[dict[str, Any]]:
+def branches_of(saved: SavedMoment, sets: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the parameters of each branch: first those of the moment, then each other set once.
 
     Args:
         saved: The moment.
-        declared: The declared parameters by name, which have the values of the moment.
-        sets: The sets to try.
+        sets: The sets to try, of parameters that the robot declares.
 
     Raises:
         InvalidInputError: Nothing is changed.
     """
-    known = saved.moment.parameters.get(saved.robot, {})
-    names = list(dict.fromkeys(name for values in sets for name in values))
-    now = {name: known.get(name, declared[name].declaration.default) for name in names}
+    known = saved.moment.parameters[saved.robot]
+    now = {name: known[name] for values in sets for name in values}
     unlike = {json.dumps(each): each for values in sets if (each := {**now, **values}) != now}
     if not unlike:
         raise InvalidInputError(

@@ -197,6 +197,11 @@ class WorldPlan(TrialPlan):
             raise InvalidInputError(f"world: no file {self.world}. Give the path of a .wbt file.")
         super().__post_init__()
 
+    @property
+    def own_world(self) -> str:
+        """The world file of the project, about which its rules are."""
+        return self.world
+
     def environment(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Return the variables with which the controllers of a trial begin with these values."""
         given = {self.robot: values} if self.robot else values
@@ -210,11 +215,13 @@ class Moment:
     Attributes:
         run: UUID of the run.
         sim_time_s: Its simulation time.
+        world: The world file of the run.
         parameters: The values of the parameters of each robot of the simulation.
     """
 
     run: str
     sim_time_s: float
+    world: str
     parameters: dict[str, dict[str, Any]]
 
 
@@ -229,6 +236,11 @@ class BranchPlan(WorldPlan):
 
     moment: Moment
     states: str
+
+    @property
+    def own_world(self) -> str:
+        """The world file of the run that is continued."""
+        return self.moment.world
 
     def environment(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Return the variables with which controllers continue, with some values changed."""

@@ -126,10 +126,10 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "quit": BuiltInAction(("status",), ends_steps=True),
     "screenshot": BuiltInAction(("quality",)),
     "take_frame": BuiltInAction(("camera",), needs_supervisor=False),
-    "save_world": BuiltInAction(("name",), ("name",)),
     "record_scene": BuiltInAction(
         ("do", "kind", "width", "height", "quality", "speed", "caption"), ("do",)
     ),
+    "save_world": BuiltInAction(("name",), ("name",)),
     "reset_state": BuiltInAction(None, needs_supervisor=False, runs_user_code=True),
     "set_parameters": BuiltInAction(("values", "when", "by"), ("values",), needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),

@@ -96,7 +96,7 @@ class Project:
     def saved(self) -> list[Path]:
         """What a save leaves in the folder of the world, and in that of the trials."""
         worlds = [each for each in self.world.parent.iterdir() if each != self.world]
-        return worlds + [*self.data.glob("trials/*")]
+        return [*worlds, *self.data.glob("trials/*")]
 
 
 @pytest.fixture

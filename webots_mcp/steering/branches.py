@@ -33,7 +33,7 @@ from webots_mcp.errors import (
 from webots_mcp.judging.branch_parting import lacks_reference
 from webots_mcp.steering.dispatch import Dispatcher, ProgressReport
 from webots_mcp.steering.target_robot import find_target
-from webots_mcp.steering.trial_plan import BranchPlan, Moment
+from webots_mcp.steering.trial_plan import BranchMoment, BranchPlan
 from webots_mcp.steering.trial_run import Simulators, StoppedError
 from webots_mcp.steering.trial_set import FOLDER, SetRun, run_trials
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
@@ -61,7 +61,7 @@ class SavedMoment:
         states: The file with the states of the robots.
     """
 
-    moment: Moment
+    moment: BranchMoment
     robot: str
     run_id: int
     world: Path
@@ -168,7 +168,7 @@ def _moment(recording: RecordingAccess, robot: str, saved: Mapping[str, Any]) ->
     text = json.dumps({"world": saved["world"], "robots": states}, ensure_ascii=False)
     file.write_text(text, "utf-8")
     parameters = {name: each["parameters"] for name, each in states.items()}
-    moment = Moment(run_uuid, saved["sim_time_s"], saved["world"], parameters)
+    moment = BranchMoment(run_uuid, saved["sim_time_s"], saved["world"], parameters)
     return SavedMoment(moment, own, run.id, Path(saved["file"]), file)
 
 

@@ -209,7 +209,7 @@ class WorldPlan(TrialPlan):
 
 
 @dataclass(frozen=True)
-class Moment:
+class BranchMoment:
     """The moment of a run at which branches begin.
 
     Attributes:
@@ -234,7 +234,7 @@ class BranchPlan(WorldPlan):
         states: File with the states of the robots at that moment.
     """
 
-    moment: Moment
+    moment: BranchMoment
     states: str
 
     @property

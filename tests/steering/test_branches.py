@@ -8,15 +8,18 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcp import Client
 
-from tests.waiting import wait_for
+from tests.server.conftest import ask, fail
+from tests.waiting import until, wait_for
 from webots_mcp.cli import main
+from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
@@ -66,7 +69,7 @@ class Project:
         self.controller.write_text(CONTROLLER.replace("RESTORE", RESTORE))
 
     @contextmanager
-    def simulated(self, mode: str = "fast") -> Iterator[Simulation]:
+    def simulated(self, mode: str = "fast") -> Generator[Simulation]:
         """Run it until its rover has driven for two seconds."""
         environment = {"WEBOTS_MCP_DATA_DIR": str(self.data)}
         with Simulation(self.world, mode=mode, environment=environment) as simulation:
@@ -239,3 +242,31 @@ def test_a_robot_that_is_no_supervisor_is_told_what_to_change(
 
     assert "save_world needs a Supervisor" in refused
     assert "set the field 'supervisor' of its Robot node to TRUE" in refused
+
+
+@pytest.mark.slow
+@pytest.mark.anyio
+async def test_an_assistant_waits_for_branches_cancels_them_and_begins_new_ones(
+    project: Project,
+) -> None:
+    asked = {"parameters": {"speed": [9.0]}, "score": "max(x)", "stand_in": True}
+    with project.simulated("realtime"):
+        async with Client(create_server(project.data / "webots.db", project.data)) as client:
+            begun = await ask(client, "webots_branch_run", **asked, for_s=0.5, timeout_wall_s=0.1)
+            assert (begun["state"], begun["trials"]) == ("under way", 2)
+            done = await until(
+                lambda: ask(client, "webots_run_trials", trial_set=begun["trial_set"]),
+                lambda found: found["state"] == "done",
+            )
+            assert done["notes"][0].startswith("branch 0 (unchanged: speed 3.0) equals")
+            endless = await ask(
+                client, "webots_branch_run", **asked, until="x > 1e6", timeout_wall_s=0.1
+            )
+            number = endless["trial_set"]
+            await until(lambda: project.rows("SELECT 1 FROM trial WHERE status = 'running'"))
+            ended = await ask(client, "webots_run_trials", trial_set=number, cancel=True)
+            assert ended["state"] == "stopped: it was cancelled"
+            assert "begin new branches" in ended["hint"]
+            refused = await fail(client, "webots_run_trials", trial_set=number)
+            assert "branched off a moment that is over" in refused
+            await until(lambda: project.saved() == [])

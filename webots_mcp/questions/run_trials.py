@@ -409,7 +409,8 @@ def _state(found: TrialSetRecord, left: int, *, at_work: bool) -> tuple[str, str
     if not left:
         return "done", None
     if found.robot_id is None:
-        return "left", f"it {_goes_on(found)}"
+        is_stopped = found.stop_reason and is_branching(json.loads(found.plan))
+        return why if is_stopped else "left", f"it {_goes_on(found)}"
     return why, f"{again} continues with the {left} that are left"
 
 

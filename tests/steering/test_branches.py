@@ -223,6 +223,16 @@ def test_what_cannot_branch_is_refused_before_anything_is_saved(
         assert "change nothing" in project.refused(capsys, "speed=3.0", *SCORE)
         without_end = project.refused(capsys, "speed=2.0", "--score", "max(x)", "--stand-in")
         assert "Give for_s, until or both" in without_end or "--for" in without_end
+        line = [sys.executable, "-m", "webots_mcp", "run", "--until", "x > 1e6"]
+        running = subprocess.Popen(
+            [*line, "--data-dir", str(project.data)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        wait_for(lambda: project.rows("SELECT 1 FROM command WHERE status = 'claimed'"))
+        assert "(run) of robot 'rover' is under way" in project.refused(capsys, "speed=2", *SCORE)
+        running.send_signal(signal.SIGINT)
+        running.wait(60)
         unknown = project.refused(capsys, "speed=2.0", "--for", "1", "--score", "max(z)")
         assert "'z'" in unknown
         paused = project.rows("SELECT count(*) FROM trial_set")

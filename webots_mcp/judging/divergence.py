@@ -11,7 +11,7 @@ import math
 import sqlite3
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
@@ -171,7 +171,7 @@ def compare_rows(
         )
     deadline = Deadline(deadline_s)
     # Half of the time is for rows that are in no chunk yet.
-    one, in_one = _read(connection, run_ids[0], until_s, deadline.part(0.25))
+    one, in_one = _read(connection, run_ids[0], until_s, deadline.part(0.25), offset_s)
     other, in_other = _read(connection, run_ids[1], until_s - offset_s, deadline.part(0.33))
     meant = resolve_signals(in_one | in_other, names)
     shared = [each for each in meant if each.name in in_one and each.name in in_other]
@@ -208,9 +208,13 @@ def compare_rows(
 
 
 def _read(
-    connection: sqlite3.Connection, run_id: int, until_s: float, deadline: Deadline
+    connection: sqlite3.Connection,
+    run_id: int,
+    until_s: float,
+    deadline: Deadline,
+    after_s: float = 0.0,
 ) -> tuple[Frame, dict[str, RegisteredSignal]]:
-    """A run, and the signals that it has."""
+    """A run after a time, by default all of it, and the signals that it has."""
     subject = Subject(fetch_run(connection, run_id).robot_id, "", run_id)
     segment = whole_run(connection, run_id)
     if segment is None:
@@ -220,6 +224,8 @@ def _read(
         )
     if until_s < segment.end_s:
         segment = segment.through(until_s)
+    if after_s:
+        segment = replace(segment, start_s=just_after(after_s), open_start=False)
     frame = read_frame(connection, segment, deadline)
     return frame, held_by(connection, frame, signals_of_frame(connection, subject, frame))
 

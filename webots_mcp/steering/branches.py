@@ -19,7 +19,7 @@ from typing import Any, Final, cast
 
 from anyio import CancelScope, to_thread
 
-from webots_mcp.contract import WORLD_ENDING, new_uuid
+from webots_mcp.contract import LOOPING, WORLD_ENDING, new_uuid
 from webots_mcp.database.files import make_folder
 from webots_mcp.database.pauses import PAUSED
 from webots_mcp.database.queue import fetch_command
@@ -43,7 +43,11 @@ from webots_mcp.store.sessions import companions
 from webots_mcp.store.trial_sets import add_trial, fetch_trial_set, stop_trial_set, trials_of
 
 SAVE: Final = "save_world"
-_COMMAND_S: Final = 10.0  # wall time for each command to the controller
+_COMMAND_S: Final = 30.0  # wall time for each command to the controller
+_UNDER_WAY: Final = (
+    "SELECT id, action FROM command WHERE robot_id = ? AND status = 'claimed' "
+    f"AND action IN ({', '.join(map(repr, LOOPING))}) ORDER BY id DESC LIMIT 1"
+)
 _END_S: Final = 15.0  # wall time in which simulators end
 _NUMBERED: Final = re.compile(r"#\d+$")  # of a robot whose name was taken in its recording
 _log = logging.getLogger(__name__)
@@ -125,6 +129,14 @@ async def _resume(order: Callable[[str], Awaitable[object]], action: str) -> Non
 def _target(recording: RecordingAccess, robot: str | None) -> tuple[str, bool]:
     with recording.reader() as connection:
         view = find_target(connection, robot, SAVE)
+        under_way = connection.execute(_UNDER_WAY, (view.robot.id,)).fetchone()
+        if under_way is not None:
+            number, action = under_way
+            raise CommandRefusedError(
+                f"Command {number} ({action}) of robot {view.robot.name!r} is under way, and the "
+                "pause for saving the world would end it. Wait for it with "
+                f"webots_wait_for_command(command_id={number}), then branch."
+            )
         return view.robot.name, view.session is not None and view.session.pause_state == PAUSED
 
 
@@ -155,7 +167,7 @@ def _moment(recording: RecordingAccess, robot: str, saved: Mapping[str, Any]) ->
         names = [robot, *(robot_name(connection, each.robot_id) for each in others)]
         for name in names:
             if (state := _state_of(view_robot(connection, name))) is not None:
-                states[_NUMBERED.sub("", name)] = state
+                states[_NUMBERED.sub("", name)] = state | {"sim_time_s": saved["sim_time_s"]}
     own = _NUMBERED.sub("", robot)
     if own not in states:
         raise NothingRecordedError(
@@ -181,7 +193,6 @@ def _state_of(view: RobotView) -> dict[str, Any] | None:
     }
     return {
         "run_id": view.run.id,
-        "sim_time_s": view.state.sim_time_s,
         "state": json.loads(view.state.data),
         "parameters": values,
         "calls": 0,

@@ -35,6 +35,8 @@ THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
 KEEP_LAST_VARIABLE: Final = "WEBOTS_MCP_KEEP_LAST_S"
 HANG_VARIABLE: Final = "WEBOTS_MCP_HANG_AFTER_S"
 PARAMETERS_VARIABLE: Final = "WEBOTS_MCP_PARAMETERS"
+RESTORED_VARIABLE: Final = "WEBOTS_MCP_RESTORED"  # of a branch: the file with the moment's states
+RESTORED_EVENT: Final = "restored"  # a controller has read what it is to continue with
 INSPECT_VARIABLE: Final = "WEBOTS_MCP_INSPECT"  # 0: a controller's variables are never read
 
 
@@ -128,6 +130,7 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "record_scene": BuiltInAction(
         ("do", "kind", "width", "height", "quality", "speed", "caption"), ("do",)
     ),
+    "save_world": BuiltInAction(("name",), ("name",)),
     "reset_state": BuiltInAction(None, needs_supervisor=False, runs_user_code=True),
     "set_parameters": BuiltInAction(("values", "when", "by"), ("values",), needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),

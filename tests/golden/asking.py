@@ -131,6 +131,10 @@ ACTIONS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
         "webots_run_trials",
         {"parameters": [{"speed": 0.3}], "score": "max(X)", "for_s": 1.0},
     ),
+    "branch a run": (
+        "webots_branch_run",
+        {"parameters": [{"speed": 0.3}], "score": "max(X)", "for_s": 1.0},
+    ),
     "film the scene": ("webots_record_scene", {"action": "start", "timeout_wall_s": 1}),
     "take a screenshot": ("webots_take_screenshot", {"timeout_wall_s": 1}),
     "pause": ("webots_simulation_control", {"command": "pause", "timeout_wall_s": 1}),

@@ -38,7 +38,7 @@ ALL = DEFAULT | {
     "webots_inspect_controller", "webots_watch",
     "webots_wait_for_command", "webots_get_field", "webots_add_node", "webots_remove_node",
     "webots_report", "webots_rerun_controller", "webots_get_clip", "webots_record_scene",
-    "webots_lint_world",
+    "webots_lint_world", "webots_branch_run",
 }  # fmt: skip
 READING = {
     "webots_list_robots", "webots_diagnose_setup", "webots_get_world_info",
@@ -232,6 +232,7 @@ async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
     assert {name for name, note in told.items() if not note.destructive_hint} == {
         "webots_annotate_run",
         "webots_add_node",
+        "webots_branch_run",
         "webots_breakpoint",
         "webots_describe_signals",
         "webots_launch_world",

@@ -202,6 +202,7 @@ COLUMNS: Final[Mapping[str, Columns]] = {
         "run_id": _RUN_ID,
         "robot": "Name of the robot.",
         "label": "The label that somebody gave the run.",
+        "branched_from": "The run and the moment that it continues, of a branch.",
         "score": "The score that was asked for.",
         "parameters": "Values of the parameters at the end.",
         "started": "Time of day at which it began, UTC.",

@@ -22,6 +22,7 @@ from webots_mcp.contract import (
     KEEP_LAST_VARIABLE,
     LOG_LEVELS,
     MAX_CAMERA_PICTURES,
+    RESTORED_EVENT,
     STRICT_VARIABLE,
     THROTTLE_VARIABLE,
     BreakpointAction,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from webots_mcp.bridge.capture import Capture
     from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handler
     from webots_mcp.bridge.parameters import Parameter, V
+    from webots_mcp.bridge.restored import RestoredState
 
 _FALSE: Final = ("", "0", "false", "no", "off")
 _MOST_SECONDS: Final = 3600.0
@@ -122,6 +124,7 @@ class MCPBridge:
         self.database, self.data_dir = resolve_database(database, data_dir)
         self._closed = False
         self._close_after_answer = False
+        self._restored_read = False
         strict = os.environ.get(STRICT_VARIABLE, "").lower() not in _FALSE
         self._errors = ErrorReport(strict=strict)
         taped = find_tape(tape, self.database)  # before the steps of the robot's class are replaced
@@ -570,6 +573,31 @@ class MCPBridge:
     def run_id(self) -> int | None:
         """Id of the current run; None while nothing has been written yet."""
         return self._session.clock.run.id
+
+    @property
+    def restored(self) -> RestoredState | None:
+        """What a controller in a branch continues with; None in any other run.
+
+            if bridge.restored is not None:
+                mode = bridge.restored.state["mode"]
+                integral = bridge.restored.state["integral"]
+
+        A branch is a copy of the world at a moment of another run ('webots-mcp help branches').
+        Webots brings back positions and velocities; the controller starts anew, and takes its own
+        variables from here. Reading it the first time is recorded as an event.
+        """
+        origin = self._session.origin
+        if origin is None or origin.restored is None:
+            return None
+        moment = origin.restored
+        if not self._restored_read:
+            self._restored_read = True
+            try:
+                where: dict[str, object] = {"run_id": moment.run_id, "at_s": moment.sim_time_s}
+                self._session.journal.event(RESTORED_EVENT, where)
+            except Exception as error:  # noqa: BLE001  (the robot comes first)
+                self._errors.failed("restored", error)
+        return moment
 
     def stats(self) -> BridgeStats:
         """Return how much was recorded so far and how much was not, and how long it took."""

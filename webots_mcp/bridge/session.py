@@ -25,6 +25,7 @@ from webots_mcp.bridge.picture_files import PictureFiles
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
+from webots_mcp.bridge.restored import find_origin
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_actions import SceneActions
@@ -34,6 +35,7 @@ from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog
 from webots_mcp.bridge.world_actions import WorldActions
+from webots_mcp.bridge.world_saving import WorldSaving
 from webots_mcp.contract import UNMOVED, VERSION
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
@@ -62,6 +64,10 @@ class BridgeSession:
     ) -> None:
         robot = (simulation.robot, simulation.supervisor)
         self.identity = identify(*robot, VERSION, throttle.interval, kind)
+        self.origin = find_origin(self.identity.robot_name, errors)
+        if self.origin is not None:
+            self.identity = self.identity._replace(world=self.origin.world)
+            throttle.begin_after(self.origin.calls)
         self.errors = errors
         self.simulation = simulation
         self.throttle = throttle
@@ -140,6 +146,7 @@ class BridgeSession:
         actions = (
             running,
             world,
+            WorldSaving(simulation, clock, pause, self.throttle),
             PictureActions(simulation, clock, self.picture_files),
             self._scene,
             self._scene_recording,

@@ -27,6 +27,15 @@ class Throttle:
         """Count from here, so that equal runs are recorded at equal times."""
         self._calls_before_run = self.calls
 
+    def begin_after(self, calls: int) -> None:
+        """Count as if that many calls had been made, so that a branch is recorded as its origin."""
+        self._calls_before_run = self.calls - calls
+
+    @property
+    def calls_in_run(self) -> int:
+        """The number of calls in this run."""
+        return self.calls - self._calls_before_run
+
     def want(self) -> None:
         """Admit the next call, whatever its number."""
         self._wanted = True
@@ -34,7 +43,7 @@ class Throttle:
     def admits(self, force: object) -> bool:
         """Count a call; True if it is to be recorded, which any true value of `force` demands."""
         self.calls += 1
-        if (self.calls - self._calls_before_run) % self.interval and not (force or self._wanted):
+        if self.calls_in_run % self.interval and not (force or self._wanted):
             self.skipped += 1
             self.stale = True
             return False

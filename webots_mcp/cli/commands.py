@@ -93,6 +93,7 @@ _OF_THE_CORE: Final = {
     "wait": CommandEntry(STEER, f"{_Q}.send_command", "webots_wait_for_command"),
     "record-scene": CommandEntry(STEER, f"{_Q}.record_scene", "webots_record_scene"),
     "capture": CommandEntry(STEER, f"{_CLI}.steering_commands", "capture"),
+    "branch": CommandEntry(RUNS, f"{_CLI}.steering_commands", "branch"),
     "trials": CommandEntry(RUNS, f"{_CLI}.steering_commands", "trials"),
     "repeatability": CommandEntry(RUNS, f"{_CLI}.judging_commands", "repeatability"),
     "rerun": CommandEntry(RUNS, f"{_CLI}.rerun_command", "rerun"),

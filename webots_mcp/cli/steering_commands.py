@@ -47,6 +47,7 @@ _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
 _WEBOTS: Final = ToWebots()
 _WHERE: Final = Where()
+_UNTIL_DONE_S: Final = 1e9  # of wall time: Ctrl-C ends the branches
 
 
 def pause(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
@@ -381,6 +382,77 @@ def _request_row(request: dict[str, Any]) -> list[Any]:
     when = clock_text(request["wall_time_s"])
     reported = [request["id"], when, request["sim_time_s"], by, request["tool"]]
     return [*reported, request["arguments"] or None, outcome, commands or None]
+
+
+# -- branches of a live run ------------------------------------------------------------------------
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class BranchOptions:
+    """When a branch ends, how it is scored, and where it runs."""
+
+    score: Annotated[
+        str,
+        Parameter("--score", metavar="FORMULA", help="Formula of a branch's score: 'max(pose.x)'."),
+    ]
+    for_s: Annotated[
+        float | None, Parameter("--for", metavar="S", help="Simulated seconds of each branch.")
+    ] = None
+    until: Annotated[
+        str | None,
+        Parameter("--until", metavar="CONDITION", help="Condition that ends a branch earlier."),
+    ] = None
+    prune: Annotated[
+        str | None,
+        Parameter(
+            "--prune", metavar="CONDITION", help="Condition that ends a branch without a score."
+        ),
+    ] = None
+    best: Annotated[
+        Literal["highest", "lowest"],
+        Parameter("--best", help="Which score is best. Default: highest."),
+    ] = "highest"
+    repeats: Annotated[
+        Count, Parameter("--repeats", metavar="N", help="Branches of each set. Default: 1.")
+    ] = 1
+    jobs: Annotated[
+        Count, Parameter("--jobs", metavar="N", help="Maximum number of simulators. Default: 1.")
+    ] = 1
+    stand_in: Annotated[
+        bool, Parameter("--stand-in", help="Use the stand-in simulator, not Webots.")
+    ] = False
+
+
+def branch(
+    *settings: Annotated[
+        str, Parameter("NAME=V1,V2,...", help="Values to try; every combination of several names.")
+    ],
+    options: BranchOptions,
+    asked: ToRobot = _ROBOT,
+    json: Json = False,
+) -> None:
+    """Try parameters from this moment of the simulation on, each in a simulator of its own.
+
+        webots-mcp branch speed=2,4,6 --for 5 --score 'max(pose.x)'
+
+    The world is saved while it stands still, and each branch continues a copy of it. Branch 0
+    changes nothing: it shows when branches part from the original by themselves. See 'webots-mcp
+    help branches'.
+    """
+    from webots_mcp.cli.options import value_of
+    from webots_mcp.questions.branch_run import webots_branch_run
+
+    if not settings:
+        raise InvalidInputError("No parameter to change. Give NAME=V1,V2, such as speed=2,4,6.")
+    grid: dict[str, list[Any]] = {}
+    for text in settings:
+        name, equals, values = text.partition("=")
+        if not (name and equals and values):
+            raise InvalidInputError(f"{text!r} has no values. Write NAME=V1,V2, as in speed=2,4.")
+        grid[name] = [value_of(each) for each in values.split(",")]
+    given = {**vars(options), "parameters": grid, "timeout_wall_s": _UNTIL_DONE_S}
+    _show(webots_branch_run, asked, as_json=json, **given)
 
 
 # -- trials of a plan file, each in a simulator of its own -----------------------------------------

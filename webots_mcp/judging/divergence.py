@@ -11,7 +11,7 @@ import math
 import sqlite3
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
@@ -143,6 +143,7 @@ def compare_rows(
     names: Sequence[str] = ("*",),
     until_s: float = math.inf,
     within: float | None = None,
+    offset_s: float = 0.0,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Parting:
     """Compare two runs row by row.
@@ -154,6 +155,8 @@ def compare_rows(
         until_s: The last simulation time that is compared.
         within: What is beyond it matters, in the unit of each signal; None for 1 mm of lengths,
             0.001 rad of angles, and a thousandth of the largest value of all else.
+        offset_s: The simulation time of the first run at which that of the second is 0. Times are
+            those of the first. A signal that is apart by just this counts time, and is left out.
         deadline_s: What was not read by then is not compared, and said.
 
     Raises:
@@ -168,11 +171,11 @@ def compare_rows(
         )
     deadline = Deadline(deadline_s)
     # Half of the time is for rows that are in no chunk yet.
-    one, in_one = _read(connection, run_ids[0], until_s, deadline.part(0.25))
-    other, in_other = _read(connection, run_ids[1], until_s, deadline.part(0.33))
+    one, in_one = _read(connection, run_ids[0], until_s, deadline.part(0.25), offset_s)
+    other, in_other = _read(connection, run_ids[1], until_s - offset_s, deadline.part(0.33))
     meant = resolve_signals(in_one | in_other, names)
     shared = [each for each in meant if each.name in in_one and each.name in in_other]
-    pair = _aligned((one, other))
+    pair = _aligned((one, other), offset_s)
     found: dict[str, PartedSignal | None] = {}
     for signal in shared:
         if deadline.passed:
@@ -191,10 +194,11 @@ def compare_rows(
     if until < until_s - _SHORT_ROWS * row_s - SAME_TIME_S and until_s < math.inf:
         left_out += [f"a run ends before {until_s:g} s"]
     remarks = [_REDUCED] * any(each.reduction for each in shared)
-    begins_s = sorted(each.bounds_s[0] for each in (one, other))
-    if len(pair.times) and begins_s[1] > begins_s[0] + row_s / 2:
+    begins_s = sorted((one.bounds_s[0], other.bounds_s[0] + offset_s))
+    if not offset_s and len(pair.times) and begins_s[1] > begins_s[0] + row_s / 2:
         remarks += ["one run begins at {:.3f} s, the other at {:.3f} s".format(*begins_s)]
-    if len(pair.times) and (last_s := max(one.bounds_s[1], other.bounds_s[1])) > until + row_s / 2:
+    last_s = max(one.bounds_s[1], other.bounds_s[1] + offset_s)
+    if len(pair.times) and last_s > until + row_s / 2:
         remarks += [f"one run goes on to {last_s:.3f} s, which the other does not"]
     return Parting(
         (run_ids[0], run_ids[1]), _unlike(connection, run_ids), len(pair.times), len(found),
@@ -204,9 +208,13 @@ def compare_rows(
 
 
 def _read(
-    connection: sqlite3.Connection, run_id: int, until_s: float, deadline: Deadline
+    connection: sqlite3.Connection,
+    run_id: int,
+    until_s: float,
+    deadline: Deadline,
+    after_s: float = 0.0,
 ) -> tuple[Frame, dict[str, RegisteredSignal]]:
-    """A run, and the signals that it has."""
+    """A run after a time, by default all of it, and the signals that it has."""
     subject = Subject(fetch_run(connection, run_id).robot_id, "", run_id)
     segment = whole_run(connection, run_id)
     if segment is None:
@@ -216,6 +224,8 @@ def _read(
         )
     if until_s < segment.end_s:
         segment = segment.through(until_s)
+    if after_s:
+        segment = replace(segment, start_s=just_after(after_s), open_start=False)
     frame = read_frame(connection, segment, deadline)
     return frame, held_by(connection, frame, signals_of_frame(connection, subject, frame))
 
@@ -227,18 +237,20 @@ class _Pair(NamedTuple):
     rows: tuple[Indexes | slice, Indexes | slice]
     times: Array
     alone: Sequence[str] = ()
+    offset_s: float = 0.0
 
     def of(self, values: Sequence[Any]) -> list[Any]:
         """Of arrays with an item for each row of their frames, the rows that are compared."""
         return [each[rows] for each, rows in zip(values, self.rows, strict=True)]
 
 
-def _aligned(frames: tuple[Frame, Frame]) -> _Pair:
+def _aligned(frames: tuple[Frame, Frame], offset_s: float) -> _Pair:
     """Rows of the same simulation time, of those whose time could be read."""
-    one, other = (np.rint(frame.times / SAME_TIME_S) for frame in frames)
+    one = np.rint(frames[0].times / SAME_TIME_S)
+    other = np.rint((frames[1].times + offset_s) / SAME_TIME_S)
     read = [frame.was_read() for frame in frames]
     if np.array_equal(one, other) and all(each.all() for each in read):
-        return _Pair(frames, (slice(None), slice(None)), frames[0].times)
+        return _Pair(frames, (slice(None), slice(None)), frames[0].times, (), offset_s)
     places = np.searchsorted(other, one) + np.arange(len(one)) - np.searchsorted(one, one)
     found: Flags = places < len(other)
     found[found] = (other[places[found]] == one[found]) & read[1][places[found]]
@@ -247,14 +259,16 @@ def _aligned(frames: tuple[Frame, Frame]) -> _Pair:
     for at, (keys, others) in enumerate(((one, other), (other, one))):
         frame, is_alone = frames[at], read[at]
         is_alone[rows[at]] = False
+        later_s = -offset_s if at else offset_s
         for part in frames[1 - at].unread:  # where the partner may be
-            is_alone[slice(*frame.places([part.start_s, just_after(part.end_s)]))] = False
+            bounds = [part.start_s + later_s, just_after(part.end_s + later_s)]
+            is_alone[slice(*frame.places(bounds))] = False
         first, last = others[[0, -1]].tolist() if len(others) else (1.0, 0.0)
         if count := int(np.count_nonzero(is_alone & (keys >= first) & (keys <= last))):
             first_s = frame.times[np.argmax(is_alone & (keys >= first))]
             run = f"{counted(count, 'row')} of run {frame.run_id}, the first at {first_s:.3f} s"
             notes += [f"without a partner at the same simulation time, and not compared: {run}"]
-    return _Pair(frames, rows, frames[0].times[rows[0]], notes)
+    return _Pair(frames, rows, frames[0].times[rows[0]], notes, offset_s)
 
 
 def _parted(signal: RegisteredSignal, pair: _Pair, within: float | None) -> PartedSignal | None:
@@ -272,7 +286,7 @@ def _parted(signal: RegisteredSignal, pair: _Pair, within: float | None) -> Part
     for was_read in pair.of([frame.was_read(name) for frame in pair.frames]):
         differs &= was_read
     rows = np.flatnonzero(differs)
-    if not len(rows):
+    if not len(rows) or (pair.offset_s and _counts_time(one - other, pair.offset_s)):
         return None
     times = pair.times[rows]
     with np.errstate(invalid="ignore", over="ignore"):
@@ -297,6 +311,12 @@ def _parted(signal: RegisteredSignal, pair: _Pair, within: float | None) -> Part
         float(times[int(np.argmax(beyond))]) if beyond.any() else None, len(rows),
         {until: float(f"{size:.4g}") for until, size in grown.items()},
     )  # fmt: skip
+
+
+def _counts_time(apart: Array, offset_s: float) -> bool:
+    """Whether a signal is apart by the time between the runs, in seconds or milliseconds."""
+    return any(bool(np.allclose(apart, by, rtol=0.0, atol=SAME_TIME_S * by / offset_s))
+               for by in (offset_s, 1000.0 * offset_s))  # fmt: skip
 
 
 def _shared_codes(values: Decoded, known: dict[object, int]) -> Indexes:

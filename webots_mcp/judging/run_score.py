@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
@@ -18,7 +18,13 @@ from webots_mcp.signals.naming import listed, nearest_first
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import TimeRange, unrecorded, whole_run
-from webots_mcp.store.reading.segment import Deadline, Subject, full_rate_parts, in_one_snapshot
+from webots_mcp.store.reading.segment import (
+    Deadline,
+    Subject,
+    full_rate_parts,
+    in_one_snapshot,
+    just_after,
+)
 from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.runs import run_info
@@ -50,6 +56,7 @@ def score_run(
     run_id: int,
     text: str,
     *,
+    start_s: float | None = None,
     end_s: float | None = None,
     deadline_s: float = SCORE_DEADLINE_S,
 ) -> RunScore:
@@ -59,6 +66,7 @@ def score_run(
         connection: Any.
         run_id: The run.
         text: The score; see 'webots-mcp help trials'.
+        start_s: Only what came after this simulation time counts; None for all of it.
         end_s: Only what came up to and with this simulation time counts; None for all of it.
         deadline_s: A run that takes longer to read has no score.
 
@@ -82,6 +90,9 @@ def score_run(
     if end_s is not None and end_s < segment.end_s:
         duration_s = end_s - began_s
         segment = segment.through(end_s)
+    if start_s is not None:
+        duration_s -= start_s - began_s
+        segment = replace(segment, start_s=just_after(start_s), open_start=False)
     time_range = TimeRange(subject.robot_id, subject.robot, (segment,), "simulation")
     deadline = Deadline(deadline_s)
     counts = {kind: _count(connection, kind, time_range, deadline) for kind in score.kinds}

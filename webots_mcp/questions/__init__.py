@@ -18,7 +18,7 @@ MODULES: Final = (
     "query_history", "describe_signals", "find_events", "list_and_compare_runs",
     "rerun_controller", "query_sql", "control_simulation", "run_trials", "set_breakpoints",
     "send_command", "controller_parameters", "edit_scene", "inspect_controller",
-    "record_scene", "lint_world",
+    "record_scene", "lint_world", "branch_run",
 )  # fmt: skip
 
 

@@ -54,7 +54,7 @@ from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
 from webots_mcp.store.relative_times import utc
 from webots_mcp.store.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace, run_info
-from webots_mcp.store.trial_sets import scored_runs
+from webots_mcp.store.trial_sets import origins_of, scored_runs
 
 if TYPE_CHECKING:
     from webots_mcp.analysis.summary import Spread
@@ -64,9 +64,9 @@ if TYPE_CHECKING:
     from webots_mcp.judging.run_measures import Measure
 
 RUN_COLUMNS: Final = (
-    "run_id", "robot", "label", "score", "parameters", "started", "began_by", "ended_by",
-    "duration_s", "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows",
-    "notable", "controller", "sha256", "git_commit", "world", "note",
+    "run_id", "robot", "label", "branched_from", "score", "parameters", "started", "began_by",
+    "ended_by", "duration_s", "real_time_factor", "own_ms", "step_wait_ms", "row_count",
+    "purged_rows", "notable", "controller", "sha256", "git_commit", "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
@@ -180,7 +180,10 @@ def webots_list_runs(
         )
         ids = [run.run_id for run in found.runs]
         scores = score_each(connection, ids, score, COMPARE_DEADLINE_S) if score else {}
-        rows = fitting([_run_row(run, scores.get(run.run_id)) for run in found.runs])
+        origins = origins_of(connection, ids)
+        rows = fitting(
+            [_run_row(run, scores.get(e := run.run_id), origins.get(e)) for run in found.runs]
+        )
         older = len(rows) < len(found.runs)
         return RunsAnswer(
             **header,
@@ -360,12 +363,13 @@ def _values_of(parameters: Mapping[str, Any]) -> Any:
     return shorten(dict(parameters), budget_tokens, WHOLE).value or None
 
 
-def _run_row(run: RunInfo, scored: Scored | None = None) -> list[Any]:
+def _run_row(run: RunInfo, scored: Scored | None = None, origin: str | None = None) -> list[Any]:
     """Return a run as a row under `RUN_COLUMNS`."""
     return [
         run.run_id,
         short_name(run.robot),
         short_name(run.label),
+        origin,
         None if scored is None else figure(scored.value),
         _values_of(run.parameters),
         started(run),

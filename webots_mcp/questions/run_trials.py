@@ -52,6 +52,7 @@ from webots_mcp.store.trial_sets import (
     fetch_trial_set,
     find_trial_set,
     is_at_work,
+    is_branching,
     progress_of,
     ranking_of,
     stop_trial_set,
@@ -228,20 +229,25 @@ def _begin(
     require_possible(recording, robot, asked["until"], asked["for_s"], reset=True)
     if asked["prune"] is not None:
         require_possible(recording, robot, asked["prune"], None, reset=True)
-    checked = _as_declared(settable(recording, robot), sets)
+    checked = as_declared(settable(recording, robot), sets)
     for name, value in {(name, each) for values in checked for name, each in values.items()}:
         permit(recording, ACTION, {**OF_EACH_TRIAL, "parameters": {name: value}})
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)
         plan = TrialPlan(parameters=checked, robot=view.robot.name, **asked)
-        _require_scorable(connection, plan, view)
+        require_scorable(connection, plan, view)
     with recording.writer() as connection:
         set_id = create_trial_set(connection, plan.text, plan.trials, view.robot.id)
     workers.begin(set_id)
     return set_id
 
 
-def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: RobotView) -> None:
+def require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: RobotView) -> None:
+    """Refuse a score that no run of the robot can have.
+
+    Raises:
+        InvalidInputError: It reads a signal or counts events that there are not.
+    """
     from webots_mcp.judging.run_score import require_kinds
 
     score = parse_score(plan.score)
@@ -250,7 +256,7 @@ def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: Rob
         score.require_known(known)
 
 
-def _as_declared(
+def as_declared(
     declared: Mapping[str, Declared], sets: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """Return the values in the types of the declared parameters."""
@@ -286,9 +292,12 @@ def _take_up(recording: RecordingAccess, workers: TrialWorkers, set_id: int, can
 
 def _goes_on(found: TrialSetRecord) -> str:
     """Return how to continue a set that no robot's simulation runs."""
+    plan = json.loads(found.plan)
+    if is_branching(plan):
+        return "branched off a moment that is over: begin new branches with webots_branch_run"
     return (
         "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
-        if "world" in json.loads(found.plan)
+        if "world" in plan
         else "came from another recording, and its robot did not: begin a new set"
     )
 
@@ -352,6 +361,7 @@ def _header(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, 
 
 def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, Any]:
     trials, plan = trials_of(connection, found.id), json.loads(found.plan)
+    from webots_mcp.judging.branch_parting import parting_notes
     from webots_mcp.judging.divergence import repeats_noted
     from webots_mcp.judging.run_score import unseen
 
@@ -361,7 +371,9 @@ def _facts(connection: sqlite3.Connection, found: TrialSetRecord) -> dict[str, A
     state, hint = _state(found, planned - over, at_work=is_at_work(connection, found))
     ranking = ranking_of(trials, best)
     rows = fitting(_rows(ranking, trials), _SIZES.table_tokens)
-    repeats = [] if state == "under way" else repeats_noted(connection, found.id)
+    repeats = list[str]()
+    if state != "under way":
+        repeats = parting_notes(connection, found.id) or repeats_noted(connection, found.id)
     left_out = len(ranking.sets) - len(rows)
     rank_lower = "that rank lower are not shown: webots_query_sql has all in table trial"
     return {
@@ -400,7 +412,8 @@ def _state(found: TrialSetRecord, left: int, *, at_work: bool) -> tuple[str, str
     if not left:
         return "done", None
     if found.robot_id is None:
-        return "left", f"it {_goes_on(found)}"
+        is_stopped = found.stop_reason and is_branching(json.loads(found.plan))
+        return why if is_stopped else "left", f"it {_goes_on(found)}"
     return why, f"{again} continues with the {left} that are left"
 
 

@@ -264,7 +264,7 @@ class SupervisorRequests:
 
     def on_node_export_string(self, node_id: int) -> str:
         """Return a node and everything in it, as written in a world file."""
-        return as_text(self._node(node_id), self._world.protos)
+        return as_text(self._node(node_id), self._world.protos, self._simulator.hidden_state())
 
     def _follow(self, node: WorldNode, name: str, value: Any) -> None:
         if node.type_name == "Robot" and name == "customData":
@@ -335,6 +335,11 @@ class SupervisorRequests:
     def on_world_load(self, path: str) -> None:
         """Load another world after the next physics step."""
         self._simulator.wanted_after_step = str(self._robot.folder / path)
+
+    def on_world_save(self, path: str | None) -> int:
+        """Write the world to a file, by default to its own; return 1, or 0 if that fails."""
+        file = self._world.path if path is None else self._robot.folder / path
+        return int(self._simulator.save_world(file))
 
     def on_simulation_quit(self, status: int) -> None:
         """End the simulation."""

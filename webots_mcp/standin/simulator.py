@@ -23,7 +23,8 @@ from webots_mcp.standin.simulated_devices import (
 from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.vehicle import Vehicle, joints_in
 from webots_mcp.standin.view_pictures import Label, PictureRequest, save_picture
-from webots_mcp.standin.world import World
+from webots_mcp.standin.world import HiddenState, World, world_text
+from webots_mcp.worlds.frames import frame_of
 from webots_mcp.worlds.vrml import WorldNode
 
 TrackedKey: TypeAlias = "tuple[int, int | str | None]"
@@ -158,11 +159,8 @@ class Simulator:
         """Nodes that controllers have added; the next reset removes them."""
         self._pictures: list[PictureRequest] = []
         self.recorder = SceneRecorder(world, self.arena, log)
-        self._start = {
-            node: ([*node.fields["translation"]], [*node.fields["rotation"]])
-            for node in world.nodes
-            if "rotation" in node.fields
-        }
+        self._start = self._poses()
+        self._set_saved_motion()
 
     @property
     def time_s(self) -> float:
@@ -274,6 +272,65 @@ class Simulator:
             robot.make_tracked_due()
             for device in robot.devices.values():
                 device.make_due()
+        self._set_saved_motion()
+
+    # Saving a world in motion --------------------------------------------------------------------
+
+    def hidden_state(self) -> HiddenState:
+        """Return what the fields of bodies and robots do not show, by the names of Webots.
+
+        Webots numbers the Solids in a node; joint `n` counts as the one that Solid `n + 1` is on.
+        """
+        vehicles = {robot.vehicle.body: robot.vehicle for robot in self.robots}
+        return {
+            body.node: hidden
+            for body in self.arena.bodies
+            if (hidden := _hidden_of(body, vehicles.get(body)))
+        }
+
+    def save_world(self, path: Path) -> bool:
+        """Write the world as it is now; False if that fails.
+
+        As in Webots, the file is the current world from then on, and a reset returns to now.
+        """
+        state = self.hidden_state()
+        try:
+            path.write_text(world_text(self.world, state), encoding="utf-8")
+        except OSError as error:
+            self.log(f"ERROR: cannot save the world {path}: {error}")
+            return False
+        self.world.path = path
+        self._start, self.added = self._poses(), []
+        for body in self.arena.bodies:
+            saved = state.get(body.node, {})
+            body.node.hidden = {name: [*numbers] for name, numbers in saved.items()}
+        return True
+
+    def _poses(self) -> dict[WorldNode, tuple[list[float], list[float]]]:
+        return {
+            node: ([*node.fields["translation"]], [*node.fields["rotation"]])
+            for node in self.world.nodes
+            if "rotation" in node.fields
+        }
+
+    def _set_saved_motion(self) -> None:
+        """Continue the motion in which the world was saved."""
+        for body in self.arena.bodies:
+            saved: dict[str, Any] = body.node.hidden
+            if rotation := saved.get("rotation_0"):
+                body.yaw_rad = rotation[3]
+            if velocity := saved.get("linearVelocity_0"):
+                body.velocity_mps, body.is_pushed = (velocity[0], velocity[1]), body.is_movable
+            if turning := saved.get("angularVelocity_0"):
+                body.yaw_rate_radps, body.is_pushed = turning[2], body.is_movable
+        for robot in self.robots:
+            for number, joint in enumerate(robot.vehicle.joints):
+                saved = robot.node.hidden
+                if position := saved.get(f"position_0_{number}"):
+                    (joint.start_rad,) = position
+                    joint.reset()
+                if turning := saved.get(f"angularVelocity_{number + 1}"):
+                    joint.velocity_radps = turning[0]
 
     def update_pose(self, body: Body) -> None:
         """Move a body to the pose in its node's fields."""
@@ -297,6 +354,25 @@ class Simulator:
             save_picture(picture, self.arena, self.time_s, [*self.labels.values()])
         except (OSError, ValueError, ImportError) as error:
             self.log(f"ERROR: cannot export the image {picture.path}: {error}")
+
+
+def _hidden_of(body: Body, vehicle: Vehicle | None) -> dict[str, list[float]]:
+    hidden: dict[str, list[float]] = {}
+    shown = frame_of(body.node.fields["translation"], body.node.fields["rotation"])
+    if shown.yaw_rad != body.yaw_rad:  # its last digits, and whole turns
+        hidden["rotation_0"] = [0.0, 0.0, 1.0, body.yaw_rad]
+    for number, joint in enumerate(vehicle.joints if vehicle else ()):
+        parameters = joint.node.fields["jointParameters"]
+        if joint.position_rad != (parameters.fields["position"] if parameters else 0.0):
+            hidden[f"position_0_{number}"] = [joint.position_rad]
+    if any(body.velocity_mps):
+        hidden["linearVelocity_0"] = [*body.velocity_mps, 0.0]
+    if body.yaw_rate_radps:
+        hidden["angularVelocity_0"] = [0.0, 0.0, body.yaw_rate_radps]
+    for number, joint in enumerate(vehicle.joints if vehicle else (), 1):
+        if joint.velocity_radps:
+            hidden[f"angularVelocity_{number}"] = [joint.velocity_radps, 0.0, 0.0]
+    return hidden
 
 
 def _has_controller(node: WorldNode) -> bool:

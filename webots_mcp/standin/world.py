@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -27,6 +27,7 @@ _NAME_OF_MISSING: Final = {
 }
 """Default names of devices that the stand-in does not have, by node type."""
 _UNSCALED: Final = [1.0, 1.0, 1.0]
+_HEADER: Final = "#VRML_SIM R2023b utf8"
 
 
 class World:
@@ -40,6 +41,8 @@ class World:
     def __init__(self, path: Path, top: list[WorldNode], protos: Protos) -> None:
         self.path = path
         self.protos = protos
+        self.externproto = [*protos.urls.values()]
+        """URLs of the PROTO files that the world itself declares."""
         self.root = WorldNode("Group", "", 1, {"children": [*top]})
         self.nodes: list[WorldNode] = []
         """Every node once, in the order of the scene tree. Nodes that were added come last."""
@@ -275,22 +278,73 @@ def own_frame(node: WorldNode) -> CoordinateFrame:
     return frame_of(node.fields["translation"], node.fields["rotation"])
 
 
-def as_text(node: WorldNode, protos: Protos) -> str:
-    """Return a node and everything in it as in a world file, without fields that have defaults."""
-    return _node(node, protos, set())
+HiddenState = Mapping[WorldNode, Mapping[str, Sequence[float]]]
+"""The state that Webots saves in hidden fields: by node, numbers by the name of the field."""
 
 
-def _node(node: WorldNode, protos: Protos, written: set[WorldNode]) -> str:
-    if node.def_name and node in written:
-        return f"USE {node.def_name}"
-    written.add(node)
-    fields = [
-        f"{name} {_value(node.fields[name], definition.type_name[2:], protos, written)}"
-        for name, definition in protos.visible_fields(node).items()
-        if node.fields[name] != _typed_default(definition.default, definition.type_name)
-    ]
-    name = f"DEF {node.def_name} " if node.def_name else ""
-    return f"{name}{node.proto_name or node.type_name} {{ {' '.join(fields)} }}"
+def as_text(
+    node: WorldNode,
+    protos: Protos,
+    state: HiddenState,
+    written: set[WorldNode] | None = None,
+) -> str:
+    """Return a node and everything in it as in a world file, without fields that have defaults.
+
+    Args:
+        node: The node.
+        protos: The PROTO nodes of its world.
+        state: What is written in hidden fields.
+        written: Nodes that the same file holds already, which are added to.
+    """
+    return _NodeWriter(protos, state, set() if written is None else written).node(node)
+
+
+def world_text(world: World, state: HiddenState) -> str:
+    """Return a world as a world file has it."""
+    urls = [f'EXTERNPROTO "{url}"' for url in world.externproto]
+    written = set[WorldNode]()
+    nodes = [as_text(node, world.protos, state, written) for node in world.root.fields["children"]]
+    return "\n".join([_HEADER, *urls, *nodes, ""])
+
+
+class _NodeWriter:
+    def __init__(self, protos: Protos, state: HiddenState, written: set[WorldNode]) -> None:
+        self._protos = protos
+        self._state = state
+        self._written = written
+
+    def node(self, node: WorldNode) -> str:
+        if node.def_name and node in self._written:
+            return f"USE {node.def_name}"
+        self._written.add(node)
+        hidden = [
+            f"hidden {name} {' '.join(map(repr, numbers))}"
+            for name, numbers in self._state.get(node, {}).items()
+        ]
+        fields = [
+            f"{name} {self._value(node.fields[name], definition.type_name[2:])}"
+            for name, definition in self._protos.visible_fields(node).items()
+            if node.fields[name] != _typed_default(definition.default, definition.type_name)
+        ]
+        name = f"DEF {node.def_name} " if node.def_name else ""
+        return f"{name}{node.proto_name or node.type_name} {{ {' '.join([*hidden, *fields])} }}"
+
+    def _value(self, value: Any, kind: str) -> str:
+        if isinstance(value, WorldNode):
+            return self.node(value)
+        if isinstance(value, str):
+            quoted = value.replace("\\", "\\\\").replace('"', '\\"')
+            return f'"{quoted}"'
+        if value is None or isinstance(value, bool):
+            return {None: "NULL", True: "TRUE", False: "FALSE"}[value]
+        if not isinstance(value, list):
+            return repr(value).removesuffix(".0")
+        values = cast("list[Any]", value)
+        texts = [self._value(each, kind) for each in values]
+        is_single = kind in ("Vec2f", "Vec3f", "Rotation", "Color") and all(
+            isinstance(each, float) for each in values
+        )
+        return " ".join(texts) if is_single else f"[ {' '.join(texts)} ]"
 
 
 def _typed_default(default: Any, type_name: str) -> object:
@@ -298,21 +352,3 @@ def _typed_default(default: Any, type_name: str) -> object:
     if isinstance(default, list) and type_name in ("SFFloat", "SFInt32"):
         return cast("list[float]", default)[0]
     return cast("object", default)
-
-
-def _value(value: Any, kind: str, protos: Protos, written: set[WorldNode]) -> str:
-    if isinstance(value, WorldNode):
-        return _node(value, protos, written)
-    if isinstance(value, str):
-        quoted = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{quoted}"'
-    if value is None or isinstance(value, bool):
-        return {None: "NULL", True: "TRUE", False: "FALSE"}[value]
-    if not isinstance(value, list):
-        return repr(value).removesuffix(".0")
-    values = cast("list[Any]", value)
-    texts = [_value(each, kind, protos, written) for each in values]
-    is_single = kind in ("Vec2f", "Vec3f", "Rotation", "Color") and all(
-        isinstance(each, float) for each in values
-    )
-    return " ".join(texts) if is_single else f"[ {' '.join(texts)} ]"

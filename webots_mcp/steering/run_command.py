@@ -31,7 +31,7 @@ from webots_mcp.store.sessions import fetch_session
 ACTION: Final = "run"
 _KEEP_THE_STATE: Final = (  # actions after which the newest row still shows the state
     "pause", "resume", "fast", "step", "run", "cancel_run", "screenshot", "take_frame",
-    "record_scene", "arm_breakpoints", "keep", "get_scene", "get_field",
+    "record_scene", "save_world", "arm_breakpoints", "keep", "get_scene", "get_field",
 )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, cast, get_args
 
 from webots_mcp.analysis.summary import Best
+from webots_mcp.contract import PARAMETERS_VARIABLE, RESTORED_VARIABLE
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.signals.conditions.scoring import parse_score
@@ -195,6 +196,58 @@ class WorldPlan(TrialPlan):
         if not Path(self.world).is_file():
             raise InvalidInputError(f"world: no file {self.world}. Give the path of a .wbt file.")
         super().__post_init__()
+
+    @property
+    def own_world(self) -> str:
+        """The world file of the project, about which its rules are."""
+        return self.world
+
+    def environment(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Return the variables with which the controllers of a trial begin with these values."""
+        given = {self.robot: values} if self.robot else values
+        return {PARAMETERS_VARIABLE: json.dumps(given)}
+
+
+@dataclass(frozen=True)
+class BranchMoment:
+    """The moment of a run at which branches begin.
+
+    Attributes:
+        run: UUID of the run.
+        sim_time_s: Its simulation time.
+        world: The world file of the run.
+        parameters: The values of the parameters of each robot of the simulation.
+    """
+
+    run: str
+    sim_time_s: float
+    world: str
+    parameters: dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BranchPlan(WorldPlan):
+    """A plan whose trials continue from a moment of a run. The first changes no parameter.
+
+    Attributes:
+        moment: That moment.
+        states: File with the states of the robots at that moment.
+    """
+
+    moment: BranchMoment
+    states: str
+
+    @property
+    def own_world(self) -> str:
+        """The world file of the run that is continued."""
+        return self.moment.world
+
+    def environment(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Return the variables with which controllers continue, with some values changed."""
+        given = dict(self.moment.parameters)
+        if self.robot is not None:
+            given[self.robot] = {**given.get(self.robot, {}), **values}
+        return {PARAMETERS_VARIABLE: json.dumps(given), RESTORED_VARIABLE: self.states}
 
 
 def read_plan(file: Path, search: Search | None = None) -> WorldPlan:

@@ -6,7 +6,6 @@ another machine as well.
 
 from __future__ import annotations
 
-import json
 import math
 import sqlite3
 import subprocess
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, ENDED_BY, PARAMETERS_VARIABLE
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, ENDED_BY
 from webots_mcp.errors import (
     CommandRefusedError,
     ConditionFailedError,
@@ -143,9 +142,8 @@ def run_attempt(attempt: TrialAttempt, command: CommandOfWorld) -> TrialResult:
         StoppedError: The caller wanted it to stop.
         InvalidInputError: No trial of the set can succeed.
     """
-    folder, plan, values = attempt.folder, attempt.plan, attempt.values
-    parameters = {plan.robot: values} if plan.robot else values
-    environment = {DATA_DIR_VARIABLE: str(folder), PARAMETERS_VARIABLE: json.dumps(parameters)}
+    folder, plan = attempt.folder, attempt.plan
+    environment = {DATA_DIR_VARIABLE: str(folder), **plan.environment(attempt.values)}
     simulator = TrialSimulator(command(plan.world), folder, environment)
     watch = TrialWatch(plan)
     try:

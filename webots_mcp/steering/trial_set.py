@@ -127,7 +127,7 @@ def _run_left(set_run: SetRun, set_id: int, report: TrialReport) -> None:
             _require_wanted(set_run, set_id)
             count = set_run.simulators.count
             while len(running) < count and (trial := _next_trial(set_run, set_id, left)):
-                asked = {"world": set_run.plan.world, "parameters": trial.values}
+                asked = {"world": set_run.plan.own_world, "parameters": trial.values}
                 permit(set_run.recording, LAUNCH, asked)
                 running[pool.submit(run_trial, set_run, trial)] = trial
             if not running:

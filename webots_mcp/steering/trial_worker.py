@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping
 from contextvars import copy_context
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
@@ -381,6 +381,25 @@ class TrialWorker(threading.Thread):
         return CommandQueue(connection).enqueue(noted.robot_id, action, params, requested_by=_ASKER)
 
 
+class SetWorker(Protocol):
+    """A thread that works on a trial set."""
+
+    @property
+    def set_id(self) -> int:
+        """The set."""
+        ...
+
+    def start(self) -> None:
+        """Begin to work."""
+
+    def stop(self) -> None:
+        """End what runs, and wait for that."""
+
+    def is_alive(self) -> bool:
+        """Return whether it works."""
+        ...
+
+
 class TrialWorkers:
     """The workers of a server.
 
@@ -390,7 +409,7 @@ class TrialWorkers:
 
     def __init__(self, recording: RecordingAccess) -> None:
         self._recording = recording
-        self._workers: list[TrialWorker] = []
+        self._workers: list[SetWorker] = []
 
     def begin(self, set_id: int) -> None:
         """Work on a set.
@@ -398,7 +417,10 @@ class TrialWorkers:
         Raises:
             CommandRefusedError: Another process works on it.
         """
-        worker = TrialWorker(self._recording, set_id)
+        self.begin_worker(TrialWorker(self._recording, set_id))
+
+    def begin_worker(self, worker: SetWorker) -> None:
+        """Let a worker begin, which is stopped with the others."""
         worker.start()
         self._workers = [each for each in self._workers if each.is_alive()] + [worker]
 

@@ -60,6 +60,7 @@ TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "quit": ("webots_launch_world", "webots_quit"),
     "screenshot": ("webots_take_screenshot",),
     "take_frame": ("webots_get_camera",),
+    "save_world": ("webots_branch_run", "branch"),
     "record_scene": ("webots_record_scene",),
     "set_parameters": ("webots_set_parameters",),
     "arm_breakpoints": (),

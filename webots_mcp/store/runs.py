@@ -256,7 +256,7 @@ def _info(
                 "AND level IN ('warning', 'error', 'critical') GROUP BY level UNION ALL "
                 "SELECT kind, count(*) FROM event WHERE run_id = :run "
                 "AND kind NOT IN ('change', 'start', 'reset', 'reload', 'inspection', 'episode', "
-                "'record_scene') "
+                "'record_scene', 'restored') "
                 "GROUP BY kind UNION ALL "
                 "SELECT 'command ' || status, count(*) FROM command c JOIN run r ON r.id = :run "
                 "AND r.session_id = c.session_id WHERE c.status IN ('failed', 'lost') "

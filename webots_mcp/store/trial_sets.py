@@ -18,6 +18,7 @@ from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.run_rows import columns_of
 
+_MOMENT: Final = "moment"  # of a plan whose trials branch off a run
 _WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
 
 
@@ -307,7 +308,10 @@ def put_back(connection: sqlite3.Connection, trial: TrialRecord) -> None:
 
 def finish_trial(connection: sqlite3.Connection, trial: TrialRecord, result: TrialResult) -> None:
     """Record the outcome of a trial; its run gets a label unless it has one."""
+    plan = json.loads(fetch_trial_set(connection, trial.trial_set_id).plan)
     label = f"trial {trial.number} of set {trial.trial_set_id}: {spelled(trial.values)}"[:100]
+    if _MOMENT in plan:
+        label = f"branch of {_origin(connection, plan)}: {spelled(trial.values)}"[:100]
     now = {"id": trial.id, "status": result.status, "now": time.time()}
     connection.execute(
         "UPDATE trial SET status = :status, run_id = :run_id, score = :score, ended_by = "
@@ -318,6 +322,37 @@ def finish_trial(connection: sqlite3.Connection, trial: TrialRecord, result: Tri
     connection.execute(
         "UPDATE run SET label = coalesce(label, ?) WHERE id = ?", (label, result.run_id)
     )
+
+
+def origins_of(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[int, str]:
+    """Return from which run, and at which moment, those of these runs branched that did."""
+    return {
+        run_id: _origin(connection, json.loads(plan))
+        for run_id, plan in connection.execute(
+            "SELECT t.run_id, s.plan FROM trial t JOIN trial_set s ON s.id = t.trial_set_id "
+            "WHERE t.run_id IN (SELECT value FROM json_each(?)) AND json_valid(s.plan) "
+            f"AND json_type(s.plan, '$.{_MOMENT}') = 'object'",
+            (json.dumps(list(run_ids)),),
+        ).fetchall()
+    }
+
+
+def origin_run(connection: sqlite3.Connection, plan: Mapping[str, Any]) -> int | None:
+    """Return the run that the branches of a plan continue; None if it is not recorded here."""
+    uuid = plan[_MOMENT]["run"]
+    row = connection.execute("SELECT id FROM run WHERE uuid = ?", (uuid,)).fetchone()
+    return row[0] if row else None
+
+
+def is_branching(plan: Mapping[str, Any]) -> bool:
+    """Return whether the trials of a stored plan are branches of a run."""
+    return _MOMENT in plan
+
+
+def _origin(connection: sqlite3.Connection, plan: Mapping[str, Any]) -> str:
+    run_id = origin_run(connection, plan)
+    run = "a run that is not recorded here" if run_id is None else f"run {run_id}"
+    return f"{run} at {plan[_MOMENT]['sim_time_s']:.3f} s"
 
 
 def spelled(values: Mapping[str, Any]) -> str:

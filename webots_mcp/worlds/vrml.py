@@ -66,6 +66,8 @@ class WorldNode:
     """Line of each field that the file names."""
     file: Path | None = None
     """The file that the node was read from, if the parser was given one."""
+    hidden: dict[str, Value] = field(default_factory=lambda: {})
+    """Fields that Webots writes where a simulation in motion is saved, such as velocities."""
 
 
 def children_of(node: WorldNode) -> Iterator[WorldNode]:
@@ -242,8 +244,9 @@ class Parser:
             )
         while self._peek().text != "}":
             token = self._name("a field name or }")
-            if token.text == "hidden":  # State of a simulation that was saved.
-                self._value(self._take())
+            if token.text == "hidden":
+                hidden = self._name("a field name")
+                node.hidden[hidden.text] = self._value(hidden)
             else:
                 node.field_lines[token.text] = token.line
                 node.fields[token.text] = self._value(token)

@@ -27,6 +27,7 @@ from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, RobotRow, require
 from webots_mcp.questions import (
+    branch_run,
     control_simulation,
     edit_scene,
     record_scene,
@@ -49,6 +50,8 @@ _STEP_S: Final = 0.016
 _SAME: Final = 1e-6
 _LOAD_S: Final = 40.0  # Until a world is loaded again.
 _STALL_S: Final = 6.0
+_BRANCHES_S: Final = 200.0  # Of three branches, each with a start of Webots.
+_ONE_STEP_APART: Final = 0.02  # In m and rad, more than the rover moves in a step.
 _STATUS: Final = 7
 _MASS: Final = "BALL.physics.mass"
 _PLACE: Final = "CRATE.translation"
@@ -223,6 +226,33 @@ def _record(bench: Bench, action: str, **given: Any) -> str:
     result = answer["result"]
     also = f", also {', '.join(result['also'])}" if "also" in result else ""
     return f"{result.get('size_bytes', 0):,} bytes{also}"
+
+
+def running_branch(bench: Bench) -> str:
+    """A saved world keeps poses, joints and velocities; otherwise branch 0 parts at once."""
+    answer = bench.ask(
+        branch_run.webots_branch_run,
+        parameters={"speed": [2.0]},
+        score="last(wheel_rad)",
+        for_s=1.0,
+        timeout_wall_s=_BRANCHES_S,
+    )
+    require(answer["state"] == "done", f"the branches are {answer['state']}")
+    query = (
+        "SELECT s.data, o.data FROM trial t JOIN trial_set p ON p.id = t.trial_set_id "
+        "JOIN state s ON s.run_id = t.run_id "
+        "JOIN run r ON r.uuid = json_extract(p.plan, '$.moment.run') JOIN state o "
+        "ON o.run_id = r.id AND abs(o.sim_time_s - s.sim_time_s - "
+        "json_extract(p.plan, '$.moment.sim_time_s')) < 1e-4 "
+        "WHERE p.id = ? AND t.number = 1 ORDER BY s.id LIMIT 1"
+    )
+    found = bench.rows(query, answer["trial_set"])
+    require(found, "no row of branch 0 has one of the rover at the same time")
+    branch, own = (json.loads(text) for text in found[0])
+    apart = {name: abs(branch[name] - own[name]) for name in ("x_m", "wheel_rad", "rounds")}
+    lost = {name: by for name, by in apart.items() if by > _ONE_STEP_APART}
+    require(not lost, f"the first row of branch 0 is apart by {lost}")
+    return str(answer["notes"][0])
 
 
 def running_camera(bench: Bench) -> str:

@@ -305,6 +305,16 @@ class Supervisor(Robot):
         """Load another world after the next physics step."""
         self._session.ask("world_load", text(filename))
 
+    def worldSave(self, filename: str | None = None) -> int:
+        """Write the world as it is now; 0 if that fails. From then on a reset returns to now."""
+        if filename is not None and not text(filename).endswith(".wbt"):
+            say(
+                "Error: the target file given to wb_supervisor_world_save() should have the "
+                "'.wbt' extension."
+            )
+            return 0
+        return self._session.ask("world_save", filename, default=1)
+
     # Pictures ------------------------------------------------------------------------------------
 
     def exportImage(self, filename: str, quality: int) -> None:

@@ -31,7 +31,7 @@ def say(command: dict[str, Any]) -> None:
 bridge.register_command("say", say)
 bridge.register_command("stall", lambda command: time.sleep(command["seconds"]))
 bridge.register_command("leave", lambda command: robot.simulationQuit(command["status"]))
-rounds = 0
+rounds = 0 if bridge.restored is None else bridge.restored.state["rounds"]
 while robot.step(STEP_MS) != -1:
     rounds += 1
     x_m = robot.getSelf().getPosition()[0]

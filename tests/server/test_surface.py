@@ -6,7 +6,7 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import pytest
 from mcp import Client, StdioServerParameters
@@ -14,6 +14,7 @@ from mcp import Client, StdioServerParameters
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
 from tests.tool_list import counts_of
+from webots_mcp.cli import server_commands
 from webots_mcp.questions.declaration import Tier
 
 pytestmark = pytest.mark.anyio
@@ -92,6 +93,12 @@ async def test_a_server_that_only_reads_lists_no_tool_that_changes_anything(
 ) -> None:
     async with connect(read_only=True) as client:
         assert {tool.name for tool in (await client.list_tools()).tools} == READING
+
+
+async def test_the_help_of_serve_says_how_many_tools_a_list_has() -> None:
+    annotation = get_type_hints(server_commands.serve, include_extras=True)["tools"]
+    told = " ".join(part.help or "" for part in get_args(annotation)[1:])
+    assert f"core ({len(CORE)} tools), default ({len(DEFAULT)}) or all" in told
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def serve(
         Literal["core", "default", "all"],
         Parameter(
             "--tools",
-            help="Tools to list: core (20 tools), default (34) or all. Tools that are not listed "
+            help="Tools to list: core (17 tools), default (34) or all. Tools that are not listed "
             "can still be called by name.",
         ),
     ] = "default",

@@ -72,7 +72,7 @@ def stood(connection: sqlite3.Connection, *span_s: float) -> list[tuple[str, flo
 
 
 @given(kind=st.sampled_from(list(driving.DRAWN)), seed=SEEDS, share=st.floats(0.0, 0.9))
-@settings(max_examples=4 * EXAMPLES, deadline=None)
+@settings(max_examples=2 * EXAMPLES, deadline=None)
 def test_a_robot_stood_as_long_whatever_part_of_its_run_is_asked_for(
     kind: str, seed: int, share: float
 ) -> None:

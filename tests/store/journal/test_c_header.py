@@ -187,14 +187,16 @@ def test_a_time_step_of_any_size_is_recorded_or_null(
     assert read(tmp_path, "SELECT rows_dropped, end_reason FROM session") == [(0, "finished")]
 
 
-@pytest.mark.parametrize(("language", "seed"), zip(LANGUAGES, "12", strict=True))
+SEEDS = {"c99": "1", "c++11": "2"}
+
+
 def test_no_number_and_no_text_crashes_a_function_or_makes_a_line_that_does_not_fit(
-    language: str, seed: str, tmp_path: Path
+    language: str, tmp_path: Path
 ) -> None:
     program = built(language, "hostile.c", tmp_path)
     folder = tmp_path / "data"
     environment = os.environ | {"WEBOTS_MCP_DATA_DIR": str(folder)}
-    command = [program, seed, "12", "150"]
+    command = [program, SEEDS[language], "12", "150"]
     done = subprocess.run(command, env=environment, capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, b"well\n", b"")
     RecordingAccess(folder / "webots.db", folder).ingest()

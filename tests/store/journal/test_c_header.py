@@ -296,13 +296,14 @@ def test_a_living_controller_is_live_and_its_complete_parts_are_deleted(
     start: Start, tmp_path: Path
 ) -> None:
     process = start()
-    do(process, *(f"begin {i}\ninteger {hexed('i')} {i:x}\npublish" for i in range(1, 2001)))
-    assert len(read(tmp_path, "SELECT 1 FROM state")) == 2000
+    long = f"text {hexed('t')} {hexed('x' * 1000)}"  # thirty fill a part
+    do(process, *(f"begin {i}\n{long}\npublish" for i in range(1, 201)))
+    assert len(read(tmp_path, "SELECT 1 FROM state")) == 200
     (parts,) = journal_parts(tmp_path / "webots.db").values()
     assert len(parts) == 1 and int(parts[0].stem[-4:]) > 5
     with RecordingAccess(tmp_path / "webots.db", tmp_path).view() as view:
         assert view.robot.live and view.status.is_moving
-        assert view.run and view.run.row_count == 2000 and view.run.ended_wall_time_s is None
+        assert view.run and view.run.row_count == 200 and view.run.ended_wall_time_s is None
     assert read(tmp_path, "SELECT typeof(process), instance FROM session")[0][0] == "text"
     end(process)
 

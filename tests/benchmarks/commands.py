@@ -24,7 +24,8 @@ from tests.benchmarks.core import (
     benchmark,
     duration,
 )
-from tests.benchmarks.processes import Program, driving, our_server, running_server
+from tests.benchmarks.processes import Program, driving
+from tests.benchmarks.servers import our_server, running_server
 from tests.benchmarks.ways import STEP_S
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect

@@ -106,8 +106,8 @@ def test_a_crowd_in_one_place_ends(tmp_path: Path) -> None:
         for i in range(400)
     )
     began = time.thread_time()
-    report = lint_world(write_world(tmp_path, solids))
-    assert time.thread_time() - began < PROCESSOR_S
+    report = lint_world(write_world(tmp_path, solids), processor_s=1.0)
+    assert time.thread_time() - began < 10 * 1.0  # each look at the clock comes soon
     assert faults_of(report, "overlap") or report.verdicts()["overlap"] == "not searched"
 
 

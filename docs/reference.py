@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -249,6 +249,9 @@ def meanings(_page: str = "") -> str:
     ))  # fmt: skip
 
 
+_described = cache(described)
+
+
 def commands(group: str | None = None) -> str:
     """Each command with its arguments, as `--help` has them.
 
@@ -260,7 +263,7 @@ def commands(group: str | None = None) -> str:
             each.text,
             [(f"`{typed}`", said) for typed, said in each.arguments.items()],
         )
-        for name, each in described().items()
+        for name, each in _described().items()
         if group in (None, COMMANDS[name].group)
     }
     return "## Reference\n\n" + "\n".join(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -58,16 +59,17 @@ cannot tell, *denied* a wrong "not found" or pass, and *inexact* an event at ano
 
 def cases(bench: Bench) -> Iterator[str]:
     """Tables of healthy robots, problems, public situations, rates and noises."""
-    alarms = {name: wrong for name, each in HEALTHY.items() if (wrong := failures(each))}
-    missed = {name: wrong for name, each in PROBLEMS.items() if (wrong := failures(each))}
-    scores = {name: score(name) for name in PUBLIC}
+    healthy, faulty = bench.sample(HEALTHY.values()), bench.sample(PROBLEMS.values())
+    alarms = {each.name: wrong for each in healthy if (wrong := failures(each))}
+    missed = {each.name: wrong for each in faulty if (wrong := failures(each))}
+    scores = {name: score(name) for name in bench.sample(PUBLIC)}
     points, most = sum(each.points for each in scores.values()), RIGHT * len(scores)
     yield (
-        f"{len(HEALTHY) - len(alarms)} of {len(HEALTHY)} healthy robots get no alarm, "
-        f"{len(PROBLEMS) - len(missed)} of {len(PROBLEMS)} problems are answered; {len(scores)} "
+        f"{len(healthy) - len(alarms)} of {len(healthy)} healthy robots get no alarm, "
+        f"{len(faulty) - len(missed)} of {len(faulty)} problems are answered; {len(scores)} "
         f"situations that were labelled first earn {points} of {most} points."
     )
-    yield _INTRODUCTION.format(healthy=len(HEALTHY), problems=len(PROBLEMS))
+    yield _INTRODUCTION.format(healthy=len(healthy), problems=len(faulty))
     wrong = [f"- {name}: {', '.join(why)}" for name, why in (alarms | missed).items()]
     yield "Answered wrongly:" if wrong else "None is answered wrongly."
     if wrong:
@@ -79,32 +81,32 @@ def cases(bench: Bench) -> Iterator[str]:
     ]
     yield table(("situation", "first", "now"), rows)
     bench.say("cases: unfamiliar robots")
-    yield _unfamiliar()
+    yield _unfamiliar(bench.sample(ROBOTS))
     bench.say("cases: other rates")
-    yield _other_rates()
-    yield _growth()
+    yield _other_rates(bench)
+    yield _growth(bench.count(_OSCILLATIONS))
     bench.say("cases: rates and noises")
     yield _RATES
-    yield table(("fault", "a row every", *(f"{100 * each:g} %" for each in NOISES)), _rates())
+    yield table(("fault", "a row every", *(f"{100 * each:g} %" for each in NOISES)), _rates(bench))
 
 
-def _unfamiliar() -> str:
+def _unfamiliar(robots: Sequence[str]) -> str:
     """Ask about robots of kinds that no rule was made with, healthy ones and ones with a fault."""
     answers = Counter(
-        ask_healthy(name, interval_s)[0] for name in ROBOTS for interval_s in INTERVALS_OF_ROBOTS_S
+        ask_healthy(name, interval_s)[0] for name in robots for interval_s in INTERVALS_OF_ROBOTS_S
     )
-    answers += Counter(ask_faulty(name)[0] for name in ROBOTS)
+    answers += Counter(ask_faulty(name)[0] for name in robots)
     rows = [(kind, str(first), str(answers[kind])) for kind, first in FIRST_ANSWERS.items()]
     rates = ", ".join(f"{1000 * each:g}" for each in INTERVALS_OF_ROBOTS_S)
-    said = _UNFAMILIAR.format(robots=len(ROBOTS), rates=f"{rates} ms")
+    said = _UNFAMILIAR.format(robots=len(robots), rates=f"{rates} ms")
     return f"{said}\n\n{table(('answer', 'first', 'now'), rows)}"
 
 
-def _growth() -> str:
+def _growth(oscillations: int) -> str:
     """Draw oscillations that grow, decay or keep their amplitude, and count the reports of it."""
     random = np.random.default_rng(10_000)
     told, found = {True: 0, False: 0}, {True: 0, False: 0}
-    for number in range(2 * _OSCILLATIONS):
+    for number in range(2 * oscillations):
         changes = number % 2 == 0
         period_s, factor = float(random.uniform(1.5, 4)), float(random.uniform(4, 20))
         over_s = 60 / math.log(factor) * float(random.choice((-1, 1)))
@@ -120,9 +122,7 @@ def _growth() -> str:
             events = asked.events("oscillation", signals=("roll",)).events
         found[changes] += bool(events)
         told[changes] += any("amplitude_at_end" in each.details for each in events)
-    return _GROWTH.format(
-        count=_OSCILLATIONS, told=told[True], false=told[False], found=found[True]
-    )
+    return _GROWTH.format(count=oscillations, told=told[True], false=told[False], found=found[True])
 
 
 def _linked(name: str) -> str:
@@ -131,11 +131,13 @@ def _linked(name: str) -> str:
     return f"{kind}{label['situation'].removesuffix('.')} ([report]({label['source']}))"
 
 
-def _other_rates() -> str:
+def _other_rates(bench: Bench) -> str:
     """Draw each healthy kind at other rates, and say which raise an alarm."""
     kinds = [each for each in HEALTHY.values() if quiet in each.expect]
     kinds += [PUBLIC[name] for name, label in labels().items() if label.get("healthy")]
-    drawn = [_at(each, interval_s) for each in kinds for interval_s in _OTHER_INTERVALS_S]
+    drawn = [
+        _at(each, interval_s) for each in bench.sample(kinds) for interval_s in _OTHER_INTERVALS_S
+    ]
     alarmed: dict[str, int] = {}
     for each in drawn:
         with recorded(each) as asked:
@@ -157,8 +159,7 @@ def _at(each: Situation, interval_s: float) -> Situation:
     return replace(each, name=f"{each.name} at {interval_s:g} s", interval_s=interval_s)
 
 
-def _rates() -> Iterator[tuple[str, ...]]:
-    for name in FAULTS:
-        for interval_s in INTERVALS_S:
-            answers = (answer(name, interval_s, noise) for noise in NOISES)
-            yield (f"`{name}`", f"{1000 * interval_s:g} ms", *answers)
+def _rates(bench: Bench) -> Iterator[tuple[str, ...]]:
+    for name, interval_s in bench.sample(product(FAULTS, INTERVALS_S)):
+        answers = (answer(name, interval_s, noise) for noise in NOISES)
+        yield (f"`{name}`", f"{1000 * interval_s:g} ms", *answers)

@@ -7,7 +7,7 @@ import random
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from itertools import repeat
+from itertools import product, repeat
 from multiprocessing import get_context
 from typing import Any, Final
 
@@ -28,15 +28,15 @@ _EFFECTS_SD: Final = (0.5, 1.0, 2.0, 4.0)
 _REPEATS: Final = (2, 4, 6, 10)
 _SCATTER: Final = 0.05  # standard deviation between like runs, as a share of the mean
 _OUTLIERS: Final = 0.1  # share of the runs that lie ten times as far out
-_KINDS: Final = {
+KINDS: Final = {
     "normal": "that scatter by 5 %",
     "skewed": "of skewed figures",
     "discrete": "of three values",
     "outliers": "with outliers",
     "lanes": "in two lanes, by chance",
 }
-_SCATTERS: Final = [*_KINDS]
-_EQUAL: Final = ((3, 3), (5, 5), (10, 10), (4, 10))
+_SCATTERS: Final = [*KINDS]
+EQUAL: Final = ((3, 3), (5, 5), (10, 10), (4, 10))
 _NOISIER: Final = (1.5, 2.0, 3.0)
 _OF_FRONT: Final = ("front_m deviation", "front_m")
 _MANY: Final = (5, 10, 20, 50)
@@ -131,15 +131,14 @@ def _comparisons(bench: Bench, pool: ProcessPoolExecutor) -> Iterator[str]:
         return list(pool.map(_said, range(pairs), *given))
 
     pairs, equal, wrong, of = bench.count(100), list[list[str]](), 0, 0
-    for scatter, kind in _KINDS.items():
-        for sizes in _EQUAL:
-            bench.say(f"comparisons of equal groups of {sizes}, {kind}")
-            said = _answers(pairs, sizes, 0.0, scatter)
-            each = Counter(value for answer in said for value in answer.values())
-            claims = sum(True in answer.values() for answer in said)
-            wrong, of = wrong + claims, of + pairs
-            figures = (share(each[value], each.total()) for value in (True, False))
-            equal.append([f"{sizes[0]} + {sizes[1]} {kind}", share(claims, pairs), *figures])
+    for (scatter, kind), sizes in bench.sample(product(KINDS.items(), EQUAL)):
+        bench.say(f"comparisons of equal groups of {sizes}, {kind}")
+        said = _answers(pairs, sizes, 0.0, scatter)
+        each = Counter(value for answer in said for value in answer.values())
+        claims = sum(True in answer.values() for answer in said)
+        wrong, of = wrong + claims, of + pairs
+        figures = (share(each[value], each.total()) for value in (True, False))
+        equal.append([f"{sizes[0]} + {sizes[1]} {kind}", share(claims, pairs), *figures])
     rows, found_of = list[list[str]](), dict[tuple[float, int], str]()
     for effect_sd in _EFFECTS_SD:
         row = [f"{effect_sd:g}"]
@@ -151,7 +150,7 @@ def _comparisons(bench: Bench, pool: ProcessPoolExecutor) -> Iterator[str]:
             found_of[effect_sd, runs] = f"{100 * found.count(True) / pairs:.0f} %"
         rows.append(row)
     noises = list[list[str]]()
-    for noisier in _NOISIER:
+    for noisier in bench.sample(_NOISIER):
         row = [f"{noisier:g}"]
         for runs in _RUNS[1:]:
             bench.say(f"comparisons with {noisier:g} times the noise, {runs} runs")

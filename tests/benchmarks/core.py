@@ -41,6 +41,12 @@ class Bench:
         """How often to do what a full run does `full` times."""
         return max(least, round(full * self.effort))
 
+    def sample(self, items: Iterable[T]) -> list[T]:
+        """Return all items in a full run, and fewer of them, in their order, in a smaller one."""
+        each = list(items)
+        wanted = min(len(each), self.count(len(each)))
+        return [each[at * len(each) // wanted] for at in range(wanted)]
+
     def place(self, name: str) -> Path:
         """A new folder inside the benchmark's own."""
         place = self.folder / name

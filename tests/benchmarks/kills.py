@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.benchmarks.core import Bench, Line, Target, benchmark
-from tests.benchmarks.processes import environment, our_server, program_line
+from tests.benchmarks.processes import environment, program_line
+from tests.benchmarks.servers import our_server
 from tests.bridge.interrupting import Interrupter, Outcome, drive, make_template, places
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect

@@ -1,4 +1,4 @@
-"""Programs of the benchmarks in processes of their own, and the servers that are compared."""
+"""Programs of the benchmarks in processes of their own."""
 
 from __future__ import annotations
 
@@ -6,19 +6,13 @@ import json
 import os
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
-import anyio
-from mcp import Client, StdioServerParameters
-
 _ROOT: Final = Path(__file__).parents[2]
-_PROGRAMS: Final = ("-m", "tests.benchmarks.programs")
-_LOOK_INTERVAL_S: Final = 1.0
-_LOOK: Final = {"robot": "rover 0", "lookback_wall_s": 60}
+PROGRAMS: Final = ("-m", "tests.benchmarks.programs")
 
 
 class Program:
@@ -81,7 +75,7 @@ def driving(
 
 def program_line(name: str, *arguments: object) -> list[str]:
     """The command line of a program."""
-    return [sys.executable, *_PROGRAMS, name, *map(str, arguments)]
+    return [sys.executable, *PROGRAMS, name, *map(str, arguments)]
 
 
 def environment() -> dict[str, str]:
@@ -99,42 +93,3 @@ def output_of(line: list[str]) -> str:
     """What a program prints until it ends."""
     done = subprocess.run(line, stdout=subprocess.PIPE, text=True, check=True, env=environment())
     return done.stdout
-
-
-def our_server(database: Path) -> StdioServerParameters:
-    """`webots-mcp serve`."""
-    return _started_by("-m", "webots_mcp", "serve", "--database", str(database))
-
-
-def one_tool_server() -> StdioServerParameters:
-    """The smallest server of the same library."""
-    return _started_by(*_PROGRAMS, "one_tool_server")
-
-
-def _started_by(*arguments: str) -> StdioServerParameters:
-    return StdioServerParameters(command=sys.executable, args=[*arguments], env=environment())
-
-
-@contextmanager
-def running_server(database: Path) -> Generator[None]:
-    """`webots-mcp serve` with a client that asks each second what `rover 0` did in a minute."""
-    over, ready = threading.Event(), threading.Event()
-
-    async def be_client() -> None:
-        try:
-            async with Client(our_server(database)) as client:
-                await client.list_tools()
-                ready.set()
-                while not await anyio.to_thread.run_sync(over.wait, _LOOK_INTERVAL_S):
-                    await client.call_tool("webots_monitor", _LOOK)
-        finally:
-            ready.set()
-
-    thread = threading.Thread(target=lambda: anyio.run(be_client))
-    thread.start()
-    ready.wait()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()

@@ -24,7 +24,8 @@ from tests.benchmarks.core import (
     compared,
     ratio,
 )
-from tests.benchmarks.processes import one_tool_server, our_server, output_of, program_line
+from tests.benchmarks.processes import output_of, program_line
+from tests.benchmarks.servers import one_tool_server, our_server
 from tests.benchmarks.ways import ORJSON, make_states
 
 _TIMED = """

@@ -36,7 +36,7 @@ Write = Callable[[str], Path]
 
 pytestmark = [pytest.mark.skipif(os.name != "posix", reason="signals"), pytest.mark.slow]
 
-GRID = 'score = "last(x)"\nfor_s = 0.3\nrepeats = {}\n[grid]\nspeed = [1.0, 2.0, 5.0]'
+GRID = 'score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0, 2.0, 5.0]'
 
 
 @pytest.fixture(scope="module")
@@ -81,21 +81,21 @@ def test_a_worker_that_is_killed_costs_nothing_and_the_scores_are_those_of_this_
     dask_cluster: Cluster,
 ) -> None:
     workers = dask_cluster.start(4)
-    plan(GRID.format(2))
+    plan(GRID)
     process = started("--scheduler", dask_cluster.address, "--json")
     busy = wait_for(lambda: next((each for each in workers if each.recording), None))
     simulator = busy.kill()
     out, said = process.communicate(timeout=120)
 
     answer = json.loads(out)
-    assert "6/6  speed " in said
-    assert [len(each["scores"]) for each in answer["sets"]] == [2, 2, 2]
+    assert "3/3  speed " in said
+    assert [len(each["scores"]) for each in answer["sets"]] == [1, 1, 1]
     counted = "SELECT count(*), count(DISTINCT uuid), count(DISTINCT label) FROM run"
-    assert rows(project, counted) == [(6, 6, 6)]
+    assert rows(project, counted) == [(3, 3, 3)]
     assert list((project / "data" / "trials").iterdir()) == []
     assert [each.trials for each in dask_cluster.workers] == [[], [], []]
     wait_for(lambda: not any(each.is_running() for each in simulator))
-    plan(GRID.format(1).replace("1.0, 2.0, 5.0", "2.0"))
+    plan(GRID.replace("1.0, 2.0, 5.0", "2.0"))
     assert scores(answer_of(run("--json")))[2.0] == scores(answer)[2.0]
 
 
@@ -281,7 +281,7 @@ def test_what_is_no_scheduler_is_refused_before_anything_is_written(
     said: str,
 ) -> None:
     monkeypatch.setattr(cluster, "_TIMES", cluster.ClusterTimes(connect_s=0.5))
-    plan(GRID.format(1))
+    plan(GRID)
 
     assert said in refused("--scheduler", address)
     assert not (project / "data").exists()
@@ -291,7 +291,7 @@ def test_a_server_that_is_no_scheduler_is_not_waited_for(
     plan: Write, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "_TIMES", cluster.ClusterTimes(connect_s=0.5))
-    plan(GRID.format(1))
+    plan(GRID)
 
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"

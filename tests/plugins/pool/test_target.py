@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import pytest
+from sqlmodel import SQLModel
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.pool_contents import open_pool
-from webots_mcp.plugins.pool.pool_interface import Batch, fitted, redacted, table, tables
+from webots_mcp.plugins.pool.pool_interface import (
+    Batch,
+    ShippedTable,
+    fitted,
+    redacted,
+    table,
+    tables,
+)
+from webots_mcp.store import models
 
 SECRET = "hunter2"
+_REGISTERED = models  # which enters its tables into the metadata of SQLModel
 
 
 @pytest.mark.parametrize(
@@ -69,6 +80,23 @@ def test_each_table_comes_after_those_that_it_refers_to() -> None:
     assert names.index("robot") < names.index("session") < names.index("run")
     assert all(names.index("run") < names.index(name) for name in ("state", "chunk", "log"))
     assert not {"lease", "watermark", "retention_limit"} & set(names)
+
+
+@pytest.mark.parametrize("shipped", tables(), ids=lambda shipped: shipped.name)
+def test_a_table_is_shipped_as_its_model_says(shipped: ShippedTable) -> None:
+    model: Any = SQLModel.metadata.tables[shipped.name]
+    columns = [model.columns[name] for name in shipped.columns]
+    said = {column.name: column.comment or "" for column in columns}
+    of_json = {name for name, comment in said.items() if comment.startswith("JSON")}
+    assert shipped.key == tuple(column.name for column in model.primary_key.columns)
+    assert shipped.json_columns == of_json | ({"replaced"} & {*said})
+    assert shipped.json_values == {name for name in of_json if said[name].startswith("JSON value")}
+    assert shipped.nullable == {column.name for column in columns if column.nullable}
+    assert shipped.lasting == {
+        column.name
+        for column in columns
+        if any(key.ondelete == "SET NULL" for key in column.foreign_keys)
+    }
 
 
 def test_a_value_of_another_type_becomes_what_comes_nearest_and_is_counted() -> None:

@@ -18,6 +18,7 @@ import pytest
 
 from docs import reference
 from tests.simulator.webots_program import put_on_path
+from webots_mcp.cli import main
 from webots_mcp.contract import host_name
 from webots_mcp.plugins.prove.bench import Bench, run_check
 from webots_mcp.plugins.prove.fact_checks import CHECKS, NOT_TRIED, check_launch
@@ -192,12 +193,19 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
     ],
 )
 def test_what_is_not_there_is_refused_before_anything_starts(
-    options: list[str], said: str, tmp_path: Path
+    options: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    command = [sys.executable, "-m", "webots_mcp", "prove", *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 2
-    assert said in done.stderr
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = main(["prove", *options])
+    except SystemExit as refused:  # by the parser of the command line
+        code = refused.code
+    assert code == 2
+    assert said in capsys.readouterr().err
 
 
 def test_the_page_about_webots_lists_each_check() -> None:

@@ -103,15 +103,20 @@ def refused(project: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., 
 
 
 @pytest.fixture
-def run(project: Path) -> Run:
-    """Run the plan on the stand-in."""
+def run(project: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the plan on the stand-in: in this process, or in one with an environment of its own."""
 
     def run_plan(
         *options: str, env: dict[str, str] | None = None
     ) -> subprocess.CompletedProcess[str]:
         line = command(project, *options)
-        return subprocess.run(
-            line, capture_output=True, text=True, timeout=120, check=False, env=env
-        )
+        if env is not None:
+            return subprocess.run(
+                line, capture_output=True, text=True, timeout=120, check=False, env=env
+            )
+        capsys.readouterr()
+        code = main(line[3:])
+        said = capsys.readouterr()
+        return subprocess.CompletedProcess(line, code, said.out, said.err)
 
     return run_plan

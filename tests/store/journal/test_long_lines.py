@@ -26,21 +26,27 @@ from webots_mcp.store.recording import RecordingAccess
 LINES = 30
 
 
-@pytest.fixture(scope="module")
-def text() -> str:
-    """A long state, of many signals."""
-    data = {f"b{i}": {f"c{j}": [1, 2, 3] for j in range(100)} for i in range(2000)}
-    return json.dumps(data, separators=(",", ":"))
-
-
-@pytest.fixture
-def folder(text: str, tmp_path: Path) -> Path:
-    """With a journal of long states."""
-    with part(tmp_path).open("w") as journal:
+def write(folder: Path, branches: int) -> Path:
+    """Write a journal of long states, of 300 values for each branch."""
+    data = {f"b{i}": {f"c{j}": [1, 2, 3] for j in range(100)} for i in range(branches)}
+    text = json.dumps(data, separators=(",", ":"))
+    with part(folder).open("w") as journal:
         journal.write(f"{json.dumps(HEADER)}\n{json.dumps([1, 'run', None, RUN_VALUES])}\n")
         for number in range(2, LINES + 2):
             journal.write(f'[{number},"state","{RUN}",[{number},1000.0,{text}]]\n')
-    return tmp_path
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With a journal of states of which an intake reads one at once: each is over 1 MB."""
+    return write(tmp_path, 800)
+
+
+@pytest.fixture
+def longest(tmp_path: Path) -> Path:
+    """With a journal of states of 3 MB."""
+    return write(tmp_path, 2000)
 
 
 def states(folder: Path) -> int:
@@ -121,14 +127,14 @@ def test_a_server_looks_after_the_database_while_it_takes_in_a_long_journal(fold
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("command", [["status"], ["export", "--format", "jsonl"], ["serve"]])
-def test_sigterm_ends_a_command_that_ingests(folder: Path, command: list[str]) -> None:
-    arguments = [sys.executable, "-m", "webots_mcp", *command, "--data-dir", str(folder)]
+def test_sigterm_ends_a_command_that_ingests(longest: Path, command: list[str]) -> None:
+    arguments = [sys.executable, "-m", "webots_mcp", *command, "--data-dir", str(longest)]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}
     peaks_bytes = [0]
     with subprocess.Popen(arguments, stderr=subprocess.DEVNULL, **pipes) as process:
 
         def begun() -> bool:
-            file = folder / "webots.db"
+            file = longest / "webots.db"
             return file.exists() and file.stat().st_size > 0
 
         def ended() -> bool:
@@ -139,5 +145,5 @@ def test_sigterm_ends_a_command_that_ingests(folder: Path, command: list[str]) -
         process.send_signal(signal.SIGTERM)
         wait_for(ended)
     assert process.returncode == 143
-    assert part(folder).exists()  # it ended before all of it was ingested
+    assert part(longest).exists()  # it ended before all of it was ingested
     assert max(peaks_bytes) < 700_000_000

@@ -97,7 +97,7 @@ PATHS = st.sampled_from((*FIELDS, "WorldInfo.info", "rover.name"))
 AT = st.sampled_from((*NODES, "rover"))
 NODE = "Solid { }"
 BRIEF = {"for_s": 0.032, "then": "go_on"}
-EXAMPLES = int(os.environ.get("POLICY_EXAMPLES", "25"))
+EXAMPLES = int(os.environ.get("POLICY_EXAMPLES", "15"))
 WORLD = Path(__file__).parents[2] / "bridge" / "worlds" / "crowd.wbt"
 
 

@@ -22,8 +22,8 @@ from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.signal_history import query_rows
 
-ROWS = 20_000
-INTERVAL_S = 0.1
+ROWS = 8_000
+INTERVAL_S = 0.25
 MODES = {0.0: "rest", 500.0: "walk", 1500.0: "turn"}  # from when on
 ENOUGH = 10_000  # looks at the clock
 SOME = (*range(10), 13, 17, 22, 28, 35, 43, 52, 59)  # looks after which the time is over
@@ -35,7 +35,7 @@ def unsummed() -> Iterator[sqlite3.Connection]:
     with memory_connection() as connection:
         recorder = start_run(connection)
         for step in range(ROWS):
-            time_s = round(step * INTERVAL_S, 1)
+            time_s = step * INTERVAL_S
             recorder.publish(
                 time_s, {"mode": mode_at(time_s), "gear": gear_at(time_s), "x": time_s}
             )

@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import math
 import re
+import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, cast
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 from urllib.parse import parse_qsl
 
+from webots_mcp.database.schema import create_schema
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -51,6 +54,7 @@ LISTED: Final[dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 _WHOLE: Final = "run.whole:{}"  # A bit for each of `_RUNS_IN_NUMBER` runs.
 _RUNS_IN_NUMBER: Final = 60
+_COMMENT: Final = re.compile(r'(?m)^\s*"?(\w+)"? .*/\* (.*) \*/')  # of a column, by its name
 _SECRET: Final = re.compile(
     "password|passwd|secret|token|credential|signature|authorization|(access|api|account)[_-]?key|"
     "^(pass|key|sig|pwd)$",
@@ -96,13 +100,20 @@ class ShippedTable:
 
 @cache
 def tables() -> tuple[ShippedTable, ...]:
-    """Return all shipped tables, each after the tables it refers to. Importing models is slow."""
-    from webots_mcp.store import models
+    """Return all shipped tables, each after the tables it refers to.
 
-    ordered: list[Any] = cast("Any", models).SQLModel.metadata.sorted_tables
+    They are read from the schema of a database: the models from which it is generated import
+    libraries that take a second to load.
+    """
     # These tables hold for one machine or moment. Console lines become log lines later.
-    local = ("lease", "watermark", "retention_limit", "console_line", "request")
-    return tuple(_table(each) for each in ordered if each.name not in local)
+    local = ("lease", "watermark", "retention_limit", "console_line", "request", "alembic_version")
+    with closing(sqlite3.connect(":memory:")) as connection:
+        create_schema(connection)
+        created = connection.execute(
+            "SELECT name, sql FROM sqlite_master "
+            "WHERE type = 'table' AND name NOT LIKE 'sqlite_%' ORDER BY rowid"
+        ).fetchall()
+        return tuple(_table(connection, name, sql) for name, sql in created if name not in local)
 
 
 def table(name: str) -> ShippedTable:
@@ -114,12 +125,23 @@ def table(name: str) -> ShippedTable:
     return {each.name: each for each in tables()}[name]
 
 
-def _table(model: Any) -> ShippedTable:
-    name: str = model.name
+def _table(connection: sqlite3.Connection, name: str, sql: str) -> ShippedTable:
+    """Return a table of the schema.
+
+    Args:
+        connection: A database with the schema.
+        name: The name of the table.
+        sql: The statement that creates it, with the comments of its columns.
+    """
     local = _LOCAL_COLUMNS.get(name, ())
-    shipped: list[Any] = [column for column in model.columns if column.name not in local]
-    columns = tuple(str(column.name) for column in shipped)
-    comments: dict[str, str] = {column.name: column.comment or "" for column in shipped}
+    found = connection.execute(f"PRAGMA table_info({name})").fetchall()
+    # Each row is (position, name, type, is not null, default, position in the key or 0).
+    shipped = [row for row in found if row[1] not in local]
+    columns = tuple(str(row[1]) for row in shipped)
+    comments = dict(_COMMENT.findall(sql))
+    json_values = [each for each in columns if comments.get(each, "").startswith("JSON value")]
+    json_columns = [each for each in columns if comments.get(each, "").startswith("JSON")]
+    references = connection.execute(f"PRAGMA foreign_key_list({name})").fetchall()
 
     def column_of(owner: str) -> str | None:
         named = "id" if name == owner else f"{owner}_id"
@@ -127,18 +149,14 @@ def _table(model: Any) -> ShippedTable:
 
     return ShippedTable(
         name=name,
-        key=tuple(column.name for column in model.primary_key.columns),
+        key=tuple(str(row[1]) for row in sorted(found, key=itemgetter(5)) if row[5]),
         columns=columns,
-        types=tuple(_TYPES[str(column.type)] for column in shipped),
-        json_columns=frozenset(
-            each for each in columns if comments[each].startswith("JSON") or each == "replaced"
-        ),
-        json_values=frozenset(each for each in columns if comments[each].startswith("JSON value")),
-        nullable=frozenset(column.name for column in shipped if column.nullable),
+        types=tuple(_TYPES[row[2].partition("(")[0]] for row in shipped),
+        json_columns=frozenset([*json_columns, *({"replaced"} & {*columns})]),
+        json_values=frozenset(json_values),
+        nullable=frozenset(str(row[1]) for row in shipped if not row[3]),
         lasting=frozenset(
-            column.name
-            for column in shipped
-            if any(key.ondelete == "SET NULL" for key in column.foreign_keys)
+            str(row[3]) for row in references if row[6] == "SET NULL" and row[3] in columns
         ),
         is_appended=name in _DATED + CHUNKS,
         time_column="wall_time_s" if name in _DATED else None,

@@ -19,8 +19,10 @@ from webots_mcp.plugins.pool.shipping import ShippingJob, ShippingReport, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import RecordingAccess
 
-RECORDINGS: Final = 30
+RECORDINGS: Final = 10
+ROBOTS: Final = 4
 STARTED_S: Final = 1_700_000_000.0  # 2023-11-14, 22:13 in UTC: later recordings begin the next day
+_APART_S: Final = 900.0
 
 
 class Many(NamedTuple):
@@ -38,7 +40,7 @@ def record(folder: Path, number: int) -> Path:
     with closing(recorded.connection) as connection:
         connection.execute("PRAGMA synchronous=OFF")  # it need not outlast the machine
         connection.execute("BEGIN IMMEDIATE")
-        robot = recorded.robot(f"rover_{number % 10}", now=STARTED_S + 300 * number)
+        robot = recorded.robot(f"rover_{number % ROBOTS}", now=STARTED_S + _APART_S * number)
         connection.execute("UPDATE run SET uuid = ?, label = 'lab'", (new_uuid(),))
         for step in range(200 + 3 * number):
             time_s = round(step * 0.1, 3)

@@ -1,4 +1,4 @@
-"""A pool of thirty recordings, asked by SQL, answers as the tools do of each recording."""
+"""A pool of several recordings, asked by SQL, answers as the tools do of each recording."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.plugins.pool.parquet import bucket
-from tests.plugins.pool.parquet.conftest import RECORDINGS, Many
+from tests.plugins.pool.parquet.conftest import RECORDINGS, ROBOTS, Many
 from tests.plugins.pool.rows import ship, uuid_of
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
@@ -113,7 +113,7 @@ def test_what_is_there_is_listed(pool: ParquetPool, told: dict[str, Told]) -> No
         run.started_wall_time_s for run in runs
     )
     assert {(run.robot, run.label, run.row_count) for run in runs} == {
-        (f"rover_{n % 10}", "lab", 200 + 3 * n) for n in range(RECORDINGS)
+        (f"rover_{n % ROBOTS}", "lab", 200 + 3 * n) for n in range(RECORDINGS)
     }
 
 
@@ -137,8 +137,8 @@ def test_a_wall_time_can_be_asked_as_a_time(pool: ParquetPool) -> None:
 def test_a_day_is_a_date(pool: ParquetPool) -> None:
     found = pool.select("SELECT day, count(DISTINCT recording_uuid) FROM state GROUP BY 1", 9).rows
     assert sorted(found) == [
-        ("2023-11-14", 22),
-        ("2023-11-15", RECORDINGS - 22),
+        ("2023-11-14", 8),
+        ("2023-11-15", RECORDINGS - 8),
     ]
 
 
@@ -219,7 +219,7 @@ def answer(section: str, many: Many) -> str:
 def test_the_recipe_for_duckdb_counts_the_states_of_each_robot(many: Many) -> None:
     pytest.importorskip("duckdb", reason="duckdb is not installed")
     counts = re.findall(r"rover_(\d) *│ *(\d+)", answer("DuckDB", many))
-    expected = {n: sum(200 + 3 * k for k in range(n, RECORDINGS, 10)) for n in range(10)}
+    expected = {n: sum(200 + 3 * k for k in range(n, RECORDINGS, ROBOTS)) for n in range(ROBOTS)}
     assert {int(name): int(count) for name, count in counts} == expected
 
 

@@ -93,7 +93,7 @@ class Publisher:
         # Checked before the call, since even a call that does nothing slows down every `publish`.
         if breakpoints.armed or breakpoints.run is not self._clock.run:
             hit = breakpoints.evaluate(state)
-            wanted |= breakpoints.reaches  # `check` evaluates the recorded rows, and needs this one
+            wanted |= breakpoints.reaches  # `webots-mcp check` needs its row
         if self._watch.asks_states:
             wanted = self._watch.evaluate(state) or wanted
         if self._throttle.admits(wanted or hit or self._heartbeat.loop):

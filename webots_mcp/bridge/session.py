@@ -271,7 +271,7 @@ class BridgeSession:
         """Write the waiting rows and end the session.
 
         Args:
-            reason: How it ended; None for `reload` after a reload command, else `finished`.
+            reason: How it ended. If None: `reload` after a reload command, otherwise `finished`.
         """
         # The maintainer first: its thread uses the recorder too.
         stop = () if self._maintainer is None else (self._maintainer.stop,)
@@ -285,7 +285,7 @@ class BridgeSession:
         self.recorder.close(reason, self.clock.sim_time_s)
 
     def release_loop(self) -> None:
-        """Resume a paused simulation, and answer commands, which no later call would do."""
+        """Resume a paused simulation, and answer open commands now; no later call will."""
         self.pause.close()
         try:
             self._scene_recording.close()

@@ -7,9 +7,9 @@ none. Exactly one maintainer does: the holder of the lease.
 Nearly all is copied without the write lock (a PASSIVE checkpoint), and only what is left when the
 log is long is copied with it, to begin the log anew (RESTART). In SQLite before 3.51.3 a checkpoint
 without the lock can damage the file, if it starts while another's commit begins the log anew (the
-WAL-reset bug). A commit does that only where the whole log has been copied. So the maintainer
-commits before each checkpoint, the renewed lease: that commit is not copied before a checkpoint
-does it, and only the holder of the lease makes one.
+WAL-reset bug). A commit does that only where the whole log has been copied. The maintainer
+therefore renews its lease, which is a commit, before each checkpoint: until its own checkpoint
+copies that commit, the log is not copied as a whole, and no other commit can begin it anew.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -65,7 +65,7 @@ class LogLimits(NamedTuple):
         held_retry_s: Time between two attempts while nothing is written; each attempt makes the log
             longer.
         restart_wait_ms: Wait for the write lock, which a loop that writes without a pause rarely
-            leaves free, and then for readers; as long, a row waits.
+            leaves free, and then for readers. A row may wait that long.
     """
 
     hurried_interval_s: float = 0.25
@@ -176,7 +176,7 @@ class Maintainer(threading.Thread):
     def _hold_lease(self, connection: sqlite3.Connection) -> bool:
         """Take or renew the lease; it is renewed at half time, so that most ticks write nothing."""
         now = time.time()
-        # Another program may have written anything there: an end that is no time has passed.
+        # Another program may have written anything: an end that is not a number counts as expired.
         lease = connection.execute(
             f"SELECT holder = :holder, holder LIKE '{_BRIDGES}', "
             "iif(typeof(until_wall_time_s) IN ('real', 'integer'), until_wall_time_s, 0) "
@@ -218,7 +218,7 @@ class Maintainer(threading.Thread):
             # The first commit into a new log waits until the disk has the log's header. Made here
             # it costs no control loop its time: 5 ms at p99.9.
             self._take_lease(connection)
-            # A reader lets nothing be copied beyond the rows that it sees; a writer does.
+            # A reader lets nothing be copied beyond the rows that it sees; a writer lets more.
             self._note_held(is_held=log_bytes > 0 and self._copied_bytes == copied_before_bytes)
         self._log_bytes = log_bytes
 
@@ -288,7 +288,7 @@ def held_log(database: Database) -> str | None:
 
 
 def _described(error: Exception) -> str:
-    """Return an error of the database or of ours speaks for itself; any other needs its kind."""
+    """Return the text of an error of the database or of ours; the `repr` of any other."""
     if isinstance(error, (sqlite3.Error, WebotsMCPError, OSError)):
         return text_of(error)
     return repr(error)

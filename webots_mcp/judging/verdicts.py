@@ -55,7 +55,7 @@ class Coverage:
 
     Attributes:
         signals: Names of those that were judged, in order.
-        intervals: What of the runs was judged; without any nothing was.
+        intervals: What of the runs was judged; empty if nothing was.
         missing: What was not judged.
         nearest: What came nearest to an event: its share of one, and in words.
         says: Of a check, what held in all that was judged.
@@ -167,7 +167,7 @@ def outcome_of(made: Fault | Coverage, sources: Mapping[str, Source]) -> tuple[O
 
     A fault is no firmer than what is known of the signals that it rests on: a failure needs ones
     that are declared, known from a device or by an unambiguous name, a warning at least ones whose
-    values show what they are, and of unknown ones nothing is judged.
+    values show what they are. If the meaning of one is unknown, the outcome is "not judged".
 
     Args:
         made: What the check found, or what it could judge without finding a fault.
@@ -205,7 +205,7 @@ class Verdicts:
         not_found: Kinds that were looked for, be it in a part, and of which there is none, each
             with what came nearest, or with an empty text.
         reasons: Why kinds were not looked for, or not everywhere, and what to ask to have them
-            looked for. A kind that stands here and above is found, or not, in what was.
+            looked for. A kind that is also above was looked for in a part only.
         coverage: Of each kind, what could be judged.
 
     Shown are the properties, which name each kind that was not found once.
@@ -291,7 +291,7 @@ class SearchCoverage:
     Attributes:
         notes: Remarks that are about no kind.
         of_several_runs: What came near has to say in which run.
-        rows: Those in which a condition held nowhere, of all runs.
+        rows: Number of rows of all runs that were searched and in which a condition never held.
     """
 
     notes: list[str] = field(default_factory=list[str])
@@ -368,7 +368,7 @@ def reasons_of_runs(reasons: Iterable[str]) -> list[str]:
 
 
 def _as_one(alike: Sequence[str]) -> str | None:
-    """Several texts that differ in numbers as one; None where no run tells them apart."""
+    """Several texts that differ in numbers as one; None unless the runs tell them apart."""
     numbers = list(zip(*(_NUMBER.findall(each) for each in alike), strict=True))
     texts = _NUMBER.split(alike[0])
     said, has_runs = texts[0], False

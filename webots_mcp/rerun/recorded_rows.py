@@ -61,7 +61,7 @@ class RowTape(NamedTuple):
     """A tape made of rows.
 
     Attributes:
-        tape: It.
+        tape: The tape.
         basis: What it rests on, in a sentence without its end.
     """
 
@@ -168,7 +168,7 @@ class _Row(NamedTuple):
     time_s: float
     state: dict[str, Any]
     is_published: bool
-    """By the controller itself, which may command between a step's end and this."""
+    """By the controller itself, which may command between the end of a step and publishing."""
 
 
 def _rows_of(connection: sqlite3.Connection, run_id: int) -> list[_Row]:
@@ -255,7 +255,7 @@ def _missing_rows(run: dict[str, Any], rows: Sequence[_Row]) -> Iterable[str]:
     basic_s = (run["basic_time_step_ms"] or 0.0) / 1000
     times = [run["started_sim_time_s"], *(each.time_s for each in rows)]
     if steps is not None and basic_s and (times[-1] - times[0]) / basic_s < steps - 0.5:
-        yield "the times of some steps, because more steps than rows have their times"
+        yield "the times of some steps: the times of the rows span fewer steps than there were"
 
 
 # -- what the rows say -----------------------------------------------------------------------------

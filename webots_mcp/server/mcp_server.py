@@ -103,9 +103,8 @@ def create_server(
             Those that are not listed answer when they are called.
         output_schemas: List the tools with the schemas of their answers, which take four times as
             much room as all else.
-        limits: What it asks for of how much is kept; a database where somebody has set limits
-            keeps to those.
-        notify: Tell clients without being asked what happens; see `channel`.
+        limits: How much is to be kept. Limits that somebody has set in the database win.
+        notify: Tell clients without being asked what happens; see `channel_notifications`.
     """
     asked = dict(limits or {})
     readers = OpenReaders()
@@ -169,10 +168,10 @@ def _lifespan(
     updates: UpdateWatch,
     notify: bool,
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[Companions]]:
-    """While a server runs, trials and Webots may; what may be written is maintained and followed.
+    """Return what lives as long as the server: its trials, its Webots, and its threads.
 
-    What it follows is the console of each Webots that belongs to the recording. With `notify`,
-    updates are sent from the beginning, else once a client asks for them.
+    They maintain the recording, unless the server only reads, and record the consoles of Webots.
+    With `notify`, updates are sent from the beginning, else once a client asks for them.
     """
     unasked, project = dict(asked), ProjectWatch(recording.data_dir)
 
@@ -188,7 +187,7 @@ def _lifespan(
         retain(connection)
 
     def make_database() -> None:
-        """Where controllers have begun to record that never open it."""
+        """Create the database where controllers wrote only journals so far."""
         if isinstance(recording.database, Path) and not recording.database.exists():
             recording.ingest()
 

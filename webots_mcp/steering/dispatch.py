@@ -40,8 +40,8 @@ class WaitingTimes:
     """Times of waiting for a command, in wall seconds.
 
     Attributes:
-        poll_s: Between two reads of its row. A read by key takes microseconds, no longer than
-            PRAGMA data_version, which would miss commits of the same connection.
+        poll_s: Between two reads of its row. A read by key takes microseconds, as
+            PRAGMA data_version does, which misses commits of the same connection.
         report_s: Between two reports of progress.
         block_search_s: Between two searches for what blocks the loop.
         outliving_s: How long an unclaimed command stays valid after the time limit. Usually the
@@ -271,7 +271,7 @@ def _block_of(recording: RecordingAccess, command: QueuedCommand) -> BlockedLoop
 
 
 class _Sending:
-    """Sends a command in a thread, which Ctrl-C does not end with the task that waits for it."""
+    """Sends a command in a thread; Ctrl-C ends the task that waits for it, not the thread."""
 
     def __init__(self, enqueue: Callable[[], QueuedCommand]) -> None:
         self._enqueue = enqueue

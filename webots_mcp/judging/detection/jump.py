@@ -40,7 +40,7 @@ CERTAINLY_LESS: Final = 0.5  # of what one chunk says is large: with less a sign
 MARGIN_ROWS: Final = 10  # around steps: what an excursion takes, and the motion next to it
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
-BACK_HALF: Final = 0.5  # of a step: who comes back by so much to where it usually is, as well
+BACK_HALF: Final = 0.5  # of a step: a step so large back to where it usually is, too
 MOTION_SHARE: Final = 0.5  # of a step: the smallest neighbouring one of the same motion
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
 WHOLE_TURNS: Final = (math.tau, 360.0)
@@ -189,17 +189,17 @@ def find_jumps(
     """Steps whose modified z-score (see `find_spikes`) is above the score; the largest step of all;
     and what a step has to be larger than.
 
-    Compared is with the steps that are not zero and do not come back at once, of which there have
-    to be ten: for counters and commanded values a step is what they do. Of a value that otherwise
-    rests only what comes back at once counts. A step next to one in the same direction and is at
-    least half as large is part of a motion, however quick, and no jump. After a gap a step may be
-    larger by as many times as the gap is longer than the usual interval; and the step of an angle
+    The usual step is that of all steps that are not zero and do not come back at once. There have
+    to be ten of them: counters and commanded values change by steps all the time. Of a value that
+    otherwise rests only what comes back at once counts. A step next to one that has the same
+    direction and is at least half as large is part of a motion, however quick, and no jump. After a
+    gap a step may be larger by as many times as the gap is longer than the usual interval; and the step of an angle
     over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left of a whole
     turn. The steps of a swing are no jumps.
 
-    What is usual is that of 16 chunks at most, at equal shares of all changes, and of one where
-    nothing is nearly as large. Opened besides are the chunks alone that have a step that is large
-    enough, by their statistics.
+    What is usual is estimated from at most 16 chunks, at equal shares of all changes; one is enough
+    if no step is nearly as large. Other chunks are opened only if their statistics show a step that
+    is large enough.
 
     Args:
         frame: The rows.
@@ -342,7 +342,7 @@ def _without_swings(jumps: Sequence[Jump], frame: Frame, name: str) -> list[Jump
 
 
 def _none_of_swings(jumps: Sequence[Jump], times: Array, values: Array) -> Sequence[Jump]:
-    # There are as many steps about as large as the least of swings has, its own too.
+    # A swing has at least three steps that are about as large as this one.
     steps = np.sort(np.abs(np.diff(values)))[-SWING_STEPS:]
     least = MUCH_SMALLER * min(jump.size for jump in jumps)
     if len(steps) < SWING_STEPS or steps[0] < least:
@@ -415,9 +415,9 @@ def _is_back(jump: Jump, following: Jump, usual: float) -> bool:
 def find_leaps(frame: Frame, x: str, y: str, at_least_m: float) -> list[tuple[float, float]]:
     """Times and lengths of steps of a position that no driving explains.
 
-    Longer than `at_least_m`, and than five times the 99th percentile of all steps, of which each
-    counts for no more than the longer one next to it: so leaps do not tell what is usual. After a
-    gap by as many times more as it is longer than the usual interval.
+    They are longer than `at_least_m` and than five times the 99th percentile of all steps. Each
+    step counts there as at most the longer one next to it, so that leaps do not tell what is usual.
+    After a gap, a leap is longer by as many times as the gap is than the usual interval.
 
     Args:
         frame: The rows.

@@ -334,9 +334,9 @@ class Frame:
         return self.rows(start, stop)
 
     def bounds_of_wall_times(self) -> tuple[Indexes, Array, Array]:
-        """Return the edges of its chunks, and the minimum and maximum wall time of each (NaN.
+        """Return the edges of its chunks, and the minimum and maximum wall time of each.
 
-        Unknown).
+        A time that is unknown is NaN.
         """
         edges, source = self._edges, self._source
         if source.order is not None:
@@ -394,8 +394,8 @@ class Frame:
     def _part_of_whole(self, column: Column) -> Decoded | None:
         """Return the numbers from those of all rows of the source, if they are known already.
 
-        The whole must have been read without errors for a frame with fewer rows: what could not be
-        read may lie in rows that only the other frame has.
+        A frame with fewer rows may use them only if all rows were read without errors: otherwise
+        what could not be read may lie in rows that only the other frame has.
         """
         source, own = self._source, (self._start, self._stop)
         for first, stop in source.frames:

@@ -193,9 +193,9 @@ def find_jumps(
     to be ten of them: counters and commanded values change by steps all the time. Of a value that
     otherwise rests only what comes back at once counts. A step next to one that has the same
     direction and is at least half as large is part of a motion, however quick, and no jump. After a
-    gap a step may be larger by as many times as the gap is longer than the usual interval; and the step of an angle
-    over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left of a whole
-    turn. The steps of a swing are no jumps.
+    gap a step may be larger by as many times as the gap is longer than the usual interval. The step
+    of an angle over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left
+    of a whole turn. The steps of a swing are no jumps.
 
     What is usual is estimated from at most 16 chunks, at equal shares of all changes; one is enough
     if no step is nearly as large. Other chunks are opened only if their statistics show a step that

@@ -141,6 +141,24 @@ def test_a_folder_that_cannot_be_written_is_named(saving: Saving) -> None:
     assert "the world cannot be saved as" in (error or "")
 
 
+@pytest.mark.skipif(os.name != "posix", reason="limits of a process")
+def test_half_a_world_is_not_left_behind(saving: Saving) -> None:
+    import resource
+    import signal
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handled = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        status, _, error = saving.save("copy.wbt")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handled)
+    assert status == "failed"
+    assert "the world cannot be saved as" in (error or "")
+    assert [*saving.world.parent.iterdir()] == [saving.world]
+
+
 # -- in the branch --
 
 
@@ -191,7 +209,19 @@ def test_a_robot_that_was_not_recorded_begins_anew(
         assert bridge.restored is None
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"world": "x", "robots": {"rover": {}}}'])
+def of_rover(**changed: Any) -> str:
+    return json.dumps({"world": "x", "robots": {"rover": ROVER | changed}})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{", "[]", '{"world": "x", "robots": {"rover": {}}}', '{"world": "x", "robots": []}',
+        '{"world": "x", "robots": {"rover": "a"}}', of_rover(calls=float("inf")),
+        of_rover(calls="two"), of_rover(state=None), of_rover(state=["mode"]),
+        of_rover(parameters=1), of_rover(sim_time_s=None), of_rover(run_id="a"),
+    ],
+)  # fmt: skip
 def test_a_file_that_cannot_be_used_is_warned_of_and_the_controller_begins(
     text: str, tmp_path: Path, robot: InProcessSupervisor, database: MemoryDatabase,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],

@@ -213,6 +213,98 @@ def test_ctrl_c_ends_the_branches_and_removes_the_saved_world(project: Project) 
     assert project.rows("SELECT stop_reason FROM trial_set") == [("it was cancelled",)]
 
 
+NON_FINITE = """
+if bridge.restored is not None:
+    assert bridge.restored.state["distance_m"] == [float("inf"), 1.0]
+    rounds, turn = bridge.restored.state["rounds"], bridge.restored.state["turn"]
+"""
+
+
+@pytest.mark.slow
+def test_numbers_that_are_not_finite_come_back(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = CONTROLLER.replace("RESTORE", NON_FINITE)
+    text = text.replace('"x": x,', '"x": x, "distance_m": [float("inf"), 1.0],')
+    project.controller.write_text(text)
+    with project.simulated():
+        answer = project.branch(capsys, "speed=1.0")
+    assert set(scores(answer)) == {1.0, 3.0}, answer
+
+
+@pytest.mark.slow
+def test_a_name_that_is_given_twice_has_all_its_values(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with project.simulated():
+        answer = project.branch(capsys, "speed=1.0", "speed=9.0", "--jobs", "3")
+    assert set(scores(answer)) == {1.0, 3.0, 9.0}
+
+
+def _interrupted_when(project: Project, sql: str, number: signal.Signals) -> None:
+    """Begin branches, and end the command at once when there is such a row."""
+    words = project.options("speed=9.0", "--until", "x > 1e6", "--score", "max(x)")
+    line = [sys.executable, "-m", "webots_mcp", *words, "--stand-in"]
+    process = subprocess.Popen(line, stderr=subprocess.DEVNULL)
+    try:
+        wait_for(lambda: project.rows(sql))
+        process.send_signal(number)
+        process.wait(60)
+    finally:
+        process.kill()
+        process.wait(60)
+
+
+@pytest.mark.slow
+def test_an_interrupt_while_the_world_is_saved_resumes_the_simulation_in_its_mode(
+    project: Project,
+) -> None:
+    slow = "import time\n" + CONTROLLER.replace("RESTORE", "").replace(
+        "robot = Supervisor()",
+        "class Slow(Supervisor):\n"
+        "    def getRoot(self):\n"
+        "        if bridge.stats().rows_written > 9:\n"
+        "            time.sleep(1.0)  # as long as a large world takes\n"
+        "        return super().getRoot()\n"
+        "robot = Slow()",
+    )
+    project.controller.write_text(slow)
+    saving = "SELECT 1 FROM command WHERE action = 'save_world' AND status = 'claimed'"
+    with project.simulated("fast") as simulation:
+        _interrupted_when(project, saving, signal.SIGTERM)
+        held_s = simulation.time_s
+        simulation.wait_for(lambda: simulation.time_s > held_s, 60.0)
+        assert project.saved() == []
+        resuming = "SELECT action FROM command WHERE action IN ('resume', 'fast')"
+        assert project.rows(resuming) == [("fast",)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
+@pytest.mark.slow
+def test_the_next_branches_remove_what_a_killed_command_has_left(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with project.simulated():
+        running = "SELECT 1 FROM trial WHERE status = 'running'"
+        _interrupted_when(project, running, signal.SIGKILL)
+        assert len(project.saved()) > 1
+        project.branch(capsys, "speed=9.0")
+    assert project.saved() == []
+    reasons = project.rows("SELECT stop_reason FROM trial_set ORDER BY id")
+    assert reasons == [("its process ended, and its moment is over",), (None,)]
+
+
+@pytest.mark.slow
+def test_a_simulation_that_could_not_be_resumed_is_never_paused(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (project.folder / "webots-mcp.toml").write_text('[allow]\nactions = ["*", "!resume"]\n')
+    with project.simulated("realtime"):
+        refused = project.refused(capsys, "speed=9.0", *SCORE)
+        assert "resume" in refused
+        assert project.rows("SELECT action FROM command WHERE action = 'pause'") == []
+
+
 def test_what_cannot_branch_is_refused_before_anything_is_saved(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -58,12 +58,21 @@ def find_origin(robot_name: str, errors: ErrorReport) -> BranchOrigin | None:
         return None
     try:
         found = cast("dict[str, Any]", json.loads(Path(file).read_text("utf-8")))
-        world, robots = str(found["world"]), cast("dict[str, Any]", found["robots"])
+        world, robots = str(found["world"]), _mapping(found["robots"])
         own = next((robots[name] for name in robots if recorded_name(name) == robot_name), None)
         if own is None:
             return BranchOrigin(world, None, 0)
-        moment = RestoredState(**{name: own[name] for name in RestoredState._fields})
+        moment = RestoredState(
+            _mapping(own["state"]), _mapping(own["parameters"]), float(own["sim_time_s"]),
+            int(own["run_id"]),
+        )  # fmt: skip
         return BranchOrigin(world, moment, int(own["calls"]))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except Exception as error:  # noqa: BLE001  (the robot comes first, whatever is in the file)
         errors.warn(RESTORED_VARIABLE, f"{RESTORED_VARIABLE}={file}: {error}; {_NOWHERE}")
         return None
+
+
+def _mapping(value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TypeError(f"an object was expected, not {value!r:.50}")
+    return cast("dict[str, Any]", value)

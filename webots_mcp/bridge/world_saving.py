@@ -107,12 +107,15 @@ def _nodes_of(robot: Any) -> list[str]:
 def _write(file: Path, text: str) -> None:
     try:
         with file.open("x", encoding="utf-8") as new:
-            new.write(text)
+            try:
+                new.write(text)
+                new.flush()
+            except BaseException:  # half a world is of no use, and nobody would remove it
+                file.unlink(missing_ok=True)
+                raise
     except FileExistsError:
         raise CommandRefusedError(
             f"{file} exists, and no file is overwritten. Give another name"
         ) from None
-    except OSError as error:
-        raise CommandRefusedError(
-            f"the world cannot be saved as {file}: {error.strerror or error}"
-        ) from error
+    except (OSError, ValueError) as error:
+        raise CommandRefusedError(f"the world cannot be saved as {file}: {error}") from error

@@ -450,7 +450,7 @@ def branch(
         name, equals, values = text.partition("=")
         if not (name and equals and values):
             raise InvalidInputError(f"{text!r} has no values. Write NAME=V1,V2, as in speed=2,4.")
-        grid[name] = [value_of(each) for each in values.split(",")]
+        grid.setdefault(name, []).extend(value_of(each) for each in values.split(","))
     given = {**vars(options), "parameters": grid, "timeout_wall_s": _UNTIL_DONE_S}
     _show(webots_branch_run, asked, as_json=json, **given)
 

@@ -81,7 +81,7 @@ async def webots_branch_run(
     """Try parameters from this moment on: each branch continues a copy of the world and is scored.
 
     The simulation is paused to save its world, and resumed if it ran. Branch 0 changes nothing; the
-    notes say when it parted from the original, and so which differences mean something. The
+    notes say when it parted from the original, and so which differences show nothing. The
     controller takes its own variables from bridge.restored. If timeout_wall_s is over first, wait
     with webots_run_trials(trial_set=...). To start from the beginning use webots_run_trials.
     """
@@ -104,7 +104,11 @@ async def webots_branch_run(
         with anyio.CancelScope(shield=True):
             await to_thread.run_sync(_end, recording, worker)
         raise
-    return TrialsAnswer(**await to_thread.run_sync(set_facts, recording, worker.set_id))
+    facts = await to_thread.run_sync(set_facts, recording, worker.set_id)
+    if saved.paused_by is not None:
+        stays = f"the simulation ran before and could not be resumed: {saved.paused_by}"
+        facts["notes"] = [stays, *(facts.get("notes") or [])]
+    return TrialsAnswer(**facts)
 
 
 def _checked(

@@ -11,9 +11,10 @@ import logging
 import re
 import shutil
 import threading
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextvars import copy_context
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -35,11 +36,19 @@ from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.trial_plan import BranchMoment, BranchPlan
 from webots_mcp.steering.trial_run import Simulators, StoppedError
 from webots_mcp.steering.trial_set import FOLDER, SetRun, run_trials
+from webots_mcp.store.export import state_of
 from webots_mcp.store.recording import RecordingAccess, RobotView, view_robot
+from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.run_parameters import described
 from webots_mcp.store.sessions import companions
-from webots_mcp.store.trial_sets import add_trial, fetch_trial_set, stop_trial_set, trials_of
+from webots_mcp.store.trial_sets import (
+    add_trial,
+    fetch_trial_set,
+    put_back,
+    stop_trial_set,
+    trials_of,
+)
 
 SAVE: Final = "save_world"
 _COMMAND_S: Final = 30.0  # wall time for each command to the controller
@@ -47,6 +56,20 @@ _UNDER_WAY: Final = (
     "SELECT id, action FROM command WHERE robot_id = ? AND status = 'claimed' "
     f"AND action IN ({', '.join(map(repr, LOOPING))}) ORDER BY id DESC LIMIT 1"
 )
+_PAUSING: Final = (
+    "SELECT 1 FROM command WHERE robot_id = ? AND status = 'claimed' AND action IN "
+    f"('pause', '{SAVE}') LIMIT 1"
+)
+_UNFINISHED: Final = (
+    "SELECT id FROM trial_set WHERE json_valid(plan) AND json_type(plan, '$.moment') = 'object' "
+    "AND stop_reason IS NULL AND EXISTS (SELECT 1 FROM trial WHERE trial_set_id = trial_set.id "
+    "AND status IN ('running', 'waiting'))"
+)
+_MODE_BEFORE: Final = "SELECT mode_before_pause FROM session WHERE id = ?"
+_CLAIMED_S: Final = 5.0  # wall time in which a command that was claimed comes to its end
+_POLL_S: Final = 0.02
+_BEGUN_S: Final = 60.0  # wall time after which a set has surely been begun
+_COPY: Final = re.compile(r"\.branch-[0-9a-f]{8}\.wbt$")
 _END_S: Final = 15.0  # wall time in which simulators end
 _NUMBERED: Final = re.compile(r"#\d+$")  # of a robot whose name was taken in its recording
 _log = logging.getLogger(__name__)
@@ -62,6 +85,7 @@ class SavedMoment:
         run_id: The run.
         world: The saved world.
         states: The file with the states of the robots.
+        paused_by: Why the simulation stays paused, although it ran before; None if it goes on.
     """
 
     moment: BranchMoment
@@ -69,6 +93,7 @@ class SavedMoment:
     run_id: int
     world: Path
     states: Path
+    paused_by: str | None = None
 
     def remove(self) -> None:
         """Remove the files."""
@@ -88,6 +113,9 @@ async def save_moment(
         NothingRecordedError: The controller has published nothing yet.
     """
     name, was_paused = await to_thread.run_sync(_target, recording, robot)
+    if not was_paused:  # nothing is paused that could not be resumed
+        await to_thread.run_sync(permit, recording, "resume", dict[str, Any]())
+    await to_thread.run_sync(_remove_left_over, recording)
     dispatcher = Dispatcher(recording, report)
 
     async def order(action: str, **params: Any) -> dict[str, Any]:
@@ -100,29 +128,55 @@ async def save_moment(
             )
         return await to_thread.run_sync(_result, recording, answer.command_id)
 
-    if not was_paused:
-        await order("pause")
-    resumes = "resume"
+    copy = await to_thread.run_sync(_new_copy, recording, name)
     try:
-        file = f"{await to_thread.run_sync(_stem, recording, name)}.branch-{new_uuid()[:8]}"
-        saved = await order(SAVE, name=f"{file}{WORLD_ENDING}")
-        resumes = "fast" if saved["running_mode"] == "fast" else "resume"
-        try:
-            return await to_thread.run_sync(_moment, recording, name, saved)
-        except BaseException:
-            Path(saved["file"]).unlink(missing_ok=True)
-            raise
-    finally:
         if not was_paused:
-            with CancelScope(shield=True):
-                await _resume(order, resumes)
+            await order("pause")
+        saved = await order(SAVE, name=copy.name)
+        moment = await to_thread.run_sync(_moment, recording, name, saved)
+    except BaseException:
+        with CancelScope(shield=True):
+            if not was_paused:
+                await _resume(recording, name, order)
+            copy.unlink(missing_ok=True)
+        raise
+    if not was_paused:
+        why = None
+        with CancelScope(shield=True):
+            why = await _resume(recording, name, order)
+        moment = replace(moment, paused_by=why)
+    return moment
 
 
-async def _resume(order: Callable[[str], Awaitable[object]], action: str) -> None:
+async def _resume(
+    recording: RecordingAccess, robot: str, order: Callable[[str], Awaitable[object]]
+) -> str | None:
+    """Let a simulation go on in its former mode; return why it stays paused, if it does."""
     try:
-        await order(action)
-    except CommandRefusedError as error:  # the branches can run nevertheless
+        action = await to_thread.run_sync(_resuming, recording, robot)
+        if action is not None:
+            await order(action)
+    except WebotsMCPError as error:  # the branches can run nevertheless
         _log.warning("the simulation stays paused after its world was saved: %s", error)
+        return str(error)
+    return None
+
+
+def _resuming(recording: RecordingAccess, robot: str) -> str | None:
+    """Return the action that ends the pause; None if there is none."""
+    until_s = time.monotonic() + _CLAIMED_S
+    while True:
+        with recording.reader() as connection:
+            view = view_robot(connection, robot)
+            pausing = connection.execute(_PAUSING, (view.robot.id,)).fetchone()
+        if pausing is None or time.monotonic() > until_s:
+            break
+        time.sleep(_POLL_S)
+    if view.session is None or view.session.pause_state != PAUSED:
+        return None
+    with recording.reader() as connection:
+        (mode,) = connection.execute(_MODE_BEFORE, (view.session.id,)).fetchone()
+    return "fast" if mode == "fast" else "resume"
 
 
 def _target(recording: RecordingAccess, robot: str | None) -> tuple[str, bool]:
@@ -146,10 +200,36 @@ def _result(recording: RecordingAccess, command_id: int | None) -> dict[str, Any
         return cast("dict[str, Any]", fetch_command(connection, command_id).decoded_result() or {})
 
 
-def _stem(recording: RecordingAccess, robot: str) -> str:
+def _new_copy(recording: RecordingAccess, robot: str) -> Path:
+    """Return the file of the saved world, which does not exist yet."""
     with recording.view(robot) as view:
-        world = view.require_run().world
-    return Path(world or "world").stem.partition(".branch-")[0]
+        world = Path(view.require_run().world or "world")
+    return world.with_name(
+        f"{world.stem.partition('.branch-')[0]}.branch-{new_uuid()[:8]}{WORLD_ENDING}"
+    )
+
+
+def _remove_left_over(recording: RecordingAccess) -> None:
+    """Remove the files of sets whose process was killed, so that it could not remove them."""
+    with recording.writer() as connection:
+        for (set_id,) in connection.execute(_UNFINISHED).fetchall():
+            found = fetch_trial_set(connection, set_id)
+            young = time.time() - found.created_wall_time_s < _BEGUN_S
+            if not found.is_left or (found.pid is None and young):
+                continue
+            plan = json.loads(found.plan)
+            world, states = Path(plan["world"]), Path(plan["states"])
+            is_copy = (
+                _COPY.search(world.name) and world.parent == Path(plan["moment"]["world"]).parent
+            )
+            if is_copy:  # what a recording says is no reason to remove another file
+                world.unlink(missing_ok=True)
+            if states.suffix == ".json" and states.parent == recording.data_dir / FOLDER:
+                states.unlink(missing_ok=True)
+            for trial in trials_of(connection, set_id):
+                shutil.rmtree(recording.data_dir / FOLDER / trial.uuid, ignore_errors=True)
+                put_back(connection, trial)
+            stop_trial_set(connection, set_id, "its process ended, and its moment is over")
 
 
 def _moment(recording: RecordingAccess, robot: str, saved: Mapping[str, Any]) -> SavedMoment:
@@ -192,7 +272,7 @@ def _state_of(view: RobotView) -> dict[str, Any] | None:
     }
     return {
         "run_id": view.run.id,
-        "state": json.loads(view.state.data),
+        "state": state_of(view.state.data, view.state.replaced),
         "parameters": values,
         "calls": 0,
     }

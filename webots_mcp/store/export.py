@@ -496,16 +496,27 @@ class StateTable(ExportTable):
 def flat_row(recorded: Recorded) -> FlatRow:
     """Return a stored row as one value per dotted name."""
     *head, data, replaced_text = recorded
-    state = parse(data)
+    state = state_of(data, replaced_text)
     replaced = cast("dict[str, str]", json.loads(replaced_text)) if replaced_text else {}
-    for path, kind in replaced.items():
-        if kind in _NOT_FINITE:
-            put_back(state, path.split("."), _NOT_FINITE[kind])
     values: dict[str, Any] = {}
     _spread("", state.items(), values)
     for name in _RESERVED.intersection(values):
         values[f"state.{name}"] = values.pop(name)
     return FlatRow(tuple(head), values, replaced)
+
+
+def state_of(data: str, replaced: str | None) -> dict[str, Any]:
+    """Return a stored state with its numbers that are not finite, for which JSON has null.
+
+    Args:
+        data: Its JSON.
+        replaced: What was replaced in it, as JSON; None if nothing was.
+    """
+    state = parse(data)
+    for path, kind in cast("dict[str, str]", json.loads(replaced or "{}")).items():
+        if kind in _NOT_FINITE:
+            put_back(state, path.split("."), _NOT_FINITE[kind])
+    return state
 
 
 def value_at(state: dict[str, Any], name: str) -> Any:

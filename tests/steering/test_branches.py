@@ -233,6 +233,34 @@ def test_numbers_that_are_not_finite_come_back(
 
 
 @pytest.mark.slow
+def test_a_robot_whose_own_name_ends_with_a_number_is_continued(
+    project: Project, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = project.world.read_text("utf-8")
+    assert 'name "rover"' in world
+    project.world.write_text(world.replace('name "rover"', 'name "rôver #2"'), "utf-8")
+    with project.simulated():
+        answer = project.branch(capsys, "speed=1.0")
+    assert set(scores(answer)) == {1.0, 3.0}
+    assert "equals what run 1 itself did to the last digit" in answer["notes"][0]
+    project.world.write_text(world.replace('name "rover"', 'name "rover#2"'), "utf-8")
+    with project.simulated():
+        answer = project.branch(capsys, "speed=1.0", "--robot", "rover#2")
+    assert set(scores(answer)) == {1.0, 3.0}, answer
+
+
+def test_a_controller_that_asks_for_no_command_is_told_what_to_add(
+    project: Project, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webots_mcp.steering.branches._COMMAND_S", 1.0)
+    text = CONTROLLER.replace("RESTORE", "").replace("    bridge.get_command()\n", "")
+    project.controller.write_text(text)
+    with project.simulated("realtime"):
+        refused = project.refused(capsys, "speed=2.0", *SCORE)
+    assert "never calls bridge.get_command(): add that line to its loop" in refused
+
+
+@pytest.mark.slow
 def test_a_name_that_is_given_twice_has_all_its_values(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,7 +15,7 @@ from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
-from webots_mcp.contract import WORLD_ENDING
+from webots_mcp.contract import WORLD_ENDING, recorded_name
 from webots_mcp.database.files import full_path
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
@@ -58,6 +58,7 @@ class WorldSaving:
         return {
             "file": str(file),
             "world": str(world),
+            "robot": recorded_name(str(self._simulation.robot.getName())),
             "sim_time_s": self._clock.sim_time_s,
             "calls": self._throttle.calls_in_run,
             "running_mode": self._pause.running_mode,

@@ -121,7 +121,7 @@ async def save_moment(
     async def order(action: str, **params: Any) -> dict[str, Any]:
         answer = await dispatcher.ask(name, action, _COMMAND_S, params)
         if answer.outcome != "done":
-            why = answer.error or answer.hint or answer.outcome
+            why = "; ".join(filter(None, (answer.error, answer.hint))) or answer.outcome
             raise CommandRefusedError(
                 f"No branch was begun: the command {action} to robot {name!r} came to "
                 f"{answer.outcome} ({why}). Check webots_get_robot_state, then call again."
@@ -236,6 +236,7 @@ def _moment(recording: RecordingAccess, robot: str, saved: Mapping[str, Any]) ->
     """Write the states of the robots to a file, as their bridges read it."""
     recording.settle()  # rows that waited next to the database
     states: dict[str, dict[str, Any]] = {}
+    own = str(saved["robot"])
     with recording.reader() as connection:
         view = view_robot(connection, robot)
         run, session = view.require_run(), view.session
@@ -246,17 +247,19 @@ def _moment(recording: RecordingAccess, robot: str, saved: Mapping[str, Any]) ->
         names = [robot, *(robot_name(connection, each.robot_id) for each in others)]
         for name in names:
             if (state := _state_of(view_robot(connection, name))) is not None:
-                states[_NUMBERED.sub("", name)] = state | {"sim_time_s": saved["sim_time_s"]}
-    own = _NUMBERED.sub("", robot)
-    if own not in states:
+                states[name] = state | {"sim_time_s": saved["sim_time_s"]}
+    found = states.pop(robot, None)
+    if found is None:
         raise NothingRecordedError(
             f"Robot {robot!r} has published no state in run {run.id}, so no branch can continue "
             "it. Let its simulation run until it has published one."
         )
-    states[own]["calls"] = saved["calls"]
+    # Only the bridge of a robot knows whether a number at the end belongs to its name.
+    states = {_NUMBERED.sub("", name): each for name, each in states.items()} | states
+    states[own] = found | {"calls": saved["calls"]}
     file = recording.data_dir / FOLDER / f"{new_uuid()}.json"
     make_folder(file.parent)
-    text = json.dumps({"world": saved["world"], "robots": states}, ensure_ascii=False)
+    text = json.dumps({"world": saved["world"], "robots": states})
     file.write_text(text, "utf-8")
     parameters = {name: each["parameters"] for name, each in states.items()}
     moment = BranchMoment(run_uuid, saved["sim_time_s"], saved["world"], parameters)

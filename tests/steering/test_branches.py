@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import sqlite3
@@ -355,6 +356,9 @@ def test_what_cannot_branch_is_refused_before_anything_is_saved(
         running.wait(60)
         unknown = project.refused(capsys, "speed=2.0", "--for", "1", "--score", "max(z)")
         assert "'z'" in unknown
+        for word in ("--until", "--prune"):
+            unknown = project.refused(capsys, "speed=2.0", *SCORE, word, "nosuch > 1")
+            assert "nosuch" in unknown
         paused = project.rows("SELECT count(*) FROM trial_set")
     assert paused == [(0,)]
 
@@ -380,8 +384,9 @@ async def test_an_assistant_waits_for_branches_cancels_them_and_begins_new_ones(
     project: Project,
 ) -> None:
     asked = {"parameters": {"speed": [9.0]}, "score": "max(x)", "stand_in": True}
+    data = Path(os.path.relpath(project.data))  # as `serve --data-dir mcp_data` gives it
     with project.simulated("realtime"):
-        async with Client(create_server(project.data / "webots.db", project.data)) as client:
+        async with Client(create_server(data / "webots.db", data)) as client:
             begun = await ask(client, "webots_branch_run", **asked, for_s=0.5, timeout_wall_s=0.1)
             assert (begun["state"], begun["trials"]) == ("under way", 2)
             done = await until(

@@ -23,6 +23,7 @@ from webots_mcp.questions.run_trials import (
     set_facts,
 )
 from webots_mcp.steering.branches import SAVE, BranchWorker, SavedMoment, branches_of, save_moment
+from webots_mcp.steering.run_command import require_possible
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.trial_plan import BranchPlan, TrialPlan, combinations
 from webots_mcp.steering.trial_run import LocalSimulators, webots
@@ -128,6 +129,9 @@ def _checked(
     with recording.reader() as connection:
         view = find_target(connection, robot, SAVE)
         name, world = view.robot.name, view.require_run().world
+    for condition in (asked["until"], asked["prune"]):
+        if condition is not None:
+            require_possible(recording, name, condition, asked["for_s"], reset=True)
     checked = as_declared(settable(recording, name), sets)
     plan = TrialPlan(parameters=checked, **asked)
     with recording.reader() as connection:

@@ -224,7 +224,7 @@ def _remove_left_over(recording: RecordingAccess) -> None:
             )
             if is_copy:  # what a recording says is no reason to remove another file
                 world.unlink(missing_ok=True)
-            if states.suffix == ".json" and states.parent == recording.data_dir / FOLDER:
+            if states.suffix == ".json" and states.parent == recording.data_dir.absolute() / FOLDER:
                 states.unlink(missing_ok=True)
             for trial in trials_of(connection, set_id):
                 shutil.rmtree(recording.data_dir / FOLDER / trial.uuid, ignore_errors=True)
@@ -257,7 +257,8 @@ def _moment(recording: RecordingAccess, robot: str, saved: Mapping[str, Any]) ->
     # Only the bridge of a robot knows whether a number at the end belongs to its name.
     states = {_NUMBERED.sub("", name): each for name, each in states.items()} | states
     states[own] = found | {"calls": saved["calls"]}
-    file = recording.data_dir / FOLDER / f"{new_uuid()}.json"
+    # A controller reads it in a folder of its own.
+    file = recording.data_dir.absolute() / FOLDER / f"{new_uuid()}.json"
     make_folder(file.parent)
     text = json.dumps({"world": saved["world"], "robots": states})
     file.write_text(text, "utf-8")

@@ -143,7 +143,7 @@ def run_attempt(attempt: TrialAttempt, command: CommandOfWorld) -> TrialResult:
         InvalidInputError: No trial of the set can succeed.
     """
     folder, plan = attempt.folder, attempt.plan
-    environment = {DATA_DIR_VARIABLE: str(folder), **plan.environment(attempt.values)}
+    environment = {DATA_DIR_VARIABLE: str(folder.absolute()), **plan.environment(attempt.values)}
     simulator = TrialSimulator(command(plan.world), folder, environment)
     watch = TrialWatch(plan)
     try:

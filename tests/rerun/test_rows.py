@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.rerun.taping import AVOID, data_dir_of, recorded, rerun_of, taped_run
+from tests.rerun.taping import AVOID, data_dir_of, project, recorded, rerun_of, taped_run
 from webots_mcp.cli import main
-from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.rerun.recorded_source import RecordedSource, find_source
 from webots_mcp.rerun.running import Rerun, find_taped_run, rerun
 
 EACH_STEP = AVOID.replace("attach(robot)", "attach(robot, throttle_interval=1)")
@@ -197,7 +198,7 @@ def test_a_source_that_was_changed_is_taken_from_the_commit_or_named(tmp_path: P
 
 def recorded_with(folder: Path, code: str, helper: Path, text: str, git: object) -> Path:
     """Record a controller with a module next to it, both committed."""
-    from tests.rerun.taping import WORLD, project, record
+    from tests.rerun.taping import WORLD, record
 
     controller = project(folder, code)
     helper.write_text(text, "utf-8")
@@ -219,3 +220,192 @@ def test_a_tape_is_used_where_there_is_one(tmp_path: Path) -> None:
     controller = recorded(tmp_path, EACH_STEP, duration_s=1.0)
     assert taped_run(tmp_path).basis is None
     assert rerun_of(tmp_path, controller).basis is None
+
+
+COUNTED = EACH_STEP.replace("turning = 0\n", "turning = 0\nn = 0\n", 1).replace(
+    "    for motor, speed", "    n += 1\n    speeds = (n % 5, n % 3)\n    for motor, speed"
+)
+"""Commands other velocities in each round."""
+
+
+def outcome_of(folder: Path, code: str) -> Rerun:
+    """Record a controller without a tape, and rerun it unchanged."""
+    return rerun_rows(folder, recorded(folder, code, tape="", duration_s=1.0))
+
+
+ROUNDED = "{'sensors': {'ds_left': round(left_m, 1), 'ds_right': round(right_m, 1)}}"
+
+
+@pytest.mark.parametrize("attached", [True, False])
+def test_values_that_the_code_publishes_as_sensors_are_not_what_it_heard(
+    tmp_path: Path, *, attached: bool
+) -> None:
+    code = EACH_STEP.replace("    if turning", f"    bridge.publish({ROUNDED})\n    if turning")
+    if not attached:
+        code = code.replace("MCPBridge.attach(", "MCPBridge(")
+    answer = outcome_of(tmp_path, code)
+    assert (answer.outcome, answer.rounds) == ("not on the tape", 1)
+    assert "the code itself publishes 'sensors'" in answer.text
+    assert "a tape has these" in answer.text
+
+
+def test_a_new_version_may_publish_what_it_likes(rows: Path) -> None:
+    controller = rows / "controllers" / "rover" / "edited.py"
+    controller.write_text(
+        EACH_STEP.replace("    if turning", f"    bridge.publish({ROUNDED})\n    if turning"),
+        "utf-8",
+    )
+    answer = rerun_rows(rows, controller)
+    controller.unlink()
+    assert (answer.outcome, answer.rounds) == ("equal", 500), answer.text
+
+
+def test_a_step_before_the_bridge_is_named(tmp_path: Path) -> None:
+    answer = outcome_of(tmp_path, EACH_STEP.replace("bridge = ", "robot.step(16)\nbridge = "))
+    assert answer.outcome == "not on the tape"
+    assert "the code makes 1 step before its MCPBridge, which no row has" in answer.text
+
+
+@pytest.mark.parametrize("call", ["robot.step(10)", "robot.step(0)", "robot.stepBegin(16)"])
+def test_a_step_that_rows_do_not_tell_is_named_and_no_lack_of_repetition(
+    call: str, tmp_path: Path
+) -> None:
+    end = "; robot.stepEnd()" if "Begin" in call else ""
+    answer = outcome_of(
+        tmp_path, EACH_STEP.replace("    if turning", f"    {call}{end}\n    if turning")
+    )
+    assert answer.outcome == "not on the tape", answer.text
+    assert f"{call} is not in the recorded rows, which have whole steps of 16 ms" in answer.text
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        EACH_STEP.replace("while robot", "bridge.publish({'a': 1})\nwhile robot"),
+        COUNTED + "    if n % 2:\n        bridge.publish({'a': 1})\n",
+        COUNTED + "    bridge.publish({'pose': [1, 2, 3]})\n    bridge.publish({})\n",
+        EACH_STEP + "    motors[0].setVelocity(float('nan'))\n",
+    ],
+    ids=["before the first step", "each second round", "names of the bridge", "refused by Webots"],
+)
+def test_code_that_repeats_itself_is_not_said_to_differ(code: str, tmp_path: Path) -> None:
+    answer = outcome_of(tmp_path, code)
+    assert answer.outcome == "equal", answer.text
+    assert answer.rounds > 55
+
+
+@pytest.mark.parametrize(
+    "reads", ["import sys\nprint(sys.argv)", "from sys import argv", "import argparse"]
+)
+def test_code_that_reads_its_arguments_needs_them(reads: str, tmp_path: Path) -> None:
+    recorded(tmp_path, f"{reads}\n{EACH_STEP}", tape="", duration_s=0.5)
+    said = missing(tmp_path)
+    assert "the arguments that the controller was started with, which controllers/rover" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("UPDATE run SET start_reason = 'reset'", "goes on from an earlier run in the same"),
+        ("UPDATE robot SET devices = '{}'", "the classes of the devices ds_left, ds_right, left"),
+        (
+            "INSERT INTO parameter_value (run_id, name, sim_time_s, wall_time_s, value, is_default,"
+            " set_by) VALUES (1, 'near_m', 1, 1, '0.4', 0, 'trial')",
+            "the parameters near_m were set by a command",
+        ),
+    ],
+)
+def test_what_the_run_heard_elsewhere_is_missing(
+    change: str, said: str, rows: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(rows, folder)
+    with closing(connect(data_dir_of(folder) / DATABASE_NAME, "writer")) as connection:
+        connection.execute(change)
+    assert said in missing(folder)
+
+
+def test_a_number_that_the_bridge_gave_a_robot_is_not_its_name(rows: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(rows, folder)
+    controller = folder / "controllers" / "rover" / "named.py"
+    controller.write_text(EACH_STEP.replace("turning = 0\n", "robot.getName(); turning = 0\n", 1))
+    assert rerun_rows(folder, controller).outcome == "equal"
+    with closing(connect(data_dir_of(folder) / DATABASE_NAME, "writer")) as connection:
+        connection.execute("UPDATE robot SET name = 'rover #2'")
+    assert "robot.getName() is not in the recorded rows" in rerun_rows(folder, controller).text
+
+
+def git_in(folder: Path, *words: str) -> str:
+    """Run git in a folder; return what it prints."""
+    identity = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+    command = ["git", "-C", str(folder), *identity, *words]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def source_of(folder: Path, commit: str | None, began_s: float) -> RecordedSource:
+    """Find the source of a controller that is as it was when it ran."""
+    file = folder / "controllers" / "rover" / "rover.py"
+    digest = hashlib.sha256(b"import limits\n").hexdigest()
+    return find_source(str(file), digest, commit, began_s, folder / "mcp_data", host_name())
+
+
+@pytest.fixture
+def committed(tmp_path: Path) -> tuple[Path, Path, str]:
+    """A project with a committed controller and module: folder, module, commit."""
+    controller = project(tmp_path, "import limits\n")
+    module = controller.with_name("limits.py")
+    module.write_text("NEAR_M = 0.35\n", "utf-8")
+    git_in(tmp_path, "init", "-q")
+    git_in(tmp_path, "add", "controllers")
+    git_in(tmp_path, "commit", "-q", "-m", "A rover")
+    return tmp_path, module, git_in(tmp_path, "rev-parse", "HEAD")
+
+
+def test_a_module_that_ran_with_uncommitted_changes_is_that_of_the_disk(
+    committed: tuple[Path, Path, str],
+) -> None:
+    folder, module, commit = committed
+    module.write_text("NEAR_M = 0.45\n", "utf-8")
+    began_s = module.stat().st_ctime
+    module.with_name("rover.py").write_text("print('a later edit')\n", "utf-8")
+    found = source_of(folder, commit, began_s)
+    assert found.texts["controllers/rover/limits.py"] == "NEAR_M = 0.45\n"
+    assert "uncommitted" not in found.basis
+
+
+def test_a_module_of_the_commit_may_have_been_changed_and_the_answer_says_so(
+    committed: tuple[Path, Path, str],
+) -> None:
+    folder, module, commit = committed
+    found = source_of(folder, commit, module.stat().st_mtime - 10.0)
+    assert found.why_not is None
+    assert found.basis.endswith(
+        "with controllers/rover/limits.py as committed: wrong if they had uncommitted changes then"
+    )
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows keeps no time of a file's status")
+def test_a_module_that_was_moved_into_its_place_counts_as_changed(
+    committed: tuple[Path, Path, str],
+) -> None:
+    folder, module, _ = committed
+    began_s = module.stat().st_ctime
+    other = folder / "limits.py"
+    other.write_text("NEAR_M = 0.45\n", "utf-8")
+    os.utime(other, (began_s - 1000.0, began_s - 1000.0))
+    other.replace(module)
+    assert module.stat().st_mtime < began_s
+    why_not = source_of(folder, None, began_s).why_not or ""
+    assert "limits.py, changed since the run began" in why_not
+
+
+def test_what_the_bridge_answered_it_answers_again(tmp_path: Path) -> None:
+    code = EACH_STEP.replace(
+        "    left_m, right_m = (eye.getValue() for eye in eyes)\n",
+        "    left_m, right_m = bridge.auto_publish()['sensors'].values()\n",
+    )
+    controller = recorded(tmp_path, code, tape="", duration_s=5.0)
+    assert rerun_rows(tmp_path, controller).outcome == "equal"
+    controller.with_name("edited.py").write_text(code.replace("0.35", "0.6"), "utf-8")
+    assert rerun_rows(tmp_path, controller.with_name("edited.py")).outcome == "differs"

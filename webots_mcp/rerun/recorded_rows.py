@@ -8,8 +8,10 @@ recorded code is replayed (`with_commands`), and compared with the new code afte
 
 from __future__ import annotations
 
+import ast
 import json
 import math
+import re
 import sqlite3
 from collections.abc import Iterable, Sequence
 from contextlib import closing
@@ -43,9 +45,15 @@ _HARMLESS: Final = (  # commands that change neither the controller nor its step
     "screenshot", "take_frame", "arm_breakpoints", "keep", "inspect", "watch", "get_scene",
     "get_field", "pause", "resume", "fast",
 )  # fmt: skip
+_NUMBERED: Final = re.compile(r" ?#\d+$")  # by the bridge, where two robots have the same name
+_ARGUMENTS: Final = frozenset({"argv", "orig_argv"})
+_READ_ARGUMENTS: Final = frozenset(
+    {"argparse", "optparse", "getopt", "docopt", "click", "typer", "fire", "absl"}
+)
 _RUN: Final = (
     "SELECT run.session_id, run.started_sim_time_s, run.steps, run.purged_rows, run.end_reason, "
-    "run.basic_time_step_ms, run.world, s.controller, s.controller_sha256, s.git_commit, s.host, "
+    "run.start_reason, run.basic_time_step_ms, run.world, s.controller, s.controller_sha256, "
+    "s.git_commit, s.host, "
     "s.started_wall_time_s, s.throttle_interval, robot.id AS robot_id, robot.name, robot.devices, "
     "(SELECT min(id) FROM run r WHERE r.session_id = run.session_id) AS first_run "
     "FROM run JOIN session s ON s.id = run.session_id JOIN robot ON robot.id = run.robot_id "
@@ -84,7 +92,7 @@ def make_tape(database: Database, data_dir: Path, run_id: int, folder: Path) -> 
     with closing(connect(database, "reader")) as connection:
         connection.row_factory = sqlite3.Row
         run: dict[str, Any] = dict(connection.execute(_RUN, (run_id,)).fetchone())
-        rows = _rows_of(connection, run_id)
+        rows = _rows_of(connection, run_id, run["started_sim_time_s"])
         missing = [*_missing_of_run(connection, run_id, run), *_missing_rows(run, rows)]
         parameters = _start_parameters(connection, run_id)
         limits = _motor_limits(connection, run["robot_id"])
@@ -94,22 +102,28 @@ def make_tape(database: Database, data_dir: Path, run_id: int, folder: Path) -> 
     )  # fmt: skip
     if source.why_not is not None:
         missing.append(source.why_not)
+    missing += _missing_of_source(source.texts)
+    devices: dict[str, str] = json.loads(run["devices"] or "{}")
+    missing += _missing_classes(rows, devices)
     if missing:
         raise NothingRecordedError(
             f"Run {run_id} has no tape, and its rows do not suffice to run code on them. Missing: "
             f"{'; '.join(missing)}."
         )
-    devices: dict[str, str] = json.loads(run["devices"] or "{}")
     facts: dict[str, dict[str, Any]] = {
         "robot": {
-            "getName": run["name"],
             "getBasicTimeStep": run["basic_time_step_ms"],
             "getWorldPath": run["world"] or "",
         }
     }
+    if not _NUMBERED.search(run["name"]):
+        facts["robot"]["getName"] = run["name"]
     facts |= {f"device:{name}": {"getMaxVelocity": high} for name, high in limits.items()}
     head: dict[str, Any] = {
-        "rests_on_rows": True, "began_late": False, "images": False, "hash_seed": None,
+        "rests_on_rows": True, "began_s": run["started_sim_time_s"], "began_late": False, "images": False,
+        "hash_seed": None,
+        "recorded_as": run["name"],
+        "throttle_interval": run["throttle_interval"] or 1,  # auto_publish() answers as it did
         "controller": source.controller, "project": str(source.root), "arguments": [],
         "executable": None, "parameters": parameters, "devices": devices, "facts": facts,
         "packages": {"controller": _surface(devices.values())},
@@ -168,12 +182,13 @@ class _Row(NamedTuple):
     time_s: float
     state: dict[str, Any]
     is_published: bool
-    """By the controller itself, which may command between the end of a step and publishing."""
+    """Perhaps by the controller, or after it: with commands between the step's end and this row."""
 
 
-def _rows_of(connection: sqlite3.Connection, run_id: int) -> list[_Row]:
-    """Return the newest row of each simulation time that has values of devices."""
+def _rows_of(connection: sqlite3.Connection, run_id: int, began_s: float) -> list[_Row]:
+    """Return the newest row of each step that has values of devices."""
     rows: dict[float, _Row] = {}
+    published: set[float] = set()
     for time_s, data, replaced in connection.execute(_ROWS, (run_id,)):
         try:
             state: Any = json.loads(data)
@@ -186,8 +201,16 @@ def _rows_of(connection: sqlite3.Connection, run_id: int) -> list[_Row]:
         if "sensors" in found or "motors" in found:
             for path, kind in cast("dict[str, Any]", lost).items():
                 _put_back(found, path, kind)
-            rows[time_s] = _Row(time_s, found, bool(found.keys() - _OF_BRIDGE))
-    return list(rows.values())
+            if time_s in rows or found.keys() - _OF_BRIDGE:
+                published.add(time_s)
+            rows[time_s] = _Row(time_s, found, is_published=False)
+    # After a round in which the controller published, the bridge waits for it up to the next step.
+    before = (began_s, *rows)
+    return [
+        row._replace(is_published=row.time_s in published or each in published)
+        for each, row in zip(before, rows.values(), strict=False)
+        if row.time_s > began_s
+    ]
 
 
 def _put_back(state: dict[str, Any], path: str, kind: Any) -> None:
@@ -215,15 +238,17 @@ def _put_back(state: dict[str, Any], path: str, kind: Any) -> None:
 def _missing_of_run(
     connection: sqlite3.Connection, run_id: int, run: dict[str, Any]
 ) -> Iterable[str]:
-    if run["first_run"] != run_id:
+    if run["first_run"] != run_id or run["start_reason"] == "reset":
+        before = "an earlier run" if run["first_run"] == run_id else f"run {run['first_run']}"
         yield (
-            f"the code's state at its beginning, because it goes on from run {run['first_run']} in "
-            "the same process"
+            f"the code's state at its beginning, because it goes on from {before} in the same "
+            "process"
         )
     if run["purged_rows"]:
         yield f"{run['purged_rows']:,} rows that retention has deleted"
     set_later = connection.execute(
-        "SELECT DISTINCT name FROM parameter_value WHERE run_id = ? AND set_by = 'command'",
+        "SELECT DISTINCT name FROM parameter_value WHERE run_id = ? "
+        "AND set_by IN ('command', 'trial')",
         (run_id,),
     ).fetchall()
     if set_later:
@@ -258,6 +283,39 @@ def _missing_rows(run: dict[str, Any], rows: Sequence[_Row]) -> Iterable[str]:
         yield "the times of some steps: the times of the rows span fewer steps than there were"
 
 
+def _missing_of_source(texts: dict[str, str]) -> Iterable[str]:
+    """Yield what the code was started with, if it asks for it."""
+    for name, text in texts.items():
+        try:
+            tree = ast.parse(text)
+        except (SyntaxError, ValueError, RecursionError):
+            continue
+        for node in ast.walk(tree):
+            asked: set[str] = set()
+            if isinstance(node, ast.Attribute):
+                asked = {node.attr} & _ARGUMENTS
+            elif isinstance(node, ast.Import):
+                asked = {each.name.partition(".")[0] for each in node.names} & _READ_ARGUMENTS
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                asked = {(node.module or "").partition(".")[0]} & _READ_ARGUMENTS
+                asked |= {each.name for each in node.names if node.module == "sys"} & _ARGUMENTS
+            if asked:
+                yield (
+                    f"the arguments that the controller was started with, which {name} reads "
+                    f"({asked.pop()}, line {getattr(node, 'lineno', 1)})"
+                )
+                return
+
+
+def _missing_classes(rows: Sequence[_Row], devices: dict[str, str]) -> Iterable[str]:
+    """Yield the devices of the rows that the robot does not have any more, since a later run."""
+    groups = ("sensors", "motors", "actuators")
+    named = {name for row in rows for group in groups for name, _ in _entries(row.state, group)}
+    if gone := sorted(named - devices.keys()):
+        listed = ", ".join(gone[:8])
+        yield f"the classes of the devices {listed}, which the robot's newest recording has not"
+
+
 # -- what the rows say -----------------------------------------------------------------------------
 
 
@@ -265,7 +323,7 @@ def _start_parameters(connection: sqlite3.Connection, run_id: int) -> str | None
     """Return the value of `WEBOTS_MCP_PARAMETERS` that gives the parameters the run began with."""
     rows = connection.execute(
         "SELECT name, value FROM parameter_value WHERE run_id = ? AND is_default = 0 "
-        "AND set_by != 'command' ORDER BY id DESC",
+        "AND set_by NOT IN ('command', 'trial') ORDER BY id DESC",
         (run_id,),
     ).fetchall()
     return json.dumps({str(name): json.loads(value) for name, value in rows}) if rows else None

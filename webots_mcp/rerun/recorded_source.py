@@ -2,7 +2,8 @@
 
 A recording has the hash of the controller's file and the commit that was checked out. Modules that
 it imports are found next to it. On the disk they count where they were not changed since the run
-began.
+began, else as they are in the commit. Whether they had changes then that were not committed is not
+recorded, and the answer says so.
 """
 
 from __future__ import annotations
@@ -86,14 +87,25 @@ def find_source(
     if commit is None or not _COMMIT.fullmatch(commit):
         return _unknown(f"{why}, and no git commit was recorded")
 
-    def read_committed(each: Path) -> bytes | None:
-        return _committed(commit, each, root)
+    of_commit: list[str] = []
 
-    committed = read_committed(file)
+    def read_of_then(each: Path) -> bytes | None:
+        if each != file and each.is_file() and not _is_newer(each, began_s):
+            return _read_file(each)
+        found = _committed(commit, each, root)
+        if found is not None and each != file:
+            of_commit.append(each.relative_to(root).as_posix())
+        return found
+
+    committed = _committed(commit, file, root)
     if committed is None or _sha256(committed) != sha256:
         return _unknown(f"{why}, and the commit {commit[:10]} does not have it")
-    texts = _with_imports(file, root, read_committed)
-    return _found(root, file, texts, f"the controller as in the commit {commit[:10]}")
+    texts = _with_imports(file, root, read_of_then)
+    basis = f"the controller as in the commit {commit[:10]}"
+    if of_commit:
+        named = ", ".join(sorted(set(of_commit))[:8])
+        basis = f"{basis}, with {named} as committed: wrong if they had uncommitted changes then"
+    return _found(root, file, texts, basis)
 
 
 def _unknown(why_not: str) -> RecordedSource:
@@ -116,8 +128,14 @@ def _read_file(file: Path) -> bytes | None:
 
 
 def _is_newer(file: Path, wall_time_s: float) -> bool:
+    """Return whether a file was changed or put in its place after a time.
+
+    A file that was moved or copied there keeps the time of its last change. On POSIX its status
+    has another time then; on Windows that is the time at which it was made.
+    """
     try:
-        return file.stat().st_mtime > wall_time_s
+        status = file.stat()
+        return max(status.st_mtime, status.st_ctime) > wall_time_s
     except OSError:
         return True
 

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, cast
+from typing import Any, Final, NoReturn, cast
 
 from webots_mcp.database.tapes.source_files import relative_source
 from webots_mcp.database.tapes.tape import NOTES, Tape, TapedCall, TapedPlace, TapedRound
@@ -119,7 +119,7 @@ class ReplayedTape:
         self.unnamed: Counter[str] = Counter()
         self.named: set[str] = set()
         self.rounds = 0
-        self.time_s = 0.0
+        self.time_s = float(tape.head.get("began_s", 0.0))
         self.run = 0
         self.first: list[CommandDifference] = []
         self.unrecorded: str | None = None
@@ -181,6 +181,8 @@ class ReplayedTape:
             return self._step_after_end()
         over = self._round
         given = self._step_arguments(arguments)
+        if self._rows is not None:
+            self._require_rows_of(name, given)
         if over is None or not over.step[0]:  # the old code had ended
             return self._end("the old code ended")
         held = self._step_arguments(over.step[1])
@@ -206,6 +208,17 @@ class ReplayedTape:
         if self.on_round is not None:
             self.on_round(self.rounds)
         return answer
+
+    def _require_rows_of(self, name: str, given: list[Any]) -> None:
+        """End the replay at a step of which the rows do not tell how it was called."""
+        basic_ms = float(self._fact("robot", "getBasicTimeStep"))
+        is_whole = name == "step" and len(given) == 1 and type(given[0]) in (int, float)
+        if not is_whole or given[0] <= 0 or (basic_ms and given[0] % basic_ms):
+            called = f"robot.{name}({', '.join(map(str, given))})"
+            self.end_unrecorded(
+                f"{called} is not in the recorded rows, which have whole steps of "
+                f"{basic_ms:g} ms; a tape has it"
+            )
 
     def _step_arguments(self, arguments: Sequence[Any]) -> list[Any]:
         """Return the arguments of a step, which is the basic one where none is given."""
@@ -302,6 +315,11 @@ class ReplayedTape:
             return False
         return path not in self.named and not name.startswith(_CONSTANT)
 
+    def end_unrecorded(self, what: str) -> NoReturn:
+        """End the replay, because the tape does not say what the code would have heard."""
+        self._miss(what)
+        raise ReplayEndedError
+
     def _miss(self, what: str) -> None:
         if self.unrecorded is None:
             self.unrecorded = what
@@ -339,6 +357,8 @@ class ReplayedTape:
             return (path.removeprefix("device:"),)
         if name == "getSupervisor" and is_own:
             return (False,)
+        if name == "getName" and is_own and "recorded_as" in head:
+            return (head["recorded_as"],)
         if name == ".value":
             for sensed in _SENSED:
                 if (found := self._recorded((path, sensed, "[]"), is_own=True)) is not None:
@@ -366,7 +386,8 @@ class ReplayedTape:
             is_sensed = any(key[0] == path for key in self._latest)
             is_enabled = path in self.named or (self.tape.head["began_late"] and is_sensed)
             return (int(self._fact("robot", "getBasicTimeStep")) if is_enabled else 0,)
-        defaults = {"setVelocity": self._fact(path, "getMaxVelocity")}
+        limit = self.tape.head["facts"].get(path, {}).get("getMaxVelocity", 0.0 if is_own else None)
+        defaults = {} if limit is None else {"setVelocity": limit}
         if is_own:
             defaults["setPosition"] = 0.0  # the world's file may say otherwise
         return (defaults[setter],) if setter in defaults else None

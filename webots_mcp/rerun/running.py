@@ -419,7 +419,7 @@ def _environment(head: Mapping[str, Any], data_dir: Path) -> dict[str, str]:
         TAPE_VARIABLE: "0",
         "WEBOTS_MCP_KEEP_LAST_S": "0",
         "WEBOTS_MCP_HANG_AFTER_S": "0",
-        "WEBOTS_MCP_THROTTLE_INTERVAL": "1000",
+        "WEBOTS_MCP_THROTTLE_INTERVAL": str(head.get("throttle_interval", 1000)),
         "WEBOTS_MCP_INSPECT": "0",
     }
     if head.get("parameters"):

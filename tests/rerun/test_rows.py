@@ -11,12 +11,23 @@ from pathlib import Path
 
 import pytest
 
-from tests.rerun.taping import AVOID, data_dir_of, project, recorded, rerun_of, taped_run
+from tests.rerun.taping import (
+    AVOID,
+    WORLD,
+    data_dir_of,
+    project,
+    record,
+    recorded,
+    rerun_of,
+    taped_run,
+)
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.database.connection import connect
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.rerun.recorded_rows import make_tape
 from webots_mcp.rerun.recorded_source import RecordedSource, find_source
+from webots_mcp.rerun.replayed_tape import ReplayedTape, ReplayEndedError
 from webots_mcp.rerun.running import Rerun, find_taped_run, rerun
 
 EACH_STEP = AVOID.replace("attach(robot)", "attach(robot, throttle_interval=1)")
@@ -198,8 +209,6 @@ def test_a_source_that_was_changed_is_taken_from_the_commit_or_named(tmp_path: P
 
 def recorded_with(folder: Path, code: str, helper: Path, text: str, git: object) -> Path:
     """Record a controller with a module next to it, both committed."""
-    from tests.rerun.taping import WORLD, record
-
     controller = project(folder, code)
     helper.write_text(text, "utf-8")
     assert callable(git)
@@ -409,3 +418,61 @@ def test_what_the_bridge_answered_it_answers_again(tmp_path: Path) -> None:
     assert rerun_rows(tmp_path, controller).outcome == "equal"
     controller.with_name("edited.py").write_text(code.replace("0.35", "0.6"), "utf-8")
     assert rerun_rows(tmp_path, controller.with_name("edited.py")).outcome == "differs"
+
+
+BY_PATH = "import sys\nsys.path.insert(0, '../lib')\nfrom limits import NEAR_M"
+BY_NAME = """\
+from importlib import import_module
+try:
+    NEAR_M = import_module('limits').NEAR_M
+except ImportError:
+    NEAR_M = 0.1
+"""
+
+
+@pytest.mark.parametrize(("how", "place"), [(BY_PATH, "lib"), (BY_NAME, "rover")])
+def test_a_module_that_is_imported_in_another_way_is_that_of_the_run(
+    how: str, place: str, tmp_path: Path
+) -> None:
+    controller = project(tmp_path, EACH_STEP.replace("NEAR_M = 0.35", how))
+    module = tmp_path / "controllers" / place / "limits.py"
+    module.parent.mkdir(exist_ok=True)
+    module.write_text("NEAR_M = 0.35\n", "utf-8")
+    record(tmp_path / "worlds" / WORLD.name, data_dir_of(tmp_path), 6.0, tape="")
+    assert rerun_rows(tmp_path, controller).outcome == "equal"
+    module.write_text("NEAR_M = 0.45\n", "utf-8")
+    if place == "lib":
+        assert "controllers/lib/limits.py, changed since the run began" in missing(tmp_path)
+    else:  # its text of then is gone, and the rows show that another value was used
+        assert rerun_rows(tmp_path, controller).outcome == "not repeatable"
+
+
+def test_a_controller_that_began_late_hears_the_time_at_which_it_began(
+    rows: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(rows, folder)
+    database = data_dir_of(folder) / DATABASE_NAME
+    with closing(connect(database, "writer")) as connection:
+        connection.execute("UPDATE run SET started_sim_time_s = 0.016, steps = steps - 1")
+    made = make_tape(database, data_dir_of(folder), 1, tmp_path)
+    replayed = ReplayedTape(made.tape)
+    assert replayed.ask("robot", "Robot", "getTime", [], is_own=False) == 0.016
+
+
+def test_a_velocity_that_nobody_set_is_unknown_where_the_limit_is(
+    rows: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(rows, folder)
+    database = data_dir_of(folder) / DATABASE_NAME
+    with closing(connect(database, "writer")) as connection:
+        connection.execute("DELETE FROM meaning WHERE name LIKE 'motors.left%'")
+    replayed = ReplayedTape(make_tape(database, data_dir_of(folder), 1, tmp_path).tape)
+    asked = ("Motor", "getVelocity", [])
+    assert replayed.ask("device:right wheel motor", *asked, is_own=False) > 0.0
+    with pytest.raises(ReplayEndedError):
+        replayed.ask("device:left wheel motor", *asked, is_own=False)
+    assert "left wheel motor.getVelocity() is not in the recorded rows" in (
+        replayed.unrecorded or ""
+    )

@@ -120,7 +120,8 @@ def make_tape(database: Database, data_dir: Path, run_id: int, folder: Path) -> 
         facts["robot"]["getName"] = run["name"]
     facts |= {f"device:{name}": {"getMaxVelocity": high} for name, high in limits.items()}
     head: dict[str, Any] = {
-        "rests_on_rows": True, "began_s": run["started_sim_time_s"], "began_late": False, "images": False,
+        "rests_on_rows": True, "began_s": run["started_sim_time_s"], "began_late": False,
+        "images": False,
         "hash_seed": None,
         "recorded_as": run["name"],
         "throttle_interval": run["throttle_interval"] or 1,  # auto_publish() answers as it did

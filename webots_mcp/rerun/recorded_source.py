@@ -10,16 +10,25 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import os
 import re
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from webots_mcp.contract import host_name
 from webots_mcp.database.location import find_project
-from webots_mcp.database.tapes.source_files import LIMITS, root_of
+from webots_mcp.database.tapes.source_files import (
+    FOREIGN,
+    LIMITS,
+    files_near,
+    read_sources,
+    root_of,
+)
 
 _COMMIT: Final = re.compile(r"[0-9a-f]{7,64}")
 _GIT_S: Final = 10.0  # that git may take for a file
@@ -82,6 +91,7 @@ def find_source(
             name for name in texts if root / name != file and _is_newer(root / name, began_s)
         ]
         if not changed:
+            texts |= _found_by_name(file, root, began_s, texts)
             return _found(root, file, texts, "the controller's file, which has the recorded hash")
         why = f"the source of that time of {', '.join(changed[:8])}, changed since the run began"
     if commit is None or not _COMMIT.fullmatch(commit):
@@ -101,6 +111,7 @@ def find_source(
     if committed is None or _sha256(committed) != sha256:
         return _unknown(f"{why}, and the commit {commit[:10]} does not have it")
     texts = _with_imports(file, root, read_of_then)
+    texts |= _found_by_name(file, root, began_s, texts)
     basis = f"the controller as in the commit {commit[:10]}"
     if of_commit:
         named = ", ".join(sorted(set(of_commit))[:8])
@@ -153,6 +164,7 @@ def _committed(commit: str, file: Path, root: Path) -> bytes | None:
 def _with_imports(controller: Path, root: Path, read: Read) -> dict[str, str]:
     """Return the texts of a controller and of the modules next to it that it imports, by path."""
     texts: dict[str, str] = {}
+    elsewhere = _modules_elsewhere(controller, root)
     waiting = [controller]
     while waiting and len(texts) < LIMITS.files:
         file = waiting.pop()
@@ -162,11 +174,48 @@ def _with_imports(controller: Path, root: Path, read: Read) -> dict[str, str]:
         texts[name] = content.decode("utf-8", "surrogateescape")
         for module in _imported(texts[name]):
             parts = module.split(".")
+            waiting += elsewhere.pop(parts[0], [])
             for folder in {controller.parent, file.parent}:
                 waiting += [folder.joinpath(*parts[:i]) / "__init__.py" for i in range(1, 9)]
                 waiting += [folder.joinpath(*parts).with_suffix(".py")]
                 waiting += [folder.joinpath(*parts[:-1]).with_suffix(".py")] if parts[1:] else []
     return texts
+
+
+def _modules_elsewhere(controller: Path, root: Path) -> dict[str, list[Path]]:
+    """Return the project's files by the module or package that they may be with another path.
+
+    A controller may add a folder of its project to `sys.path`. What is found next to it, or in
+    Python, has precedence.
+    """
+    modules: dict[str, list[Path]] = {}
+    if controller.parent == root:  # of no project: its folder may hold anything
+        return modules
+    for folder, folders, names in os.walk(root):
+        here = Path(folder)
+        folders[:] = sorted(set(folders) - FOREIGN)
+        if here == controller.parent:
+            folders[:] = []
+            continue
+        package = here
+        while (package.parent / "__init__.py").is_file() and package.parent != root:
+            package = package.parent
+        is_packaged = (package / "__init__.py").is_file()
+        for name in sorted(names):
+            if name.endswith(".py"):
+                of = package.name if is_packaged else name[:-3]
+                modules.setdefault(of, []).append(here / name)
+    near = {each.stem for each in controller.parent.glob("*")} | sys.stdlib_module_names
+    return {name: files for name, files in modules.items() if name not in near}
+
+
+def _found_by_name(
+    controller: Path, root: Path, began_s: float, known: dict[str, str]
+) -> dict[str, str]:
+    """Return the other files next to a controller, which it may import by a name that it makes."""
+    old = (each for each in files_near(controller, root) if not _is_newer(each, began_s))
+    files = islice(old, max(LIMITS.files - len(known), 0))
+    return read_sources(files, root, {*known})
 
 
 def _imported(text: str) -> set[str]:

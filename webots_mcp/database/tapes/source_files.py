@@ -15,7 +15,7 @@ from webots_mcp.contract import PROJECT_DATA_FOLDER
 from webots_mcp.database.location import find_project
 from webots_mcp.errors import InvalidInputError
 
-_FOREIGN: Final = frozenset(
+FOREIGN: Final = frozenset(
     {"site-packages", "dist-packages", ".venv", "venv", "__pycache__", PROJECT_DATA_FOLDER}
 )
 
@@ -52,7 +52,7 @@ def _relative(file: str, root: str) -> str | None:
         relative = Path(file).relative_to(root)
     except ValueError:
         return None
-    return None if _FOREIGN.intersection(relative.parts) else relative.as_posix()
+    return None if FOREIGN.intersection(relative.parts) else relative.as_posix()
 
 
 def files_near(controller: Path, root: Path) -> Iterator[Path]:
@@ -61,7 +61,7 @@ def files_near(controller: Path, root: Path) -> Iterator[Path]:
         yield from sorted(controller.parent.glob("*.py"))
         return
     for folder, folders, names in os.walk(controller.parent):
-        folders[:] = sorted(set(folders) - _FOREIGN)
+        folders[:] = sorted(set(folders) - FOREIGN)
         yield from (Path(folder, name) for name in sorted(names) if name.endswith(".py"))
 
 
@@ -129,7 +129,7 @@ def unpack_sources(sources: Mapping[str, str], folder: Path, original: Path) -> 
 def _link_others(original: Path, made: Path) -> None:
     for each in original.iterdir():
         target = made / each.name
-        if each.name in _FOREIGN or each.suffix == ".py" or target.exists():
+        if each.name in FOREIGN or each.suffix == ".py" or target.exists():
             continue
         try:
             target.symlink_to(each)

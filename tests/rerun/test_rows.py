@@ -469,7 +469,8 @@ def test_a_velocity_that_nobody_set_is_unknown_where_the_limit_is(
     with closing(connect(database, "writer")) as connection:
         connection.execute("DELETE FROM meaning WHERE name LIKE 'motors.left%'")
     replayed = ReplayedTape(make_tape(database, data_dir_of(folder), 1, tmp_path).tape)
-    asked = ("Motor", "getVelocity", [])
+    nothing: list[float] = []
+    asked = ("Motor", "getVelocity", nothing)
     assert replayed.ask("device:right wheel motor", *asked, is_own=False) > 0.0
     with pytest.raises(ReplayEndedError):
         replayed.ask("device:left wheel motor", *asked, is_own=False)

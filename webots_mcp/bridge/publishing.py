@@ -24,6 +24,7 @@ from webots_mcp.bridge.recorder import Recorder, this_call
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.database.tapes import tape_notes
 from webots_mcp.signals.register import SignalNames, StateChanges
 
 _BYTES_PER_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
@@ -58,6 +59,8 @@ class Publisher:
         variables: ControllerVariables,
         begin_run: Callable[[], None],
     ) -> None:
+        if tape_notes.replayed is not None:
+            tape_notes.replayed.bridge_begins()
         self._clock = clock
         self._recorder = recorder
         self._journal = journal
@@ -81,6 +84,8 @@ class Publisher:
 
     def publish(self, state: Mapping[Any, Any], force: bool) -> None:
         """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
+        if tape_notes.replayed is not None:
+            tape_notes.replayed.publishes(state)
         if self._clock.update():
             self._begin_run()
         self.episode.add(state)
@@ -119,6 +124,8 @@ class Publisher:
             The state; None if the devices were not read.
         """
         state = None
+        if tape_notes.replayed is not None:
+            tape_notes.replayed.publishes(extra)
         if self._clock.update():
             self._begin_run()
         self.episode.add(extra)

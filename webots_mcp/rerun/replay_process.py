@@ -7,7 +7,6 @@ database, which is thrown away.
 from __future__ import annotations
 
 import faulthandler
-import functools
 import json
 import mmap
 import os
@@ -24,7 +23,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final, TextIO
 
-from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.database import location
 from webots_mcp.database.tapes import tape_notes
 from webots_mcp.database.tapes.package_surface import caller_frame
@@ -43,7 +41,6 @@ PROGRESS: Final = struct.Struct("<qdq")  # rounds, simulation time, run
 PROGRESS_FILE: Final = "progress"  # next to the result, for a replay that cannot write one
 STACK_FILE: Final = "stack.txt"  # of one that was ended while C code held the interpreter
 _GRACE_S: Final = 5.0
-_OF_DEVICES: Final = ("sensors", "motors", "actuators", "battery_j")  # keys of a state
 _EDITORS_DEBUGGER: Final = "pydevd"  # of debugpy, which VS Code runs; a person may look for long
 
 
@@ -178,8 +175,6 @@ class _Replay:
         job, head = self._job, self.tape.tape.head
         activate(self.tape)
         tape_notes.replayed = self.tape
-        if head.get("rests_on_rows") is True:  # the recorded code, which made the rows
-            _watch_publisher(self.tape)
         data_dir = Path(job.data_dir)
         here = (data_dir / "webots.db", data_dir)
 
@@ -281,43 +276,6 @@ class _Replay:
         aside = file.with_suffix(".part")
         aside.write_text(json.dumps(asdict(result)), "utf-8")
         aside.replace(file)
-
-
-def _watch_publisher(tape: ReplayedTape) -> None:
-    """End the replay where the code makes rows that do not say what the devices measured.
-
-    A controller may publish values of its own under the names that the bridge gives to devices, or
-    step before it makes its bridge, of which no row tells.
-    """
-    begin: Any = Publisher.__init__
-
-    @functools.wraps(begin)
-    def begin_after_steps(publisher: Any, *args: Any, **kwargs: Any) -> None:
-        if tape.rounds:
-            count = f"{tape.rounds} step" + "s" * (tape.rounds > 1)
-            tape.end_unrecorded(
-                f"the code makes {count} before its MCPBridge, which no row has; a tape has it"
-            )
-        begin(publisher, *args, **kwargs)
-
-    def watched(publish: Any) -> Any:
-        @functools.wraps(publish)
-        def call(publisher: Any, state: Any, *args: Any, **kwargs: Any) -> Any:
-            own = [each for each in _OF_DEVICES if each in state]
-            if own:
-                named = ", ".join(map(repr, own))
-                tape.end_unrecorded(
-                    f"the code itself publishes {named}, so the rows may have its values and not "
-                    "those of the devices; a tape has these"
-                )
-            return publish(publisher, state, *args, **kwargs)
-
-        return call
-
-    replaced: Any = Publisher
-    replaced.__init__ = begin_after_steps
-    replaced.publish = watched(Publisher.publish)
-    replaced.publish_devices = watched(Publisher.publish_devices)
 
 
 def _shared_memory(file: Path) -> Any:

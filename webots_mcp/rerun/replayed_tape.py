@@ -50,6 +50,7 @@ _HELD: Final = {  # what Webots' library answers from the commands that it was g
     "getAcceleration": "setAcceleration", "getSamplingPeriod": "enable",
     ".sampling_period": "enable", "get": "set", ".value": "set",
 }  # fmt: skip
+_OF_DEVICES: Final = ("sensors", "motors", "actuators", "battery_j")  # keys of a row
 _SENSED: Final = ("getValue", "getValues", "getRollPitchYaw")
 _OF_BRIDGE: Final[Mapping[str, Any]] = {  # where nothing is known; a replay has no supervisor
     "getSupervisor": False, "getSynchronization": True, "getModel": "", "getCustomData": "",
@@ -267,6 +268,23 @@ class ReplayedTape:
         """Return the parameters that were set in this round of the old run."""
         due, self._parameters = self._parameters, {}
         return due
+
+    def bridge_begins(self) -> None:
+        """End the replay where the recorded code has made steps before, of which no row tells."""
+        if self._rows is not None and self.rounds:
+            count = f"{self.rounds} step" + "s" * (self.rounds > 1)
+            what = f"the code makes {count} before its MCPBridge"
+            self.end_unrecorded(f"{what}, which no row has; a tape has it")
+
+    def publishes(self, state: Mapping[Any, Any]) -> None:
+        """End the replay where the recorded code names values of its own as the devices' are."""
+        own = [each for each in _OF_DEVICES if each in state] if self._rows is not None else []
+        if own:
+            named = ", ".join(map(repr, own))
+            self.end_unrecorded(
+                f"the code itself publishes {named}, so the rows may have its values and not "
+                "those of the devices; a tape has these"
+            )
 
     # -- answers ---------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ The bridge imports this module alone; both names are None in a process without a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 Note = Callable[[str, Any], None]
@@ -16,6 +16,14 @@ class ReplayedNotes(Protocol):
 
     def command_due(self) -> tuple[str, dict[str, Any]] | None:
         """Return the next command of this round, its action and parameters, once."""
+        ...
+
+    def bridge_begins(self) -> None:
+        """Take note that a bridge is made."""
+        ...
+
+    def publishes(self, state: Mapping[Any, Any]) -> None:
+        """Take note of what the controller itself publishes."""
         ...
 
     def parameters_due(self) -> dict[str, Any]:

@@ -361,7 +361,9 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     speed.press("Enter")
     tab.says("speed = 7: done")
     assert newest(driven, "SELECT value FROM parameter_value ORDER BY id DESC") == "7.0"
-    speed.fill("70")  # and while it is typed, a look brings the value that somebody else set
+    speed.fill("70")  # and while it is typed, the loop stalls, and somebody else sets a value
+    tab.page.evaluate("showParameters(shown.parameters, false)")
+    assert speed.is_enabled()
     tab.page.evaluate("ask('steer', {robot: 'rover'}, {name: 'speed', value: 6})")
     for _ in range(3):
         tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)

@@ -687,7 +687,8 @@ function showParameters(parameters, settable, anew = false) {
   }
   for (const { name, value } of parameters) {
     const made = [...place.querySelectorAll("[data-name]")].find((each) => each.dataset.name === name);
-    made.disabled = !settable;
+    // A disabled input loses its focus, and what was typed with it: a slow loop must not cause that.
+    made.disabled = !settable && !made.dataset.typing;
     if (made.dataset.typing || (!anew && made.dataset.told === JSON.stringify(value))) continue;
     made.dataset.told = JSON.stringify(value);
     if (made.type === "checkbox") made.checked = value;

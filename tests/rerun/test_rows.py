@@ -447,14 +447,22 @@ def test_a_module_that_is_imported_in_another_way_is_that_of_the_run(
         assert rerun_rows(tmp_path, controller).outcome == "not repeatable"
 
 
-def test_a_controller_that_began_late_hears_the_time_at_which_it_began(
-    rows: Path, tmp_path: Path
-) -> None:
+def changed_copy(rows: Path, tmp_path: Path, sql: str) -> tuple[Path, Path]:
+    """A copy of the recording after a statement: its folder, and its database."""
     folder = tmp_path / "copy"
     shutil.copytree(rows, folder)
     database = data_dir_of(folder) / DATABASE_NAME
     with closing(connect(database, "writer")) as connection:
-        connection.execute("UPDATE run SET started_sim_time_s = 0.016, steps = steps - 1")
+        connection.execute(sql)
+    return folder, database
+
+
+def test_a_controller_that_began_late_hears_the_time_at_which_it_began(
+    rows: Path, tmp_path: Path
+) -> None:
+    folder, database = changed_copy(
+        rows, tmp_path, "UPDATE run SET started_sim_time_s = 0.016, steps = steps - 1"
+    )
     made = make_tape(database, data_dir_of(folder), 1, tmp_path)
     replayed = ReplayedTape(made.tape)
     assert replayed.ask("robot", "Robot", "getTime", [], is_own=False) == 0.016
@@ -463,11 +471,9 @@ def test_a_controller_that_began_late_hears_the_time_at_which_it_began(
 def test_a_velocity_that_nobody_set_is_unknown_where_the_limit_is(
     rows: Path, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "copy"
-    shutil.copytree(rows, folder)
-    database = data_dir_of(folder) / DATABASE_NAME
-    with closing(connect(database, "writer")) as connection:
-        connection.execute("DELETE FROM meaning WHERE name LIKE 'motors.left%'")
+    folder, database = changed_copy(
+        rows, tmp_path, "DELETE FROM meaning WHERE name LIKE 'motors.left%'"
+    )
     replayed = ReplayedTape(make_tape(database, data_dir_of(folder), 1, tmp_path).tape)
     nothing: list[float] = []
     asked = ("Motor", "getVelocity", nothing)

@@ -66,7 +66,7 @@ _UNFINISHED: Final = (
     "AND status IN ('running', 'waiting'))"
 )
 _MODE_BEFORE: Final = "SELECT mode_before_pause FROM session WHERE id = ?"
-_CLAIMED_S: Final = 5.0  # wall time in which a command that was claimed comes to its end
+_CLAIMED_S: Final = 5.0  # wall time that a claimed command gets to end
 _POLL_S: Final = 0.02
 _BEGUN_S: Final = 60.0  # wall time after which a set has surely been begun
 _COPY: Final = re.compile(r"\.branch-[0-9a-f]{8}\.wbt$")

@@ -45,6 +45,7 @@ HANGS = (
         pass
 """
 )
+HANGS_AT_ONCE = PLAIN.replace("while robot", "while True:\n    pass\nwhile robot")
 RESETS = (
     CONTROLLER
     + """
@@ -141,6 +142,21 @@ async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reloa
         # Of the robot whose loop hangs, or of the observer, whichever was seen last.
         assert "computes" in simulation["seen"]
         assert "rover" in simulation["seen"]
+        answer = await ask(
+            client, "webots_simulation_control", command="reload", robot="rover", timeout_wall_s=60
+        )
+        assert (answer["outcome"], answer["route"]) == ("done", "observer")
+
+
+async def test_a_loop_that_hangs_before_its_first_step_does_not_hold_up_the_observer(
+    begin: Any,
+) -> None:
+    async with begin(HANGS_AT_ONCE) as client:
+
+        def is_unseen(answer: dict[str, Any]) -> bool:
+            return answer["robot"] == "rover" and answer["status"].startswith("not seen moving")
+
+        await once(client, "webots_get_world_info", is_unseen)
         answer = await ask(
             client, "webots_simulation_control", command="reload", robot="rover", timeout_wall_s=60
         )

@@ -111,7 +111,7 @@ def _write(file: Path, text: str) -> None:
             try:
                 new.write(text)
                 new.flush()
-            except BaseException:  # half a world is of no use, and nobody would remove it
+            except BaseException:  # half a world is of no use, and nothing else removes it
                 file.unlink(missing_ok=True)
                 raise
     except FileExistsError:

@@ -252,6 +252,7 @@ class ObservedBodies:
         self._next_walk_s = 0.0
         self._count = -1
         self._is_tracking = True
+        self._asked_at: dict[str, list[float]] = {}
         self._seen_at_walk: dict[str, BodyPose] = {}
         self._is_cut = False
         self._is_walked = False
@@ -273,6 +274,22 @@ class ObservedBodies:
             if body.is_published and (signals := body.signals()):
                 seen.setdefault(WORLD if body.is_robot else SOLIDS, {})[body.key] = signals
         return seen
+
+    def moves(self) -> bool:
+        """Return whether a robot is elsewhere than at the last call, whatever the time says.
+
+        Unlike a pose, which Webots sends with the steps, a position is asked of it each time.
+        """
+        before, self._asked_at = self._asked_at, {}
+        for key, body in self.bodies.items():
+            if body.is_robot and body.is_there:
+                node: Any = body.scene.node
+                self._asked_at[key] = [float(value) for value in node.getPosition()]
+        return any(
+            math.dist(position, before[key]) > _LIMITS.moved_m
+            for key, position in self._asked_at.items()
+            if key in before
+        )
 
     def go_on(self) -> None:
         """Continue the walk, or begin one when it is due."""

@@ -19,7 +19,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from typing import Any, Final
 
@@ -53,10 +53,14 @@ class StepPace:
         robot: The observer's own Supervisor.
         period_ms: The step that it makes where it makes one.
         world_waits: Whether the world waits for the observer's steps.
+        moves: Returns whether something in the world has moved since it was last asked.
     """
 
-    def __init__(self, robot: Any, period_ms: int, *, world_waits: bool) -> None:
+    def __init__(
+        self, robot: Any, period_ms: int, *, world_waits: bool, moves: Callable[[], bool]
+    ) -> None:
         self._robot = robot
+        self._moves = moves
         self._period_ms = period_ms
         self._may_pump = not world_waits
         self._tells_time: bool | None = None
@@ -76,7 +80,10 @@ class StepPace:
         if not self._may_pump or self._tells_time is False or is_fast:
             return self._robot.step(self._period_ms) != -1
         if self._tells_time is None and self._has_stood():
-            return self._try_step()
+            self._stood_since_s = time.monotonic()
+            # Where a robot's loop hangs, nothing moves, and a step would wait for it.
+            if self._moves():
+                return self._try_step()
         answer = self._robot.step(0)
         now_s = float(self._robot.getTime())
         if now_s != self._time_s:
@@ -91,7 +98,7 @@ class StepPace:
 
     def _try_step(self) -> bool:
         """Make one step; where time advances by more, `step(0)` is no longer trusted to show it."""
-        before_s, self._stood_since_s = self._time_s, time.monotonic()
+        before_s = self._time_s
         answer = self._robot.step(self._period_ms)
         self._time_s = float(self._robot.getTime())
         if self._time_s - before_s > 2 * self._period_ms / 1000:
@@ -249,7 +256,8 @@ class Observer:
         self.world = ObservedBodies(robot, self._period_ms, self._warn)
         self.bridge.record_meanings(self.world.describe_signals())
         self.custom_data = self.bridge.read_custom_data()
-        self._pace = StepPace(robot, self._period_ms, world_waits=self.bridge.world_waits)
+        waits = self.bridge.world_waits
+        self._pace = StepPace(robot, self._period_ms, world_waits=waits, moves=self._moves)
         self._due_s = -math.inf
         self._mode = -1
         self._record_again_s = math.inf
@@ -265,6 +273,13 @@ class Observer:
             self.bridge.failed(error)
         self.bridge.get_command()
         return True
+
+    def _moves(self) -> bool:
+        try:
+            return self.world.moves()
+        except Exception as error:  # noqa: BLE001  (it still steers, and tries again later)
+            self.bridge.failed(error)
+            return False
 
     def _observe(self) -> None:
         """Follow what is in the world, and record where everything is if that is due."""

@@ -52,6 +52,21 @@ def test_a_solid_is_recorded_from_when_it_moves(watching: Watching) -> None:
     assert "PILLAR" not in seen
 
 
+def test_a_robot_that_moves_is_noticed_although_no_time_passes(watching: Watching) -> None:
+    watching.go_on(20)
+    world = watching.observer.world
+    assert not world.moves()  # nothing to compare with
+    assert not world.moves()
+    rider = watching.robot.getFromDef("RIDER")
+    assert rider is not None
+    place = rider.getField("translation")
+    assert place is not None
+    place.setSFVec3f([3.0, 3.0, 0.0])
+    assert watching.robot.step(0) != -1
+    assert world.moves()
+    assert not world.moves()
+
+
 def test_a_row_costs_no_request(watching: Watching, monkeypatch: pytest.MonkeyPatch) -> None:
     watching.go_on(20)
     requests: list[Any] = []

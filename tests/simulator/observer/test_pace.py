@@ -55,8 +55,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(observer, "time", Time)
 
 
-def rounds(simulator: Any, count: int = 10) -> list[int]:
-    looping = StepPace(simulator, STEP_MS, world_waits=simulator.synchronous)
+def rounds(simulator: Any, count: int = 10, *, moves: bool = True) -> list[int]:
+    waits = simulator.synchronous
+    looping = StepPace(simulator, STEP_MS, world_waits=waits, moves=lambda: moves)
     for _ in range(count):
         assert looping.go_on()
     return simulator.asked
@@ -70,6 +71,10 @@ def test_where_the_time_is_not_told_it_steps_after_a_trial() -> None:
     asked = rounds(Simulator(tells_time=False))
     assert asked[0] == 0
     assert asked[-5:] == [STEP_MS] * 5
+
+
+def test_a_world_in_which_nothing_moves_is_no_trial_since_a_hanging_loop_may_hold_it() -> None:
+    assert set(rounds(Simulator(tells_time=False), 50, moves=False)) == {0}
 
 
 def test_a_pause_from_the_start_is_no_trial() -> None:

@@ -14,6 +14,7 @@ from tests.cases import healthy_robots, problems
 from tests.cases.public import PUBLIC
 from tests.cases.situations import HEALTHY, PROBLEMS, recorded
 from tests.cases.unfamiliar import ROBOTS, situation_of
+from tests.exploring import attempts
 from tests.judging.checks.labelled import FAULTS, healthy
 from tests.judging.checks.labelled import record as record_run
 from tests.judging.detection.drawing import KINDS, draw_case
@@ -29,8 +30,7 @@ from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 _MODULES = (healthy_robots, problems)  # which fill the registries
-_REPEATABLE = settings.default is not None and settings.default.derandomize
-_EXAMPLES = 8 if _REPEATABLE else 200
+_EXAMPLES = attempts(8, exploring=200)
 _UNHURRIED_S: Final = 300.0
 _SEEDS = st.integers(0, 2**32 - 1)
 # Each of these events is a fault; of the other kinds a check tells whether one of them is.

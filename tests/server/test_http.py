@@ -24,6 +24,7 @@ import pytest
 from mcp import Client
 from mcp.client.streamable_http import streamable_http_client
 
+from tests.exploring import attempts
 from tests.server.conftest import Driver, ask, fail
 from tests.waiting import until, wait_for
 from webots_mcp.cli import main
@@ -46,7 +47,7 @@ from webots_mcp.cli import main
 http_limits.HEADERS_S, http_limits.BODY_S = {}
 raise SystemExit(main())
 """
-_LOAD = 100  # calls of each of two clients
+_LOAD = attempts(100, exploring=900)  # calls of each of two clients
 _AT_ONCE = 10
 
 

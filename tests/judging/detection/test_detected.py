@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.exploring import attempts
 from tests.judging.detection import drawing, driving
 from tests.judging.detection.asking import Answer, ask_since
 from tests.judging.detection.drawing import KINDS, draw_case
@@ -27,8 +28,7 @@ from webots_mcp.store.reading.ranges import Scope, find_range
 
 pytestmark = pytest.mark.slow
 
-_REPEATABLE = settings.default is not None and settings.default.derandomize
-EXAMPLES = 4 if _REPEATABLE else 100
+EXAMPLES = attempts(4, exploring=100)
 MOST_VALUES = 10_000  # that are added to a run: enough to be searched, and read in no time
 LOOKED_FOR: tuple[Measure, ...] = (
     "standstill", "missing", "flat", "dropout", "leap", "swing", "gap",

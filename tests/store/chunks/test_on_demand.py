@@ -112,7 +112,10 @@ def test_questions_of_the_command_line_make_chunks_before_they_answer(
     monkeypatch.chdir(tmp_path)
     assert main([*command, "--database", "webots.db"]) == 0
     assert in_chunks(recording) == ROWS
-    assert capsys.readouterr().err == ""
+    told = (
+        capsys.readouterr().err
+    )  # nothing, or how far it was after the two seconds of a slow machine
+    assert [line for line in told.splitlines() if "preparing statistics" not in line] == []
 
 
 def test_a_question_says_that_another_is_still_at_it(

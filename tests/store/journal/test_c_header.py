@@ -20,6 +20,7 @@ import anyio
 import pytest
 from mcp import Client
 
+from tests.exploring import attempts
 from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import C_HEADER
@@ -255,14 +256,17 @@ while True:
 """
 
 
-KILLED_AFTER = {"c99": (30, 300, 1000), "c++11": (300,)}  # rows, in each attempt
+KILLED_AFTER = {  # rows, in each attempt
+    "c99": [30, 300, 1000] + [random.randrange(1, 3000) for _ in range(attempts(0, exploring=50))],
+    "c++11": [300] + [random.randrange(1, 3000) for _ in range(attempts(0, exploring=20))],
+}
 
 
 @pytest.mark.slow
 def test_kills_lose_nothing_and_double_nothing(start: Start, language: str, tmp_path: Path) -> None:
     """With two readers, which are killed as well, and journals of several parts."""
-    for published in KILLED_AFTER[language]:
-        folder = tmp_path / str(published)
+    for attempt, published in enumerate(KILLED_AFTER[language]):
+        folder = tmp_path / str(attempt)
         writer = start("forever", "100000", folder=folder)
         command = [sys.executable, "-c", READER, str(folder)]
         readers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]

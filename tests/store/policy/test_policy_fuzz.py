@@ -7,7 +7,6 @@ worlds that were started. It is judged here by plain sets, not by the code that 
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -19,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcp import Client
 
+from tests.exploring import attempts
 from tests.server.test_parameters import TunableDriver
 from webots_mcp.cli import main
 from webots_mcp.plugins.page.page_orders import steer, tune
@@ -97,7 +97,7 @@ PATHS = st.sampled_from((*FIELDS, "WorldInfo.info", "rover.name"))
 AT = st.sampled_from((*NODES, "rover"))
 NODE = "Solid { }"
 BRIEF = {"for_s": 0.032, "then": "go_on"}
-EXAMPLES = int(os.environ.get("POLICY_EXAMPLES", "15"))
+EXAMPLES = attempts(15, exploring=1000)
 WORLD = Path(__file__).parents[2] / "bridge" / "worlds" / "crowd.wbt"
 
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -72,10 +72,20 @@ class Outcome:
 
 def ask(scenario: Scenario, client: AskedClient) -> Outcome:
     """Ask a client of this process, whose calls go to a server of this process."""
+    (outcome,) = ask_readers(scenario, [client])
+    return outcome
+
+
+def ask_readers(scenario: Scenario, clients: Iterable[AskedClient]) -> list[Outcome]:
+    """Ask clients of this process one after the other about one subject, which they only read."""
+    outcomes = list[Outcome]()
     with subject(scenario.of) as asked:
-        began_s = time.monotonic()
-        said, calls = anyio.run(_answer, scenario, client, asked.file)
-        return _judged(scenario, asked, calls, said, time.monotonic() - began_s)
+        for client in clients:
+            began_s = time.monotonic()
+            said, calls = anyio.run(_answer, scenario, client, asked.file)
+            took_s = time.monotonic() - began_s
+            outcomes.append(_judged(scenario, asked, calls, said, took_s))
+    return outcomes
 
 
 async def _answer(

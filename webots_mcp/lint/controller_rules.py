@@ -12,7 +12,7 @@ from typing import Final
 from webots_mcp.contract import CONTROLLER_FOLDER
 from webots_mcp.lint.controller_source import ControllerSource, read_source
 from webots_mcp.lint.scene import DEVICES, LintDeadline, Scene, TreeNode
-from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
+from webots_mcp.lint.world_faults import LintReport, WorldFault
 from webots_mcp.simulator.project import ProjectController, controllers_of
 
 _WITHOUT_PROCESS: Final = frozenset({"", "void", "<none>", "<generic>", "<extern>"})
@@ -50,14 +50,6 @@ class ControllerRules:
             for robot in those:
                 self._devices(robot, source, those)
                 self._synchronization(robot, source)
-
-    def _fault(
-        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
-    ) -> None:
-        path = f"{node.path}.{field}" if field else node.path
-        self._report.faults.append(
-            WorldFault(rule, severity, path, node.file, node.line_of(field), what, fix)
-        )
 
     def _source_of(self, controller: ProjectController) -> ControllerSource:
         if controller.file not in self._sources:
@@ -125,7 +117,7 @@ class ControllerRules:
         self._report.judge("controller")
         close = difflib.get_close_matches(name, self._controllers, 1)
         meant = f"Set it to {close[0]!r}" if close else "Set it to the name of a folder in there"
-        self._fault(
+        self._report.blame(
             "controller", "error", robot, "controller",
             f"{robot.label} has the controller {name!r}, and there is no controllers/{name}",
             f"{meant}, or add controllers/{name}/{name}.py.",
@@ -204,7 +196,7 @@ class ControllerRules:
             return
         names = ", ".join(repr(node.text("name")) for node in idle[:_MOST_NAMED])
         more = f" and {len(idle) - _MOST_NAMED} more" if len(idle) > _MOST_NAMED else ""
-        self._fault(
+        self._report.blame(
             "devices", "note", idle[0], "name",
             f"The controller of {robot.label} never asks for {names}{more}",
             "Use them in the controller, or remove them from the robot.",
@@ -247,7 +239,7 @@ class ControllerRules:
         self._report.judge("synchronization")
         if is_synchronous or not source.learns_with:
             return
-        self._fault(
+        self._report.blame(
             "synchronization", "error", robot, "synchronization",
             f"{robot.label} has synchronization FALSE, and its controller learns with "
             f"{source.learns_with}: what an action does depends on the load of the computer",

@@ -14,7 +14,7 @@ from webots_mcp.lint.bodies import Bodies, JointLine, SolidPart
 from webots_mcp.lint.physics_rules import is_driven_wheel
 from webots_mcp.lint.scene import MOTORS, Scene, TreeNode
 from webots_mcp.lint.shapes import Array
-from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
+from webots_mcp.lint.world_faults import LintReport, Severity
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,6 @@ class JointRules:
         for robot, motors in endless.items():
             self._without_limits(robot, motors)
 
-    def _fault(
-        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
-    ) -> None:
-        path = f"{node.path}.{field}" if field else node.path
-        self._report.faults.append(
-            WorldFault(rule, severity, path, node.file, node.line_of(field), what, fix)
-        )
-
     # -- wheels --
 
     def _wheel(self, part: SolidPart) -> None:
@@ -91,14 +83,14 @@ class JointRules:
         if sine > _TOLERANCES.wobble and (is_named or (is_disc and off < radius / 10.0)):
             angle = degrees(asin(min(sine, 1.0)))
             fix = _axis_in_joint(part, wheel.axes[:, 2])
-            self._fault(
+            self._report.blame(
                 "wheel axis", "error", node, field,
                 f"{part.node.label} turns about an axis {angle:.0f}° off its cylinder's axis",
                 f"Set axis to {fix}, or turn the cylinder in the boundingObject.",
             )  # fmt: skip
         elif off > _TOLERANCES.wobble * radius and is_named:
             fix = _point_in_joint(part, wheel.center)
-            self._fault(
+            self._report.blame(
                 "wheel axis", "error", node, "anchor" if line.parameters else "",
                 f"The centre of {part.node.label} is {1000.0 * off:.3g} mm off the axis that it "
                 f"turns about; its radius is {1000.0 * radius:.3g} mm",
@@ -114,7 +106,7 @@ class JointRules:
         step_s = self._scene.step_s
         if gain * step_s < 2.0:
             return
-        self._fault(
+        self._report.blame(
             "time step", "warning", motor, "controlPID",
             f"P = {gain:g} with a step of {1000.0 * step_s:g} ms: each step multiplies the error "
             f"of position by 1 - P step = {1.0 - gain * step_s:.3g}, so the motor oscillates",
@@ -131,7 +123,7 @@ class JointRules:
         slack = 1e-6 * max(1.0, abs(low), abs(high), *map(abs, stops))
         has_soft, has_hard = low != high, stops[0] != stops[1]
         if has_soft and has_hard and (stops[0] > low + slack or stops[1] < high - slack):
-            self._fault(
+            self._report.blame(
                 "motor limits", "warning", motor, "maxPosition",
                 f"The limits of {motor.label}, {low:g} to {high:g}, exceed the stops of its joint, "
                 f"{stops[0]:g} to {stops[1]:g}",
@@ -139,14 +131,14 @@ class JointRules:
                 f"{stops[1]:g}.",
             )  # fmt: skip
         if has_soft and not low - slack <= position <= high + slack:
-            self._fault(
+            self._report.blame(
                 "motor limits", "warning", motor, "minPosition",
                 f"{motor.label} starts at {position:g}, outside its limits {low:g} to {high:g}",
                 f"Let minPosition and maxPosition include {position:g}, or change position and "
                 "the pose of the endPoint.",
             )  # fmt: skip
         if has_hard and parameters is not None and position in stops and part.physics is not None:
-            self._fault(
+            self._report.blame(
                 "motor limits", "note", parameters, "position",
                 f"The joint of {motor.label} starts exactly at its stop {position:g}: Webots warns "
                 "that this may be unstable",
@@ -167,7 +159,7 @@ class JointRules:
             return
         names = ", ".join(motor.text("name") for motor in motors[:4])
         more = f" and {len(motors) - 4} more" if len(motors) > 4 else ""
-        self._fault(
+        self._report.blame(
             "motor limits", severity, motors[0], "maxPosition",
             f"Motors of {robot.label} have neither limits nor stops ({names}{more}): they {verb} "
             "without an end, and wrong targets are not clipped",

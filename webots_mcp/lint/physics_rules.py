@@ -12,7 +12,7 @@ import numpy as np
 from webots_mcp.lint.bodies import Bodies, JointLine, PhysicsBody, SolidPart, inertia_matrix
 from webots_mcp.lint.scene import LintDeadline, Scene, TreeNode
 from webots_mcp.lint.shapes import Primitive, overlap_m
-from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
+from webots_mcp.lint.world_faults import LintReport
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,6 @@ class PhysicsRules:
         self._sinking()
         self._pairs()
 
-    def _fault(
-        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
-    ) -> None:
-        path = f"{node.path}.{field}" if field else node.path
-        self._report.faults.append(
-            WorldFault(rule, severity, path, node.file, node.line_of(field), what, fix)
-        )
-
     # -- one Solid --
 
     def _bounding_object(self, part: SolidPart) -> None:
@@ -94,7 +86,7 @@ class PhysicsRules:
         taken = "the identity as its inertia, 1 kg m² about each axis"
         if mass <= 0.0:
             taken = f"a mass of 1 kg and {taken}"
-        self._fault(
+        self._report.blame(
             "bounding object", "warning", part.node, "boundingObject",
             f"{part.node.label} has physics but no boundingObject: Webots takes {taken}, and it "
             "collides with nothing",
@@ -128,7 +120,7 @@ class PhysicsRules:
                 ["bounding object"], part.node.path, "a PROTO in it cannot be read"
             )
             return
-        self._fault(
+        self._report.blame(
             "bounding object", "warning", part.node, "boundingObject",
             f"{part.node.label} has physics and no bounding object anywhere: it falls through the "
             "floor",
@@ -141,7 +133,7 @@ class PhysicsRules:
             above = next((each for each in part.ancestors() if each.physics), None)
             below = next((each for each in part.descendants() if each.physics), None)
             if above is not None and below is not None and not part.is_in_unread:
-                self._fault(
+                self._report.blame(
                     "physics", "error", part.node, "physics",
                     f"{part.node.label} has no physics, but {above.node.label} around it and "
                     f"{below.node.label} in it have: the chain is broken",
@@ -154,7 +146,7 @@ class PhysicsRules:
         body = self._bodies.bodies[number]
         if body.is_fixed and body.top is part and not part.is_in_unread:
             moving = part.node.type_name == "Robot" or body.joined
-            self._fault(
+            self._report.blame(
                 "physics", "note", part.node, "physics",
                 f"{part.node.label} has physics, but no Solid around it has: Webots fixes it to "
                 "the world and it does not move",
@@ -172,7 +164,7 @@ class PhysicsRules:
             if child.physics and child.parent is part and is_driven_wheel(child)
         ]
         if len(wheels) >= 2:
-            self._fault(
+            self._report.blame(
                 "physics", "error", part.node, "physics",
                 f"{part.node.label} has no physics, but its wheels have: its base is fixed to the "
                 "world and the wheels turn in place",
@@ -186,7 +178,7 @@ class PhysicsRules:
         self._report.judge("inertia")
         mass, density = physics.number("mass"), physics.number("density")
         if mass <= 0.0 and density <= 0.0:
-            self._fault(
+            self._report.blame(
                 "inertia", "error", physics, "mass",
                 f"mass is {mass:g} and density is {density:g}: none of them is positive, so that "
                 "the mass is not given",
@@ -198,14 +190,14 @@ class PhysicsRules:
         if not values:
             return
         if len(values) != 6:
-            self._fault(
+            self._report.blame(
                 "inertia", "error", physics, "inertiaMatrix",
                 f"inertiaMatrix has {len(values)} numbers instead of two vectors of three",
                 "Give [I11 I22 I33, I12 I13 I23], or leave it out.",
             )  # fmt: skip
             return
         if physics.number("mass") <= 0.0:
-            self._fault(
+            self._report.blame(
                 "inertia", "error", physics, "mass",
                 "inertiaMatrix is set, but mass is not: Webots needs both",
                 "Set mass to the mass in kg and density to -1.",
@@ -215,13 +207,13 @@ class PhysicsRules:
         smallest, middle, largest = sorted(np.linalg.eigvalsh(inertia_matrix(values)).tolist())
         shown = f"{smallest:.3g}, {middle:.3g} and {largest:.3g} kg m²"
         if smallest <= 0.0:
-            self._fault(
+            self._report.blame(
                 "inertia", "error", physics, "inertiaMatrix",
                 f"The principal moments of inertia are {shown}: they have to be positive",
                 "Correct the matrix, or leave it out: Webots then computes it from boundingObject.",
             )  # fmt: skip
         elif smallest + middle < largest * (1.0 - _TOLERANCES.inertia):
-            self._fault(
+            self._report.blame(
                 "inertia", "warning", physics, "inertiaMatrix",
                 f"The principal moments of inertia are {shown}: no mass distribution has one that "
                 "is larger than the sum of the other two",
@@ -251,7 +243,7 @@ class PhysicsRules:
         if large_kg <= _TOLERANCES.mass_ratio * small_kg:
             return
         node = light.top.physics or light.top.node
-        self._fault(
+        self._report.blame(
             "mass ratio", "warning", node, "mass" if node.type_name == "Physics" else "",
             f"{light.top.node.label} ({small_kg:.3g} kg) and {heavy.top.node.label} "
             f"({large_kg:.3g} kg) are {how} at a ratio of 1:{large_kg / small_kg:,.0f}",
@@ -284,7 +276,7 @@ class PhysicsRules:
             best_ms = int(2000.0 / rate)
             shorter = f"WorldInfo.basicTimeStep to at most {best_ms} ms, or " if best_ms else ""
             softer = 4.0 * load / step_s**2
-            self._fault(
+            self._report.blame(
                 "time step", "warning", parameters, "springConstant",
                 f"A spring of {stiffness:.3g} {unit} on {load:.3g} {moved} oscillates at "
                 f"{rate:.3g} rad/s: basicTimeStep {1000.0 * step_s:g} ms is longer than 2/omega = "
@@ -342,7 +334,7 @@ class PhysicsRules:
                 continue
             wanted = self._cfm * _TOLERANCES.sag_share * smallest / sag
             named = any(self._scene.info.children("contactProperties"))
-            self._fault(
+            self._report.blame(
                 "time step", "warning", top.node, "physics",
                 f"{top.node.label} weighs {mass:.3g} kg: with a step of "
                 f"{1000.0 * self._scene.step_s:g} ms, CFM {self._cfm:g} and ERP {self._erp:g} it "
@@ -451,7 +443,7 @@ class PhysicsRules:
         speed = self._erp * depth / step_s
         mover = one if one in self._bodies.body_of else other
         still = other if mover is one else one
-        self._fault(
+        self._report.blame(
             "overlap", "warning", mover.node, "translation",
             f"{mover.node.label} overlaps {still.node.label} by {1000.0 * depth:.3g} mm at the "
             f"start: they part at ERP depth / step = {speed:.2g} m/s",

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, NamedTuple, get_args
 
+from webots_mcp.lint.scene import TreeNode
+
 Severity = Literal["error", "warning", "note"]
 """An error keeps the world from working as written, a warning makes it likely to misbehave."""
 SEVERITIES: Final = get_args(Severity)
@@ -179,6 +181,15 @@ class LintReport:
     def judge(self, rule: str, count: int = 1) -> None:
         """Count what a rule judged, whether or not it found a fault."""
         self.searched[rule] = self.searched.get(rule, 0) + count
+
+    def blame(
+        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
+    ) -> None:
+        """Note a fault of a node, or of one of its fields ("" for none); see `WorldFault`."""
+        path = f"{node.path}.{field}" if field else node.path
+        self.faults.append(
+            WorldFault(rule, severity, path, node.file, node.line_of(field), what, fix)
+        )
 
     def leave_out(self, rules: Iterable[str], subject: str, reason: str) -> None:
         """Note what these rules could not judge."""

@@ -59,14 +59,6 @@ class WorldRules:
         self._names()
         self._rendering()
 
-    def _fault(
-        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
-    ) -> None:
-        path = f"{node.path}.{field}" if field else node.path
-        self._report.faults.append(
-            WorldFault(rule, severity, path, node.file, node.line_of(field), what, fix)
-        )
-
     def _values(self) -> None:
         """Report values of another kind than their field takes, such as a number in quotes."""
         for node in self._scene.nodes:
@@ -74,13 +66,13 @@ class WorldRules:
             for name in node.fields.keys() & types.keys():
                 takes, value = _TAKES[types[name].type_name[2:]], node.fields[name]
                 if not _is_of_kind(value, types[name].type_name):
-                    self._fault(
+                    self._report.blame(
                         "file", "error", node, name,
                         f"{node.type_name}.{name} takes {takes}, not {_as_written(value)}",
                         f"Write {takes} there.",
                     )  # fmt: skip
             if "axis" in types and not any(node.vector("axis", 3)):
-                self._fault(
+                self._report.blame(
                     "file", "error", node, "axis",
                     f"{node.type_name}.axis is 0 0 0, which is no direction",
                     "Set axis to a direction, for example 0 1 0.",
@@ -90,7 +82,7 @@ class WorldRules:
         info = self._scene.info
         step_ms = info.number("basicTimeStep")
         if step_ms < 1.0:
-            self._fault(
+            self._report.blame(
                 "time step", "error", info, "basicTimeStep",
                 f"basicTimeStep is {step_ms:g} ms; the shortest is 1 ms",
                 "Set it to 1 or more, for example 16.",
@@ -172,7 +164,7 @@ class WorldRules:
                 "device": "getDevice returns only one of them",
                 "Solid": "Webots warns, and only one can be found by name",
             }[kind]
-            self._fault(
+            self._report.blame(
                 "names", severity, those[1], "name",
                 f"{count} {kind}s {where} have the name {name!r} (lines {lines}{more}): {effect}",
                 "Give each a name of its own.",
@@ -197,7 +189,7 @@ class WorldRules:
         _, node, what = max(loads, key=lambda load: load[0])
         field = "horizontalResolution" if node.type_name == "Lidar" else "width"
         others = f", with {len(loads) - 1} others" if len(loads) > 1 else ""
-        self._fault(
+        self._report.blame(
             "rendering load", "warning", node, field,
             f"{node.label} renders {what}{others}: sampled at each step of {1000.0 * step_s:g} ms, "
             f"about {total / step_s / 1e6:.0f} million pixels per simulated second, an estimated "
@@ -213,7 +205,7 @@ class WorldRules:
             wide = 2.0 * pi
         rows = columns * high / wide if wide > 0.0 else 0.0
         if layers > 1.0 and layers >= rows > 0.0:
-            self._fault(
+            self._report.blame(
                 "lidar layers", "warning", node, "numberOfLayers",
                 f"{node.label} has {layers:g} layers, but its image has only {rows:.3g} rows: "
                 "verticalFieldOfView * horizontalResolution / fieldOfView",

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, get_args
-
-from webots_mcp.lint.scene import TreeNode
+from typing import Final, Literal, NamedTuple, Protocol, get_args
 
 Severity = Literal["error", "warning", "note"]
 """An error keeps the world from working as written, a warning makes it likely to misbehave."""
@@ -160,6 +158,24 @@ class WorldFault(NamedTuple):
         return RULES[self.rule].page
 
 
+class Located(Protocol):
+    """A node with its path in the scene tree, and its place in a file."""
+
+    @property
+    def path(self) -> str:
+        """Its path in the scene tree."""
+        ...
+
+    @property
+    def file(self) -> Path:
+        """The file that has its fields."""
+        ...
+
+    def line_of(self, field: str, /) -> int:
+        """Return the line of a field, or of the node for ""."""
+        ...
+
+
 class NotSearched(NamedTuple):
     """A part of the world that a rule could not judge, and the reason."""
 
@@ -183,7 +199,7 @@ class LintReport:
         self.searched[rule] = self.searched.get(rule, 0) + count
 
     def blame(
-        self, rule: str, severity: Severity, node: TreeNode, field: str, what: str, fix: str
+        self, rule: str, severity: Severity, node: Located, field: str, what: str, fix: str
     ) -> None:
         """Note a fault of a node, or of one of its fields ("" for none); see `WorldFault`."""
         path = f"{node.path}.{field}" if field else node.path

@@ -267,6 +267,7 @@ class Meaning(NamedTuple):
         same_as: The signal that measures the same thing.
         side: Which part of the robot it is of.
         low: The lowest value it can have; `high` the highest.
+        limits_by: Where `low` and `high` are known from.
         source: Where the meaning is known from.
         why: The reason, for a person.
     """
@@ -279,6 +280,7 @@ class Meaning(NamedTuple):
     side: str | None = None
     low: float | None = None
     high: float | None = None
+    limits_by: Source = "unknown"
     source: Source = "unknown"
     why: str = ""
 
@@ -571,9 +573,9 @@ def _stated_over(name: str, stated: StatedMeaning, weaker: Meaning) -> Meaning:
     if role is None and quantity is not None:
         role = _role_of(name, quantity, "")
     decides = said.quantity is not None or weaker.quantity is None
-    low, high = said.low, said.high
+    low, high, limits_by = said.low, said.high, stated.source
     if low is None and high is None and agrees:
-        low, high = weaker.low, weaker.high
+        low, high, limits_by = weaker.low, weaker.high, weaker.limits_by
     return Meaning(
         quantity,
         role,
@@ -583,6 +585,7 @@ def _stated_over(name: str, stated: StatedMeaning, weaker: Meaning) -> Meaning:
         said.side or weaker.side or side_in(name),
         low,
         high,
+        limits_by,
         stated.source if decides else weaker.source,
         stated.why if decides else f"{weaker.why}; {stated.why}",
     )

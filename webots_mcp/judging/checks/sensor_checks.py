@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from webots_mcp.analysis.arrays import MOSTLY, Array, Runs, median, np, runs_of
 from webots_mcp.judging.checks.check import Examined, RunUnderCheck, times
@@ -16,7 +16,7 @@ from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.sensors import FLAT, MOST_REPEATED, OTHER_ROWS, is_noisy
 from webots_mcp.judging.verdicts import Fault
 from webots_mcp.signals.meaning import CAN_BE_OFF, INERT, Meaning
-from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, find_targets, listed
+from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, counted, find_targets, listed
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal, stored_roles
 
@@ -36,6 +36,7 @@ _REPEATED: Final = 1.5  # times as many as may repeat are sorted first
 _HASH_BITS: Final = 25
 _MIXES: Final = 0x9E3779B97F4A7C15  # 2^64 by the golden ratio
 _NEAR_LIMIT: Final = 0.01  # of the range
+_ROUNDING: Final = 1e-9  # of a limit: a value that was calculated ends there only about
 _UNIQUE: Final = 0.95  # of all values but the extreme: so many differ from all others
 
 
@@ -224,21 +225,74 @@ _IN_A_ROW, _OFTEN = 3, 3
 
 
 def sensors_within_limits(run: RunUnderCheck) -> Examined:
-    """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
+    """Fails where a signal left the limits that were declared of it.
 
-    Also where a noisy one, whose values never repeat, came back to one extreme again and again.
-    Not a range, which ends where nothing is in sight.
+    Warns where one was cut off at its least or greatest value in 5 % of the rows, or where a noisy
+    one, whose values never repeat, came back to one extreme again and again. Not a range, which
+    ends where nothing is in sight.
     """
+    outside = list(_outside_declared_limits(run))
+    if outside:
+        first = min(outside, key=lambda each: each.since_s)
+        others = listed([each.name for each in outside if each is not first], MOST_NAMED)
+        evidence = f"{first.says}; also {others}" if others else first.says
+        names = tuple(each.name for each in outside)
+        return Fault(
+            "fail", evidence, first.since_s, first.stretches, run.shows(first.name), signals=names
+        )
     found = list(_saturated(run))
     if not found:
         names = _names_in(run).sensors
         limit = f"limit {100 * _AT_LIMIT:g} % of the rows"
-        return run.covered("none was cut off at a limit", signals=names, limit=limit)
+        declared = any(each.limits_by == "declared" for each in run.meanings.values())
+        says = "none was cut off at a limit" + ", and none left its declared limits" * declared
+        return run.covered(says, signals=names, limit=limit)
     name, limit, share, since_s, count = max(found, key=lambda each: each[2])
     others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
     evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
     evidence += f"; also {others}" if others else ""
     return Fault("warn", evidence, since_s, count, run.shows(name), signals=(name,))
+
+
+class _OutsideLimits(NamedTuple):
+    """A signal that was beyond a declared limit, how often, and since when."""
+
+    name: str
+    says: str
+    since_s: float
+    stretches: int
+
+
+def _outside_declared_limits(run: RunUnderCheck) -> Iterator[_OutsideLimits]:
+    """Signals beyond limits that a person declared; those of a device leave room for its noise."""
+    for name, meaning in run.meanings.items():
+        if meaning.limits_by != "declared" or name not in run.frame:
+            continue
+        for limit, sign, which, to in (
+            (meaning.low, -1, "below", "down to"),
+            (meaning.high, 1, "above", "up to"),
+        ):
+            if limit is None:
+                continue
+            zones, beyond = run.frame.zone_map(name), sign * limit + _room_at(meaning, limit)
+            if not (sign * (zones.max if sign > 0 else zones.min) > beyond).any():
+                continue
+            clock, values = run.frame.usable(name)
+            out = sign * values > beyond
+            stretches = runs_of(out, clock)
+            farthest = sign * float((sign * values).max())
+            says = (
+                f"{name} was {which} its declared limit {limit:.6g} in "
+                f"{np.count_nonzero(out)} of {counted(len(values), 'row')}, {to} {farthest:.6g}"
+            )
+            yield _OutsideLimits(name, says, float(stretches.starts_s[0]), len(stretches))
+
+
+def _room_at(meaning: Meaning, limit: float) -> float:
+    """Return by how much a value may be beyond a limit: a joint's stop is soft and yields."""
+    if meaning.quantity == "joint position" and None not in (meaning.low, meaning.high):
+        return _NEAR_LIMIT * ((meaning.high or 0.0) - (meaning.low or 0.0))
+    return _ROUNDING * abs(limit)
 
 
 def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:

@@ -28,6 +28,7 @@ from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import find_events
 from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.segment import one_reading
 
 _MODULES = (healthy_robots, problems)  # which fill the registries
 _EXAMPLES = attempts(8, exploring=200)
@@ -58,11 +59,12 @@ def contradictions(
     """
     kinds = tuple(dict.fromkeys(kind for check in CHECKS for kind in check.kinds))
     options = EventOptions() if by_default else EventOptions(kinds)
-    found = find_events(
-        connection, find_range(connection, Scope(run_id=run_id)), options, limit=500, group=False,
-        deadline_s=_UNHURRIED_S,
-    )  # fmt: skip
-    findings = check_run(connection, run_id, deadline_s=_UNHURRIED_S).findings
+    with one_reading(connection):  # both judge the same rows, which are parsed once
+        found = find_events(
+            connection, find_range(connection, Scope(run_id=run_id)), options, limit=500,
+            group=False, deadline_s=_UNHURRIED_S,
+        )  # fmt: skip
+        findings = check_run(connection, run_id, deadline_s=_UNHURRIED_S).findings
     outcomes = {each.name: each.outcome for each in findings}
     wrong = list[str]()
     for kind, check in _REPORTED_BY.items():

@@ -531,6 +531,7 @@ def _source_of(
         columns, cut_at_s = rows_in_no_chunk(connection, run_id, span, at, deadline)
         groups = groups_as_array(connection, run_id, *span)
         if every_call and cut_at_s is None:
+            columns = columns.part(0, len(columns))
             cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
     query = (
         "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "

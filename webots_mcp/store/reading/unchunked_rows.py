@@ -1,16 +1,17 @@
 """Read state rows that are in no chunk: the newest of a run, and those that arrived late.
 
-They are parsed for each question. A maintainer puts rows into chunks in groups of 1,024, so few
-rows are left while it works.
+They are parsed once for each question. A maintainer puts rows into chunks in groups of 1,024, so
+few rows are left while it works.
 """
 
 from __future__ import annotations
 
 import sqlite3
+from bisect import bisect_left
 from typing import Final
 
-from webots_mcp.store.chunks import STATE_COLUMNS, ChunkProgress, StateColumns
-from webots_mcp.store.reading.segment import Deadline
+from webots_mcp.store.chunks import ABSENT, STATE_COLUMNS, ChunkProgress, StateColumns
+from webots_mcp.store.reading.segment import Deadline, read_so_far
 from webots_mcp.store.run_rows import reading_texts
 
 FEW_ROWS: Final = 4096  # without a maintainer there may be more; those are sampled for new names
@@ -40,8 +41,39 @@ def rows_in_no_chunk(
         deadline: For all reading.
 
     Returns:
-        The rows, and the time of the last one if the deadline passed before all were read.
+        The rows, not to be changed, and the time of the last one if the deadline passed before all
+        were read.
     """
+    memo: dict[tuple[float, float], StateColumns] = read_so_far(connection).setdefault(
+        ("rows in no chunk", run_id, at), {}
+    )
+    for (start_s, end_s), known in memo.items():
+        if start_s <= span[0] and span[1] <= end_s:
+            return _between(known, *span), None
+    columns, cut_s = _read_new(connection, run_id, span, at, deadline)
+    if cut_s is None:
+        memo[span] = columns
+    return columns, cut_s
+
+
+def _between(columns: StateColumns, start_s: float, end_s: float) -> StateColumns:
+    """Return the rows in [start, end), with the names that they hold."""
+    first, behind = (bisect_left(columns.times, each) for each in (start_s, end_s))
+    if (first, behind) == (0, len(columns)):
+        return columns
+    part = columns.part(first, behind - first)
+    for name in [name for name, each in part.values.items() if all(v is ABSENT for v in each)]:
+        del part.values[name]
+    return part
+
+
+def _read_new(
+    connection: sqlite3.Connection,
+    run_id: int,
+    span: tuple[float, float],
+    at: ChunkProgress,
+    deadline: Deadline,
+) -> tuple[StateColumns, float | None]:
     place = (at.end_s, at.last_state_id)
     columns, cut_s = StateColumns(), None
     # without a chunk no row is late, and this would read the whole file

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.rerun.taping import AVOID, data_dir_of, record, recorded, rerun_of, tapes
+from tests.rerun.taping import AVOID, recorded, rerun_of, tapes
 from webots_mcp.database.tapes.tape import Tape
 from webots_mcp.rerun.running import Rerun
 
@@ -70,23 +70,41 @@ def held_commands(tape: Tape) -> list[tuple[float, dict[str, object]]]:
     return found
 
 
-def rerun_edit(tmp_path: Path, code: str, edit: tuple[str, str]) -> tuple[Rerun, Tape, Tape]:
-    """Record a controller, replay an edit of it, and record that edit in a new simulation."""
-    assert edit[0] in code
-    controller = recorded(tmp_path / "old", code)
-    edited = controller.with_name("edited.py")
-    edited.write_text(code.replace(*edit), "utf-8")
-    answer = rerun_of(tmp_path / "old", edited)
-    edited.rename(controller)
-    world = tmp_path / "old" / "worlds" / "arena.wbt"
-    record(world, data_dir_of(tmp_path / "new"), 8.0)
-    return answer, tapes(tmp_path / "old")[0], tapes(tmp_path / "new")[0]
+@pytest.fixture(scope="module")
+def stateful(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project of a recorded controller that holds a state; not to be changed."""
+    folder = tmp_path_factory.mktemp("stateful")
+    recorded(folder, STATEFUL)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project of a recorded controller; not to be changed."""
+    folder = tmp_path_factory.mktemp("driven")
+    recorded(folder)
+    return folder
+
+
+def rerun_code(folder: Path, code: str, **options: float) -> Rerun:
+    """Run code on the tape of a project, from a file next to the controller."""
+    edited = folder / "controllers" / "rover" / "edited.py"
+    edited.write_text(code, "utf-8")
+    try:
+        return rerun_of(folder, edited, **options)
+    finally:
+        edited.unlink()
 
 
 @pytest.mark.parametrize("name", EDITS)
-def test_the_first_difference_is_that_of_a_new_simulation(tmp_path: Path, name: str) -> None:
-    answer, old, new = rerun_edit(tmp_path, STATEFUL, EDITS[name])
-    found = first_difference(old, new)
+def test_the_first_difference_is_that_of_a_new_simulation(
+    stateful: Path, tmp_path: Path, name: str
+) -> None:
+    assert EDITS[name][0] in STATEFUL
+    code = STATEFUL.replace(*EDITS[name])
+    answer = rerun_code(stateful, code)
+    recorded(tmp_path, code)
+    found = first_difference(tapes(stateful)[0], tapes(tmp_path)[0])
     assert found is not None
     assert answer.outcome == "differs", answer.text
     assert (answer.rounds, answer.until_s) == found
@@ -106,41 +124,34 @@ def test_the_first_difference_is_that_of_a_new_simulation(tmp_path: Path, name: 
     ],
 )
 def test_the_line_that_decides_is_named_with_its_values_in_both(
-    tmp_path: Path, edit: tuple[str, str], line: str, values: str
+    driven: Path, edit: tuple[str, str], line: str, values: str
 ) -> None:
-    controller = recorded(tmp_path)
-    edited = controller.with_name("edited.py")
-    edited.write_text(AVOID.replace(*edit), "utf-8")
-    answer = rerun_of(tmp_path, edited)
+    answer = rerun_code(driven, AVOID.replace(*edit))
     assert answer.deciding_line is not None
     assert answer.deciding_line["text"].startswith(line)
     assert values in answer.deciding_line["new_values"]
     assert f"decided at {answer.deciding_line['place']}" in answer.text
 
 
-def test_setting_a_motor_only_when_it_changes_is_no_difference(tmp_path: Path) -> None:
-    controller = recorded(tmp_path)
+def test_setting_a_motor_only_when_it_changes_is_no_difference(driven: Path) -> None:
     code = AVOID.replace("turning = 0\n", "turning = 0\nlast = {}\n", 1).replace(
         "        motor.setVelocity(speed)",
         "        if last.get(motor) != speed:\n            motor.setVelocity(speed)\n"
         "        last[motor] = speed",
     )
-    controller.write_text(code, "utf-8")
-    answer = rerun_of(tmp_path, controller)
+    answer = rerun_code(driven, code)
     assert answer.outcome == "equal"
     assert not answer.is_unchanged
 
 
-def test_what_the_old_run_never_asked_ends_the_replay_with_its_name(tmp_path: Path) -> None:
-    controller = recorded(tmp_path)
+def test_what_the_old_run_never_asked_ends_the_replay_with_its_name(driven: Path) -> None:
     code = AVOID.replace(
         "    if turning > 0:", "    robot.getDevice('gps').getSpeed()\n    if turning:"
     )
-    controller.write_text(code, "utf-8")
-    answer = rerun_of(tmp_path, controller)
+    answer = rerun_code(driven, code)
     assert answer.outcome == "not on the tape"
     assert "gps.getSpeed() was not asked in this round of the old run" in answer.text
-    assert "rover.py:" in answer.text
+    assert "edited.py:" in answer.text
 
 
 def test_a_sensor_that_only_the_bridge_read_can_be_asked(tmp_path: Path) -> None:
@@ -158,27 +169,24 @@ def test_a_sensor_that_only_the_bridge_read_can_be_asked(tmp_path: Path) -> None
     assert rerun_of(tmp_path, controller).outcome == "equal"
 
 
-def test_an_exception_of_the_new_code_is_the_answer(tmp_path: Path) -> None:
-    controller = recorded(tmp_path)
-    controller.write_text(AVOID.replace("turning = 20", "turning = 20 / 0"), "utf-8")
-    answer = rerun_of(tmp_path, controller)
+def test_an_exception_of_the_new_code_is_the_answer(driven: Path) -> None:
+    answer = rerun_code(driven, AVOID.replace("turning = 20", "turning = 20 / 0"))
     assert answer.outcome == "ended early"
     assert "ZeroDivisionError" in answer.text
-    assert "rover.py:" in answer.text
+    assert "edited.py:" in answer.text
 
 
-def test_a_loop_without_a_step_is_ended_in_time(tmp_path: Path) -> None:
-    controller = recorded(tmp_path)
-    controller.write_text(AVOID.replace("turning = 20", "\n        while True: pass"), "utf-8")
-    answer = rerun_of(tmp_path, controller, stall_s=5.0)
+def test_a_loop_without_a_step_is_ended_in_time(driven: Path) -> None:
+    answer = rerun_code(
+        driven, AVOID.replace("turning = 20", "\n        while True: pass"), stall_s=5.0
+    )
     assert answer.outcome == "timed out"
-    assert "rover.py:" in answer.text
+    assert "edited.py:" in answer.text
 
 
-def test_until_a_time_no_later_difference_is_found(tmp_path: Path) -> None:
-    controller = recorded(tmp_path)
-    controller.write_text(AVOID.replace("NEAR_M = 0.35", "NEAR_M = 0.45"), "utf-8")
-    whole = rerun_of(tmp_path, controller)
-    part = rerun_of(tmp_path, controller, until_s=whole.until_s / 2)
+def test_until_a_time_no_later_difference_is_found(driven: Path) -> None:
+    code = AVOID.replace("NEAR_M = 0.35", "NEAR_M = 0.45")
+    whole = rerun_code(driven, code)
+    part = rerun_code(driven, code, until_s=whole.until_s / 2)
     assert (whole.outcome, part.outcome) == ("differs", "equal")
     assert part.until_s == pytest.approx(whole.until_s / 2, abs=0.02)

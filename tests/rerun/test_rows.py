@@ -63,16 +63,25 @@ def test_unchanged_code_repeats_and_the_answer_names_what_it_rests_on(rows: Path
     assert "recorded hash" in answer.text
 
 
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project with a run of which each step has a row, and a tape."""
+    folder = tmp_path_factory.mktemp("both")
+    recorded(folder, EACH_STEP)
+    return folder
+
+
 @pytest.mark.parametrize(("old", "new"), EDITS)
 def test_an_edit_differs_where_it_does_on_a_tape_of_the_same_run(
-    old: str, new: str, tmp_path: Path
+    old: str, new: str, both: Path
 ) -> None:
-    controller = recorded(tmp_path, EACH_STEP)
-    edited = controller.with_name("edited.py")
+    edited = both / "controllers" / "rover" / "edited.py"
     edited.write_text(EACH_STEP.replace(old, new), "utf-8")
-    by_tape = rerun_of(tmp_path, edited)
-    shutil.rmtree(data_dir_of(tmp_path) / "tapes")
-    by_rows = rerun_rows(tmp_path, edited)
+    by_tape = rerun_of(both, edited)
+    tapes = data_dir_of(both) / "tapes"
+    aside = tapes.rename(tapes.with_name("aside"))
+    by_rows = rerun_rows(both, edited)
+    aside.rename(tapes)
     assert by_tape.outcome == "differs"
     assert by_tape.basis is None
     assert (by_rows.outcome, by_rows.rounds) == ("differs", by_tape.rounds)
@@ -80,10 +89,7 @@ def test_an_edit_differs_where_it_does_on_a_tape_of_the_same_run(
     assert by_rows.deciding_line == by_tape.deciding_line
 
 
-def test_a_command_that_no_row_has_is_compared_with_that_of_the_old_code(
-    rows: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(rows, tmp_path / "copy")
+def test_a_command_that_no_row_has_is_compared_with_that_of_the_old_code(rows: Path) -> None:
     controller = rows / "controllers" / "rover" / "edited.py"
     controller.write_text(
         EACH_STEP.replace("turning = 20", "turning = 20; robot.setCustomData('near')"), "utf-8"
@@ -225,10 +231,10 @@ def test_the_command_takes_the_newest_run_where_none_has_a_tape(
     assert "no tape: this rests on" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_tape_is_used_where_there_is_one(tmp_path: Path) -> None:
-    controller = recorded(tmp_path, EACH_STEP, duration_s=1.0)
-    assert taped_run(tmp_path).basis is None
-    assert rerun_of(tmp_path, controller).basis is None
+def test_a_tape_is_used_where_there_is_one(both: Path) -> None:
+    assert taped_run(both).basis is None
+    controller = both / "controllers" / "rover" / "rover.py"
+    assert rerun_of(both, controller, until_s=1.0).basis is None
 
 
 COUNTED = EACH_STEP.replace("turning = 0\n", "turning = 0\nn = 0\n", 1).replace(

@@ -25,6 +25,7 @@ from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.events import Events, find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.segment import one_reading
 
 Columns = Mapping[str, Any]
 Draw = Callable[[Array, np.random.Generator], Columns]
@@ -127,7 +128,8 @@ def recorded(each: Situation) -> Generator[Recording]:
     times, columns = each.columns()
     with memory_connection() as connection:
         record(connection, times, columns)
-        yield Recording(connection)
+        with one_reading(connection):  # events and checks are asked of the same rows
+            yield Recording(connection)
 
 
 def record(connection: sqlite3.Connection, times: Array, columns: Columns) -> None:

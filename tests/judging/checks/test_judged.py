@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.exploring import attempts
 from tests.judging.checks.judging import HEALTHY, checked, judge, render
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.judging.checks.check_run import CHECKS, UNDERSTOOD, check_run
@@ -20,7 +21,7 @@ from webots_mcp.store.chunk_making import make_chunks
 
 @pytest.mark.slow
 def test_each_fault_is_noticed_by_its_check_and_no_check_fails_in_healthy_runs() -> None:
-    judged = judge(8, 2)
+    judged = judge(attempts(4, exploring=8), 2)
     table = render(judged)
     healthy = judged.pop(HEALTHY)
     assert healthy.wrong == [], table

@@ -16,6 +16,7 @@ from webots_mcp.judging.detection.events import find_events
 from webots_mcp.signals.meaning import declare_meaning
 from webots_mcp.store.meanings import set_meanings
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.segment import one_reading
 
 INTERVALS_S = (0.064, 0.5)
 _CHECKS = {"stuck": "moves when commanded", "off_target": "follows its targets"}
@@ -47,7 +48,8 @@ def tell(way: Publishing, interval_s: float, *, is_held: bool, declares: bool = 
         if declares:
             said = [declare_meaning(name, **of) for name, of in (way.declared or {}).items()]
             set_meanings(connection, 1, said, "mcp")
-        return _told(connection, way.kind)
+        with one_reading(connection):  # events and checks are asked of the same rows
+            return _told(connection, way.kind)
 
 
 def _told(connection: sqlite3.Connection, kind: str) -> Told:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -35,24 +36,21 @@ def _spins(time_s: float) -> tuple[float, float]:
     return (4.0, 4.0) if time_s % 20 < 10 else (-2.5, 2.5)
 
 
-def _drive(
-    t: Array,
-    random: Random,
+@cache
+def _driven(
+    lasts_s: float,
     wheels: Wheels,
+    grip: Callable[[float], tuple[float, float]],
+    radii: tuple[float, float],
+    track_m: float,
     *,
-    grip: Callable[[float], tuple[float, float]] = lambda time_s: (1.0, 1.0),
-    steers_back: bool = False,
-    radii: tuple[float, float] = (_RADIUS_M, _RADIUS_M),
-    track_m: float = _TRACK_M,
-    beside_m: float = 0.0,
-    heading: str | None = "rad",
-    names: tuple[str, ...] = ("left_wheel_speed", "right_wheel_speed"),
-) -> Columns:
-    """Integrate where wheels take a robot; each side rolls its share of what its wheels turn."""
+    steers_back: bool,
+) -> Array:
+    """Integrate where wheels take a robot: its place, heading and wheel speeds in each step."""
     x = y = yaw = 0.0
     wanted = 0.0
     rows: list[tuple[float, ...]] = []
-    for at in range(round(float(t[-1]) / _STEP_S) + 1):
+    for at in range(round(lasts_s / _STEP_S) + 1):
         time_s = at * _STEP_S
         left, right = wheels(time_s)
         wanted += _RADIUS_M * (right - left) / _TRACK_M * _STEP_S
@@ -65,11 +63,34 @@ def _drive(
         yaw += (rolled[1] - rolled[0]) / track_m * _STEP_S
         x += (rolled[0] + rolled[1]) / 2 * math.cos(yaw) * _STEP_S
         y += (rolled[0] + rolled[1]) / 2 * math.sin(yaw) * _STEP_S
-        off = beside_m * math.sin(yaw), -beside_m * math.cos(yaw)
-        rows.append((x - off[0], y - off[1], yaw, left, right))
+        rows.append((x, y, yaw, left, right))
+    return np.array(rows)
+
+
+def _grips(_time_s: float) -> tuple[float, float]:
+    return 1.0, 1.0
+
+
+def _drive(
+    t: Array,
+    random: Random,
+    wheels: Wheels,
+    *,
+    grip: Callable[[float], tuple[float, float]] = _grips,
+    steers_back: bool = False,
+    radii: tuple[float, float] = (_RADIUS_M, _RADIUS_M),
+    track_m: float = _TRACK_M,
+    beside_m: float = 0.0,
+    heading: str | None = "rad",
+    names: tuple[str, ...] = ("left_wheel_speed", "right_wheel_speed"),
+) -> Columns:
+    """Return what a robot records; each side rolls its share of what its wheels turn."""
+    rows = _driven(float(t[-1]), wheels, grip, radii, track_m, steers_back=steers_back)
     moments = np.arange(len(rows)) * _STEP_S
+    x = rows[:, 0] - beside_m * np.sin(rows[:, 2])
+    y = rows[:, 1] + beside_m * np.cos(rows[:, 2])
     px, py, course, on_left, on_right = (
-        np.interp(t, moments, [row[at] for row in rows]) for at in range(5)
+        np.interp(t, moments, column) for column in (x, y, *rows[:, 2:].T)
     )
     columns: dict[str, Any] = {
         "gps.x": px + noise(random, t, 0.003),
@@ -85,6 +106,7 @@ def _drive(
     return columns
 
 
+@cache  # the same side slips at several rates
 def _slips(side: str, share: float) -> Callable[[float], tuple[float, float]]:
     def grip(time_s: float) -> tuple[float, float]:
         here = share if _SLIPS_S[0] <= time_s < _SLIPS_S[1] else 1.0

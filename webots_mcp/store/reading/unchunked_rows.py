@@ -48,7 +48,7 @@ def rows_in_no_chunk(
         ("rows in no chunk", run_id, at), {}
     )
     for (start_s, end_s), known in memo.items():
-        if start_s <= span[0] and span[1] <= end_s:
+        if start_s <= span[0] and span[1] <= end_s and not deadline.passed:
             return _between(known, *span), None
     columns, cut_s = _read_new(connection, run_id, span, at, deadline)
     if cut_s is None:

@@ -89,9 +89,8 @@ def _drive(
     moments = np.arange(len(rows)) * _STEP_S
     x = rows[:, 0] - beside_m * np.sin(rows[:, 2])
     y = rows[:, 1] + beside_m * np.cos(rows[:, 2])
-    px, py, course, on_left, on_right = (
-        np.interp(t, moments, column) for column in (x, y, *rows[:, 2:].T)
-    )
+    curves: list[Array] = [x, y, rows[:, 2], rows[:, 3], rows[:, 4]]
+    px, py, course, on_left, on_right = (np.interp(t, moments, column) for column in curves)
     columns: dict[str, Any] = {
         "gps.x": px + noise(random, t, 0.003),
         "gps.y": py + noise(random, t, 0.003),

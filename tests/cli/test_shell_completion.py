@@ -7,6 +7,9 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -38,6 +41,32 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@cache
+def printed(shell: str) -> str:
+    """What `completion` prints for a shell: one takes seconds, so tests share it."""
+    out = StringIO()
+    with redirect_stdout(out):
+        assert main(["completion", shell, *(["--json"] if shell == "zsh" else [])]) == 0
+    return out.getvalue()
+
+
+def script_of(shell: str) -> str:
+    """The script for a shell, which JSON has as well."""
+    return json.loads(printed(shell))["script"] if shell == "zsh" else printed(shell)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two recordings and the folder `worlds`; do not change it."""
+    folder = tmp_path_factory.mktemp("project")
+    (folder / "worlds").mkdir()
+    for file, robot in (("webots.db", "rover"), ("other.db", "dog")):
+        recording = Recorded(folder / file)
+        recording.robot(robot).state(0.1, {"pose": {"x": 1.0, "y": 2.0}, "mode": "drive"})
+        recording.close()
+    return folder
+
+
 @pytest.mark.skipif(BASH is None, reason="no bash")
 @pytest.mark.parametrize(
     ("typed", "offered"),
@@ -58,18 +87,13 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_bash_completes_commands_options_choices_files_and_recorded_names(
-    script: Path, tmp_path: Path, typed: list[str], offered: set[str]
+    script: Path, project: Path, typed: list[str], offered: set[str]
 ) -> None:
-    (tmp_path / "worlds").mkdir()
-    for file, robot in (("webots.db", "rover"), ("other.db", "dog")):
-        recording = Recorded(tmp_path / file)
-        recording.robot(robot).state(0.1, {"pose": {"x": 1.0, "y": 2.0}, "mode": "drive"})
-        recording.close()
     programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     ended = subprocess.run(
         [str(BASH), "--noprofile", "--norc", "-c", TAB, "bash", script, "webots-mcp", *typed],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={**os.environ, "PATH": programs, "WEBOTS_MCP_DATA_DIR": str(tmp_path)},
+        cwd=project, capture_output=True, text=True, check=False,
+        env={**os.environ, "PATH": programs, "WEBOTS_MCP_DATA_DIR": str(project)},
     )  # fmt: skip
     assert set(ended.stdout.split()) - {"--help", "--version"} == offered, ended.stderr
 
@@ -97,26 +121,22 @@ $function
 )
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
 def test_zsh_and_fish_complete_recorded_names(
-    shell: str, tmp_path: Path, typed: list[str], offered: str, capsys: pytest.CaptureFixture[str]
+    shell: str, tmp_path: Path, project: Path, typed: list[str], offered: str
 ) -> None:
     program = shutil.which(shell)
     if program is None:
         pytest.skip(f"no {shell}")
-    for file, robot in (("webots.db", "rover"), ("other.db", "dog")):
-        recording = Recorded(tmp_path / file)
-        recording.robot(robot).state(0.1, {"pose": {"x": 1.0, "y": 2.0}, "mode": "drive"})
-        recording.close()
-    assert main(["completion", shell]) == 0
-    (tmp_path / "script").write_text(capsys.readouterr().out)
+    script = tmp_path / "script"
+    script.write_text(script_of(shell))
     line = " ".join(["webots-mcp", *typed])
     arguments = {
-        "zsh": ["-f", "-c", ZSH_TAB, "zsh", "./script", "webots-mcp", *typed],
-        "fish": ["--no-config", "-c", f"source script; complete -C '{line}'"],
+        "zsh": ["-f", "-c", ZSH_TAB, "zsh", str(script), "webots-mcp", *typed],
+        "fish": ["--no-config", "-c", f"source '{script}'; complete -C '{line}'"],
     }[shell]
     ended = subprocess.run(
-        [program, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False,
+        [program, *arguments], cwd=project, capture_output=True, text=True, check=False,
         env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
-             "WEBOTS_MCP_DATA_DIR": str(tmp_path)},
+             "WEBOTS_MCP_DATA_DIR": str(project)},
     )  # fmt: skip
     assert offered in ended.stdout.split(), (ended.stdout, ended.stderr)
 
@@ -129,13 +149,11 @@ def test_each_shell_has_a_script_that_knows_every_command(
         assert main(["completion", shell]) == 2
         assert "PowerShell needs Python 3.11 or newer" in capsys.readouterr().err
         return
-    assert main(["completion", shell]) == 0
-    script = capsys.readouterr().out
+    script = script_of(shell)
     assert [name for name in COMMANDS if name not in script] == []
 
 
-def test_a_script_comes_as_json_as_well(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["completion", "zsh", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+def test_a_script_comes_as_json_as_well() -> None:
+    told = json.loads(printed("zsh"))
     assert told.keys() == {"shell", "script"}
     assert told["shell"] == "zsh" and told["script"].startswith("#compdef webots-mcp")

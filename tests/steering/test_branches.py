@@ -70,11 +70,13 @@ class Project:
         self.controller.write_text(CONTROLLER.replace("RESTORE", RESTORE))
 
     @contextmanager
-    def simulated(self, mode: str = "fast") -> Generator[Simulation]:
-        """Run it until its rover has driven for two seconds."""
+    def simulated(self, mode: str = "realtime") -> Generator[Simulation]:
+        """Run it until its rover has driven for two seconds, and then in a mode."""
         environment = {"WEBOTS_MCP_DATA_DIR": str(self.data)}
-        with Simulation(self.world, mode=mode, environment=environment) as simulation:
+        with Simulation(self.world, mode="fast", environment=environment) as simulation:
             simulation.wait_for(lambda: simulation.time_s > 2.0, 60.0)
+            if mode == "realtime":
+                simulation.resume()
             wait_for(lambda: self.data.exists() and self.rows("SELECT 1 FROM state"))
             yield simulation
 
@@ -120,7 +122,7 @@ def test_an_unchanged_branch_equals_what_the_run_itself_did_to_the_last_digit(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = project.world.read_bytes()
-    with project.simulated() as simulation:
+    with project.simulated("fast") as simulation:
         answer = project.branch(capsys, "speed=1.0,9.0")
         went_on_s = simulation.time_s
         simulation.wait_for(lambda: simulation.time_s > went_on_s, 60.0)  # it was only held
@@ -151,7 +153,7 @@ def test_an_unchanged_branch_equals_what_the_run_itself_did_to_the_last_digit(
 def test_where_the_run_stays_paused_a_second_unchanged_branch_is_the_measure(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with project.simulated("realtime") as simulation:
+    with project.simulated() as simulation:
         assert main(["pause", "--data-dir", str(project.data)]) == 0
         held_s = simulation.time_s
         answer = project.branch(capsys, "speed=9.0", "--jobs", "2")
@@ -184,7 +186,7 @@ def test_a_run_that_was_steered_afterwards_is_no_measure(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = ["--data-dir", str(project.data)]
-    with project.simulated("realtime") as simulation:
+    with project.simulated() as simulation:
         assert main(["pause", *data]) == 0
         process = subprocess.Popen(
             [sys.executable, "-m", "webots_mcp", *project.options("speed=9.0"), *SCORE, "--json"],
@@ -256,7 +258,7 @@ def test_a_controller_that_asks_for_no_command_is_told_what_to_add(
     monkeypatch.setattr("webots_mcp.steering.branches._COMMAND_S", 1.0)
     text = CONTROLLER.replace("RESTORE", "").replace("    bridge.get_command()\n", "")
     project.controller.write_text(text)
-    with project.simulated("realtime"):
+    with project.simulated():
         refused = project.refused(capsys, "speed=2.0", *SCORE)
     assert "never calls bridge.get_command(): add that line to its loop" in refused
 
@@ -328,7 +330,7 @@ def test_a_simulation_that_could_not_be_resumed_is_never_paused(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (project.folder / "webots-mcp.toml").write_text('[allow]\nactions = ["*", "!resume"]\n')
-    with project.simulated("realtime"):
+    with project.simulated():
         refused = project.refused(capsys, "speed=9.0", *SCORE)
         assert "resume" in refused
         assert project.rows("SELECT action FROM command WHERE action = 'pause'") == []
@@ -337,7 +339,7 @@ def test_a_simulation_that_could_not_be_resumed_is_never_paused(
 def test_what_cannot_branch_is_refused_before_anything_is_saved(
     project: Project, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with project.simulated("realtime"):
+    with project.simulated():
         assert "speed=2,4" in project.refused(capsys, "speed", *SCORE)
         assert "Give NAME=V1,V2" in project.refused(capsys, *SCORE)
         assert "sped" in project.refused(capsys, "sped=2.0", *SCORE)
@@ -371,7 +373,7 @@ def test_a_robot_that_is_no_supervisor_is_told_what_to_change(
     project.world.write_text(world.replace("supervisor TRUE", "supervisor FALSE"))
     driving = CONTROLLER.replace("RESTORE", "").replace("robot.getSelf().getPosition()", "0, 0, 0")
     project.controller.write_text(driving)
-    with project.simulated("realtime"):
+    with project.simulated():
         refused = project.refused(capsys, "speed=2.0", *SCORE)
 
     assert "save_world needs a Supervisor" in refused
@@ -385,7 +387,7 @@ async def test_an_assistant_waits_for_branches_cancels_them_and_begins_new_ones(
 ) -> None:
     asked = {"parameters": {"speed": [9.0]}, "score": "max(x)", "stand_in": True}
     data = Path(os.path.relpath(project.data))  # as `serve --data-dir mcp_data` gives it
-    with project.simulated("realtime"):
+    with project.simulated():
         async with Client(create_server(data / "webots.db", data)) as client:
             begun = await ask(client, "webots_branch_run", **asked, for_s=0.5, timeout_wall_s=0.1)
             assert (begun["state"], begun["trials"]) == ("under way", 2)

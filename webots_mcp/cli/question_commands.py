@@ -12,7 +12,8 @@ import shlex
 import sys
 import types
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import replace
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import anyio
@@ -37,7 +38,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRec
 from webots_mcp.questions.argument_errors import faults_of
 from webots_mcp.questions.arguments import FOR_A_PERSON, SCOPE
 from webots_mcp.questions.declaration import Caller, Question, Reply
-from webots_mcp.store.recording import RecordingAccess
+from webots_mcp.store.recording import OpenReaders, RecordingAccess
 
 # Options of arguments that have another name in all questions.
 OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
@@ -166,12 +167,14 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
         WebotsMCPError: As the question declares.
     """
     asks_controllers = question.has_caller  # reading also takes a row in the queue
-    recording = where.recording(read_only=question.effect.reads and not asks_controllers)
-    valid = _valid(question, given, recording)
-    if {"signals", "pattern"} & {each.name for each in question.parameters}:
-        make_chunks_first(recording)
-    with line_of_progress(), _caller(question, recording) as caller:
-        return anyio.run(question.ask, recording, valid, caller)
+    opened = where.recording(read_only=question.effect.reads and not asks_controllers)
+    with closing(OpenReaders()) as readers:
+        recording = replace(opened, readers=readers)
+        valid = _valid(question, given, recording)
+        if {"signals", "pattern"} & {each.name for each in question.parameters}:
+            make_chunks_first(recording)
+        with line_of_progress(), _caller(question, recording) as caller:
+            return anyio.run(question.ask, recording, valid, caller)
 
 
 @contextmanager

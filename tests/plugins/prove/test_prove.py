@@ -181,7 +181,7 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
         stuck.join()
         assert late == ["Webots ended: True"]
     finally:
-        bench.end()
+        bench.close()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The data that the page shows. Each request opens the recording anew, and cannot write."""
+"""The data that the page shows. No request can write."""
 
 from __future__ import annotations
 

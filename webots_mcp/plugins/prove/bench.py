@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -26,6 +27,7 @@ from webots_mcp.simulator.launch import WebotsLaunch
 from webots_mcp.simulator.orders import WebotsAddress
 from webots_mcp.simulator.starting import LaunchedWebots, Mode, Start, free_port
 from webots_mcp.standin.in_process import DEFAULT_WORLD
+from webots_mcp.store.recording import OpenReaders
 
 T = TypeVar("T")
 ROVER: Final = "rover"
@@ -92,7 +94,8 @@ class Bench:
         self.world = _write_project(folder)
         self.patience_s = patience_s
         self.where = Where(data_dir=folder / PROJECT_DATA_FOLDER)
-        self.recording = self.where.recording(read_only=False)
+        self._readers = OpenReaders()  # It asks up to 30 times a second.
+        self.recording = replace(self.where.recording(read_only=False), readers=self._readers)
         self._launch: WebotsLaunch | None = None
         self._never = set[tuple[bool, Mode | None]]()
         self._last_row = 0  # The newest row before the start of Webots.
@@ -143,6 +146,11 @@ class Bench:
         assert self._launch is not None
         asked = WebotsAddress("127.0.0.1", self._launch.start.port)
         return self._launch.webots.address_now() or asked
+
+    def close(self) -> None:
+        """End the Webots that runs, and close the recording."""
+        self.end()
+        self._readers.close()
 
     def end(self) -> None:
         """End the Webots that runs."""

@@ -107,7 +107,7 @@ def _run_checks(only: list[str] | None, patience_s: int, *, as_json: bool) -> li
                 found.append({"check": name, **answer})
                 print(printable("; ".join(parts)), file=sys.stderr if as_json else None, flush=True)
         finally:
-            bench.end()
+            bench.close()
     return found
 
 

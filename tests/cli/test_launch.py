@@ -17,6 +17,7 @@ import pytest
 
 from tests.simulator.conftest import CONTROLLER, free_port, started, webots, write_project
 from tests.waiting import wait_for
+from webots_mcp.cli import main
 
 __all__ = ["webots"]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")
@@ -52,6 +53,19 @@ def _told(process: subprocess.Popen[str], text: str) -> str:
         if text in line:
             return line
     raise AssertionError(f"{text!r} never came: {said}")
+
+
+def _refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """What the command says that refuses these arguments before anything starts."""
+    capsys.readouterr()
+    try:
+        code = main(["launch", *map(str, arguments)])
+    except SystemExit as refused:  # by the parser of the command line
+        code = refused.code
+    out, told = capsys.readouterr()
+    assert (code, out) == (2, "")
+    assert "Traceback" not in told
+    return told
 
 
 def _assert_told(launch: Launch, world: Path, *options: str, text: str) -> None:
@@ -182,30 +196,25 @@ def test_without_a_free_port_webots_says_so_and_ends(
     ],
 )
 def test_a_world_that_cannot_be_meant_is_refused(
-    launch: Launch,
+    webots: Path,
     project: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
     arguments: list[str],
     said: str,
 ) -> None:
     folder = project().parent.parent
     (folder.parent / "lonely.wbt").write_text("#VRML_SIM R2025a utf8\n")
     monkeypatch.chdir(folder)
-    process = launch(*arguments)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert said.format(folder) in told
+    assert said.format(folder) in _refusal(capsys, *arguments)
 
 
 def test_a_folder_where_nothing_can_be_recorded_is_told_before_webots_runs(
-    launch: Launch, project: Callable[..., Path]
+    webots: Path, project: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     world = project()
     (world.parent.parent / "mcp_data").write_text("a file")
-    process = launch(world)
-    out, told = process.communicate(timeout=60)
-    assert (process.returncode, out) == (2, "")
-    assert "mcp_data" in told and "Traceback" not in told
+    assert "mcp_data" in _refusal(capsys, world)
 
 
 def test_who_reads_no_longer_ends_it(launch: Launch, project: Callable[..., Path]) -> None:
@@ -217,15 +226,19 @@ def test_who_reads_no_longer_ends_it(launch: Launch, project: Callable[..., Path
 
 
 def test_what_webots_says_is_recorded_also_where_no_controller_ever_recorded(
-    launch: Launch, project: Callable[..., Path], tmp_path: Path
+    launch: Launch,
+    project: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     process = launch(project(FAILING), "--mode", "fast", "--patience", "0")
     _told(process, "no controller has recorded")
-    asking = [sys.executable, "-m", "webots_mcp", "logs", "--source", "console"]
+    asking = ["logs", "--source", "console"]
     asking += ["--data-dir", str(tmp_path / "project" / "mcp_data")]
 
     def told() -> str:
-        return subprocess.run(asking, capture_output=True, text=True, check=False).stdout
+        main(asking)  # which may find no recording yet
+        return capsys.readouterr().out
 
     wait_for(lambda: "console: ValueError: no arm" in told())
 
@@ -273,16 +286,17 @@ def test_the_stand_in_runs_a_file_for_an_extern_robot(
     ],
 )
 def test_a_file_for_a_robot_is_refused_where_it_cannot_be_run(
-    launch: Launch, project: Callable[..., Path], options: list[str], why: str
+    webots: Path,
+    project: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    why: str,
 ) -> None:
-    process = launch(project(), *options)
-    _, told = process.communicate(timeout=60)
-    assert (process.returncode, why in told) == (2, True)
+    assert why in _refusal(capsys, project(), *options)
 
 
 def test_what_only_webots_has_is_refused_for_the_stand_in(
-    launch: Launch, project: Callable[..., Path]
+    webots: Path, project: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    process = launch(project(), "--stand-in", "--stream")
-    _, told = process.communicate(timeout=60)
-    assert (process.returncode, "--stream and --port apply only to Webots" in told) == (2, True)
+    told = _refusal(capsys, project(), "--stand-in", "--stream")
+    assert "--stream and --port apply only to Webots" in told

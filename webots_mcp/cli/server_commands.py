@@ -471,11 +471,12 @@ def _launch_stand_in(
     from webots_mcp.simulator.console import StandInConsole
     from webots_mcp.simulator.launch import newest_in
 
+    controllers = _controllers(robots)
     os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
     watched = recording, newest_in(recording), world, patience_s
     threading.Thread(target=_watch, args=watched, daemon=True).start()
     with StandInConsole(recording) as recorder:
-        status = stand_in_simulator()(world, mode, None, _controllers(robots), recorder)
+        status = stand_in_simulator()(world, mode, None, controllers, recorder)
     option = _data_dir_option(recording)
     if _has_recorded(*watched[:2]):
         _say(f"next: 'webots-mcp check{option}' judges what was recorded")

@@ -172,12 +172,12 @@ def test_a_controller_that_restores_nothing_parts_and_small_differences_show_not
 ) -> None:
     project.controller.write_text(CONTROLLER.replace("RESTORE", ""))
     with project.simulated():
-        answer = project.branch(capsys, "speed=3.001")
+        answer = project.branch(capsys, "speed=3.0001")
 
     first = answer["notes"][0]
     assert "parted from what run 1 itself did after 0.0" in first
     assert "rounds by " in first or "turn by " in first
-    assert "a smaller difference of two branches shows nothing: speed 3.001 may be" in first
+    assert "a smaller difference of two branches shows nothing: speed 3.0001 may be" in first
     assert any("did not read bridge.restored" in note for note in answer["notes"])
 
 

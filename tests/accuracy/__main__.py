@@ -30,7 +30,7 @@ PARTS: Final = (
     Part(
         "survival",
         "Kills of other recorders",
-        "How do other recorders survive?",
+        "Compared with other recorders?",
         recorders.survival,
     ),
     Part("loop", "Cost of recording", "Does it slow the controller?", recorders.loop),

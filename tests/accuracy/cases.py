@@ -52,7 +52,7 @@ found, and {told} are reported with their amplitudes at start and end. Of {count
 amplitude, {false} are reported to grow."""
 _RATES: Final = """\
 The verdict about a situation must not depend on the rate or the noise of its recording. In this
-table, noise is a share of a signal's range (standard deviation). *Found* means an event whose
+table, noise is its standard deviation over the signal's range. *Found* means an event whose
 start and end are right within 1 s or 3 rows. *Not searched* means an answer that says why it
 cannot tell, *denied* a wrong "not found" or pass, and *inexact* an event at another time."""
 

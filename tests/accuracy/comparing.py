@@ -158,9 +158,9 @@ def _comparisons(bench: Bench, pool: ProcessPoolExecutor) -> Iterator[str]:
             row += [share(sum(bool(a[name]) for a in said), pairs) for name in _OF_FRONT]
         noises.append(row)
     yield (
-        f"A difference is claimed in {wrong} of {of} comparisons of equal groups; one of 2 "
-        f"standard deviations is found in {found_of[2.0, 10]} of comparisons of 10 runs with 10, "
-        f"in {found_of[2.0, 5]} of 5 with 5."
+        f"A difference is claimed in {wrong} of {of} comparisons of equal groups; a "
+        f"difference of 2 standard deviations is found in {found_of[2.0, 10]} of comparisons of 10 "
+        f"runs with 10, in {found_of[2.0, 5]} of 5 with 5."
     )
     yield _COMPARED.format(pairs=pairs, figures=len(_said(0, (2, 2), 0.0)))
     yield table(("equal groups", "answers that claim a difference", "figures called different",
@@ -193,11 +193,11 @@ def _rare(draws: int) -> list[list[str]]:
 
 _COMPARED: Final = """\
 `webots_compare_runs` compares the runs before and after an edit of a controller, with {pairs}
-pairs of groups in each line. In each run, the speed and the means of the sensors scatter. An
+pairs of groups in each line. From run to run, speed and the means of the sensors scatter. An
 answer judges {figures} figures: levels and spreads of signals. If runs keep to one of two lanes,
 the figures of a run depend on each other; the intervals below assume independence and are too
-narrow there. In the second table, the edit makes the robot faster by a number of standard
-deviations between repeated runs."""
+narrow there. In the second table, the edit makes the robot faster by so many standard
+deviations of repeated runs."""
 _POWER: Final = """\
 Comparisons are designed to claim a false difference in at most {chance:g} of 1,000 answers. The
 second table shows the price: 3 runs of each prove nothing, and effects below two standard
@@ -230,7 +230,7 @@ def trials(bench: Bench) -> Iterator[str]:
         rows.append(row)
     alike = rankings * sum(not each for each, *_ in cases) * len(_REPEATS[1:])
     yield (
-        f"Of equal sets, repeated {_REPEATS[1]} times or more, a best is confirmed in "
+        f"Of equal sets, repeated {_REPEATS[1]} times or more, one is confirmed as the best in "
         f"{false:,} of {alike:,} rankings."
     )
     yield _RANKED.format(rankings=f"{rankings:,}")

@@ -230,7 +230,7 @@ def trials(bench: Bench) -> Iterator[str]:
         rows.append(row)
     alike = rankings * sum(not each for each, *_ in cases) * len(_REPEATS[1:])
     yield (
-        f"Of equal sets, repeated {_REPEATS[1]} times or more, one is confirmed as the best in "
+        f"Of equal sets, repeated {_REPEATS[1]} times or more, one is wrongly confirmed as best in "
         f"{false:,} of {alike:,} rankings."
     )
     yield _RANKED.format(rankings=f"{rankings:,}")

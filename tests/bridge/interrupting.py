@@ -95,7 +95,7 @@ class Interrupter:
 
     def _trace(self, frame: FrameType, event: str, _: Any) -> Any:
         file = frame.f_code.co_filename
-        if not _writes(file) or (self._at and self._at[0][0] != file):
+        if not _writes(file):
             return None
         frame.f_trace_opcodes = self._instructions
         if event == ("opcode" if self._instructions else "line"):

@@ -9,7 +9,6 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
@@ -95,7 +94,7 @@ class Interrupter:
 
     def _trace(self, frame: FrameType, event: str, _: Any) -> Any:
         file = frame.f_code.co_filename
-        if not _writes(file):
+        if not file.startswith(PACKAGE) or Path(file).name not in WRITING:
             return None
         frame.f_trace_opcodes = self._instructions
         if event == ("opcode" if self._instructions else "line"):
@@ -107,11 +106,6 @@ class Interrupter:
         if not self.done and self._at == (place, self.visits[place]):
             self.done = True
             raise KeyboardInterrupt
-
-
-@cache
-def _writes(file: str) -> bool:
-    return file.startswith(PACKAGE) and Path(file).name in WRITING
 
 
 def _apart(act: Callable[[], object]) -> Iterator[object]:

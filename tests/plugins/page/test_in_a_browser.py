@@ -372,9 +372,10 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     tab.says("a number from 0 up to 10, not 70")
     tab.page.get_by_role("button", name="Reset").click()
     tab.says("run 2, simulation time")
+    tab.page.get_by_role("button", name="Step").click()  # it is still paused: no time passes
+    tab.page.wait_for_function(f"() => ({FIGURES})[0]?.curves?.[0].t.at(-1) < {reached}")
     tab.page.get_by_role("button", name="Resume").click()
     tab.says("running")
-    tab.page.wait_for_function(f"() => ({FIGURES})[0]?.curves?.[0].t.at(-1) < {reached}")
     assert tab.errors == []
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import wait_for
 from webots_mcp import MCPBridge
 from webots_mcp.database.connection import connect
 from webots_mcp.database.schema import create_schema
@@ -132,9 +133,14 @@ def test_an_answer_whose_time_is_up_names_the_journal_of_which_rows_are_missing(
     states = [state.replace("[2,", f"[{number},", 1) for number in range(2, 302)]
     part(tmp_path).write_text("\n".join([header, run, *states, ""]))
     monkeypatch.setattr("webots_mcp.store.recording.BUDGET_S", 0.0)
-    with RecordingAccess(tmp_path / "webots.db", tmp_path).view() as view:
-        assert f"newer rows of {part(tmp_path).name}" in view.header()["storage"]
-        assert 0 < len(rows(tmp_path, "state")) < 300
+
+    def is_begun() -> bool:  # another thread that takes in its own journals has its turn first
+        with RecordingAccess(tmp_path / "webots.db", tmp_path).view() as view:
+            assert f"newer rows of {part(tmp_path).name}" in view.header()["storage"]
+        return bool(rows(tmp_path, "state"))
+
+    wait_for(is_begun)
+    assert len(rows(tmp_path, "state")) < 300
     monkeypatch.undo()
     with RecordingAccess(tmp_path / "webots.db", tmp_path).view() as view:
         assert "storage" not in view.header()

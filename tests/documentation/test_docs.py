@@ -81,7 +81,7 @@ def test_the_page_of_the_bridge_names_every_action_that_is_built_in_and_no_other
     [
         ("bridge.md", f"up to {MAX_WAITING_ROWS:,} rows or {MAX_WAITING_BYTES / 1e6:g} MB"),
         ("bridge.md", f"(up to {MOST_LINES_PER_S} lines a second of each;"),
-        ("bridge.md", f"No call waits longer than {MAX_WAIT_S} s"),
+        ("bridge.md", f"No tool call waits longer than {MAX_WAIT_S} s"),
         ("bridge.md", f"the nearest distance in each of {WORDS[SECTORS]} sectors"),
         ("bridge.md", f"their number and the nearest {WORDS[MOST_OBJECTS]}"),
         ("bridge.md", f"keeps the last seconds, and the next {WORDS[KEEP_AFTER_S]}"),

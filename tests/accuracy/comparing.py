@@ -196,7 +196,7 @@ _COMPARED: Final = """\
 pairs of groups in each line. From run to run, speed and the means of the sensors scatter. An
 answer judges {figures} figures: levels and spreads of signals. If runs keep to one of two lanes,
 the figures of a run depend on each other; the intervals below assume independence and are too
-narrow there. In the second table, the edit makes the robot faster by so many standard
+narrow there. In the second table, the edit makes the robot faster by N standard
 deviations of repeated runs."""
 _POWER: Final = """\
 Comparisons are designed to claim a false difference in at most {chance:g} of 1,000 answers. The

@@ -80,20 +80,13 @@ def test_a_declared_quantity_does_not_make_the_limits_of_a_device_declared(
     assert found(empty).outcome == "pass"
 
 
-def test_the_soft_stop_of_a_joint_yields_a_little(empty: sqlite3.Connection) -> None:
+@pytest.mark.parametrize(("quantity", "outcome"), [("joint position", "pass"), ("torque", "fail")])
+def test_only_the_soft_stop_of_a_joint_yields_a_little(
+    empty: sqlite3.Connection, quantity: str, outcome: str
+) -> None:
     robot = RecordedRobot(empty, "arm", 1000.0)
     for row in range(300):
         robot.state(0.1 * row, {"q3": round(1.502 * math.sin(0.05 * row), 5)})
     robot.end_run("finished")
-    limits = {"low": -1.5, "high": 1.5}
-    state(empty, robot.id, "q3", quantity="joint position", set_by="mcp", **limits)
-    assert found(empty).outcome == "pass"
-
-
-def test_a_torque_beyond_its_limits_by_as_little_is_told(empty: sqlite3.Connection) -> None:
-    robot = RecordedRobot(empty, "arm", 1000.0)
-    for row in range(300):
-        robot.state(0.1 * row, {"u3": round(1.502 * math.sin(0.05 * row), 5)})
-    robot.end_run("finished")
-    state(empty, robot.id, "u3", quantity="torque", low=-1.5, high=1.5, set_by="mcp")
-    assert found(empty).outcome == "fail"
+    state(empty, robot.id, "q3", quantity=quantity, low=-1.5, high=1.5, set_by="mcp")
+    assert found(empty).outcome == outcome

@@ -52,9 +52,9 @@ what recording costs.
 ## Public situations
 
 `tests/cases` rebuilds situations from public reports as recordings, with the answer that an expert
-would give. The rules were made with the first two groups in view. The others were labelled before
-the first question about them; then some rules were improved. In the third group, a right answer
-earns 2 points, a helpful one 1, a false one -1: {first} of {most} points at first, {now} today."""
+would give. The rules were made with the first two groups in view. The other groups were labelled
+before their first question; then some rules were improved. In the third group, a right answer earns
+2 points, a helpful one 1, a false one -1. That gave {first} of {most} points at first, {now} today."""
 _SIMULATED: Final = """\
 ## All figures
 
@@ -155,7 +155,7 @@ def situations(details: str) -> list[str]:
     texts += [f"Answered wrongly in the first two groups:\n\n{wrong[1]}"] if wrong else []
     missed = [f"- {name}: {now}" for name, (_, now) in points.items() if now < _RIGHT]
     if missed:
-        head = "Not answered completely in the third group, with the points:"
+        head = "Incomplete answers in the third group, with their points:"
         texts.append("\n".join([f"{head}\n", *missed]))
     return texts
 

@@ -54,7 +54,8 @@ what recording costs.
 `tests/cases` rebuilds situations from public reports as recordings, with the answer that an expert
 would give. The rules were made with the first two groups in view. The other groups were labelled
 before their first question; then some rules were improved. In the third group, a right answer earns
-2 points, a helpful one 1, a false one -1. That gave {first} of {most} points at first, {now} today."""
+2 points, a helpful one 1, a false one -1. That gave {first} of {most} points at first, {now}
+today."""
 _SIMULATED: Final = """\
 ## All figures
 

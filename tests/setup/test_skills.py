@@ -236,7 +236,7 @@ def call_of(statement: ast.stmt) -> tuple[str, dict[str, Any]]:
 @pytest.mark.parametrize("page", skill_files(), ids=lambda page: page.parent.name)
 async def test_each_skill_can_be_followed_to_the_letter(page: Path, project: Path) -> None:
     before, facts = STORIES[page.parent.name]
-    parts = page.read_text("utf-8").split("started again now")  # with a new server
+    parts = page.read_text("utf-8").split("restart it now")  # with a new server
     with following(project) as followed:
         if "new-world" in page.parent.name:
             shutil.rmtree(project / "worlds")

@@ -265,7 +265,7 @@ def repeatability(
     asked: Waiting = _WAITING,
     json: Json = False,
 ) -> None:
-    """Repeat a run several times, and find where the repeats diverge and how that grows.
+    """Repeat a run several times, and find where the repeats diverge and how the difference grows.
 
         webots-mcp repeatability --by reset --by process -n 3 --for 20
 

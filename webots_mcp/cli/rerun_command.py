@@ -52,7 +52,7 @@ def rerun(
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
-    """Run new code on the tape of an old run, and say when it first commands something else.
+    """Run new code on the tape of an old run, and report when it first commands something else.
 
         webots-mcp rerun 12 controllers/rover/rover.py
 

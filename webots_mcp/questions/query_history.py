@@ -423,7 +423,7 @@ def webots_get_trends(
     signals: AnyNames = None,
     limit: ShownLimit = None,
 ) -> TrendsAnswer:
-    """Describe in words what each signal did: rises, falls, oscillates, constant since when.
+    """Describe in words how each signal rises, falls, oscillates or stays constant, and since when.
 
     Signals that changed most come first; modes and flags are given with the time spent in each
     value. Covers the whole run unless a time range is given. For numbers over time use

@@ -81,7 +81,7 @@ async def webots_query_sql(
     ],
     limit: ShownLimit = None,
 ) -> SqlAnswer:
-    """Read the database with one SELECT statement (SQLite), for what no other tool answers.
+    """Read the database with one SELECT statement (SQLite), for what other tools cannot answer.
 
     Tables: robot, session, run(id, robot_id, session_id, row_count, label, last_sim_time_s),
     state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path), log, event, command,

@@ -116,7 +116,7 @@ async def webots_wait_for_command(
     caller: Caller,
     timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
-    """Wait for the outcome of a command that was still running when its call was answered.
+    """Wait for the outcome of a command that still ran when its call returned.
 
     Never send such a command again: it would run twice. For all commands use
     webots_list_commands.

@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -25,6 +25,7 @@ from webots_mcp.bridge.cleaning import Cleaner
 from webots_mcp.bridge.conversion import MAX_ITEMS, is_c_number_array, is_number_array, item_count
 from webots_mcp.bridge.non_finite import remember_non_finite, without_non_finite
 from webots_mcp.bridge.plain_values import NotPlainError, is_plain, require_plain
+from webots_mcp.bridge.state_shapes import ShapeOfLast
 
 orjson: Any
 try:
@@ -33,6 +34,7 @@ except ImportError:
     orjson = None
 
 MAX_ROW_BYTES: Final = 1_000_000
+_USUAL_ROW_CHARACTERS: Final = 16_000  # of such a row no text has to be checked or cut
 # Numpy's type codes. Half and single floats are not here: orjson writes them with fewer digits.
 _ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")
 _WITH_ITEMS: Final = frozenset((dict, list, tuple))  # in which a plain value may hold a None
@@ -76,6 +78,30 @@ def encode(state: object) -> Encoded:
         return encoded
 
 
+class StateEncoder:
+    """Encodes states as `encode` does, in half of the time while their keys stay the same.
+
+    A shape is learned only from a state that passed the check of `encode`. So of a state of the
+    same shape only what may differ is checked: the kinds of its values, large integers, long texts
+    and numbers that are not finite.
+    """
+
+    def __init__(self) -> None:
+        self._last = ShapeOfLast()
+
+    def encode(self, state: object) -> Encoded:
+        """Encode a state as fast as its content allows; the state itself is never changed."""
+        if (shape := self._last.shape) is not None:
+            text = _encode_alike(state, shape.read)
+            if text is not None:
+                return Encoded(text, {})
+        encoded = encode(state)
+        if encoded.replaced or len(encoded.text) > _USUAL_ROW_CHARACTERS:
+            self._last.learn_seldom()
+        self._last.learn(state, is_plain)
+        return encoded
+
+
 def plain(value: Any) -> Any:
     """Return what a row holds of a value, in JSON's terms; numbers of numpy may still be NaN."""
     is_ordinary = is_number_array(value) and value.dtype.char in _ORDINARY_NUMBERS
@@ -105,6 +131,26 @@ def _encode_plain(state: object) -> Encoded:
     if (len(text) if text.isascii() else len(text.encode())) > MAX_ROW_BYTES:
         raise NotPlainError
     return Encoded(text, replaced)
+
+
+def _encode_alike(state: object, read: Callable[[object], tuple[Any, ...]]) -> str | None:
+    """Encode a state of a known shape; return None if it has another one or needs more checks."""
+    try:
+        values = read(state)
+        integers = [value for value in values if value.__class__ is int]
+        if integers and (min(integers) < -(2**63) or max(integers) >= 2**63):
+            return None
+        if orjson is None:
+            text = _encode_with_json(state)
+        else:
+            data: bytes = orjson.dumps(state)
+            nulls = data.count(b"null")
+            if nulls and nulls != values.count(None):  # a NaN became one, or a text holds the word
+                return None
+            text = data.decode()
+    except Exception:  # noqa: BLE001  (another shape, or an object of the user's raises)
+        return None
+    return text if len(text) <= _USUAL_ROW_CHARACTERS else None
 
 
 def _clean_and_encode(state: object) -> Encoded:

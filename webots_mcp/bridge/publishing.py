@@ -15,7 +15,7 @@ from webots_mcp.bridge.claimed_commands import Reloads
 from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.devices import DeviceReader
-from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.encoding import StateEncoder
 from webots_mcp.bridge.episode import Episode
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.full_rate import FullRateRecorder
@@ -72,6 +72,7 @@ class Publisher:
         self._reloads = reloads
         self._variables = variables
         self._begin_run = begin_run
+        self._encoder = StateEncoder()
         self._changes = StateChanges()
         self._names = SignalNames()
         recorder.new_database_entries.append(self._names.begin_anew)
@@ -164,7 +165,7 @@ class Publisher:
     def _record(self, state: Mapping[Any, Any]) -> None:
         started_s = time.perf_counter()
         self._reloads.fire()
-        encoded = encode(state)
+        encoded = self._encoder.encode(state)
         if not encoded.text.startswith("{"):
             raise TypeError(f"publish() takes a dict, got {type(state).__name__}")
         self._journal.state(encoded)

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from tests.bridge.monsters import MONSTERS
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.bridge.state_copies import StateCopier, shape_of
+from webots_mcp.bridge.state_copies import StateCopier
+from webots_mcp.bridge.state_shapes import shape_of
 
 LEAVES = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(st.characters(), max_size=5)
@@ -102,4 +103,4 @@ def test_keys_that_change_with_each_call_do_not_compile_a_function_each_time() -
     copier = StateCopier()
     for number in range(100):
         assert copier.copy({f"key{number}": math.pi}) is None
-    assert copier._shapes == 8  # pyright: ignore[reportPrivateUsage]
+    assert copier._last._learned == 8  # pyright: ignore[reportPrivateUsage]

@@ -24,6 +24,7 @@ from webots_mcp.analysis.arrays import (
     Runs,
     find_gaps,
     median,
+    no_runs,
     np,
     runs_of,
     weighted_mean,
@@ -93,7 +94,7 @@ def condition_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError("nothing was recorded in that range")
     frame = _read(search, search.recorded, condition)
     position = position_in(frame, search.known) if condition.asks_position else None
-    first = int(np.searchsorted(frame.times, search.recorded.start_s))
+    first = int(frame.places([search.recorded.start_s])[0])
     runs = where_held(condition, frame, position, first)
     read = frame.was_read()[first:]
     search.not_searched("condition", *map(str, frame.unread))
@@ -232,6 +233,8 @@ def where_held(
         holds = holds_in(condition.scanned, condition.tree, frame, position)
     except ConditionFailedError as error:
         raise InvalidInputError(str(error)) from error
+    if not holds[first:].any():
+        return no_runs()
     return runs_of(holds & frame.was_read() & (np.arange(len(frame)) >= first), frame.times)
 
 
@@ -822,7 +825,7 @@ def _worst(
     start, end = side.col_offset, side.end_col_offset or 0
     columns = expected.scanned.columns
     text = expected.scanned.original[columns[start] : columns[end]]
-    return text.strip(), float(values[row]), float(frame.times[row])
+    return text.strip(), float(values[row]), frame.rows(int(row), int(row) + 1).bounds_s[0]
 
 
 def violation_events(search: Search) -> Iterator[Event]:

@@ -22,7 +22,7 @@ from webots_mcp.plotting.colours import EVENT_COLOURS
 from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.store.reading.catalogue import one_signal, signals_of
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
-from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, SEARCH_DEADLINE_S
 from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.run_parameters import differing, parameters_of
 from webots_mcp.store.run_rows import fetch_run
@@ -243,7 +243,7 @@ def event_lanes(
     names: Sequence[str],
     rows: int = MOST_LANES,
     known: Mapping[int, Found] | None = None,
-    deadline_s: float = QUESTION_DEADLINE_S,
+    deadline_s: float = SEARCH_DEADLINE_S,
 ) -> tuple[list[Lane], list[str]]:
     """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole.
 
@@ -328,7 +328,7 @@ def _found(
     part: PlottedRun,
     options: EventOptions,
     known: Mapping[int, Found],
-    deadline_s: float = QUESTION_DEADLINE_S,
+    deadline_s: float = SEARCH_DEADLINE_S,
 ) -> Events:
     """Return what is drawn of a run: searched for, or out of what was searched before."""
     if (before := known.get(part.run.run_id)) is None:

@@ -56,7 +56,7 @@ from webots_mcp.plotting.plotted_runs import (
 )
 from webots_mcp.signals.naming import counted, listed, spelled_out
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.segment import SEARCH_DEADLINE_S, Deadline
 
 _FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
 
@@ -87,7 +87,7 @@ class SignalLayout:
     time_labels_px: float = 24.0
     band_opacity: float = 0.35
     event_lines: int = 30
-    events_share: float = 0.4
+    events_share: float = 0.7
 
 
 _LAYOUT: Final = SignalLayout()
@@ -138,7 +138,7 @@ def compose_signals(
     found: Mapping[int, Found] | None = None,
     room: Room | None = None,
     grouped: Sequence[Sequence[str]] | None = None,
-    deadline_s: float = QUESTION_DEADLINE_S,
+    deadline_s: float = SEARCH_DEADLINE_S,
 ) -> tuple[SignalAxes, tuple[str, ...]]:
     """Return what `plot_signals` paints, and its notes; arguments and errors as there.
 

@@ -25,6 +25,7 @@ from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import (
     QUESTION_DEADLINE_S,
+    SEARCH_DEADLINE_S,
     Deadline,
     Segment,
     in_one_snapshot,
@@ -162,7 +163,7 @@ def find_events(
     around: Sequence[str] | None = None,
     group: bool = True,
     after: str | None = None,
-    deadline_s: float = QUESTION_DEADLINE_S,
+    deadline_s: float = SEARCH_DEADLINE_S,
 ) -> Events:
     """What happened in a range: with its true begin and end, also where it reaches out of it.
 
@@ -201,7 +202,7 @@ def search_events(
     around: Sequence[str] | None = None,
     group: bool = True,
     after: str | None = None,
-    deadline_s: float = QUESTION_DEADLINE_S,
+    deadline_s: float = SEARCH_DEADLINE_S,
 ) -> Found:
     """All that happened in a range; see `find_events` for the arguments."""
     options = options or EventOptions()

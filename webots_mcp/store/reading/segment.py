@@ -25,6 +25,7 @@ HAS_LOST_ROWS: Final = (  # for a run `r`: rows were deleted whose chunks are de
     "WHERE run_id = r.id AND is_complete = 1), 0)"
 )
 QUESTION_DEADLINE_S: Final = 2.0
+SEARCH_DEADLINE_S: Final = 6.0  # of a search for events, also of that within a check
 MOST_ROWS: Final = 30_000  # rows of a range that is answered from each call
 _IS_NUMBER: Final = "IN ('real', 'integer')"
 _FULL_RATE_SEGMENTS: Final = (

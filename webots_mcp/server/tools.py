@@ -30,6 +30,7 @@ from webots_mcp.answers.shortening import cut_text
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.questions.declaration import Caller, Question, Reply
 from webots_mcp.server.consent import ask_with_consent
+from webots_mcp.server.freed_memory import give_back
 from webots_mcp.server.tool_arguments import CheckedTool
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import Requester
@@ -123,6 +124,8 @@ def _answering(question: Question) -> Callable[..., Any]:
                 f"({type(error).__name__}: {str(error)[:200]}); ask for another range "
                 "or by another tool, and report what the server wrote to stderr"
             ) from error
+        finally:
+            give_back()
 
     context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=_CONTEXT)
     own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in question.parameters]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
@@ -180,7 +181,7 @@ class _NamesIn:
     """What the names of a run's signals tell, looked up once for all of its events."""
 
     def __init__(self, run: RunUnderCheck) -> None:
-        self._run = run
+        self._run: RunUnderCheck = weakref.proxy(run)  # which holds this in turn
         self._targets: dict[str, str | None] = {}
 
     @cached_property

@@ -48,6 +48,15 @@ def test_unwrapping_is_numpys(angles: Array) -> None:
     assert unwrap(angles, 360.0).tolist() == pytest.approx(np.unwrap(angles, period=360.0).tolist())
 
 
+@given(st.lists(st.floats(-50, 50) | st.just(math.nan), min_size=1, max_size=50))
+def test_what_is_no_angle_does_not_change_the_others(listed: list[float]) -> None:
+    angles = np.array(listed)
+    known = np.isfinite(angles)
+    found = unwrap(angles)
+    assert found[known].tolist() == pytest.approx(unwrap(angles[known]).tolist())
+    np.testing.assert_array_equal(found[~known], angles[~known])
+
+
 def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float], float]) -> Trend:
     """One minute of it, a row each 0.1 s."""
     recorder = start_run(connection)

@@ -410,10 +410,19 @@ def unwrap(angles: Array, turn: float = math.tau) -> Array:
     """Angles without the jumps of a full turn, as if turns were counted.
 
     Each step is taken as the shorter way round (K. Itoh, Analysis of the phase unwrapping
-    algorithm, Applied Optics 21, 1982).
+    algorithm, Applied Optics 21, 1982). What is not finite stays as it is, and the step across it
+    is one from the angle before it to the one after it.
     """
     turns = np.rint(np.diff(angles) / turn)
-    return angles - turn * np.append(0.0, np.cumsum(turns)) if turns.any() else angles
+    if not turns.any():
+        return angles
+    counted = np.cumsum(turns)
+    if math.isfinite(counted[-1]):
+        return angles - turn * np.append(0.0, counted)
+    known = np.isfinite(angles)
+    course = np.array(angles)
+    course[known] = unwrap(angles[known], turn)
+    return course
 
 
 # Whether groups of runs differ by more than like runs do.

@@ -145,6 +145,21 @@ def test_the_side_that_slips_is_named_with_its_times(
     assert f"the {side} side slipped" in check.evidence
 
 
+@pytest.mark.parametrize("name", ["imu.yaw", "gps.x", "left_wheel_speed"])
+def test_rows_without_a_value_of_one_sensor_hide_no_slip(name: str) -> None:
+    def draw(t: Array, random: Random) -> Columns:
+        columns = _drive(t, random, _rounds, grip=_slips("left", 0.2), steers_back=True)
+        values = np.array(columns[name])
+        values[0] = math.nan  # a sensor has no value in the step in which it is enabled
+        values[5::40] = math.nan
+        return {**columns, name: values}
+
+    (found,) = _ask(draw, 0.05).events("slip").events
+    assert found.details["side"] == "left"
+    assert found.start_s == pytest.approx(_SLIPS_S[0], abs=1.5)
+    assert found.end_s == pytest.approx(_SLIPS_S[1], abs=1.5)
+
+
 @pytest.mark.parametrize("interval_s", [0.016, 0.05, 0.2])
 @pytest.mark.parametrize(
     "how",

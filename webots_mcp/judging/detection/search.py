@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.analysis.path_length import PathLength, SmoothedTrack, tracks_of
-from webots_mcp.analysis.summary import LARGEST
+from webots_mcp.analysis.summary import LARGEST, unwrap
 from webots_mcp.judging.detection.event import Alike, Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.verdicts import Cause, JudgedInterval, SearchCoverage
@@ -294,9 +294,25 @@ def places_in(
     frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal]
 ) -> tuple[Indexes, Array, Array]:
     """The rows that have a position, and it in metres."""
+    names = tuple((each.name, each.metres) for each in position)
+    return frame.shared(("places", names), lambda: _places_in(frame, position))
+
+
+def _places_in(
+    frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal]
+) -> tuple[Indexes, Array, Array]:
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
     return (rows, x, y) if len(rows) == len(frame) else (rows, x[rows], y[rows])
+
+
+def course_in(frame: Frame, heading: RegisteredSignal) -> Array:
+    """The heading in each row in rad, as if whole turns were counted; NaN where it is unknown."""
+    turn = heading.turn or math.tau
+    return frame.shared(
+        ("course", heading.name, turn),
+        lambda: unwrap(frame.numbers(heading.name), turn) * (math.tau / turn),
+    )
 
 
 def tracks_in(

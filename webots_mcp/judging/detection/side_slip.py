@@ -17,17 +17,21 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, Flags, median, np, runs_of
-from webots_mcp.analysis.summary import unwrap
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, np, runs_of
 from webots_mcp.judging.detection.event import NotSearchableError
-from webots_mcp.judging.detection.search import Search, places_in
+from webots_mcp.judging.detection.search import Search, course_in, places_in
 from webots_mcp.judging.detection.standstill import ON_THE_SPOT
 from webots_mcp.signals.meaning import words_in
+from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal
 
 SLIP_S: Final = 3.0  # for so long
 SLIPS: Final = 0.5  # of the usual way per turn of the wheels
-CELLS_S: Final = (0.25, 0.5, 1.0)  # over which speeds are compared; the noise chooses
+CELLS_S: Final = (
+    0.25,
+    0.5,
+    1.0,
+)  # each twice the one before; over which speeds are compared; the noise chooses
 _CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
 _LEAST_CELLS: Final = 6  # that tell a factor
 _DIFFERS: Final = 0.2  # of the faster side: by so much a curve shows in the wheels
@@ -128,12 +132,13 @@ def side_slips(search: Search, wheels: Sequence[RegisteredSignal], usual_m_s: fl
         raise NotSearchableError("no heading is recorded")
     why = "its rows are too few"
     columns = _wheel_columns(search, left, right)
+    sums: CellSums | None = None
     for lasts_s in CELLS_S:
         if lasts_s < 3 * search.noise.interval_s and lasts_s != CELLS_S[-1]:
             continue
-        cells = _cells_of(columns, lasts_s)
+        sums = sums.twice_as_long() if sums else CellSums.of(columns, lasts_s, columns[3])
         try:
-            return _slips_in(cells, usual_m_s)
+            return _slips_in(_cells_of(sums), usual_m_s)
         except NotSearchableError as error:
             why = str(error)
     raise NotSearchableError(why)
@@ -141,45 +146,111 @@ def side_slips(search: Search, wheels: Sequence[RegisteredSignal], usual_m_s: fl
 
 def _wheel_columns(
     search: Search, left: Sequence[RegisteredSignal], right: Sequence[RegisteredSignal]
-) -> Array:
+) -> tuple[Array, ...]:
     """Times, x, y, the course and the mean speeds of both sides, in rows that have all of them."""
     frame, position, heading = search.whole, search.motion.position, search.motion.heading
     assert position is not None and heading is not None
     rows, x, y = places_in(frame, position)
-    turn = heading.turn or math.tau
-    course = unwrap(frame.numbers(heading.name)[rows], turn) * math.tau / turn
-    sides = (
-        np.mean([frame.numbers(each.name)[rows] for each in wheels], axis=0)
-        for wheels in (left, right)
+    columns = (
+        frame.times,
+        course_in(frame, heading),
+        *(mean_speed(frame, e) for e in (left, right)),
     )
-    columns = np.array([frame.times[rows], x, y, course, *sides])
-    known = np.isfinite(columns).all(axis=0)
-    return columns if known.all() else columns[:, known]
+    if len(rows) < len(frame):
+        columns = tuple(each[rows] for each in columns)
+    times, course, on_left, on_right = columns
+    return finite_rows((times, x, y, course, on_left, on_right))
 
 
-def _cells_of(columns: Array, lasts_s: float) -> _WheelCells:
-    """Return means over cells of equal time.
+def mean_speed(frame: Frame, wheels: Sequence[RegisteredSignal]) -> Array:
+    """Return the mean of the speeds of some wheels in each row."""
+    total = frame.numbers(wheels[0].name)
+    for wheel in wheels[1:]:
+        total = total + frame.numbers(wheel.name)
+    return total / len(wheels) if len(wheels) > 1 else total
+
+
+def finite_rows(columns: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Return the rows in which all columns are finite."""
+    known = np.isfinite(sum(columns))
+    return columns if known.all() else tuple(each[known] for each in columns)
+
+
+class CellSums(NamedTuple):
+    """Sums of columns over cells of equal time that have rows.
+
+    Attributes:
+        numbers: How many cells each one lies after the time 0.
+        counts: The rows in each.
+        sums: Of each column, in the order of the columns; the first are times.
+        turns_fast: In which the course turns from row to row by more than can be resolved.
+    """
+
+    lasts_s: float
+    numbers: Indexes
+    counts: Indexes
+    sums: tuple[Array, ...]
+    turns_fast: Flags
+
+    @classmethod
+    def of(cls, columns: Sequence[Array], lasts_s: float, course: Array) -> CellSums:
+        """Add up columns.
+
+        Args:
+            columns: The columns, of which the first are times.
+            lasts_s: How long a cell is: a power of two.
+            course: The course in the same rows.
+        """
+        numbers = np.floor(columns[0] / lasts_s).astype(np.intp)
+        firsts = np.flatnonzero(np.diff(numbers, prepend=-1))
+        if not len(firsts):
+            return cls(lasts_s, numbers, numbers, (np.zeros(0),) * len(columns), numbers > 0)
+        counts = np.diff(firsts, append=len(numbers))
+        sums = tuple(np.add.reduceat(each, firsts) for each in columns)
+        fast = np.abs(np.diff(course, append=course[-1:])) > _TURNS_RAD
+        turns_fast = np.logical_or.reduceat(fast, firsts) if fast.any() else firsts < 0
+        return cls(lasts_s, numbers[firsts], counts, sums, turns_fast)
+
+    def twice_as_long(self) -> CellSums:
+        """Return the sums over cells of twice the length."""
+        numbers = self.numbers // 2
+        firsts = np.flatnonzero(np.diff(numbers, prepend=-1))
+        if not len(firsts):
+            return self._replace(lasts_s=2 * self.lasts_s)
+        sums = tuple(np.add.reduceat(each, firsts) for each in self.sums)
+        counts = np.add.reduceat(self.counts, firsts)
+        turns_fast = np.logical_or.reduceat(self.turns_fast, firsts)
+        return CellSums(2 * self.lasts_s, numbers[firsts], counts, sums, turns_fast)
+
+    @property
+    def means(self) -> tuple[Array, ...]:
+        """Of each column."""
+        return tuple(each / self.counts for each in self.sums)
+
+
+def _cells_of(sums: CellSums) -> _WheelCells:
+    """Return how the robot moved from cell to cell.
 
     Args:
-        columns: As `_wheel_columns` gives them.
-        lasts_s: How long a cell is.
+        sums: Of the columns that `_wheel_columns` gives.
     """
-    numbers = (columns[0] // lasts_s).astype(np.intp)
-    firsts = np.flatnonzero(np.diff(numbers, prepend=-1))
-    if len(firsts) < 2:
+    lasts_s = sums.lasts_s
+    if len(sums.numbers) < 2:
         return _WheelCells(np.zeros(0), lasts_s, *[np.zeros(0)] * 5)
-    counts = np.diff(firsts, append=len(numbers))
-    t, x, y, course, on_left, on_right = np.add.reduceat(columns, firsts, axis=1) / counts
-    follows = (np.diff(numbers[firsts]) == 1) & (np.diff(t) > 0)
-    row_turns = np.abs(np.diff(columns[3], append=columns[3][-1:]))
-    fast = np.maximum.reduceat(row_turns, firsts) > _TURNS_RAD
+    t, x, y, course, on_left, on_right = sums.means
+    fast = sums.turns_fast
+    follows = (np.diff(sums.numbers) == 1) & (np.diff(t) > 0)
     follows &= (np.abs(np.diff(course)) <= _TURNS_RAD) & ~fast[1:] & ~fast[:-1]
     steps_s = np.where(follows, np.diff(t), 1.0)
     went = (np.diff(x) + 1j * np.diff(y)) / steps_s
     turned = np.diff(course) / steps_s
     bend = np.minimum(np.abs(np.diff(course)), _TURNS_RAD) / 2  # the way along an arc is longer
     went /= np.sinc(bend / math.pi)
-    moved = (went, turned, *((each[1:] + each[:-1]) / 2 for each in (course, on_left, on_right)))
+    moved: Any = (
+        went,
+        turned,
+        *((each[1:] + each[:-1]) / 2 for each in (course, on_left, on_right)),
+    )
     return _WheelCells(t[:-1][follows], lasts_s, *(each[follows] for each in moved))
 
 

@@ -12,13 +12,21 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, median, np, runs_of
-from webots_mcp.analysis.summary import unwrap
 from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
-from webots_mcp.judging.detection.search import EventKind, Search, in_metres, places_in
+from webots_mcp.judging.detection.search import (
+    EventKind,
+    Search,
+    course_in,
+    in_metres,
+    places_in,
+)
 from webots_mcp.judging.detection.side_slip import (
     SLIP_S,
     SLIPS,
+    CellSums,
     SideSlip,
+    finite_rows,
+    mean_speed,
     side_slips,
     wheels_by_side,
 )
@@ -181,19 +189,15 @@ def _turns_though_straight(
     if heading is None or not all(sides):
         return
     frame, turn = search.whole, heading.turn or math.tau
-    course = unwrap(frame.numbers(heading.name), turn) * math.tau / turn
-    speeds = (np.mean([frame.numbers(e.name) for e in wheels], axis=0) for wheels in sides)
-    columns = np.array([frame.times, course, *speeds])
-    columns = columns[:, np.isfinite(columns).all(axis=0)]
-    cells = (columns[0] // _CELL_S).astype(np.intp)
-    firsts = np.flatnonzero(np.diff(cells, prepend=-1))
-    if len(firsts) < 2:
+    speeds = (mean_speed(frame, each) for each in sides)
+    columns = finite_rows((frame.times, course_in(frame, heading), *speeds))
+    cells = CellSums.of(columns, _CELL_S, columns[1])
+    if len(cells.numbers) < 2:
         return
-    counts = np.diff(firsts, append=len(cells))
-    t, course, left, right = np.add.reduceat(columns, firsts, axis=1) / counts
+    t, course, left, right = cells.means
     fastest, mean = np.maximum(np.abs(left), np.abs(right)), (left + right) / 2
     alike = (np.abs(left - right) <= _ALIKE * fastest) & (fastest > _CREEPS * fastest.max())
-    alike = alike[1:] & alike[:-1] & (mean[1:] * mean[:-1] > 0) & (np.diff(cells[firsts]) == 1)
+    alike = alike[1:] & alike[:-1] & (mean[1:] * mean[:-1] > 0) & (np.diff(cells.numbers) == 1)
     if not alike.any():
         return
     steps_s, apart = np.diff(t), right - left
@@ -232,16 +236,24 @@ def _ratios(
     Raises:
         NotSearchableError: The position is too noisy to tell how far it went.
     """
-    rows, x, y = places_in(search.whole, position)
-    clock = search.whole.times[rows]
-    speeds = np.nan_to_num([search.whole.numbers(each.name)[rows] for each in wheels])
-    mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
+    frame = search.whole
+    rows, x, y = places_in(frame, position)
+    is_all = len(rows) == len(frame)
+    total, fastest = np.zeros(len(rows)), np.zeros(len(rows))
+    for wheel in wheels:
+        speed = np.nan_to_num(
+            frame.numbers(wheel.name) if is_all else frame.numbers(wheel.name)[rows]
+        )
+        total += speed
+        np.maximum(fastest, np.abs(speed), out=fastest)
+    mean = total / len(wheels)
     least = max(4 * search.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
     ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
-    course = np.zeros(len(rows))
-    if (heading := search.motion.heading) is not None:
-        turn = heading.turn or math.tau
-        course = unwrap(search.whole.numbers(heading.name)[rows], turn) * math.tau / turn
+    clock, course = frame.times, np.zeros(len(frame))
+    if search.motion.heading is not None:
+        course = course_in(frame, search.motion.heading)
+    if not is_all:
+        clock, course = clock[rows], course[rows]
     per_row_s = max(search.noise.interval_s, 1e-6)
     columns = (clock, x, y, mean, course, np.sign(mean) * ahead)
     for lasts_s in [each for each in _CELLS_S if each >= 3 * per_row_s] or _CELLS_S[-1:]:
@@ -264,7 +276,7 @@ def _ratios_in(columns: Sequence[Array], lasts_s: float) -> tuple[Array, Array, 
         lasts_s: How long cells are.
     """
     clock = columns[0]
-    cells = (clock // lasts_s).astype(np.intp)
+    cells = np.floor(clock / lasts_s).astype(np.intp)
     starts = np.flatnonzero(np.diff(cells, prepend=-1))
     if len(starts) < 2:
         return np.zeros(0), np.zeros(0), np.zeros(0)

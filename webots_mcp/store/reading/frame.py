@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, time_weights
 from webots_mcp.analysis.summary import usable_part
@@ -57,6 +57,9 @@ _KEPT: Final = (
     "SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state "
     f"WHERE {_IN} ORDER BY sim_time_s, id LIMIT ?"
 )
+
+
+T = TypeVar("T")
 
 
 class Coded(NamedTuple):
@@ -187,6 +190,15 @@ class Frame:
         The frame must be as stored. Chunks without the signal are left out.
         """
         return self._source.values(column, self._start, self._stop)
+
+    def shared(self, key: object, make: Callable[[], T]) -> T:
+        """Return what another reader of these rows made of their values, or make it now.
+
+        Args:
+            key: Says what it is.
+            make: Makes arrays, a tuple of them, or an object that has arrays as attributes.
+        """
+        return self._source.cached((key, self._start, self._stop), make)
 
     def forget(self) -> None:
         """Drop the values read so far, if they will not be requested again."""

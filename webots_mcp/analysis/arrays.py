@@ -31,6 +31,9 @@ else:
     np = _AtFirstUse()
 
 MOSTLY: Final = 0.5  # of the rows
+MOSTLY_KNOWN: Final = 0.75  # of the rows
+LONGEST_DROPOUT_S: Final = 0.25
+EVEN_LOSS: Final = 0.1  # of the usual interval: by so much others may differ from multiples of it
 _ORDER: Final = 4
 # The fourth difference of independent noise has sqrt(1 + 16 + 36 + 16 + 1) = sqrt(70) times its
 # standard deviation, and a normal variable has a median magnitude of 0.6745 of it.
@@ -243,6 +246,58 @@ def weighted_mean(values: Array, weights: Array | None) -> float:
         return float(values.mean())
     mean = inner(values, weights) / float(weights.sum())
     return min(max(mean, float(values.min())), float(values.max()))  # sums round
+
+
+# -- single values that are missing ----------------------------------------------------------------
+
+
+def without_dropouts(values: Array, times: Array) -> Array:
+    """Return values with straight lines in place of short dropouts.
+
+    A dropout is short if one row has no value, or if it lasts at most 0.25 s: no robot goes
+    somewhere and comes back in it. A signal that has no value in a quarter of its rows is not
+    changed, since it is recorded less often by its nature.
+
+    Args:
+        values: NaN where there is none.
+        times: Of the rows.
+    """
+    rows = np.flatnonzero(np.isfinite(values))
+    if len(rows) == len(values) or len(rows) < MOSTLY_KNOWN * len(values):
+        return values
+    short = (np.diff(rows) == 2) | (np.diff(times[rows]) <= LONGEST_DROPOUT_S)
+    missing = np.flatnonzero(~np.isfinite(values))
+    after = np.searchsorted(rows, missing)
+    inside = (after > 0) & (after < len(rows))
+    missing, after = missing[inside], after[inside]
+    missing = missing[short[after - 1]]
+    found: Array = np.array(values)
+    found[missing] = np.interp(times[missing], times[rows], values[rows])
+    return found
+
+
+def with_lost_rows(times: Array, interval_s: float) -> Array:
+    """Return times with those of rows that were lost out of evenly recorded ones.
+
+    Rows that come unevenly, or of which more than a quarter is missing, are returned as they are.
+    Longer gaps than those that `without_dropouts` bridges stay.
+
+    Args:
+        times: They rise.
+        interval_s: The usual interval.
+    """
+    intervals = np.diff(times)
+    if interval_s <= 0 or not len(intervals) or intervals.max() < 1.5 * interval_s:
+        return times
+    lost = np.rint(intervals / interval_s).astype(np.intp) - 1
+    lost[(lost > 1) & (intervals > LONGEST_DROPOUT_S)] = 0
+    lost[np.abs(intervals - (lost + 1) * interval_s) > EVEN_LOSS * interval_s] = 0
+    lost = np.maximum(lost, 0)
+    count = int(lost.sum())
+    if not count or len(times) < MOSTLY_KNOWN * (len(times) + count):
+        return times
+    places = np.concatenate(([0], np.cumsum(lost + 1)))  # of the recorded rows among all
+    return np.interp(np.arange(len(times) + count), places, times)
 
 
 # -- how regularly rows were recorded, and where some are missing ----------------------------------

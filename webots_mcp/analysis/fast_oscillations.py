@@ -56,8 +56,7 @@ def find_fast_swings(rows: EvenRows, values: Array, least_half_swings: int) -> I
         values: Angles have to be unwrapped.
         least_half_swings: Shorter ones are none.
     """
-    values = values if rows.moving is None else values[rows.moving]
-    for times, part in rows.stretches(values):
+    for times, part in rows.stretches(rows.even(values)):
         if len(part) >= _WINDOW and part.min() < part.max():
             yield from _in_stretch(times, part, least_half_swings)
 

@@ -28,6 +28,7 @@ from webots_mcp.analysis.arrays import (
     noise_of,
     np,
     sums_of,
+    with_lost_rows,
 )
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
@@ -135,10 +136,17 @@ class Swing:
 
 @dataclass(frozen=True)
 class EvenRows:
-    """The rows of several signals: where time moved on, in stretches without recording gaps."""
+    """The rows of several signals: where time moved on, in stretches without recording gaps.
 
-    times: Array
+    Attributes:
+        recorded: Times at which time moved on; `moving` is in which rows, None for all.
+        times: The same and those of single lost rows, so that they come evenly.
+        borders: Where a stretch begins in `times`.
+    """
+
+    recorded: Array
     moving: Flags | None
+    times: Array
     borders: Indexes
     interval_s: float
 
@@ -152,10 +160,18 @@ class EvenRows:
             times = times[moving]
             intervals = np.diff(times)
         interval_s = median(intervals) if len(intervals) else 0.0
-        return cls(times, moving, gap_borders(times, interval_s), interval_s)
+        even = with_lost_rows(times, interval_s)
+        return cls(times, moving, even, gap_borders(even, interval_s), interval_s)
+
+    def even(self, values: Array) -> Array:
+        """Return the value at each of `times`, of the values in all rows."""
+        values = values if self.moving is None else values[self.moving]
+        if len(self.times) == len(self.recorded):
+            return values
+        return np.interp(self.times, self.recorded, values)
 
     def stretches(self, values: Array) -> Iterator[tuple[Array, Array]]:
-        """Times and values of each stretch, of values where time moved on."""
+        """Yield times and values of each stretch, of values at `times`."""
         edges = [0, *self.borders.tolist(), len(self.times)]
         for start, stop in itertools.pairwise(edges):
             yield self.times[start:stop], values[start:stop]
@@ -178,7 +194,7 @@ def swings_in(
 ) -> list[Swing]:
     """As `find_swings`, of one of several signals."""
     found: list[Swing] = []
-    values = values if rows.moving is None else values[rows.moving]
+    values = rows.even(values)
     for times, part in rows.stretches(values):
         if len(part) > 3 * SHORTEST_PERIOD_ROWS and part.min() < part.max():
             stretch = _Stretch(times, part, least_half_swings, longest_period_s)

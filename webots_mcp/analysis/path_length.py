@@ -12,7 +12,15 @@ from itertools import pairwise
 from math import log, sqrt
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np, rhythm_of
+from webots_mcp.analysis.arrays import (
+    LONGEST_DROPOUT_S,
+    Array,
+    Indexes,
+    find_gaps,
+    median,
+    noise_of,
+    np,
+)
 
 _PLACES: Final = ("x", "y", "raw_x", "raw_y")
 
@@ -113,10 +121,11 @@ def tracks_of(
 ) -> list[SmoothedTrack]:
     """One track per stretch without a gap.
 
-    A gap is an interval of more than three median ones: what happened in it is unknown. The
-    noise is that of the longest stretch, unless it is given.
+    A gap is an interval in which rows are missing (see `find_gaps`), and that lasts so long that
+    what happened in it is unknown. The noise is that of the longest stretch, unless it is given.
     """
-    ends_s = [gap.end_s for gap in rhythm_of(times).gaps]
+    gaps = find_gaps(times)
+    ends_s = [gap.end_s for gap in gaps if gap.end_s - gap.start_s > LONGEST_DROPOUT_S]
     cuts = np.unique(np.searchsorted(times, ends_s))
     edges = [0, *cuts.tolist(), len(times)]
     parts = [slice(start, end) for start, end in pairwise(edges) if end > start]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, Final, cast
 
 from webots_mcp.analysis.arrays import Array, Indexes, RowSpan, median, np, runs_of
-from webots_mcp.analysis.summary import unwrap
+from webots_mcp.analysis.summary import usable_part
 from webots_mcp.judging.checks.check import Examined, RunUnderCheck, times, total_s
 from webots_mcp.judging.detection.event import Event, NotSearchableError
 from webots_mcp.judging.detection.fall import FALL, FALLEN_RAD
@@ -93,7 +93,7 @@ def rests_when_commanded(run: RunUnderCheck) -> Examined:
     frame = run.frame
     idle = np.ones(len(frame), np.bool_)
     for each in commands:
-        idle &= np.abs(frame.numbers(each.name)) <= COMMAND_NOISE * run.noise.of(each.name)
+        idle &= np.abs(frame.bridged(each.name)) <= COMMAND_NOISE * run.noise.of(each.name)
     least_s = ROLLS_OUT_S + APART_S
     rests = [
         rest for rest in runs_of(idle, frame.times).spans() if rest.end_s - rest.start_s >= least_s
@@ -131,9 +131,8 @@ def _moved_in(run: RunUnderCheck, part: Frame) -> Iterator[str]:
     may_turn = motion.turn_command is None and not motion.wheel_commands  # by a command unknown
     if (heading := motion.heading) is not None and not may_turn:
         turn = heading.turn or math.tau
-        course = part.numbers(heading.name)
-        times_s = part.times[np.isfinite(course)]
-        course = unwrap(course[np.isfinite(course)], turn) * math.tau / turn
+        times_s, course = usable_part(part.times, part.bridged(heading.name, turn))
+        course = course * math.tau / turn
         if len(course) > 2 * ends:
             turned = median(course[-ends:]) - median(course[:ends])
             noise = run.noise.of(heading.name) * math.tau / turn

@@ -125,7 +125,7 @@ def _moves_on(search: Search, start_s: float, end_s: float) -> bool:
     moved_m2 = np.zeros(len(starts) - 1)
     least_m = MOVES_M_S * SETTLED_S
     for each in places:
-        values = in_metres(each, part.numbers(each.name))
+        values = in_metres(each, part.bridged(each.name))
         means = np.add.reduceat(values, starts) / counts
         moved_m2 += np.diff(means) ** 2
         noise = in_metres(each, np.array([search.noise.of(each.name)]))[0]
@@ -174,7 +174,7 @@ def tilt_of(frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal
     angles = [
         np.zeros(len(frame))
         if each is None
-        else frame.numbers(each.name) * math.tau / (each.turn or math.tau)
+        else frame.bridged(each.name, each.turn or math.tau) * math.tau / (each.turn or math.tau)
         for each in (roll, pitch)
     ]
     there = np.isfinite(angles[0]) & np.isfinite(angles[1])

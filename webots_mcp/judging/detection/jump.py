@@ -39,6 +39,7 @@ SAMPLED_CHUNKS: Final = 16  # that tell what is usual
 CERTAINLY_LESS: Final = 0.5  # of what one chunk says is large: with less a signal has no jump
 MARGIN_ROWS: Final = 10  # around steps: what an excursion takes, and the motion next to it
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
+LONGEST_LOSS: Final = 8  # rows that are lost one after the other
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
 BACK_HALF: Final = 0.5  # of a step: a step so large back to where it usually is, too
 MOTION_SHARE: Final = 0.5  # of a step: the smallest neighbouring one of the same motion
@@ -275,10 +276,13 @@ def _wide(
     """The steps above a limit that are no part of a motion."""
     steps = np.pad(np.diff(values), 1)
     wide = np.flatnonzero(np.abs(steps[1:-1]) > limit)
-    far = _step(values[wide], values[wide + 1], turns) > limit * _intervals(times, wide, interval_s)
+    intervals = _intervals(times, wide, interval_s)
+    far = _step(values[wide], values[wide + 1], turns) > limit * intervals
     here, sign = np.abs(steps[wide + 1]), np.sign(steps[wide + 1])
     beside = np.maximum(steps[wide] * sign, steps[wide + 2] * sign)
-    for row in wide[far & (beside < MOTION_SHARE * here)].tolist():
+    sudden = far & (beside * intervals < MOTION_SHARE * here)
+    sudden &= ~_is_usual_motion(values, wide, intervals)
+    for row in wide[sudden].tolist():
         time_s = float(times[row + 1])
         yield Jump(time_s, time_s, float(values[row]), float(values[row + 1]))
 
@@ -366,6 +370,20 @@ def _may_be_of(swing: Swing, jump: Jump) -> bool:
     about_s = swing.period_s / 2
     inside = swing.start_s - about_s <= jump.start_s <= swing.end_s + about_s
     return inside and jump.size < SWING_HEIGHTS * swing.amplitude
+
+
+def _is_usual_motion(values: Array, rows: Indexes, intervals: Array) -> Flags:
+    """Return which steps over lost rows are no larger than what the value does in as many rows."""
+    usual = np.zeros(len(rows), np.bool_)
+    over = np.rint(intervals).astype(np.intp)
+    for count in np.unique(over[(over > 1) & (over <= LONGEST_LOSS)]).tolist():
+        changes = np.abs(values[count:] - values[:-count])
+        for row in rows[over > 1].tolist():
+            changes[max(0, row - count + 1) : row + 1] = 0.0
+        here = over == count
+        steps = np.abs(values[rows[here] + 1] - values[rows[here]])
+        usual[here] = steps <= changes.max(initial=0.0)
+    return usual
 
 
 def _intervals(times: Array, rows: Indexes, interval_s: float) -> Array:

@@ -30,7 +30,7 @@ from webots_mcp.analysis.oscillations import (
     Swing,
     swings_in,
 )
-from webots_mcp.analysis.summary import unwrap
+from webots_mcp.analysis.summary import unwrap, usable_part
 from webots_mcp.judging.detection.event import Alike, Event, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.detection.search import EventKind, Search
@@ -235,10 +235,8 @@ def _found(
                 part = frame.rows(*span)
                 shared[span] = part, EvenRows.of(part.times)
             part, rows = shared[span]
-            times, numbers = part.usable(signal.name)
+            times, numbers = usable_part(part.times, part.bridged(signal.name, signal.turn))
             rows = rows if len(times) == len(part) else EvenRows.of(times)
-            if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
-                numbers = unwrap(numbers, signal.turn)
             courses = _Courses(rows, times, numbers)
             found = [courses.of(swing) for swing in swings_in(rows, numbers, *asked)]
             fast = (

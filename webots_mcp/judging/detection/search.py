@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.analysis.path_length import PathLength, SmoothedTrack, tracks_of
-from webots_mcp.analysis.summary import LARGEST, unwrap
+from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.judging.detection.event import Alike, Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.verdicts import Cause, JudgedInterval, SearchCoverage
@@ -301,7 +301,7 @@ def places_in(
 def _places_in(
     frame: Frame, position: tuple[RegisteredSignal, RegisteredSignal]
 ) -> tuple[Indexes, Array, Array]:
-    x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
+    x, y = (in_metres(each, frame.bridged(each.name)) for each in position)
     rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
     return (rows, x, y) if len(rows) == len(frame) else (rows, x[rows], y[rows])
 
@@ -309,10 +309,8 @@ def _places_in(
 def course_in(frame: Frame, heading: RegisteredSignal) -> Array:
     """The heading in each row in rad, as if whole turns were counted; NaN where it is unknown."""
     turn = heading.turn or math.tau
-    return frame.shared(
-        ("course", heading.name, turn),
-        lambda: unwrap(frame.numbers(heading.name), turn) * (math.tau / turn),
-    )
+    course = frame.bridged(heading.name, turn)
+    return course if turn == math.tau else course * (math.tau / turn)
 
 
 def tracks_in(

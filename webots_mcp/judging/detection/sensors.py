@@ -94,19 +94,19 @@ def changes_in(zones: ZoneMap) -> int:
 
 
 def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[RowSpan]:
-    """Where a signal kept its value for so long.
+    """Where a signal kept its value for so long, also across short dropouts.
 
     Opened are only the chunks with so many rows that repeat the one before, and their neighbours.
     """
     zones = frame.zone_map(name)
     # Of a rest across a border one of both chunks has at least half.
     lasts_s = np.maximum(zones.end_s - zones.start_s, least_s)
-    least_rows = np.maximum(2, least_s / 2 * zones.row_count / lasts_s)
+    least_rows = np.maximum(2, least_s / 2 * zones.value_count / lasts_s)
     may_rest = zones.value_count - zones.change_count >= least_rows
     may_rest |= np.append(may_rest[1:], False) | np.append(False, may_rest[:-1])
     for first, stop in zones.spans(may_rest):
         part = frame.rows(first, stop)
-        numbers = part.numbers(name)
+        numbers = part.bridged(name)
         runs = constant_runs(numbers, part.times)
         for run in runs.only(runs.durations_s >= least_s).spans():
             rows = {"start": first + run.start, "stop": first + run.stop}

@@ -164,9 +164,9 @@ def _wheel_columns(
 
 def mean_speed(frame: Frame, wheels: Sequence[RegisteredSignal]) -> Array:
     """Return the mean of the speeds of some wheels in each row."""
-    total = frame.numbers(wheels[0].name)
+    total = frame.bridged(wheels[0].name)
     for wheel in wheels[1:]:
-        total = total + frame.numbers(wheel.name)
+        total = total + frame.bridged(wheel.name)
     return total / len(wheels) if len(wheels) > 1 else total
 
 

@@ -241,9 +241,8 @@ def _ratios(
     is_all = len(rows) == len(frame)
     total, fastest = np.zeros(len(rows)), np.zeros(len(rows))
     for wheel in wheels:
-        speed = np.nan_to_num(
-            frame.numbers(wheel.name) if is_all else frame.numbers(wheel.name)[rows]
-        )
+        speed = frame.bridged(wheel.name)
+        speed = np.nan_to_num(speed if is_all else speed[rows])
         total += speed
         np.maximum(fastest, np.abs(speed), out=fastest)
     mean = total / len(wheels)

@@ -27,6 +27,7 @@ from webots_mcp.judging.detection.search import (
     Motion,
     RunNoise,
     Search,
+    course_in,
     in_metres,
     tracks_in,
 )
@@ -144,14 +145,14 @@ class Standings:
         self.speeds = np.full(len(rows), np.nan)
         least = 0.0
         if self.speed is not None and self.speed.name in frame:
-            self.speeds = frame.numbers(self.speed.name)[rows]
+            self.speeds = frame.bridged(self.speed.name)[rows]
             least_m_s = options.min_commanded_m_s / SPEED_UNITS.get(self.speed.unit or "m/s", 1.0)
             least = max(least_m_s, COMMAND_NOISE * noise.of(self.speed.name))
         self.told = np.abs(self.speeds) >= least
         self.turn_speeds = np.full(len(rows), np.nan)
         least_turn = 0.0
         if (turning := motion.turn_command) is not None and turning.name in frame:
-            self.turn_speeds = frame.numbers(turning.name)[rows]
+            self.turn_speeds = frame.bridged(turning.name)[rows]
             slowest = TURNED_RAD / CELL_S / SPEED_UNITS.get(turning.unit or "rad/s", 1.0)
             least_turn = max(slowest, COMMAND_NOISE * noise.of(turning.name))
         self.told_to_turn: Flags = np.abs(self.turn_speeds) >= least_turn
@@ -169,7 +170,7 @@ class Standings:
         factors = [SPEED_UNITS.get(each.unit or "", 1.0) for each in self.wheels]
         turned = np.nan_to_num(
             [
-                frame.numbers(each.name)[rows] * factor
+                frame.bridged(each.name)[rows] * factor
                 for each, factor in zip(self.wheels, factors, strict=True)
             ]
         )
@@ -188,9 +189,7 @@ class Standings:
         )
         self.course: Array | None = None
         if (heading := motion.heading) is not None and heading.name in frame:
-            self.course = frame.numbers(heading.name)[rows] * math.tau / (heading.turn or math.tau)
-            there = np.isfinite(self.course)
-            self.course[there] = np.unwrap(self.course[there])
+            self.course = course_in(frame, heading)[rows]
         self.turns = self._turning()
         if heading is None:  # wheels that turn it on the spot move it nowhere
             self.turns |= turn & ~ahead
@@ -624,7 +623,7 @@ def _places(
     for each in find_standstills(track, *limits, lambda: search.deadline.passed):
         ends = [(each.start, each.last + 1)]
         if motion.height is not None:
-            high = frame.numbers(motion.height.name)[rows[slice(*ends[0])]]
+            high = frame.bridged(motion.height.name)[rows[slice(*ends[0])]]
             ends = list(_at_one_height(track, in_metres(motion.height, high), each.start, options))
         for start, stop in ends:
             part = slice(start, stop)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple, TypeVar
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, time_weights
-from webots_mcp.analysis.summary import usable_part
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, time_weights, without_dropouts
+from webots_mcp.analysis.summary import unwrap, usable_part
 from webots_mcp.signals.naming import Value
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunks import (
@@ -236,6 +236,20 @@ class Frame:
     def numbers(self, name: str) -> Array:
         """Return the number of a signal in each row: NaN where it has none; flags are 0 and 1."""
         return self._decoded(name).numbers
+
+    def bridged(self, name: str, turn: float | None = None) -> Array:
+        """Return numbers as `numbers` does, with straight lines in place of short dropouts.
+
+        Args:
+            name: The signal.
+            turn: A whole turn of an angle, which is unwrapped; None for other signals.
+        """
+
+        def make() -> Array:
+            numbers = self.numbers(name)
+            return without_dropouts(unwrap(numbers, turn) if turn else numbers, self.times)
+
+        return self.shared(("bridged", name, turn), make)
 
     def usable(self, name: str) -> tuple[Array, Array]:
         """Return times and numbers of the rows with a usable one: not NaN and not beyond 1e100."""

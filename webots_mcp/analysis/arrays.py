@@ -33,6 +33,7 @@ else:
 MOSTLY: Final = 0.5  # of the rows
 MOSTLY_KNOWN: Final = 0.75  # of the rows
 LONGEST_DROPOUT_S: Final = 0.25
+SINGLE_PRECISION: Final = 2.0**-23  # of a value: the last bit of a 32-bit float, as sensors give
 EVEN_LOSS: Final = 0.1  # of the usual interval: by so much others may differ from multiples of it
 _ORDER: Final = 4
 # The fourth difference of independent noise has sqrt(1 + 16 + 36 + 16 + 1) = sqrt(70) times its
@@ -107,6 +108,11 @@ def in_order(values: Array, place: int) -> float:
     ordered: Array = np.array(values)
     ordered.partition((place, place))
     return float(ordered[place])
+
+
+def rounding_of(values: Array) -> float:
+    """Return by how much rounding to 32-bit floats changes the largest of some values."""
+    return SINGLE_PRECISION * max(float(values.max()), -float(values.min()))
 
 
 def sums_of(values: Array, rows: int) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, runs_of
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, np, rounding_of, runs_of
 from webots_mcp.analysis.oscillations import EvenRows, Swing
 
 LONGEST_FAST_ROWS: Final = 7.0  # of a period; longer ones are found by their bends
@@ -75,6 +75,8 @@ def _in_stretch(times: Array, values: Array, least: int) -> Iterator[Swing]:
         half_swings = int(2 * float(times[end] - times[begin]) / period_s)
         if half_swings >= least:
             size = float(np.median(amplitude[run.start : run.stop]))
+            if size < rounding_of(values[begin : end + 1]):
+                continue
             explained = float(np.median(share[run.start : run.stop]))
             yield Swing(
                 float(times[begin]), float(times[end]), half_swings, period_s, size, explained

@@ -27,6 +27,7 @@ from webots_mcp.analysis.arrays import (
     median,
     noise_of,
     np,
+    rounding_of,
     sums_of,
     with_lost_rows,
 )
@@ -283,7 +284,7 @@ class _Stretch:
             min(DECIDE.noise_amplitudes, DECIDE.mean_amplitudes / (period * count / 2) ** 0.5)
             * noise
         )
-        if amplitude < max(least, _resolution(values)):
+        if amplitude < max(least, _resolution(values), rounding_of(values)):
             return
         if _turns_back(values, period) < DECIDE.turns_back and _is_straight(values, period, noise):
             return

@@ -16,7 +16,17 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Final, Literal, NamedTuple, get_args
 
-from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, angle_unit, unit_in, words_of
+from webots_mcp.signals.naming import (
+    BRANCHES,
+    ELSEWHERE,
+    OBSERVED,
+    REDUCTIONS,
+    SOLIDS,
+    WORLD,
+    angle_unit,
+    unit_in,
+    words_of,
+)
 
 Quantity = Literal[
     "x", "y", "height", "heading", "roll", "pitch", "speed", "turn rate", "wheel speed",
@@ -149,7 +159,21 @@ _NO_SPEED: Final = frozenset((
 _OF_SPEEDS: Final = frozenset((
     "speed", "velocity", "robot", "forward", "linear", "command", "target", "measured", "actual",
     "m", "mm", "cm", "s", "km", "h", "ps", "mps", "setpoint", "desired", "reference", "body",
-    "gps", "base", "odometry",
+    "gps", "base", "odometry", "sensor",
+))  # fmt: skip
+
+# Branches that hold all sorts of things of the robot itself.
+_CONTAINERS: Final = frozenset((
+    "state", "status", "data", "value", "telemetry", "reading", "measurement", "observation", "obs",
+    "info", "message", "msg", "payload", "robot", "rover", "vehicle", "self", "own",
+))  # fmt: skip
+_CLOCKS: Final = frozenset(("time", "timestamp", "stamp", "t", "clock", "step", "sim"))
+# Words that say something of what stands below them.
+_TELLING: Final = frozenset((
+    *_COMMAND, *_TARGET, *_LIMIT, *_MEASURED, *_COUNTS, *_JOINTS, *HOLDING, *_FREE_MOTORS, *INPUTS,
+    *_HEADINGS, *_OF_HEADINGS, *_TURNING, *_HEIGHTS, *_GYROS, *_WORD_QUANTITIES, *_DIRECTIONS,
+    *_NO_SPEED, *_OF_SPEEDS, *_SIDES, *_ENDS, *_SHORT_FORMS.values(), *BRANCHES, *ELSEWHERE,
+    "wheel", "motor", "camera", "display", "led", WORLD, SOLIDS, OBSERVED,
 ))  # fmt: skip
 
 
@@ -200,6 +224,35 @@ def words_in(name: str) -> tuple[str, ...]:
         singular = word[:-1] if len(word) > 3 and word.endswith("s") and word[-2] != "s" else word
         found.append(_SHORT_FORMS.get(singular, _SHORT_FORMS.get(word, singular)))
     return tuple(found)
+
+
+def own_names(names: Iterable[str]) -> dict[str, str]:
+    """Return each of a robot's names without leading branches that say nothing of what it means.
+
+    `state.gps.x` means what `gps.x` does, and where all that a robot publishes stands under one
+    key, such as its own name, that key says nothing. Times may stand next to it.
+    """
+    found = {name: _without_containers(name) for name in names}
+    tops = {
+        own.partition(".")[0]
+        for own in found.values()
+        if "." in own or _CLOCKS.isdisjoint(words_in(own))
+    }
+    if len(tops) != 1 or not _TELLING.isdisjoint(words_in(top := next(iter(tops)))):
+        return found
+    below = f"{top}."
+    if not any(own.startswith(below) for own in found.values()):
+        return found
+    return {name: _without_containers(own.removeprefix(below)) for name, own in found.items()}
+
+
+@lru_cache(maxsize=_CACHE.names)
+def _without_containers(name: str) -> str:
+    top, _, rest = name.partition(".")
+    while rest and _CONTAINERS.issuperset(words_in(top)) and not rest[0].isdigit():
+        name = rest
+        top, _, rest = name.partition(".")
+    return name
 
 
 @lru_cache(maxsize=_CACHE.names)
@@ -381,8 +434,9 @@ def meanings_by_name(
 
 @lru_cache(maxsize=_CACHE.robots)  # a question about many runs asks of the same names
 def _meanings_of_all(asked: tuple[tuple[str, str, str | None], ...]) -> dict[str, Meaning]:
-    names = frozenset(name for name, _, _ in asked)
-    return {name: meaning_by_name(name, kind, role, names) for name, kind, role in asked}
+    own = own_names(name for name, _, _ in asked)
+    names = frozenset(own.values())
+    return {name: meaning_by_name(own[name], kind, role, names) for name, kind, role in asked}
 
 
 # -- meanings that only the values tell ----------------------------------------------------------

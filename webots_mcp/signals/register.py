@@ -16,10 +16,10 @@ import sqlite3
 import time
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from functools import lru_cache
-from itertools import islice
+from itertools import filterfalse, islice
 from typing import Any, Final, Literal, NamedTuple, cast
 
-from webots_mcp.signals.meaning import is_asked_for, meaning_by_name
+from webots_mcp.signals.meaning import is_asked_for, meaning_by_name, own_names
 from webots_mcp.signals.naming import (
     LONGEST_SPREAD_ARRAY,
     METRES,
@@ -62,6 +62,7 @@ _COMMANDED_WHEEL: Final = re.compile(
 )
 _ANGLES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
 _THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
+_TILTS: Final = frozenset(("roll", "pitch", "tilt"))
 _HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*")
 _ALTITUDE: Final = ("altitude", "alt")
 _MOTIONS: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
@@ -229,7 +230,20 @@ def decide_roles(
         position: x and y, where they are known already; else they are found by their names.
     """
     # A path in SQL does not reach all names, whatever the version of SQLite.
-    known: dict[str, Kind] = {name: kind for name, kind in kinds.items() if is_reachable(name)}
+    named = own_names(name for name in kinds if is_reachable(name))
+    names: dict[str, str] = {}
+    for name in sorted(named, key=_shortest):
+        names.setdefault(named[name], name)
+    known: dict[str, Kind] = {own: kinds[names[own]] for own in dict.fromkeys(named.values())}
+    few = {own for own in known if names[own] in choices}
+    if position is not None:
+        position = (named.get(position[0], position[0]), named.get(position[1], position[1]))
+    return {names.get(own, own): role for own, role in _roles_in(known, few, position).items()}
+
+
+def _roles_in(
+    known: Mapping[str, Kind], choices: Container[str], position: tuple[str, str] | None
+) -> dict[str, str]:
     roles: dict[str, str] = {}
     measured: dict[str, Kind] = {
         name: kind for name, kind in known.items() if not is_asked_for(name)
@@ -302,7 +316,7 @@ def _yaws(known: Mapping[str, Kind], pairs: Sequence[tuple[str, str]]) -> list[s
 
     Of each the shortest first.
     """
-    angles = sorted(_angles(known), key=_shortest)
+    angles = sorted(filterfalse(_says_tilt, _angles(known)), key=_shortest)
     branches = [branch for x, _ in pairs if (branch := _branch_of(x))]
     first = branches[0] if branches and _branch_of(pairs[0][0]) else None
     beside = [name for name in angles if _branch_of(name) == first]
@@ -313,6 +327,11 @@ def _yaws(known: Mapping[str, Kind], pairs: Sequence[tuple[str, str]]) -> list[s
 
 def _angles(known: Mapping[str, Kind]) -> list[str]:
     return [name for name, kind in known.items() if turn_of(name, kind) is not None]
+
+
+@lru_cache(maxsize=_KEPT)
+def _says_tilt(name: str) -> bool:
+    return not _TILTS.isdisjoint(words_of(name.rpartition(".")[2]))
 
 
 @lru_cache(maxsize=_KEPT)

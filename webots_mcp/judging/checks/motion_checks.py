@@ -57,7 +57,7 @@ _HEADING_CELL_S: Final = 1.0
 # Words of who measures a heading, and of what it is: a name of others is not of the robot's own.
 _MEASURES: Final = frozenset((
     "ahrs", "compass", "ekf", "estimate", "estimated", "filtered", "fused", "gps", "gyro", "imu",
-    "mag", "magnetometer", "odom", "odometry", "pose", "position", "true",
+    "mag", "magnetometer", "odom", "odometry", "pose", "position", "sensor", "true",
 ))  # fmt: skip
 _HEADINGS: Final = frozenset(("attitude", "deg", "degree", "euler", "heading", "rad", "rpy", "yaw"))
 
@@ -389,7 +389,7 @@ def _drift(
 
 def _is_own_heading(run: RunUnderCheck, name: str) -> bool:
     """Whether a heading is measured, and its name says of nothing but by whom."""
-    meaning, words = run.meanings[name], frozenset(words_in(name))
+    meaning, words = run.meanings[name], frozenset(words_in(run.search.own_names[name]))
     if not run.search.known[name].is_number or meaning.quantity not in ("heading", None):
         return False
     is_heading = meaning.quantity == "heading" or not words.isdisjoint(("heading", "yaw"))
@@ -526,7 +526,8 @@ def _laid_over(a: Any, b: Any, first: int) -> Array:
 def _are_own(*positions: tuple[RegisteredSignal, RegisteredSignal]) -> bool:
     """Whether the names of all say that they are positions of the robot itself."""
     return all(
-        not set(BRANCHES).isdisjoint(words_of(x.name.partition(".")[0])) for x, _ in positions
+        any(not set(BRANCHES).isdisjoint(words_of(part)) for part in x.name.split(".")[:-1])
+        for x, _ in positions
     )
 
 

@@ -145,8 +145,9 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
         return None
     others = run.events("standstill") + run.events("stuck")
     if run.motion.position is None:
-        branch = name.partition(".")[0]
-        others = [e for e in run.events(FLAT.name) if (e.name or "").partition(".")[0] != branch]
+        branches = run.search.branches
+        flats = run.events(FLAT.name)
+        others = [e for e in flats if branches.get(e.name or "") != branches.get(name)]
     rests_s = (min(flat.end_s, e.end_s) - max(flat.start_s, e.start_s) for e in others)
     return None if sum(max(0.0, each) for each in rests_s) > flat.duration_s / 2 else "warn"
 

@@ -75,7 +75,7 @@ def reason_of(run: RunUnderCheck, silent: Event) -> Reason | None:
 
 
 def _reasons(run: RunUnderCheck, name: str, lacks: Flags) -> Iterator[Reason]:
-    frame, branch = run.frame, name.partition(".")[0]
+    frame, branches = run.frame, run.search.branches
     mode = run.motion.mode
     if mode is not None and mode.name in frame:
         codes, labels = frame.coded(mode.name)
@@ -91,7 +91,7 @@ def _reasons(run: RunUnderCheck, name: str, lacks: Flags) -> Iterator[Reason]:
             or not meaning.is_sensed
             or not signal.is_number
             or signal.turn is not None
-            or other.partition(".")[0] == branch
+            or branches[other] == branches[name]
             or other not in frame
         ):
             continue

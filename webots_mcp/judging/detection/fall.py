@@ -14,8 +14,13 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.analysis.arrays import Array, np, runs_of
 from webots_mcp.judging.detection.event import Event, NotSearchableError
-from webots_mcp.judging.detection.search import EventKind, Search, in_metres
-from webots_mcp.signals.naming import SOLIDS, WORLD, words_of
+from webots_mcp.judging.detection.search import (
+    EventKind,
+    Search,
+    in_metres,
+    is_counted_by_wheels,
+)
+from webots_mcp.signals.naming import SOLIDS, WORLD
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal
 
@@ -24,7 +29,6 @@ FALLEN_RAD: Final = math.radians(60)  # ... beyond this it has tipped over ...
 DOWN_RAD: Final = math.radians(45)  # ... and beyond this it lies
 SETTLED_S: Final = 1.0  # for so long each of them has to last
 MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
-_BY_WHEELS: Final = frozenset(("odom", "odometry"))
 _BETWEEN: Final = math.tan(math.radians(67.5))  # nearer to one side than to between two sides
 _NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
 _FALLEN_DEG: Final = math.degrees(FALLEN_RAD)
@@ -114,7 +118,7 @@ def _moves_on(search: Search, start_s: float, end_s: float) -> bool:
     places = [
         each
         for each in (*(motion.position or ()), motion.height)
-        if each is not None and _BY_WHEELS.isdisjoint(words_of(each.name.partition(".")[0]))
+        if each is not None and not is_counted_by_wheels(each)
     ]
     part = search.frame.between(start_s, end_s)
     seconds = np.floor((part.times - start_s) / SETTLED_S).astype(np.intp)

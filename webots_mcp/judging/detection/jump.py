@@ -28,7 +28,7 @@ from webots_mcp.judging.detection.event import (
     Event,
 )
 from webots_mcp.judging.detection.search import EventKind, Search, were_not_searched
-from webots_mcp.signals.meaning import ANGLES, Meaning
+from webots_mcp.signals.meaning import ANGLES, INERT, Meaning
 from webots_mcp.signals.naming import metres_in
 from webots_mcp.store.reading.frame import Frame, ZoneMap
 
@@ -39,6 +39,7 @@ SAMPLED_CHUNKS: Final = 16  # that tell what is usual
 CERTAINLY_LESS: Final = 0.5  # of what one chunk says is large: with less a signal has no jump
 MARGIN_ROWS: Final = 10  # around steps: what an excursion takes, and the motion next to it
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
+RESTING_SHARE: Final = 1e-4  # of the largest step: a smaller usual one is that of who rests
 LONGEST_LOSS: Final = 8  # rows that are lost one after the other
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
 BACK_HALF: Final = 0.5  # of a step: a step so large back to where it usually is, too
@@ -73,7 +74,10 @@ def jump_events(search: Search) -> Iterator[Event]:
     for signal in search.in_time("jump", signals):
         meaning = search.meanings[signal.name]
         turns = _turns_of(meaning)
-        jumps, largest, least = find_jumps(frame, signal.name, search.options.jump_min_score, turns)
+        may_step = meaning.sets or meaning.quantity not in INERT
+        jumps, largest, least = find_jumps(
+            frame, signal.name, search.options.jump_min_score, turns, may_step=may_step
+        )
         jumps = [each for each in jumps if not _is_wrap(each, meaning)]
         jumps = _above_resolution(jumps, frame, signal.name)
         if not jumps and largest < least < math.inf:
@@ -185,18 +189,24 @@ class Jump:
 
 
 def find_jumps(
-    frame: Frame, name: str, score: float, turns: tuple[float, ...] = WHOLE_TURNS
+    frame: Frame,
+    name: str,
+    score: float,
+    turns: tuple[float, ...] = WHOLE_TURNS,
+    *,
+    may_step: bool = False,
 ) -> tuple[list[Jump], float, float]:
     """Steps whose modified z-score (see `find_spikes`) is above the score; the largest step of all;
     and what a step has to be larger than.
 
     The usual step is that of all steps that are not zero and do not come back at once. There have
     to be ten of them: counters and commanded values change by steps all the time. Of a value that
-    otherwise rests only what comes back at once counts. A step next to one that has the same
-    direction and is at least half as large is part of a motion, however quick, and no jump. After a
-    gap a step may be larger by as many times as the gap is longer than the usual interval. The step
-    of an angle over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left
-    of a whole turn. The steps of a swing are no jumps.
+    otherwise rests only what comes back at once counts; and so of one that may step, and that is
+    ten thousand times as exact as it steps: physics engines let nothing rest quite. A step next to
+    one that has the same direction and is at least half as large is part of a motion, however
+    quick, and no jump. After a gap a step may be larger by as many times as the gap is longer than
+    the usual interval. The step of an angle over the end of its scale (pi, 180 degrees, 360
+    degrees) is as large as what is left of a whole turn. The steps of a swing are no jumps.
 
     What is usual is estimated from at most 16 chunks, at equal shares of all changes; one is enough
     if no step is nearly as large. Other chunks are opened only if their statistics show a step that
@@ -207,6 +217,7 @@ def find_jumps(
         name: Of the signal.
         score: How much larger than usual a step has to be.
         turns: Where its values may begin again at 0.
+        may_step: Neither mass nor capacity forbids it to step.
     """
     zones = frame.zone_map(name)
     changes, largest = _steps_of(zones)
@@ -225,19 +236,20 @@ def find_jumps(
             return [], float(largest.max()), limit
         if changing == 1:
             break
+    rests = may_step and middle < RESTING_SHARE * largest.max()
     wanted = zones.spans(largest > limit if is_known else changes > 0)
     found: dict[float, Jump] = {}
     for start, stop in wanted:
         part = frame.rows(start - MARGIN_ROWS, stop + MARGIN_ROWS).usable(name)
         jumps = (
             _wide(*part, limit, interval_s, turns)
-            if is_known
-            else _excursions(*part, interval_s, turns)
+            if is_known and not rests
+            else _excursions(*part, interval_s, turns, limit if is_known else 0.0)
         )
         found |= {jump.start_s: jump for jump in jumps}
     jumps = _without_swings(list(found.values()), frame, name)
     sizes = float(largest.max(initial=0.0)), limit if is_known else math.inf
-    if len(jumps) < 2 or not is_known:
+    if len(jumps) < 2 or not is_known or rests:
         return jumps, *sizes
     spans = _sampled(zones, zones.value_count, SAMPLED_CHUNKS)
     levels = [frame.rows(*span).usable(name)[1] for span in spans]
@@ -299,10 +311,10 @@ def _staying(times: Array, values: Array, interval_s: float, turns: tuple[float,
 
 
 def _excursions(
-    times: Array, values: Array, interval_s: float, turns: tuple[float, ...]
+    times: Array, values: Array, interval_s: float, turns: tuple[float, ...], noise: float
 ) -> Iterator[Jump]:
-    """The values that left one that had rested and came back soon."""
-    lefts, backs = _come_back(times, values, np.abs(np.diff(values)), interval_s, turns)
+    """The values that left one that had rested, but for noise, and came back soon."""
+    lefts, backs = _come_back(times, values, np.abs(np.diff(values)), interval_s, turns, noise)
     for row, back in zip(lefts.tolist(), backs.tolist(), strict=True):
         away = values[row + 1 : back]
         farthest = float(away[np.abs(away - values[row]).argmax()])
@@ -311,22 +323,27 @@ def _excursions(
 
 
 def _come_back(
-    times: Array, values: Array, steps: Array, interval_s: float, turns: tuple[float, ...]
+    times: Array,
+    values: Array,
+    steps: Array,
+    interval_s: float,
+    turns: tuple[float, ...],
+    noise: float = 0.0,
 ) -> tuple[Indexes, Indexes]:
     """Rows after which a value that had rested left, and rows in which it was back soon after.
 
     What was recorded on the other side of a gap is not soon after.
     """
     # At the turn of a swing two rows may meet the same value; three are a rest.
-    rests = steps[1:-1] == 0
+    rests = steps[1:-1] <= noise
     if not rests.any():
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    left = np.flatnonzero((steps[2:] > 0) & rests & (steps[:-2] == 0)) + 2
-    left = left[_step(values[left], values[left + 1], turns) > 0]
+    left = np.flatnonzero((steps[2:] > noise) & rests & (steps[:-2] <= noise)) + 2
+    left = left[_step(values[left], values[left + 1], turns) > noise]
     backs = np.zeros(len(left), np.intp)
     for later in range(LONGEST_EXCURSION + 1, 1, -1):
         after = np.minimum(left + later, len(values) - 1)
-        is_back = (values[after] == values[left]) & (after == left + later)
+        is_back = (np.abs(values[after] - values[left]) <= noise) & (after == left + later)
         backs[is_back] = after[is_back]
     gaps = gap_borders(times, interval_s)
     is_soon = np.searchsorted(gaps, left, "right") == np.searchsorted(gaps, backs, "right")

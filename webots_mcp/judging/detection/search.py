@@ -19,7 +19,7 @@ from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.judging.detection.event import Alike, Event, NotAskedError, NotSearchableError
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.verdicts import Cause, JudgedInterval, SearchCoverage
-from webots_mcp.signals.meaning import INPUTS, Meaning, Quantity, words_in
+from webots_mcp.signals.meaning import INPUTS, Meaning, Quantity, own_names, words_in
 from webots_mcp.signals.naming import FARTHEST_M, listed, unit_in
 from webots_mcp.signals.register import first_in, pair_in
 from webots_mcp.store.chunks import shown
@@ -42,6 +42,7 @@ AWAY_S: Final = 20.0
 LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
 USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
 LEAST_VISITS: Final = 3
+_ODOMETRY: Final = frozenset(("odometry",))
 _OF_MOTION: Final = ("speed", "turn rate", "wheel speed", "heading")
 EARLIER_RUNS: Final = 3
 MOST_ROWS: Final = 2_000_000  # of a run: its first ones
@@ -247,6 +248,11 @@ def motion_in(frame: Frame, known: dict[str, RegisteredSignal], options: EventOp
             if name in always or (name in some and any(row.held(name).any() for row in rows))
         }
     return find_motion(known, options, here)
+
+
+def is_counted_by_wheels(x: RegisteredSignal) -> bool:
+    """Whether a position is counted by the wheels themselves, which may spin in place."""
+    return not x.stated and not _ODOMETRY.isdisjoint(words_in(x.name))
 
 
 def doubt_of_unit(
@@ -578,6 +584,16 @@ class Search:
         if whole.cut_at_s is None:
             memo.append((self.known, meanings))
         return meanings
+
+    @cached_property
+    def own_names(self) -> dict[str, str]:
+        """By name, each name without branches that say nothing."""
+        return own_names(self.known)
+
+    @cached_property
+    def branches(self) -> dict[str, str]:
+        """By name, the first part of each name that says something."""
+        return {name: own.partition(".")[0] for name, own in self.own_names.items()}
 
     @cached_property
     def signals(self) -> list[RegisteredSignal]:

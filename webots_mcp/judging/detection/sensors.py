@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -80,7 +80,7 @@ def flat_events(search: Search) -> Iterator[Event]:
             if not own and not left and shown.changes_but_for([longest]):
                 shown.note_near(longest)
     for shown, rest in frozen:
-        if _rests_with_others(shown.signal, rest, resting):
+        if _rests_with_others(shown.signal, rest, resting, search.branches):
             shown.note_near(rest)
         else:
             yield shown.event(rest)
@@ -317,19 +317,22 @@ def is_lively(run: Frame, name: str) -> bool:
 
 
 def _rests_with_others(
-    signal: RegisteredSignal, rest: RowSpan, resting: dict[str, _Resting]
+    signal: RegisteredSignal,
+    rest: RowSpan,
+    resting: dict[str, _Resting],
+    branches: Mapping[str, str],
 ) -> bool:
     """Whether something else holds one value for most of that time: then the robot rests.
 
     What never changes, or is at its limit, is no sign of that; and the items of an array freeze
     together.
     """
-    branch = signal.name.partition(".")[0]
+    branch = branches[signal.name]
     return any(
         min(rest.end_s, other.end_s) - max(rest.start_s, other.start_s) > MOSTLY * rest.duration_s
         and not shown.is_limit(other)
         for name, shown in resting.items()
-        if name.partition(".")[0] != branch
+        if branches[name] != branch
         for other in shown.rests
     )
 

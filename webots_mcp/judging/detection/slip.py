@@ -18,6 +18,7 @@ from webots_mcp.judging.detection.search import (
     Search,
     course_in,
     in_metres,
+    is_counted_by_wheels,
     places_in,
 )
 from webots_mcp.judging.detection.side_slip import (
@@ -45,7 +46,6 @@ _CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less littl
 _TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
 _LEAST_CELLS: Final = 10
 _SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
-_BY_WHEELS: Final = ("odom", "odometry")
 _OFF_THE_FLOOR_M: Final = 0.3
 _NOISE: Final = 6.0  # standard deviations
 _OWN_HEIGHT: Final = frozenset(("altitude", "height", "m", "cm", "pressure", "gps", "position"))
@@ -124,7 +124,7 @@ def _slips_of(
     Raises:
         NotSearchableError: Its usual distance per turn is unknown.
     """
-    if position[0].name.partition(".")[0] in _BY_WHEELS:
+    if is_counted_by_wheels(position[0]):
         raise NotSearchableError(f"{position[0].name} is counted by the wheels themselves")
     starts_s, lasts_s, ratios = _ratios(search, position, wheels)
     known = np.isfinite(ratios)

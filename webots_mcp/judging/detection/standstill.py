@@ -29,10 +29,11 @@ from webots_mcp.judging.detection.search import (
     Search,
     course_in,
     in_metres,
+    is_counted_by_wheels,
     tracks_in,
 )
 from webots_mcp.judging.verdicts import AS_STUCK
-from webots_mcp.signals.meaning import meaning_by_name, words_in
+from webots_mcp.signals.meaning import meaning_by_name
 from webots_mcp.signals.naming import NAME_POSITION
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame
@@ -64,7 +65,6 @@ MOSTLY: Final = 0.5
 TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
 BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
 JUDGED_AT_ONCE: Final = 500_000  # rows, between two looks at the deadline
-_ODOMETRY: Final = frozenset(("odometry",))
 BY_WHEELS: Final = (
     "{} may be counted by wheels that spin in place: publish the position of a GPS or a Supervisor"
 )
@@ -710,8 +710,7 @@ def _counted_by_wheels(motion: Motion) -> str | None:
     if motion.position is None:
         return None
     x, _ = motion.position
-    is_odometry = not x.stated and not _ODOMETRY.isdisjoint(words_in(x.name))
-    return (x.name.rpartition(".")[0] or x.name) if is_odometry else None
+    return (x.name.rpartition(".")[0] or x.name) if is_counted_by_wheels(x) else None
 
 
 def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:

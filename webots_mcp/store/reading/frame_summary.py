@@ -31,7 +31,7 @@ from webots_mcp.analysis.summary import (
     with_extremes,
     wraps,
 )
-from webots_mcp.signals.meaning import ANGLES, meaning_by_name
+from webots_mcp.signals.meaning import ANGLES, meaning_by_name, own_names
 from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, ZoneMap, read_frame
@@ -89,7 +89,8 @@ def as_angle(frame: Frame, signal: RegisteredSignal, found: Summary) -> Register
     if not signal.may_be_angle or found.min is None or found.max is None:
         return signal
     turn = may_wrap(found.min, found.max)
-    if turn is None or meaning_by_name(signal.name, signal.kind).quantity not in _MAY_TURN:
+    name = own_names([signal.name])[signal.name]
+    if turn is None or meaning_by_name(name, signal.kind).quantity not in _MAY_TURN:
         return signal
     return replace(signal, wraps_at=turn) if wraps(frame.usable(signal.name)[1], turn) else signal
 

@@ -1,7 +1,8 @@
-"""Short dropouts change no answer: single values that sensors do not give, and rows that are lost.
+"""What changes nothing about a robot changes no answer about it.
 
-Each situation is recorded whole and with dropouts. Found must be the same kinds of events, and
-checks must end alike, except those that are about the dropouts themselves.
+Each situation is recorded as it is and in another way: with single missing values, with lost rows,
+under one key, in 32-bit floats. Found must be the same kinds of events, and checks must end alike,
+except those that are about what is missing.
 """
 
 from __future__ import annotations
@@ -55,6 +56,30 @@ def _without_rows(times: Array, columns: Columns) -> tuple[Array, Columns]:
     return times[rows], {name: _part(column, rows) for name, column in columns.items()}
 
 
+def _under_a_key(times: Array, columns: Columns) -> tuple[Array, Columns]:
+    """All that it publishes stands under the key `state`."""
+    return times, {
+        name if name == "recorded" else f"state.{name}": column for name, column in columns.items()
+    }
+
+
+def _under_its_name(times: Array, columns: Columns) -> tuple[Array, Columns]:
+    """All that it publishes stands under the name of the robot."""
+    return times, {
+        name if name == "recorded" else f"freddy.{name}": column for name, column in columns.items()
+    }
+
+
+def _in_single_precision(times: Array, columns: Columns) -> tuple[Array, Columns]:
+    """Sensors give 32-bit floats."""
+    return times, {
+        name: np.float64(np.float32(column))
+        if getattr(column, "dtype", None) == np.float64
+        else column
+        for name, column in columns.items()
+    }
+
+
 def _part(column: Any, rows: Any) -> Any:
     if isinstance(column, np.ndarray):
         return column[rows]
@@ -77,9 +102,13 @@ def _whole(name: str) -> Answers:
 
 
 @pytest.mark.parametrize("name", SITUATIONS)
-@pytest.mark.parametrize("drop", [_without_values, _without_rows], ids=["values", "rows"])
-def test_short_dropouts_change_no_answer(
-    name: str, drop: Callable[[Array, Columns], tuple[Array, Columns]]
+@pytest.mark.parametrize(
+    "change",
+    [_without_values, _without_rows, _under_a_key, _under_its_name, _in_single_precision],
+    ids=["values", "rows", "key", "name", "floats"],
+)
+def test_what_changes_nothing_about_a_robot_changes_no_answer(
+    name: str, change: Callable[[Array, Columns], tuple[Array, Columns]]
 ) -> None:
     each: Situation = SITUATIONS[name]
-    assert _answers(*drop(*each.columns())) == _whole(name)
+    assert _answers(*change(*each.columns())) == _whole(name)

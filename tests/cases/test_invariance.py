@@ -70,6 +70,11 @@ def _under_its_name(times: Array, columns: Columns) -> tuple[Array, Columns]:
     }
 
 
+def _with_underscores(times: Array, columns: Columns) -> tuple[Array, Columns]:
+    """It publishes `gps_x` in place of `gps.x`."""
+    return times, {name.replace(".", "_"): column for name, column in columns.items()}
+
+
 def _in_single_precision(times: Array, columns: Columns) -> tuple[Array, Columns]:
     """Sensors give 32-bit floats."""
     return times, {
@@ -104,8 +109,15 @@ def _whole(name: str) -> Answers:
 @pytest.mark.parametrize("name", SITUATIONS)
 @pytest.mark.parametrize(
     "change",
-    [_without_values, _without_rows, _under_a_key, _under_its_name, _in_single_precision],
-    ids=["values", "rows", "key", "name", "floats"],
+    [
+        _without_values,
+        _without_rows,
+        _under_a_key,
+        _under_its_name,
+        _with_underscores,
+        _in_single_precision,
+    ],
+    ids=["values", "rows", "key", "name", "underscores", "floats"],
 )
 def test_what_changes_nothing_about_a_robot_changes_no_answer(
     name: str, change: Callable[[Array, Columns], tuple[Array, Columns]]

@@ -110,6 +110,8 @@ _HEADINGS: Final = frozenset(("heading", "yaw"))
 _OF_HEADINGS: Final = frozenset((  # what measures a heading, and words next to it
     "compass", "gyro", "gyroscope", "imu", "gps", "gnss", "odometry", "estimate", "estimated",
     "fused", "ekf", "true", "robot", "body", "base", "raw", "rad", "deg", "value", "angle",
+    "attitude", "orientation", "euler", "rpy", "ahrs", "filtered", "pose", "position", "location",
+    "vehicle", "drone", "car", "rover",
 )) | _MEASURED | _TARGET | _COMMAND  # fmt: skip
 _TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
 _HEIGHTS: Final = frozenset(("height", "altitude"))

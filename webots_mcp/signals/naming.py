@@ -55,7 +55,11 @@ ELSEWHERE: Final = frozenset((
     "reference", "setpoint", "solid", "target", "waypoint",
 ))  # fmt: skip
 # Words next to an x that leave it the robot's own, as in robot_x and currentPosX.
-OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
+OWN: Final = frozenset((
+    *BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self", "body", "base",
+    "vehicle", "drone", "car", "agent", "estimate", "estimated", "filtered", "fused", "ekf", "slam",
+    "true", "ground", "truth", "map", "local", "global",
+))  # fmt: skip
 _SEEN: Final = f"{WORLD}."
 PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
 # Words of actions and of arguments that mean the same, whatever their letters.

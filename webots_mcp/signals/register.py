@@ -23,6 +23,7 @@ from webots_mcp.signals.meaning import is_asked_for, meaning_by_name, own_names
 from webots_mcp.signals.naming import (
     LONGEST_SPREAD_ARRAY,
     METRES,
+    OWN,
     REDUCTIONS,
     Value,
     angle_unit,
@@ -62,6 +63,8 @@ _COMMANDED_WHEEL: Final = re.compile(
 )
 _ANGLES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
 _THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
+_HEADINGS: Final = frozenset(("heading", "yaw", "theta", "bearing"))
+_OF_FLAT_NAME: Final = re.compile(r"(^|_)x(?=_|$)")  # the axis in pose_x, x_m
 _TILTS: Final = frozenset(("roll", "pitch", "tilt"))
 _HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*")
 _ALTITUDE: Final = ("altitude", "alt")
@@ -294,9 +297,11 @@ def _height(known: Mapping[str, Kind], x: str, *, first: bool) -> str | None:
     The third of a pose or odometry of three is its heading.
     """
     branch, _, axis = x.rpartition(".")
-    third = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
-    if known.get(third) == "num" and not ends_pose(third, known):
-        return third
+    camel = f"{axis[:-1]}Z" if axis.endswith("X") else axis
+    for last in (_THIRD_AXES.get(axis, ""), _OF_FLAT_NAME.sub(r"\1z", axis), camel):
+        third = f"{branch}.{last}".removeprefix(".")
+        if third != x and known.get(third) == "num" and not ends_pose(third, known):
+            return third
     branches = (branch, "") if first else (branch,)
     altitudes = (name for name, kind in known.items() if kind == "num" and _is_altitude(name))
     return min((each for each in altitudes if _branch_of(each) in branches), default=None)
@@ -336,7 +341,9 @@ def _says_tilt(name: str) -> bool:
 
 @lru_cache(maxsize=_KEPT)
 def _says_heading(name: str) -> bool:
-    return _HEADING.search(in_snake_case(name)) is not None
+    words = words_of(name.rpartition(".")[2])
+    of_own = any(word in _HEADINGS for word in words) and (OWN | _HEADINGS).issuperset(words)
+    return of_own or _HEADING.search(in_snake_case(name)) is not None
 
 
 def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:

@@ -526,7 +526,7 @@ def _laid_over(a: Any, b: Any, first: int) -> Array:
 def _are_own(*positions: tuple[RegisteredSignal, RegisteredSignal]) -> bool:
     """Whether the names of all say that they are positions of the robot itself."""
     return all(
-        any(not set(BRANCHES).isdisjoint(words_of(part)) for part in x.name.split(".")[:-1])
+        any(not set(BRANCHES).isdisjoint(words_of(part)) for part in x.name.split("."))
         for x, _ in positions
     )
 

@@ -93,6 +93,7 @@ USUAL_POSITIONS: Final = (
     *((f"{branch}.{x}", f"{branch}.{y}") for branch in BRANCHES for x, y in _AXES),
     *((f"{branch}_{unit}.0", f"{branch}_{unit}.1") for branch in BRANCHES for unit in _LENGTHS),
     *_AXES[1:],  # at the top
+    ("X", "Y"),
 )
 NO_POSITION: Final = "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
 NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x, y]"

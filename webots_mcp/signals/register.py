@@ -62,7 +62,7 @@ _COMMANDED_WHEEL: Final = re.compile(
     rf"(^|[._])(commands?|cmds?|commanded|target_speeds?)[._]{_SIDE}([._](speed|velocity|rad_s))*$"
 )
 _ANGLES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
-_THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
+_THIRD_AXES: Final = {"0": "2", "x": "z", "X": "Z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
 _HEADINGS: Final = frozenset(("heading", "yaw", "theta", "bearing"))
 _OF_FLAT_NAME: Final = re.compile(r"(^|_)x(?=_|$)")  # the axis in pose_x, x_m
 _TILTS: Final = frozenset(("roll", "pitch", "tilt"))
